@@ -13,13 +13,20 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from .configuration import build, merge, parse_assignments
+from .configuration import build, merge, parse_assignments, with_homes
 from .contracts import Progress
 from .errors import HeadbenchError, InputError
 from .executors.command import ExecutionOptions, chosen_execution
 from .executors.settings import Execution, ExecutorName, check_executor
 from .io.documents import read_yaml
-from .io.files import check_output_folder, check_writable, removed_if_empty, write_json, write_text
+from .io.files import (
+    check_kind,
+    check_output_folder,
+    check_writable,
+    removed_if_empty,
+    write_json,
+    write_text,
+)
 from .io.lock import locked
 from .machine import check_device
 from .progress import log_to_file
@@ -69,6 +76,7 @@ def demo(settings: DemoSettings, progress: Progress) -> Findings:
     resolve_metrics(comparison)
     check_device(comparison.device)
     out = Path(settings.out)
+    check_kind(out, "a run")
     check_output_folder(out)
     with _log_file(out):
         start = time.perf_counter()
@@ -117,6 +125,7 @@ def synth(settings: SynthSettings, progress: Progress) -> Findings:
     """Render a synthetic multi-view capture in the GaussianAvatars/VHAP layout."""
     out, execution = Path(settings.out), settings.execution
     check_executor(execution, "cpu")
+    check_kind(out, "a synthetic capture", "captures")
     check_output_folder(out)
     with locked(out, beside=True):  # a capture is made in an empty folder
         size = parse_size(settings.size)
@@ -163,6 +172,7 @@ class RunSettings:
 def run(settings: RunSettings, progress: Progress) -> Findings:
     """Train methods on a capture, render, measure, and write tables and pictures."""
     values: dict[str, Any] = read_yaml(Path(settings.config)) if settings.config else {}
+    values = with_homes(values, settings.config or "")
     given = {name: getattr(settings, name) for name in ("data", "out", "methods", "preset", "seeds")}
     values = merge(values, {key: value for key, value in given.items() if value is not None})
     if settings.head is not None:
@@ -178,6 +188,7 @@ def run(settings: RunSettings, progress: Progress) -> Findings:
         values["reader"] = reader_of(values["data"])
     execution = chosen_execution(values.pop("execution", {}), settings.executor, settings.workers, source)
     config = build(RunConfig, values, source)
+    check_kind(Path(config.out), "a run")  # before the log is written there
     with _log_file(Path(config.out)):
         return _run(config, execution, unchecked=settings.unchecked)
 

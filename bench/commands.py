@@ -4,6 +4,7 @@
 
 import difflib
 import json as json_module
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -14,7 +15,7 @@ from typing import Annotated, Any, Union, get_args
 import tyro
 
 from .errors import EXIT_CODES, ExitCode, HeadbenchError, InputError
-from .io.files import plain
+from .io.files import check_kind, expand_home, plain
 from .io.lock import locked
 from .progress import log_to_terminal, progress
 from .registry import discover
@@ -48,6 +49,7 @@ RENAMED_OPTIONS = {
 
 def call(words: Sequence[str]) -> int:
     """Call the command that the words of a command line name, or print its help; returns the exit code."""
+    words = [with_home(word) for word in words]
     offered = offered_commands()
     check_known(words, offered)
     first = ("demo", "run", "table")  # what a newcomer needs
@@ -65,6 +67,14 @@ def call(words: Sequence[str]) -> int:
         registry=_values(),
     )
     return code
+
+
+def with_home(word: str) -> str:
+    """A word of the command line with the home folder for ``~``, which shells leave as it is behind ``=`` and in quotes."""
+    match = re.fullmatch(r"((?:[^=]*=)*?)(~.*)", word)
+    if match is None or (match[2] == "~" and match[1] and not match[1].startswith("--")):  # null in YAML
+        return word
+    return match[1] + expand_home(match[2], "command line")
 
 
 def offered_commands() -> dict[str, Command | dict[str, Command]]:
@@ -131,6 +141,8 @@ def _command(spec: CommandSpec) -> Command:
 
     def command(settings: settings_type, json: bool = False) -> int:
         folder = getattr(settings, spec.writes) if spec.writes else None
+        if folder:
+            check_kind(Path(folder), *spec.kinds)
         lock = locked(Path(folder)) if folder else nullcontext()
         with log_to_terminal(), lock, progress(spec.name) as report:
             findings = spec.function(settings, report)

@@ -13,6 +13,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from .errors import InputError
 from .io.documents import parse_setting, shown
+from .io.files import expand_home
 from .registry import unknown
 from .specs import Renamed
 
@@ -34,7 +35,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
             if not isinstance(level, dict):
                 raise InputError("--set", path, f"{key} to be a group of settings", "a value set before")
         level[keys[-1]] = value
-    return nested
+    return with_homes(nested, "--set")
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -46,6 +47,15 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
         else:
             result[key] = value
     return result
+
+
+def with_homes(value: Any, source: str) -> Any:
+    """Settings in which each text that is a path under ``~`` is that path in the home folder, see `expand_home`."""
+    if isinstance(value, Mapping):
+        return {key: with_homes(each, source) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(with_homes(each, source) for each in value)
+    return expand_home(value, source) if isinstance(value, str) else value
 
 
 def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = "") -> T:

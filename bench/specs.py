@@ -347,7 +347,8 @@ class CommandSpec:
         unless they give one.
     settings : annotation of the function's first parameter: a frozen dataclass whose attributes, described in
         docstrings, become the options.
-    writes : the setting with the folder that the command writes, see `writes`; "" for none.
+    writes, kinds : the setting with the folder that the command writes, and the kinds of folder that it may continue in,
+        see `writes`; "" for none.
     """
 
     name: str
@@ -355,6 +356,7 @@ class CommandSpec:
     function: CommandFunction
     settings: type
     writes: str = ""
+    kinds: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, name: str, function: Any) -> CommandSpec:
@@ -370,14 +372,18 @@ class CommandSpec:
                 f"{function!r}: a command is called with settings and a Progress: {error}"
             ) from error
         summary = (function.__doc__ or "").strip().partition("\n")[0]
-        return cls(name, summary, function, settings, getattr(function, "writes", ""))
+        setting, kinds = getattr(function, "writes", ("", ()))
+        return cls(name, summary, function, settings, setting, kinds)
 
 
-def writes(setting: str) -> Callable[[CommandFunction], CommandFunction]:
-    """Declare the setting that names the folder a command writes: no other process works in it meanwhile."""
+def writes(setting: str, *kinds: str) -> Callable[[CommandFunction], CommandFunction]:
+    """Declare the setting that names the folder a command writes: no other process works in it meanwhile.
+
+    A folder that holds another kind of thing than ``kinds`` is refused, see `bench.io.files.check_kind`.
+    """
 
     def declare(function: CommandFunction) -> CommandFunction:
-        function.__dict__["writes"] = setting
+        function.__dict__["writes"] = setting, kinds
         return function
 
     return declare

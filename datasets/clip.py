@@ -201,6 +201,13 @@ class CaptureClip:
             raise InputError("clip", "frame key", f"a frame of subject {self.subject}", str(key)) from None
 
 
+def check_apart(clip: CaptureClip, out: Path) -> None:
+    """Raise `InputError` where images of a capture lie in the folder that is to be written."""
+    images = [files.image for files in clip.files.values() if files.image is not None]
+    if any(out.resolve() in image.resolve().parents for image in images):
+        raise InputError("command line", "--out", "a folder apart from the capture", str(out))
+
+
 def as_capture(clip: Clip) -> CaptureClip:
     """Any clip as a `CaptureClip`, so that every step and command works on it; one that is such comes back itself.
 

@@ -13,7 +13,7 @@ import numpy as np
 from ..bench.contracts import ByteArray
 from ..bench.errors import InputError
 from ..bench.io.files import write_bytes
-from ..bench.io.images import probe_image, read_pixels
+from ..bench.io.images import encode_image, probe_image, read_pixels
 
 _ROWS = 64
 
@@ -43,7 +43,7 @@ class ImageStore:
         return self._get(path, tuple(float(c) for c in background))
 
     def mask(self, path: Path) -> ByteArray:
-        """(H, W) 8-bit coverage: the alpha channel where the file has one, else its first channel."""
+        """(H, W) 8-bit coverage, see `read_mask`."""
         return self._get(path, None)
 
     def _get(self, path: Path, background: tuple[float, ...] | None) -> ByteArray:
@@ -96,13 +96,24 @@ def read_image(path: Path, background: Iterable[float]) -> ByteArray:
     return result
 
 
-def read_mask(path: Path) -> ByteArray:
-    """Decode a mask to (H, W): the alpha channel where there is one, else the first channel."""
-    pixels = read_pixels(path)
+def read_mask(path: Path, size: tuple[int, int] | None = None) -> ByteArray:
+    """Decode a mask to (H, W) 8-bit coverage.
+
+    It is the alpha channel where there is one, else the level of grey, else the largest of the three channels. The
+    entries of a colour table are labels where they are not all grey: whatever is not black then covers fully. So a
+    mask covers what a viewer shows as not black. An alpha channel that is opaque everywhere beside grey is no mask, but
+    that of an editor that always saves one. ``size`` and errors are those of `read_pixels`.
+    """
+    pixels = read_pixels(path, size)
     if pixels.ndim == 2:
         return pixels
-    channel = 3 if pixels.shape[2] == 4 else 0
-    return np.ascontiguousarray(pixels[..., channel])
+    blue, green, red, *alpha = (channel.astype(np.uint8, copy=False) for channel in cv2.split(pixels))
+    grey = np.array_equal(blue, green) and np.array_equal(green, red)
+    if alpha and not (grey and alpha[0].min() == 255):
+        return alpha[0]
+    if not grey and probe_image(path).table:
+        return np.where((blue | green | red) > 0, 255, 0).astype(np.uint8)
+    return np.maximum(np.maximum(blue, green), red)
 
 
 def is_whole(path: Path, width: int, height: int) -> bool:
@@ -117,9 +128,6 @@ def is_whole(path: Path, width: int, height: int) -> bool:
 def write_image(path: Path, image: ByteArray, *options: int) -> None:
     """Write (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA, 8-bit, atomically; ``options`` are OpenCV's.
 
-    The suffix decides the format.
+    The suffix decides the format. Raises `InputError` as `encode_image` does.
     """
-    if image.ndim == 3:  # OpenCV encodes BGR(A)
-        order = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
-        image = cv2.cvtColor(image, order).astype(np.uint8, copy=False)
-    write_bytes(path, cv2.imencode(path.suffix, image, options)[1].tobytes())
+    write_bytes(path, encode_image(image, path.suffix, options, place=path))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,11 +15,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from PIL import Image
 
 from ..bench.contracts import ByteArray, FloatArray
-from ..bench.io.files import write_bytes
-from ..bench.io.provenance import COMPOSITE, mark_png
+from ..bench.io.images import write_png
+from ..bench.io.provenance import COMPOSITE
 
 INK, MUTED, LINE, BOX = "#1e1e1e", "#6e6e6e", "#cdcdcd", "#e1e1e1"
 GAP, MARGIN, MARKED = 8, 24, 3
@@ -125,9 +123,7 @@ class _Paper:
                 size = (max(1, width), max(1, height))
                 image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
             pixels[top : top + image.shape[0], left : left + image.shape[1]] = image
-        plain = io.BytesIO()
-        Image.fromarray(pixels).save(plain, "png")
-        write_bytes(path, mark_png(plain.getvalue(), COMPOSITE))
+        write_png(path, np.ascontiguousarray(pixels), COMPOSITE)
 
 
 @style.context("default")  # whatever the user's matplotlibrc says, such as text.usetex

@@ -14,8 +14,8 @@ import cv2
 
 from ..bench.audit.bundle import without_paths
 from ..bench.errors import InputError
-from ..bench.io.files import atomic_path, write_text
-from ..bench.io.images import read_png
+from ..bench.io.files import atomic_path, write_bytes, write_text
+from ..bench.io.images import encode_image, read_png
 from ..bench.rows import ALL, Rows
 from ..bench.runner.scoring import FULL
 from ..bench.runner.store import RunFolder
@@ -33,9 +33,8 @@ def publish_demo(out: Path, readme: Path) -> None:
     target = RunFolder(readme.parent / GALLERY)
     _copy(RunFolder(out), target)
     # A page's picture, not a measurement: a lossy copy a third the size.
-    sheet = cv2.cvtColor(read_png(RunFolder(out).contact_sheet), cv2.COLOR_RGB2BGR)
-    with atomic_path(target.root / PICTURE) as temporary:
-        cv2.imwrite(str(temporary), sheet, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    path, sheet = target.root / PICTURE, read_png(RunFolder(out).contact_sheet)
+    write_bytes(path, encode_image(sheet, path.suffix, (cv2.IMWRITE_JPEG_QUALITY, 90), place=path))
     _write(readme, "demo", demo_block(target.root))
 
 

@@ -134,8 +134,16 @@ READ_IN_ONE_PLACE = {
         "methods/gaussian_ply/formats.py",  # an archive just made in memory
         "metrics/torch_file.py",
     },
-    r"\bcv2\.(imread|imdecode)\(": {"bench/io/images.py"},
-    r"\bImage\.open\(": {"bench/audit/evaluate.py"},  # behind a check of the header
+    r"\bcv2\.im(read|readmulti|decode|decodemulti|write|writemulti|encode)\b": {
+        "bench/io/images.py",
+        "methods/official/gha/stages.py",  # a program for the authors' interpreter, run there
+    },
+    r"\bImage\.open\(|\bimageio\b|\bimread\(|\bimsave\(|skimage\.io\b|mimread|\.fromarray\(.*\.save\(": {
+        "bench/io/images.py",  # the words, in the names of OpenCV's functions
+        "bench/io/video.py",  # the package that brings ffmpeg
+        "methods/official/gha/method.py",  # names of packages that the authors' code needs
+    },
+    r"\bcv2\.VideoCapture\(": {"bench/io/video.py", "datasets/nersemble/sequence.py"},
     r"\bsafe_open\(|\bload_file\(": {"methods/shared/tensor_files.py"},
     r"\btorch\.load\(": {
         "methods/official/gbs/method.py"

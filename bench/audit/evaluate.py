@@ -8,19 +8,18 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
-from PIL import Image, UnidentifiedImageError
-
 from ..contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
 from ..errors import HeadbenchError, InputError
 from ..io.files import (
     atomic_path,
+    check_kind,
     check_name,
     check_output_folder,
     digest,
     digest_file,
     grouped_writes,
 )
-from ..io.images import probe_image, write_png
+from ..io.images import probe_image, read_pixels, write_png
 from ..io.lock import locked
 from ..protocol import Protocol, make_protocols
 from ..registry import discover, get, resolve
@@ -100,6 +99,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
         method = images_method(config.methods[0], digest(digests)[:12])
         adapted_for = [method]
     folder = RunFolder(Path(config.out))
+    check_kind(folder.root, "a run")
     check_output_folder(folder.root)
     with locked(folder.root):
         manifest = describe(config, [method], metrics, clips, protocols)
@@ -259,19 +259,15 @@ def _places(folder: Path, task: str, key: FrameKey, subjects: int) -> list[Path]
 
 
 def _check(path: Path, size: tuple[int, int]) -> None:
-    info = probe_image(path)  # before Pillow decodes what may be a bomb
+    info = probe_image(path)
     if (info.width, info.height) != size:
         expected, found = ("{} x {} pixels".format(*pair) for pair in (size, (info.width, info.height)))
         remedy = "Render at the capture's size; a resized image would be scored for its resizing, too."
         raise InputError(path, "size", f"{expected}, as the ground truth", found, remedy)
-    try:
-        with Image.open(path) as image:
-            if image.format != "PNG":
-                raise InputError(path, "format", "PNG, which is lossless", str(image.format))
-            if image.mode == "RGBA" and image.getchannel("A").getextrema() != (255, 255):
-                remedy = "Composite it on the background of the capture."
-                raise InputError(path, "alpha", "an opaque image", "transparent pixels", remedy)
-            if image.mode not in ("RGB", "RGBA"):
-                raise InputError(path, "mode", "8-bit RGB", str(image.mode))
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
-        raise InputError(path, "", "a PNG image", f"a file that cannot be read ({error})") from error
+    if info.format != "PNG":
+        raise InputError(path, "format", "PNG, which is lossless", info.format)
+    if info.table or info.channels not in (3, 4):
+        raise InputError(path, "mode", "8-bit RGB", "a table of colours" if info.table else "grey")
+    if info.has_alpha and read_pixels(path)[..., 3].min() < 255:
+        remedy = "Composite it on the background of the capture."
+        raise InputError(path, "alpha", "an opaque image", "transparent pixels", remedy)

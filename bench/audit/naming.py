@@ -14,7 +14,8 @@ import numpy as np
 
 from ..contracts import ByteArray, Clip, FrameKey
 from ..errors import InputError
-from ..io.files import read_bytes
+from ..io.documents import read_text
+from ..io.files import with_slashes
 from ..io.images import read_pixels, read_png
 from ..registry import get, resolve, unknown
 from ..runner.captures import found_captures
@@ -230,14 +231,14 @@ def _every_frame(clip: Clip) -> set[FrameKey]:
 
 def _listed(path: Path, folder: Path, clips: Sequence[Clip]) -> Renders:
     """Images that a CSV file names, relative to ``folder``; a column ``subject`` is needed with several captures."""
-    text = read_bytes(path, "a CSV file", MAX_MAP_BYTES)
+    text = read_text(path, "CSV", MAX_MAP_BYTES)
     needed = {*COLUMNS, *(["subject"] if len(clips) > 1 else [])}
     try:
-        reader = csv.reader(io.StringIO(text.decode("utf-8-sig"), newline=""), strict=True)
+        reader = csv.reader(io.StringIO(text, newline=""), strict=True)
         header = next(reader, [])
         rows = [(reader.line_num, row) for row in reader if row]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "", "a CSV file in UTF-8", str(error)) from error
+    except csv.Error as error:
+        raise InputError(path, "", "a CSV file", str(error)) from error
     allowed = needed | {"subject"}
     if len(set(header)) != len(header) or not needed <= set(header) <= allowed:
         raise InputError(path, "line 1", f"the columns {', '.join(sorted(needed))}", ", ".join(header))
@@ -249,7 +250,7 @@ def _listed(path: Path, folder: Path, clips: Sequence[Clip]) -> Renders:
         if len(row) != len(header):
             raise InputError(path, where, f"{len(header)} entries", f"{len(row)}")
         entry = dict(zip(header, row))
-        place = PurePosixPath(entry["file"])
+        place = PurePosixPath(with_slashes(entry["file"]))
         if not entry["file"] or place.is_absolute() or ".." in place.parts:
             expected = f"a path inside {folder}"
             raise InputError(path, f"{where}, file", expected, repr(entry["file"]))

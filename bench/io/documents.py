@@ -1,4 +1,4 @@
-"""JSON and YAML from outside: bounded in size and nesting, every key once, checked against dataclasses.
+"""Text, JSON and YAML from outside: bounded in size and nesting, every key once, checked against dataclasses.
 
 A document that breaks a rule is refused by an `InputError` with the file, the dotted key, what was expected and what
 was found. Non-finite numbers are refused everywhere: JSON has none, and whoever measures nothing writes null.
@@ -6,6 +6,7 @@ was found. Non-finite numbers are refused everywhere: JSON has none, and whoever
 
 from __future__ import annotations
 
+import codecs
 import functools
 import json
 import math
@@ -45,7 +46,7 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises `InputError` for a file that is missing, cannot be read, is larger than `MAX_JSON_BYTES`, does not parse,
     nests deeper than `MAX_DEPTH`, repeats a key, holds a number that is not finite, or something else than an object.
     """
-    return parse_json(_read(path, "JSON", MAX_JSON_BYTES), path)
+    return parse_json(read_text(path, "JSON", MAX_JSON_BYTES), path)
 
 
 def parse_json(text: str | bytes, source: Source, key: str = "") -> dict[str, Any]:
@@ -72,7 +73,7 @@ def read_yaml(path: Path) -> dict[Any, Any]:
     `read_json` does, and for anchors that are used, tags, dates, and whole numbers that YAML 1.1 takes otherwise than
     they look (057 is 47 to it, 1:30 is 90).
     """
-    value = _parse_yaml(_read(path, "YAML", MAX_YAML_BYTES), path, "", literal=False)
+    value = _parse_yaml(read_text(path, "YAML", MAX_YAML_BYTES), path, "", literal=False)
     if value is None:
         return {}
     if not isinstance(value, dict):
@@ -137,7 +138,12 @@ class _Refused(ValueError):
         super().__init__(f"expected {expected}, found {found}")
 
 
-def _read(path: Path, what: str, limit: int) -> str:
+def read_text(path: Path, what: str, limit: int) -> str:
+    """Read a text file in UTF-8, with or without a byte order mark; line ends are left as they are.
+
+    ``what`` names the format in errors. Raises `InputError` for a file that is missing, cannot be read, is larger than
+    ``limit`` bytes, or has another encoding.
+    """
     article = f"a {what} file"
     try:
         if path.exists() and not path.is_file():
@@ -146,7 +152,8 @@ def _read(path: Path, what: str, limit: int) -> str:
             content = stream.read(limit + 1)
         if len(content) > limit:
             raise InputError(path, "", f"{article} of at most {limit} bytes", "a larger one")
-        return content.decode("utf-8")
+        refuse_utf16(content, path, f"{article} in UTF-8")
+        return content.decode("utf-8-sig")
     except FileNotFoundError as error:
         raise InputError(path, "", article, "no such file") from error
     except UnicodeDecodeError as error:
@@ -156,6 +163,12 @@ def _read(path: Path, what: str, limit: int) -> str:
         raise InputError(path, "", f"a readable {what} file", error.strerror or str(error)) from error
     except ValueError as error:  # a name that no file can have
         raise InputError(path, "", f"a readable {what} file", str(error)) from error
+
+
+def refuse_utf16(content: bytes, source: Source, expected: str) -> None:
+    """Raise `InputError` for text whose first bytes show that it is UTF-16 or UTF-32, as some editors save it."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or b"\0" in content[:4]:
+        raise InputError(source, "", expected, "UTF-16 or UTF-32", "Save it as UTF-8.")
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

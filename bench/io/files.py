@@ -7,11 +7,12 @@ import fcntl
 import hashlib
 import json
 import os
+import re
 import stat
 import tempfile
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, is_dataclass
@@ -114,7 +115,7 @@ def _naming(write: _Write) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno is not None and error.filename in (None, str(write.temporary)):
-            error.filename, error.filename2 = str(write.path), None
+            raise OSError(error.errno, error.strerror, str(write.path)) from error
         raise
 
 
@@ -341,6 +342,39 @@ def check_output_folder(folder: Path) -> None:
         _try_to_write(folder)
 
 
+KINDS: Mapping[str, tuple[str, ...]] = {
+    "a capture": (
+        *("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json"),
+        *("canonical_flame_param.npz", "fg_masks", "flame_params.json", "flame/exp"),
+    ),
+    "captures": ("*/transforms.json", "*/transforms_train.json", "*/flame_params.json"),
+    "a synthetic capture": ("synthesis.json",),
+    "a COLMAP dataset": ("sparse", "cameras.bin", "cameras.txt"),
+    "a recording": (
+        *("camera_params", "recording", "sequence_*_part-*", "calibration/camera_params.json"),
+        *("*/calibration/camera_params.json", "*/*/calibration/camera_params.json"),
+    ),
+    "a run": ("run.json",),
+    "a cell of a run": ("fit.json",),
+    "an avatar": ("subject.npz",),
+}
+"""What marks a folder as one of a kind: patterns of files and folders in it."""
+
+
+def check_kind(folder: Path, *kinds: str) -> None:
+    """Make sure, before anything is written, that the folder of ``--out`` holds nothing of another kind.
+
+    ``kinds``, out of `KINDS`, are those that the command writes, so that it may continue in one. Raises `InputError`
+    that names the file by which another was recognised.
+    """
+    for kind, patterns in KINDS.items():
+        marks = (path for pattern in patterns for path in folder.glob(pattern)) if kind not in kinds else ()
+        for mark in marks:
+            expected = " or ".join(["a new folder", *(f"that of {kind}" for kind in kinds)])
+            found = f"{kind} ({mark.relative_to(folder)})"
+            raise InputError(folder, "--out", expected, found, "Nothing was written. Name another folder.")
+
+
 @contextmanager
 def removed_if_empty(folder: Path) -> Iterator[None]:
     """When the block ends, remove the folder and its parents if the block made them and they are empty."""
@@ -437,6 +471,35 @@ def check_name(name: str, file: str | os.PathLike[str], key: str) -> str:
         expected = f"a name without slashes, colons and leading dots, of 1 to {MAX_NAME_BYTES} bytes"
         raise InputError(file, key, expected, repr(name[:60]))
     return name
+
+
+def with_slashes(path: str) -> str:
+    """A relative path out of a file, with slashes for the backslashes that programs on Windows write."""
+    return path.replace("\\", "/")
+
+
+def is_system_file(name: str) -> bool:
+    """Whether an operating system or a tool left a file of that name, hidden ones like ``._a.png`` included."""
+    return name.startswith(".") or name.lower() in ("thumbs.db", "desktop.ini", "__macosx")
+
+
+def entries(folder: Path, pattern: str = "*") -> list[Path]:
+    """What a folder holds that fits a pattern, sorted, without files of operating systems; [] where it is none."""
+    return sorted(path for path in folder.glob(pattern) if not is_system_file(path.name))
+
+
+def expand_home(text: str, source: str) -> str:
+    """Replace ``~`` or ``~user`` at the start of a path by the home folder, as a shell does; leave other text alone.
+
+    Raises `InputError`, naming the ``source`` of the path, where the home folder is not known.
+    """
+    if not re.match(r"~($|[\w.-]*/)", text):
+        return text
+    path = os.path.expanduser(text)
+    if path.startswith("~"):
+        found = f"none for {text.partition('/')[0]}"
+        raise InputError(source, text, "a path in a home folder that is known", found)
+    return path
 
 
 def plain(value: Any) -> Any:

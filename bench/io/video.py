@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import os
 import shutil
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import cv2
 
 from ..contracts import ByteArray
 from ..errors import HeadbenchError, InputError, UnavailableError, install_extra
-from .files import atomic_path
+from .files import ROOM_BYTES, atomic_path
 from .provenance import note
 
 _H264, _MPEG4 = "avc1", "mp4v"
@@ -48,6 +49,7 @@ def write_video(path: Path, frames: Iterable[ByteArray], fps: float) -> str:
     """
     codec = video_codec()
     writer: cv2.VideoWriter | None = None
+    count = 0
     with atomic_path(path) as temporary:
         for frame in frames:
             height, width = frame.shape[:2]
@@ -61,10 +63,26 @@ def write_video(path: Path, frames: Iterable[ByteArray], fps: float) -> str:
                     raise InputError(path, "", "a video that OpenCV can write", f"no encoder for {codec}")
             order = cv2.COLOR_GRAY2BGR if frame.ndim == 2 else cv2.COLOR_RGB2BGR
             writer.write(cv2.cvtColor(frame, order))
+            count += 1
         if writer is None:
             raise InputError(path, "", "at least one frame", "none")
         writer.release()
+        _check_whole(path, temporary, count)
     return codec
+
+
+def _check_whole(path: Path, written: Path, count: int) -> None:
+    """Raise an error where a video has fewer frames than were written: OpenCV does not report a full disk."""
+    capture = cv2.VideoCapture(str(written), cv2.CAP_FFMPEG)
+    found = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+    complete = capture.isOpened() and found == count
+    capture.release()
+    if not complete:
+        with written.open("ab") as stream:  # fails with the system's reason, if that persists
+            stream.write(bytes(ROOM_BYTES))
+            stream.flush()
+            os.fsync(stream.fileno())
+        raise InputError(path, "", f"a video of {count} frames after writing it", f"{found} frames")
 
 
 def webm_writer() -> Any:

@@ -16,7 +16,7 @@ from ..contracts import Avatar, CheckedMethod, Clip
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..executors.outcome import outcome_path
 from ..executors.settings import Execution, check_executor
-from ..io.files import atomic_path, check_output_folder, output_inside
+from ..io.files import atomic_path, check_kind, check_output_folder, output_inside
 from ..io.lock import locked
 from ..machine import check_device_answers, machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
@@ -52,6 +52,7 @@ def run(
     execution = execution or Execution()
     check_executor(execution, config.device)
     folder = RunFolder(Path(config.out))
+    check_kind(folder.root, "a run")
     check_output_folder(folder.root)
     start = time.perf_counter()
     with locked(folder.root):

@@ -31,7 +31,7 @@ from typing_extensions import TypedDict
 from ..contracts import FrameKey
 from ..errors import InputError
 from ..io.documents import checked, read_json
-from ..io.files import digest_file, write_json
+from ..io.files import digest_file, is_system_file, write_json
 from ..manifest import Manifest
 from ..rows import ALL, Rows
 
@@ -176,8 +176,9 @@ def _kept_design(manifest: Manifest) -> dict[str, str]:
 
 
 def avatar_files(folder: Path) -> list[Path]:
-    """Files of an avatar's folder, sorted; logs, which official programs leave there, are no part of the avatar."""
-    return sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix != ".log")
+    """Files of an avatar's folder, sorted, without logs of official programs and files of operating systems."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.suffix != ".log")
+    return sorted(path for path in files if not is_system_file(path.name))
 
 
 def _damage(path: Path, known: str) -> str:

@@ -11,7 +11,7 @@ from ..contracts import FloatArray, HeadAsset
 from ..errors import InputError
 from ..io.arrays import TEXT, Member, read_arrays
 from ..io.documents import checked, read_json
-from ..io.files import digest, digest_file
+from ..io.files import digest, digest_file, entries
 from ..registry import get
 from ..specs import MethodSpec
 from .config import AVATAR_FOLDER, ResolvedMethod, default_names, resolve_method
@@ -22,7 +22,7 @@ def avatar_folder(folder: Path) -> Path:
     """The folder with the files of an avatar: this one, or ``avatar`` in the cell of a run. Raises `InputError`."""
     inside = folder / "avatar"
     found = inside if inside.is_dir() else folder
-    if not found.is_dir() or not any(path.is_file() for path in found.iterdir()):
+    if not found.is_dir() or not any(path.is_file() for path in entries(found)):
         reason = "no such folder" if not found.is_dir() else "one without files"
         raise InputError(folder, "", f"the {AVATAR_FOLDER}", reason)
     return found

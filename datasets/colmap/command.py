@@ -41,15 +41,17 @@ class ExportColmapSettings(CaptureOptions):
     Gaussian splatting, GaussianAvatars, OpenSplat and nerfbaselines need it; masks are then NAME.png and NAME.png.png."""
 
 
-@writes("out")
+@writes("out", "a COLMAP dataset")
 def export_colmap(settings: ExportColmapSettings, progress: Progress) -> Findings:
     """Write frames of a capture as a COLMAP dataset: images, masks and a sparse model.
 
     See `export_model`. Raises `InputError` for timesteps that the capture lacks.
     """
+    from ..clip import check_apart
     from .writer import export_model, export_tracking
 
     clip = settings.open(settings.capture, progress)
+    check_apart(clip, Path(settings.out))
     chosen = set(settings.timesteps) or {clip.timesteps("train")[0]}
     if settings.all_timesteps:
         chosen = set(clip.poses)

@@ -22,7 +22,8 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 
 from ...bench.errors import InputError
-from ...bench.io.files import check_name
+from ...bench.io.documents import refuse_utf16
+from ...bench.io.files import check_name, with_slashes
 
 
 @cache
@@ -195,7 +196,7 @@ def _images_binary(file: Path) -> Iterator[tuple[int, ColmapImage]]:
         for _ in range(reader.count(struct.calcsize("<I7dIQ") + 1, "images")):
             number, *pose, camera = reader.take("I7dI", "image")
             key = f"image {number}"
-            name = reader.name(key)
+            name = with_slashes(reader.name(key))
             points = reader.count(_POINT, f"{key}, points")
             reader.skip(points * _POINT, key)
             yield number, ColmapImage(name, camera, tuple(pose[:4]), tuple(pose[4:]))
@@ -208,7 +209,8 @@ _IMAGE_WORDS = 10  # number, quaternion, translation, camera, name
 
 def _cameras_text(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
     lengths = dict(camera_models().values())
-    for line, words in _lines(file):
+    for line, text in _lines(file):
+        words = text.split()
         if not words:
             continue
         key = f"line {line}"
@@ -224,7 +226,8 @@ def _cameras_text(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 def _images_text(file: Path) -> Iterator[tuple[int, ColmapImage]]:
     lines = _lines(file)
-    for line, words in lines:
+    for line, text in lines:
+        words = text.strip().split(maxsplit=_IMAGE_WORDS - 1)  # the name, which comes last, may hold spaces
         if not words:
             continue
         key = f"line {line}"
@@ -232,23 +235,25 @@ def _images_text(file: Path) -> Iterator[tuple[int, ColmapImage]]:
             raise InputError(file, key, f"{_IMAGE_WORDS} words of an image", f"{len(words)}")
         number, camera = _whole(file, key, [words[0], words[8]])
         pose = _real(file, key, words[1:8])
-        yield number, ColmapImage(words[9], camera, pose[:4], pose[4:])
-        _, points = next(lines, (0, ["missing"]))
-        if len(points) % 3:
+        yield number, ColmapImage(with_slashes(words[9]), camera, pose[:4], pose[4:])
+        _, points = next(lines, (0, "missing"))
+        if len(points.split()) % 3:
             expected = "the image's points, three numbers each"
             raise InputError(file, f"line {line + 1}", expected, "another line")
 
 
-def _lines(file: Path) -> Iterator[tuple[int, list[str]]]:
-    """Number and words of each line that is no comment. An empty line may be an image without points."""
+def _lines(file: Path) -> Iterator[tuple[int, str]]:
+    """Number and text of each line that is no comment. An empty line may be an image without points."""
     try:
-        with file.open(encoding="utf-8") as stream:
+        with file.open("rb") as start:
+            refuse_utf16(start.read(4), file, "text in UTF-8")
+        with file.open(encoding="utf-8-sig") as stream:
             for number, line in enumerate(iter(partial(stream.readline, _LONGEST_LINE + 1), ""), start=1):
                 if len(line) > _LONGEST_LINE:
                     expected = f"at most {_LONGEST_LINE} characters in a line"
                     raise InputError(file, f"line {number}", expected, "more")
                 if not line.startswith("#"):
-                    yield number, line.split()
+                    yield number, line
     except UnicodeDecodeError as error:
         raise InputError(file, "", "text in UTF-8", str(error)) from error
 

@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from ...bench.contracts import Camera, FrameKey, Progress, StepRecord, no_progress
 from ...bench.errors import InputError
-from ...bench.io.files import check_name, digest
+from ...bench.io.files import check_name, digest, entries
 from ...bench.io.images import probe_image
 from ..clip import CaptureClip, FrameFiles
 from ..ga.content_digests import content_digests
@@ -110,7 +110,7 @@ def find_datasets(root: Path) -> list[Path]:
 
 def pose_files(path: str | Path) -> dict[int, Path]:
     """The file with the tracked parameters of every timestep that has one."""
-    files = (Path(path) / TRACKING_FOLDER).glob("*.npz")
+    files = entries(Path(path) / TRACKING_FOLDER, "*.npz")
     return {int(file.stem): file for file in files if file.stem.isdecimal()}
 
 

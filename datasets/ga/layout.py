@@ -30,7 +30,7 @@ import numpy as np
 from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.documents import checked, read_json, shown
-from ...bench.io.files import check_name, write_json
+from ...bench.io.files import check_name, with_slashes, write_json
 from ..rounding import ANGLE_BITS, on_grid
 
 CyConvention = Literal["top", "bottom", "centre"]
@@ -180,7 +180,8 @@ class Declaration:
             check_name(name, path, f"sequences.{part}")
         if not all(0 <= channel <= 1 for channel in file.background):
             raise InputError(path, "background", "three numbers in [0, 1]", str(file.background))
-        values = {**vars(file), "excluded": {entry.timestep: entry.reason for entry in file.excluded}}
+        values = {**vars(file), "head_file": with_slashes(file.head_file)}
+        values |= {"excluded": {entry.timestep: entry.reason for entry in file.excluded}}
         del values["format_version"]
         return cls(**values)
 

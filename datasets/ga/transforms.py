@@ -14,8 +14,8 @@ import numpy as np
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
-from ...bench.io.files import check_name
-from ..foreign import frame_route
+from ...bench.io.files import check_name, with_slashes
+from ..foreign import IMAGES, frame_route
 
 INTRINSIC_KEYS = ("cx", "cy", "fl_x", "fl_y", "camera_angle_x")
 RIGID_TOLERANCE = 1e-4
@@ -125,10 +125,10 @@ def parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any])
     way = frame_route(frame)
     if way:
         raise InputError(path, f"{where}.flame_param_path", "text", "no such key", way)
-    image = reader.text("file_path")
-    if ".png" not in image and ".jpg" not in image.lower():
-        image += ".png"  # the rule of GaussianAvatars, to which we add JPEG
-    mask = reader.text("fg_mask_path") if "fg_mask_path" in frame else None
+    image = with_slashes(reader.text("file_path"))
+    if Path(image).suffix.lower() not in IMAGES:
+        image += ".png"  # as GaussianAvatars does
+    mask = with_slashes(reader.text("fg_mask_path")) if "fg_mask_path" in frame else None
     camera_index = reader.integer("camera_index") if "camera_index" in frame else 0
     intrinsics = {key: reader.number(key) for key in INTRINSIC_KEYS if reader.has(key)}
     _check_intrinsics(path, where, intrinsics)
@@ -141,7 +141,7 @@ def parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any])
         sequence_folder=check_name(_sequence_folder(path.parent, image), path, f"{where}.file_path"),
         image=path.parent / image,
         mask=path.parent / mask if mask else None,
-        parameters=path.parent / reader.text("flame_param_path"),
+        parameters=path.parent / with_slashes(reader.text("flame_param_path")),
         width=reader.integer("w") if reader.has("w") else None,
         height=reader.integer("h") if reader.has("h") else None,
         intrinsics=intrinsics,

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from itertools import combinations, pairwise
 
 from ...bench.errors import InputError
+from ...bench.io.files import entries
 from ..ga import layout
 from ..ga.transforms import FrameEntry
 from .checks_images import unit_range
@@ -262,8 +263,8 @@ def _orphans(evidence: Evidence) -> Iterator[Hit]:
         path
         for folder in folders
         if folder.is_dir()
-        for path in folder.iterdir()
-        if path.suffix in suffixes and not path.name.startswith(".") and path.resolve() not in known
+        for path in entries(folder)
+        if path.suffix in suffixes and path.resolve() not in known
     )
     if orphans:
         yield Hit(f"{several(len(orphans), 'image')} that no split names", orphans[0])

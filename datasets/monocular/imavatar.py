@@ -24,6 +24,7 @@ from ...bench.contracts import Camera, FloatArray, HeadPose, Progress
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers
 from ...bench.io.documents import checked, read_json
+from ...bench.io.files import with_slashes
 from ...bench.io.images import ImageInfo, probe_image
 from ..ga.transforms import read_rigid
 from ..head.arrays import HeadArrays
@@ -104,7 +105,7 @@ def _frame(
     intrinsics: tuple[float, float, float, float],
     head: HeadArrays,
 ) -> VideoFrame:
-    image = folder / f"{frame.file_path.removesuffix('.png')}.png"
+    image = folder / f"{with_slashes(frame.file_path).removesuffix('.png')}.png"
     number = frame_number(path, f"{where}.file_path", image.stem)
     info = probe_image(image)
     mask = image

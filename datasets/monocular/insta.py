@@ -28,8 +28,8 @@ from scipy.spatial.transform import Rotation
 from ...bench.contracts import Camera, FloatArray, HeadPose, Progress
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers
-from ...bench.io.documents import checked, read_json
-from ...bench.io.files import read_bytes
+from ...bench.io.documents import checked, read_json, read_text
+from ...bench.io.files import with_slashes
 from ...bench.io.images import probe_image
 from ..ga.layout import ALL_FRAMES_FILE, SPLIT_FILES
 from ..ga.transforms import check_lenses, read_rigid
@@ -151,7 +151,7 @@ def _source(root: Path, path: Path, where: str, frame: _Frame, document: _Docume
         )
     if not frame.file_path:
         raise InputError(path, f"{where}.file_path", "the file of an image", "none")
-    image = root / frame.file_path
+    image = root / with_slashes(frame.file_path)
     image = image if image.suffix else image.with_suffix(".png")
     number = frame_number(path, f"{where}.file_path", image.stem)
     info = probe_image(image)
@@ -167,8 +167,8 @@ def _source(root: Path, path: Path, where: str, frame: _Frame, document: _Docume
     world_to_camera = np.linalg.inv(read_rigid(path, f"{where}.transform_matrix", frame.transform_matrix))
     K = _intrinsics(path, where, frame, document, info.width, info.height)
     camera = Camera("0", info.width, info.height, K, world_to_camera)
-    expression = root / (frame.exp_path or f"{EXPRESSIONS}/{image.stem}.txt")
-    mesh = root / (frame.mesh_path or f"meshes/{image.stem}.obj")
+    expression = root / with_slashes(frame.exp_path or f"{EXPRESSIONS}/{image.stem}.txt")
+    mesh = root / with_slashes(frame.mesh_path or f"meshes/{image.stem}.obj")
     return _Source((path, where), number, image, mask, camera, expression, mesh)
 
 
@@ -273,7 +273,7 @@ class _Meshes:
         return rotations_of_6d(path, values.reshape(count, 6)).ravel()
 
     def _numbers(self, path: Path) -> FloatArray:
-        text = read_bytes(path, "a text file of numbers", MAX_TEXT)
+        text = read_text(path, "text", MAX_TEXT)
         try:
             values = np.array([float(word) for word in text.split()])  # no array of the longest word
         except ValueError as error:

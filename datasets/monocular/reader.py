@@ -15,7 +15,7 @@ import numpy as np
 
 from ...bench.contracts import FrameKey, Progress, StepRecord, no_progress
 from ...bench.errors import InputError
-from ...bench.io.files import check_name, digest
+from ...bench.io.files import check_name, digest, entries
 from ..clip import CaptureClip, FrameFiles, FramePixels
 from ..ga.content_digests import content_digests
 from ..ga.layout import DECLARATION_FILE, HEAD_FILE, Declaration
@@ -45,7 +45,7 @@ def find_videos(root: Path) -> list[Path]:
         return [root]
     if not root.is_dir():
         return []
-    below = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
+    below = [path for path in entries(root) if path.is_dir()]
     return [path for path in below if is_insta(path) or (not (path / PARAMETERS).exists() and videos(path))]
 
 

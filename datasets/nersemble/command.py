@@ -10,6 +10,7 @@ import tyro
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.io.files import check_kind
 from ...bench.specs import Findings, writes
 from ..ga.layout import HEAD_FILE
 from ..head.arrays import save_head
@@ -105,6 +106,7 @@ def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progres
             raise InputError("command line", f"--{key}", "a number from 0", f"{getattr(settings, key)}")
     if settings.union_root:
         return check_unions(Path(settings.union_root), subjects, rejoin=settings.rejoin, progress=progress)
+    check_kind(Path(settings.out), "captures")
     _check_named(settings, subjects)
     plans = [plan_subject(settings, subject) for subject in subjects]
     if settings.check:
@@ -166,17 +168,19 @@ def _done(results: list[SubjectResult], plans: list[SubjectPlan], settings: Prep
     return Findings("\n".join(lines), data, passed)
 
 
-@writes("out")
+@writes("out", "a recording")
 def record_nersemble(settings: RecordSettings, progress: Progress = no_progress) -> Findings:
     """Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to try prepare on.
 
     For synthetic captures, as they bring their own head model.
     """
     from ...bench.io.video import video_codec
+    from ..clip import check_apart
     from .re_record import re_record
 
     clip = settings.open(settings.capture, progress)
     out = Path(settings.out)
+    check_apart(clip, out)
     masks = settings.frames == "images"
     sequences = re_record(
         clip,

@@ -20,9 +20,9 @@ import cv2
 from ...bench.contracts import ByteArray, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import grouped_writes
-from ...bench.io.images import read_pixels
+from ...bench.io.images import read_bgr
 from ...bench.machine import processor_count
-from ..images import is_whole, write_image
+from ..images import is_whole, read_mask, write_image
 from .pixels import prepare_pixels, read_still
 from .plan import SequenceJob
 from .sequence import RecordedView, open_video
@@ -45,8 +45,8 @@ def read_frames(view: RecordedView, numbers: Sequence[int]) -> Iterator[RawFrame
     """
     if view.video is None:
         for number in numbers:
-            mask = read_pixels(view.masks[number], cv2.IMREAD_GRAYSCALE, view.size) if view.masks else None
-            bgr = read_pixels(view.images[number], cv2.IMREAD_COLOR, view.size)
+            mask = read_mask(view.masks[number], view.size) if view.masks else None
+            bgr = read_bgr(view.images[number], view.size)
             yield RawFrame(number, bgr, mask)
         return
     frames = _decode_video(view.video, view, numbers)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ...bench.contracts import ByteArray, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import check_numbers, read_npy
-from ...bench.io.images import read_pixels
+from ...bench.io.images import read_bgr
 from ..srgb import srgb_to_linear
 
 Correction = Callable[[ByteArray], ByteArray]
@@ -215,7 +215,7 @@ def read_still(path: Path, size: tuple[int, int]) -> ByteArray:
 
     Raises `InputError` where it does not decode.
     """
-    still = read_pixels(path, cv2.IMREAD_COLOR)
+    still = read_bgr(path)
     return cv2.resize(still, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
 
 

@@ -18,6 +18,7 @@ cameras (raw recordings) or one per camera (the benchmark's cropped videos); no 
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,8 +28,8 @@ import numpy as np
 
 from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
-from ...bench.io.documents import read_json
-from ...bench.io.files import check_name
+from ...bench.io.documents import MAX_YAML_BYTES, read_json, read_text
+from ...bench.io.files import check_name, entries
 from ..ga.transforms import found_entry, read_matrix, read_rigid
 from .names import BACKGROUND, FULL_SIZE, is_subject, match_sequence, serial_of
 from .pixels import Correction, affine_correction, polynomial_correction
@@ -100,7 +101,7 @@ def participants(root: Path) -> dict[str, Participant]:
     found = {name: _participant(root, parts, name, listed.get(name, ())) for name in sorted(ids)}
     if not found:
         expected = "folders named after participants (three digits), such as 074"
-        names = ", ".join(sorted(path.name for path in root.iterdir())[:5]) or "an empty folder"
+        names = ", ".join([path.name for path in entries(root)][:5]) or "an empty folder"
         raise InputError(root, "", expected, names, "Give the folder that holds the participants' folders.")
     return found
 
@@ -123,11 +124,11 @@ def _participant(root: Path, parts: Iterable[Path], subject: str, listed: tuple[
     for parent in (folder / "sequences", folder, *(part / subject for part in parts)):
         if parent == folder and (folder / "sequences").is_dir():
             continue
-        for path in sorted(parent.iterdir()) if parent.is_dir() else ():
+        for path in entries(parent):
             if path.is_dir() and path.name not in ("calibration", "annotations"):
                 sequences.setdefault(check_name(path.name, parent, "sequence"), path)
     stills = sequences.pop(BACKGROUND, None)
-    named = {serial_of(path.stem, "image"): path for path in stills.glob("image_*.*")} if stills else {}
+    named = {serial_of(path.stem, "image"): path for path in entries(stills, "image_*.*")} if stills else {}
     colour_file = folder / "calibration" / COLOUR_FILE
     places = (folder / "calibration", root / "camera_params" / subject, folder)
     calibrations = [place / CAMERA_FILE for place in places]
@@ -148,10 +149,9 @@ def _listed_sequences(root: Path) -> dict[str, tuple[str, ...]]:
     if not path.exists():
         return {}
     try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            rows = [*csv.DictReader(stream)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "", "a CSV file in UTF-8", f"content that does not parse ({error})") from error
+        rows = [*csv.DictReader(io.StringIO(read_text(path, "CSV", MAX_YAML_BYTES), newline=""))]
+    except csv.Error as error:
+        raise InputError(path, "", "a CSV file", f"content that does not parse ({error})") from error
     if rows and "ID" not in rows[0]:
         expected = "a column of participants"
         raise InputError(path, "ID", expected, f"columns {', '.join(map(str, rows[0]))[:80]}")

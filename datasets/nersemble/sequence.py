@@ -18,6 +18,7 @@ from typing import BinaryIO, Literal
 import cv2
 
 from ...bench.errors import InputError
+from ...bench.io.files import entries
 from ...bench.io.images import MAX_PIXELS, probe_image
 from .names import numbered, serial_of
 from .recording import Calibration, Participant
@@ -32,7 +33,7 @@ _TRUNCATED = "Fetch the file again."
 _FRAME_FOLDER = re.compile(r"frame_(\d+)")
 _IMAGE_FOLDERS = ("images-2x", "images-2x-73fps")
 _MASK_FOLDERS = ("alpha_map", "alpha_map-73fps")
-_IMAGE_SUFFIXES = (".jpg", ".png")
+_IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +193,7 @@ def _image_views(
 def _numbered(folder: Path, serials: Sequence[str]) -> dict[str, dict[int, Path]]:
     """Files of VHAP's preprocessing, which drops the serial where it ran on one camera."""
     found: dict[str, dict[int, Path]] = {}
-    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+    for path in entries(folder):
         parsed = numbered(path.stem) if path.suffix.lower() in _IMAGE_SUFFIXES else None
         if parsed is None:
             continue
@@ -260,8 +261,12 @@ def probe_video(path: Path) -> tuple[int, tuple[int, int]]:
 
 
 def open_video(path: Path) -> cv2.VideoCapture:
-    """Open a video on one decoding thread: streams run side by side. Raises `InputError` where it will not."""
+    """Open a video on one decoding thread: streams run side by side. Raises `InputError` where it will not.
+
+    Pixels are as they are stored, whatever rotation the file asks viewers for.
+    """
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     if not capture.isOpened():
         raise InputError(path, "", "a video that OpenCV can decode", "one it cannot open")
     return capture

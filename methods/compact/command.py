@@ -39,7 +39,7 @@ class CompactSettings(CaptureOptions):
             raise ValueError(f"frames and scale must be at least 1, found {self.frames} and {self.scale}")
 
 
-@writes("out")
+@writes("out", "an avatar")
 def compact(settings: CompactSettings, progress: Progress = no_progress) -> Findings:
     """Store an avatar of ours in about a fifteenth of its bytes; with a capture, measure the cost in quality.
 

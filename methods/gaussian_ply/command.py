@@ -105,7 +105,7 @@ def _export(settings: ExportOptions, name: str, progress: Progress) -> Findings:
     return export_pose(settings, name, progress)
 
 
-@writes("out")
+@writes("out", "an avatar")
 def import_ga(settings: ImportGASettings, progress: Progress = no_progress) -> Findings:
     """Make an avatar of a GaussianAvatars PLY, and of flame_param.npz or its capture.
 

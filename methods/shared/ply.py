@@ -23,6 +23,7 @@ SCALARS = {
 }
 """Types of a property, by both of their names."""
 BEGIN, END = re.compile(rb"ply\r?\n"), re.compile(rb"\nend_header\r?\n")
+OPACITY, LARGEST_LOGIT = "opacity", 20.0  # the sigmoid of which is 1 in float32
 _COUNT = re.compile(r"[0-9]{1,18}")
 EXPECTED, MAX_BYTES = "a PLY file", 2**30
 HEADER_LIMIT = 65536  # bytes; a longer header is no file of ours
@@ -48,7 +49,7 @@ def read_ply(path: Path, names: tuple[str, ...]) -> FloatArray:
     """Read columns of a binary little-endian vertex table by name, as (N, len(names)) float32.
 
     Other columns may be there, of any scalar type. Raises `InputError` where the file is no such PLY, lacks a column,
-    is cut short, or holds numbers that are not finite in float32.
+    is cut short, or holds numbers that are not finite in float32. Infinite logits of opacities are cut to `LARGEST_LOGIT`.
     """
     content = read_bytes(path, EXPECTED, MAX_BYTES)
     count, columns, start = _header(path, content)
@@ -64,8 +65,13 @@ def read_ply(path: Path, names: tuple[str, ...]) -> FloatArray:
     with np.errstate(over="ignore"):
         for column, name in enumerate(names):
             chosen[:, column] = table[name]
+    if OPACITY in names:  # opaque and invisible splats have infinite logits where a program clamps none
+        logits = chosen[:, names.index(OPACITY)]
+        logits[np.isinf(logits)] = np.sign(logits[np.isinf(logits)]) * LARGEST_LOGIT
     if not np.isfinite(chosen).all():
-        raise InputError(path, "vertex data", "finite numbers", "NaN or infinity")
+        vertex, column = np.argwhere(~np.isfinite(chosen))[0]
+        found = f"{chosen[vertex, column]} in vertex {vertex}"
+        raise InputError(path, f"vertex data, {names[column]}", "finite numbers", found)
     return chosen
 
 

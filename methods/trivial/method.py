@@ -14,8 +14,8 @@ import numpy as np
 from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, Frame, FrameKey, HeadPose
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
-from ...bench.io.files import atomic_path
 from ...bench.io.images import read_pixels
+from ...datasets.images import write_image
 from ..shared.avatar_files import TRACKED, write_arrays, write_record
 from ..shared.loop import Fit, Outcome
 from ..shared.method import TrainedMethod
@@ -204,8 +204,7 @@ class NearestCamera(TrainedMethod[NearestCameraConfig, NearestCameraAvatar]):
         column = {name: number for number, name in enumerate(sorted({key.camera for key in keys}))}
         images = np.full((len(row), len(column)), -1, dtype=np.int64)
         for number, key in enumerate(keys):
-            with atomic_path(image_path(fit.out, number)) as temporary:
-                cv2.imwrite(str(temporary), cv2.cvtColor(_rgba(clip, key), cv2.COLOR_RGBA2BGRA))
+            write_image(image_path(fit.out, number), _rgba(clip, key))
             images[row[key.timestep], column[key.camera]] = number
             fit.progress(number + 1, len(keys))
         signals = np.stack([driving_signal(clip.poses[timestep]) for timestep in timesteps])

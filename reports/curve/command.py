@@ -11,7 +11,7 @@ from typing import Literal
 import tyro
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.io.files import output_inside
+from ...bench.io.files import check_kind, output_inside
 from ...bench.io.lock import locked
 from ...bench.runner.config import RunOptions
 from ...bench.specs import Findings
@@ -111,5 +111,6 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Find
     run.read_manifest().check_done(run.manifest)  # before a folder is made in what is no run
     name = "curve" if settings.over == "budget" else f"curve-{settings.over.replace('_', '-')}"
     out = Path(settings.out) if settings.out else run.root / name
+    check_kind(out, "a run")
     with nullcontext() if settings.out else output_inside(run.root), locked(out):
         return curve(settings, out)

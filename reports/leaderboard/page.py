@@ -10,7 +10,7 @@ from pathlib import Path
 from ...bench.audit.bundle import Bundle, read_bundle
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
-from ...bench.io.files import digest_file, write_text
+from ...bench.io.files import digest_file, entries, write_text
 from ...bench.manifest import Manifest
 from ...bench.runner.store import RunFolder
 from ...bench.specs import Findings
@@ -66,7 +66,7 @@ def build(folder: Path, out: Path, title: str, progress: Progress) -> Findings:
 
     Raises `InputError` for a folder without bundles, and for a bundle that is not as it lists itself.
     """
-    files = sorted(folder.glob("*.zip"))
+    files = entries(folder, "*.zip")
     if not files:
         raise InputError(folder, "", "bundles (*.zip) of `headbench bundle`", "none")
     with tempfile.TemporaryDirectory() as scratch:

@@ -16,6 +16,7 @@ import cv2
 
 from ...bench.contracts import ByteArray, Clip, FrameKey, Progress
 from ...bench.errors import HeadbenchError, InputError
+from ...bench.io.images import encode_image
 from ...bench.runner.captures import open_run_clips
 from ...bench.runner.config import RunOptions
 from ...bench.specs import MetricSpec
@@ -124,9 +125,7 @@ def open_truth(runs: RunSet, options: RunOptions) -> tuple[dict[str, Clip], str]
 
 def encode(image: ByteArray, quality: int) -> str:
     """An (H, W, 3) image as the base64 of a WebP."""
-    done, data = cv2.imencode(".webp", image[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
-    if not done:
-        raise InputError("report", "image", "pixels that WebP can hold", f"shape {image.shape}")
+    data = encode_image(image, ".webp", (cv2.IMWRITE_WEBP_QUALITY, quality), place="report")
     return base64.b64encode(data).decode("ascii")
 
 

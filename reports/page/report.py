@@ -14,7 +14,7 @@ import numpy as np
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.io.files import check_output_folder, check_writable, write_text
+from ...bench.io.files import check_kind, check_output_folder, check_writable, write_text
 from ...bench.io.provenance import COMPOSITE, source_type, tool
 from ...bench.protocol import TASK_TITLES
 from ...bench.runner.config import RunOptions
@@ -68,6 +68,7 @@ def write_report(settings: PageSettings, progress: Progress = no_progress) -> Fi
     out = Path(settings.out or ("report" if settings.split else "report.html"))
     max_mb = settings.max_mb or (MAX_SPLIT_MB if settings.split else MAX_MB)
     if settings.split:
+        check_kind(out)
         check_folder(out)
         check_output_folder(out)
     else:

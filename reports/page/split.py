@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...bench.errors import InputError
-from ...bench.io.files import TEMPORARY, check_inside, write_text
+from ...bench.io.files import check_inside, entries, write_text
 
 INDEX, FOLDER = "index.html", "pictures"
 FILE_BYTES = 2 * 10**6
@@ -53,7 +53,7 @@ def check_folder(folder: Path) -> None:
     """Raise `InputError` for a folder that holds anything but an earlier report."""
     if folder.exists() and not folder.is_dir():
         raise InputError(folder, "--out", "a folder", "a file")
-    names = [path.name for path in folder.glob("*") if not path.name.startswith(TEMPORARY)]
+    names = [path.name for path in entries(folder)]
     others = sorted({*names} - {INDEX, FOLDER})
     if others:
         expected = "a new folder, or one with an earlier report alone"

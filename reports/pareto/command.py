@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.io.files import check_output_folder, output_inside, write_text
+from ...bench.io.files import check_kind, check_output_folder, output_inside, write_text
 from ...bench.io.lock import locked
 from ...bench.runner.config import RunOptions
 from ...bench.specs import Findings, writes
@@ -140,6 +140,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
 
     out = Path(settings.out) if settings.out else Path(settings.run) / "sweep"
     RunFolder(Path(settings.run)).read_manifest()  # before a folder is made in what is no run
+    check_kind(out, "a run")
     with nullcontext() if settings.out else output_inside(Path(settings.run)), locked(out):
         sweep(settings, out, progress)
         what = settings.task, settings.metric, settings.time

@@ -12,7 +12,7 @@ import tyro
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.executors.command import ExecutionOptions
-from ...bench.io.files import output_inside
+from ...bench.io.files import check_kind, output_inside
 from ...bench.io.lock import locked
 from ...bench.runner.config import RunOptions
 from ...bench.specs import Findings
@@ -100,6 +100,7 @@ def run_robustness_test(
     folder = Path(settings.run)
     out = Path(settings.out) if settings.out else folder / default_folder
     RunFolder(folder).read_manifest()  # before a folder is made in what is no run
+    check_kind(out)
     with nullcontext() if settings.out else output_inside(folder), locked(out):
         _, jobs = trained(folder, settings.methods, settings, out)
         summaries = judge(jobs, settings, out, progress)

@@ -11,6 +11,7 @@ from typing import get_type_hints
 import pytest
 
 from headbench.bench import cli, commands, registry
+from headbench.bench.io.files import KINDS
 from headbench.bench.io.lock import locked
 from headbench.bench.runner.config import AvatarFolder
 
@@ -261,3 +262,56 @@ def test_every_command_with_a_folder_to_write_locks_it():
         spec = plugin.spec
         names = {field.name for field in dataclasses.fields(spec.settings)}
         assert ("out" in names) == (spec.writes == "out" or spec.name in own | files), spec.name
+
+
+@pytest.mark.parametrize(
+    "mark", ["run.json", "transforms_train.json", "subject.npz", "sparse/x", "900_A/transforms.json"]
+)
+def test_a_folder_of_another_kind_is_refused_untouched(capsys, tmp_path, mark):
+    (tmp_path / mark).parent.mkdir(exist_ok=True)
+    (tmp_path / mark).write_text("{}")
+    before = sorted(tmp_path.rglob("*"))
+    commands = [
+        "export colmap x",
+        "import ga x.ply",
+        "inspect x",
+        "refit x --target ga",
+        "render x --capture x",
+    ]
+    commands += ["compact x", "pareto x", "tongue x", "demo", "synth", "report x --split"]
+    continued = {"run.json": {"demo"}, "subject.npz": {"import ga x.ply", "compact x"}}
+    continued |= {"sparse/x": {"export colmap x"}, "900_A/transforms.json": {"synth", "refit x --target ga"}}
+    for command in commands:
+        if command not in continued.get(mark, ()):
+            assert cli.main([*command.split(), "--out", str(tmp_path)]) == 2
+            assert "Nothing was written" in capsys.readouterr().err, command
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("~/a", "/h/a"),
+        ("--out=~/a=b", "--out=/h/a=b"),
+        ("--out=~", "--out=/h"),
+        ("reader_settings.head=~/a", "reader_settings.head=/h/a"),
+        ("settings.ga.x=~", "settings.ga.x=~"),
+        ("--set=a.b=~/c", "--set=a.b=/h/c"),
+        ("a=b~c", "a=b~c"),
+    ],
+)
+def test_a_tilde_on_the_command_line_is_the_home_folder(monkeypatch, word, expected):
+    monkeypatch.setenv("HOME", "/h")
+    assert commands.with_home(word) == expected
+
+
+def test_a_tilde_in_a_configuration_is_the_home_folder(monkeypatch, capsys, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "run.yaml").write_text("data: ~/cap\nout: ~/run\n")
+    assert cli.main(["run", "--config=~/run.yaml"]) == 2
+    assert f"{tmp_path}/cap" in capsys.readouterr().err
+
+
+def test_kinds_of_folders_that_commands_write_are_known():
+    for plugin in registry.discover("commands").values():
+        assert {*plugin.spec.kinds} <= {*KINDS}, plugin.spec.name

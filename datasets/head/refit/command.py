@@ -100,7 +100,7 @@ class RefitCommandSettings(CaptureOptions):
 BLOCKS_FOLDER = "refit-blocks"
 
 
-@writes("out")
+@writes("out", "captures")
 def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progress) -> Findings:
     """Fit another head model to a capture's tracking; residuals in millimetres, a heat map.
 
@@ -109,6 +109,7 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
     Writes under ``settings.out`` the capture (images linked), ``refit.json`` with every timestep's residuals and
     ``heat_map.png``. Raises `InputError` before any fitting where capture and head model do not go together.
     """
+    from ...clip import check_apart
     from ...images import write_image
     from .heat_map import draw_heat_map
     from .refit import refit
@@ -122,9 +123,7 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
             "command line", "--target", f"another head model than {clip.head.version}", target.version
         )
     capture_plan(clip, settings.capture)  # What cannot be written again is found before the fit.
-    images = [files.image for files in clip.files.values() if files.image is not None]
-    if any(out.resolve() in image.resolve().parents for image in images):
-        raise InputError("command line", "--out", "a folder apart from the capture", str(out))
+    check_apart(clip, out)
     refitted = refit(clip, target, settings.settings, folder=out / BLOCKS_FOLDER, progress=progress)
     write_image(out / "heat_map.png", draw_heat_map(refitted))
     union = write_capture(refitted.clip, out, progress)

@@ -91,7 +91,10 @@ def numbered(part):
 
     def imwrite(path, image, *rest):
         number = part["numbers"][int(os.path.splitext(os.path.basename(path))[0])]
-        done = write(os.path.join(part["renders"], f"{number:06d}.png"), image)
+        path = os.path.join(part["renders"], f"{number:06d}.png")
+        done = write(path, image)
+        if not done:
+            raise OSError(f"OpenCV could not write {path}")
         print(f"\nheadbench: drawn {number + 1}", flush=True)
         return done
 

@@ -76,7 +76,7 @@ class ParitySettings:
             raise ValueError("iterations and orders must be at least 1, samples 10, the tolerance above 0")
 
 
-@writes("out")
+@writes("out", "captures")
 def parity(settings: ParitySettings, progress: Progress = no_progress) -> Findings:
     """Train a method and its authors' code on one capture with equal settings, and tell how their results differ."""
     from .parity import compare

@@ -35,14 +35,13 @@ PLAIN = st.recursive(
             "[1]",
             "3",
             '"text"',
-            "\ufeff{}",
             "[" * DEEP,
             '{"a":' * DEEP,
             '{"a": ' + "[" * 70 + "]" * 70 + "}",
         ),
         *('{"a": NaN}', '{"a": -Infinity}', '{"a": [1e999]}', '{"a": {"b": 1, "b": 1}}'),
         *('{"a": 1' + "0" * 5000 + "}", '{"a": "' + "x" * 10**6, '{"' + "k" * 10**6 + '": 1, "a": NaN}'),
-        b"\xff\xfe\x81",
+        *(b"\xff\xfe\x81", b"{\x81}", "\ufeff".encode(), "\ufeff\ufeff{}".encode()),
     ],
     ids=lambda text: str(text[:12]),
 )
@@ -238,3 +237,15 @@ def test_an_unknown_entry_is_answered_with_the_nearest(value, near):
 def test_json_inside_another_file_is_named_with_it():
     with pytest.raises(InputError, match="a.npz, settings: expected valid JSON"):
         parse_json("{", "a.npz", "settings")
+
+
+@pytest.mark.parametrize("read", [read_json, read_yaml])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"])
+def test_text_of_windows_editors_is_read_or_refused_by_name(tmp_path, read, encoding):
+    path = tmp_path / "a"
+    path.write_bytes('{"a": 1,\r\n "b": "é"}\r\n'.encode(encoding))
+    if encoding.startswith("utf-8"):
+        assert read(path) == {"a": 1, "b": "é"}
+    else:
+        with pytest.raises(InputError, match=r"in UTF-8, found UTF-16 or UTF-32\. Save it as UTF-8"):
+            read(path)

@@ -13,12 +13,16 @@ from headbench.bench.errors import InputError
 from headbench.bench.io import files
 from headbench.bench.io.files import (
     GROUP_FILES,
+    KINDS,
     MAX_NAME_BYTES,
     TEMPORARY,
     atomic_path,
+    check_kind,
     check_name,
     digest,
     digest_file,
+    entries,
+    expand_home,
     flush_renames,
     grouped_writes,
     output_inside,
@@ -317,3 +321,48 @@ def test_a_device_is_not_replaced(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(FileExistsError, match="Not a regular file"):
         write_text(tmp_path / "pipe", "")
+
+
+@pytest.mark.parametrize(("kind", "mark"), [(kind, mark) for kind in KINDS for mark in KINDS[kind]])
+def test_a_folder_of_another_kind_is_refused(tmp_path, kind, mark):
+    check_kind(tmp_path / "new")
+    place = tmp_path / mark.replace("*", "x")
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.touch()
+    check_kind(tmp_path, kind)
+    for own in ((), tuple(other for other in KINDS if other != kind)):
+        with pytest.raises(InputError, match="--out: expected a new folder") as caught:
+            check_kind(tmp_path, *own)
+        assert caught.value.found == f"{kind} ({place.relative_to(tmp_path)})"
+
+
+def test_files_of_operating_systems_are_no_entries(tmp_path):
+    names = ("._a.npz", ".DS_Store", "Thumbs.db", "desktop.ini", "__MACOSX", "b.npz", "a.npz")
+    for name in names:
+        (tmp_path / name).touch()
+    assert [path.name for path in entries(tmp_path)] == ["a.npz", "b.npz"]
+    assert [path.name for path in entries(tmp_path, "a*")] == ["a.npz"]
+    assert entries(tmp_path / "none") == []
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("~/a b", "/h/a b"),
+        ("~", "/h"),
+        ("a/~/b", "a/~/b"),
+        ("~ours", "~ours"),
+        ("./~/a", "./~/a"),
+        ("", ""),
+        ("~nobody-of-that-name/a", None),
+    ],
+)
+def test_a_tilde_is_the_home_folder(monkeypatch, text, expected):
+    monkeypatch.setenv("HOME", "/h")
+    if expected is None:
+        with pytest.raises(
+            InputError, match="run.yaml, ~nobody-of-that-name/a: expected a path in a home folder"
+        ):
+            expand_home(text, "run.yaml")
+    else:
+        assert expand_home(text, "run.yaml") == expected

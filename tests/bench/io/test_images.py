@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import resource
 import struct
 import tracemalloc
 import zlib
@@ -18,13 +19,16 @@ from headbench.bench.io.images import (
     MAX_PIXELS,
     MAX_SCANS,
     ImageInfo,
+    encode_image,
     probe_image,
     quantise,
+    read_bgr,
     read_pixels,
     read_png,
     write_png,
 )
-from headbench.datasets.images import read_image, read_mask
+from headbench.bench.io.video import write_video
+from headbench.datasets.images import read_image, read_mask, write_image
 
 MODES = {"L": 1, "RGB": 3, "RGBA": 4, "LA": 2, "P": 3}
 
@@ -169,3 +173,191 @@ def test_rounding_goes_to_the_nearest_level_and_clamps():
 def test_what_is_no_colour_is_refused(rgb, match):
     with pytest.raises(InputError, match=match):
         quantise(np.asarray(rgb))
+
+
+NOISE = np.random.default_rng(3).integers(0, 256, (23, 37, 4), np.uint8)
+STEPS = NOISE[..., 0] // 64 * 64
+RED_TABLE, DARK_TABLE, GREY_TABLE = ([0, 0, 0, *entry] for entry in ((128, 0, 0), (0, 64, 0), (90, 90, 90)))
+
+
+def picture(mode: str, table: list[int] | None = None) -> Image.Image:
+    """Noise in a mode of Pillow; "P" with a number of colours, "Pa" with transparent ones."""
+    if table is not None:
+        indexed = Image.fromarray((NOISE[..., 0] > 127).astype(np.uint8)).convert("P")
+        indexed.putpalette(table + [0] * (768 - len(table)))
+        indexed.putdata((NOISE[..., 0] > 127).astype(np.uint8).ravel().tolist())
+        return indexed
+    if mode == "Pa":
+        return Image.fromarray(NOISE).quantize(64)
+    if mode[0] == "P":
+        return Image.fromarray(NOISE[..., :3]).quantize(int(mode[1:]))
+    if mode == "steps":
+        return Image.fromarray(STEPS)
+    return Image.fromarray(NOISE if mode in ("RGBA", "LA") else NOISE[..., :3]).convert(mode)
+
+
+def saved(image: Image.Image, format: str = "PNG", **options) -> bytes:
+    stream = io.BytesIO()
+    image.save(stream, format, **options)
+    return stream.getvalue()
+
+
+STORED = {
+    **{
+        mode: saved(picture(mode))
+        for mode in ("1", "L", "LA", "RGB", "RGBA", "P256", "P16", "P4", "P2", "Pa")
+    },
+    "L, one level transparent": saved(picture("steps"), transparency=64),
+    "1, black transparent": saved(picture("1"), transparency=0),
+    "RGB, one colour transparent": saved(picture("RGB"), transparency=tuple(NOISE[0, 0, :3].tolist())),
+    "P, opaque table": saved(picture("P16"), transparency=bytes([255] * 16)),
+}
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_pixels_are_those_that_another_decoder_shows(tmp_path, name):
+    path = tmp_path / "image.png"
+    path.write_bytes(STORED[name])
+    with Image.open(path) as image:
+        rgba = np.array(image.convert("RGBA"))
+    assert probe_image(path).has_alpha == (rgba[..., 3] < 255).any()
+    assert np.array_equal(read_png(path), rgba[..., :3])
+    assert np.array_equal(read_bgr(path)[..., ::-1], rgba[..., :3])
+    if probe_image(path).has_alpha:
+        assert np.array_equal(read_pixels(path)[..., 3], rgba[..., 3])
+        assert np.array_equal(read_mask(path), rgba[..., 3])
+        weight = rgba[..., 3:].astype(np.float32) / 255
+        assert np.abs(read_image(path, (0, 0, 0)) - weight * rgba[..., :3]).max() <= 0.5 + 1e-4
+    else:
+        assert np.array_equal(read_image(path, (0, 0, 0)), rgba[..., :3])
+
+
+ON = NOISE[..., 0] > 127
+MASKS = {
+    "red table": (saved(picture("P", RED_TABLE)), 255 * ON),
+    "dark green table": (saved(picture("P", DARK_TABLE)), 255 * ON),
+    "grey table": (saved(picture("P", GREY_TABLE)), 90 * ON),
+    "soft grey": (saved(picture("L")), np.array(picture("L"))),
+    "soft grey in RGB": (saved(picture("L").convert("RGB")), np.array(picture("L"))),
+    "soft red in RGB": (
+        saved(Image.fromarray(NOISE[..., :3] * np.array([1, 0, 0], np.uint8))),
+        NOISE[..., 0],
+    ),
+    "one bit": (saved(Image.fromarray(ON)), 255 * ON),
+    "grey in opaque RGBA": (saved(picture("L").convert("RGBA")), np.array(picture("L"))),
+    "colours in opaque RGBA": (saved(picture("RGB").convert("RGBA")), 255 + 0 * NOISE[..., 0]),
+}
+
+
+@pytest.mark.parametrize("name", MASKS)
+def test_a_mask_covers_what_a_viewer_shows_as_not_black(tmp_path, name):
+    content, expected = MASKS[name]
+    (tmp_path / "mask.png").write_bytes(content)
+    assert np.array_equal(read_mask(tmp_path / "mask.png"), expected)
+
+
+@pytest.mark.parametrize("orientation", range(2, 9))
+@pytest.mark.parametrize(("mode", "format"), [("RGB", "PNG"), ("L", "PNG"), ("RGB", "JPEG"), ("L", "JPEG")])
+def test_pixels_stay_where_they_are_stored(tmp_path, mode, format, orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    paths = tmp_path / "plain", tmp_path / "tagged"
+    paths[0].write_bytes(saved(picture(mode), format))
+    paths[1].write_bytes(saved(picture(mode), format, exif=exif))
+    for read in (read_pixels, read_png, read_bgr, read_mask, lambda path: read_image(path, (1, 1, 1))):
+        plain, tagged = map(read, paths)
+        assert np.array_equal(plain, tagged)
+    assert probe_image(paths[1]) == probe_image(paths[0])
+
+
+BEHIND = {
+    "text": b"trailing text",
+    "zeros": bytes(5000),
+    "markers of scans": b"\xff\xda\xff\xd8" * 1000,
+    "another image": STORED["RGB"] + saved(picture("L"), "JPEG") + bytes(100),
+}
+
+
+@pytest.mark.parametrize("behind", BEHIND)
+@pytest.mark.parametrize(
+    ("format", "options"),
+    [("PNG", {}), ("JPEG", {}), ("JPEG", {"progressive": True, "exif": b"Exif\0\0\xff\xd9"})],
+)
+def test_bytes_behind_an_image_are_ignored(tmp_path, format, options, behind):
+    whole = saved(picture("RGB"), format, **options)
+    plain, longer, cut = (tmp_path / name for name in ("plain", "longer", "cut"))
+    plain.write_bytes(whole)
+    longer.write_bytes(whole + BEHIND[behind])
+    assert np.array_equal(read_pixels(longer), read_pixels(plain))
+    assert probe_image(longer, decode=True) == probe_image(plain)
+    if behind in ("text", "zeros"):
+        cut.write_bytes(whole[: len(whole) // 2] + BEHIND[behind])
+        with pytest.raises(InputError, match="truncated"):
+            probe_image(cut)
+
+
+def test_a_file_of_two_pictures_is_read_as_its_first(tmp_path):
+    first, second = picture("RGB"), Image.new("RGB", (37, 23), "red")
+    (tmp_path / "first").write_bytes(saved(first, "JPEG"))
+    (tmp_path / "both").write_bytes(saved(first, "MPO", save_all=True, append_images=[second]))
+    assert np.array_equal(read_png(tmp_path / "both"), read_png(tmp_path / "first"))
+
+
+OTHERS = {
+    "CMYK": (saved(picture("RGB").convert("CMYK"), "JPEG"), "4 components, CMYK or YCCK"),
+    "16 bits": (saved(Image.fromarray(NOISE[..., 0].astype(np.uint16) * 257)), "bit depth 16"),
+    "animation": (
+        saved(picture("RGB"), save_all=True, append_images=[Image.new("RGB", (37, 23))]),
+        "an animated PNG",
+    ),
+    "WebP": (saved(picture("RGBA"), "WEBP"), "WebP data"),
+    "TIFF": (saved(picture("RGB"), "TIFF"), "TIFF data"),
+    "TIFF of floats": (saved(Image.fromarray(NOISE[..., 0].astype(np.float32)), "TIFF"), "TIFF data"),
+    "Lab": (saved(picture("RGB").convert("LAB"), "TIFF"), "TIFF data"),
+    "GIF": (saved(picture("P16"), "GIF"), "GIF data"),
+    "JPEG 2000": (b"\0\0\0\x0cjP  \r\n\x87\n" + bytes(40), "JPEG 2000 data"),
+    "HEIC": (b"\0\0\0\x18ftypheic" + bytes(40), "HEIF, AVIF or video data"),
+    "a file of macOS": (b"\0\x05\x16\x07" + bytes(80), "AppleDouble"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_what_is_not_converted_is_refused_by_name(tmp_path, name):
+    content, found = OTHERS[name]
+    path = tmp_path / "image.png"
+    path.write_bytes(content)
+    for read in (probe_image, read_pixels, read_png, read_mask):
+        with pytest.raises(InputError, match=found) as caught:
+            read(path)
+        assert caught.value.file == str(path)
+
+
+WRITERS = {
+    "frame": ("a.png", lambda path: write_png(path, NOISE[..., :3])),
+    "image": ("a.png", lambda path: write_image(path, NOISE)),
+    "JPEG": ("a.jpg", lambda path: write_image(path, NOISE[..., :3])),
+    "video": ("a.mp4", lambda path: write_video(path, [np.tile(NOISE[:22, :36, :3], (9, 9, 1))] * 9, 25.0)),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_is_reported_with_the_file(tmp_path, name):
+    file, write = WRITERS[name]
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (700, limits[1]))
+    try:
+        with pytest.raises(OSError, match=rf"File too large: '{tmp_path / file}'$"):
+            write(tmp_path / file)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
+    write(tmp_path / file)
+    assert [path.name for path in tmp_path.iterdir()] == [file]
+
+
+@pytest.mark.parametrize(
+    ("shape", "suffix"), [((4, 4, 5), ".png"), ((0, 4, 3), ".png"), ((4, 4, 3), ".nope")]
+)
+def test_what_a_format_cannot_hold_is_refused(shape, suffix):
+    with pytest.raises(InputError, match=f"a.x: expected an image that the format {suffix} can hold"):
+        encode_image(np.zeros(shape, np.uint8), suffix, place="a.x")

@@ -241,7 +241,7 @@ def test_damaged_bytes_raise_nothing_but_input_errors(tmp_path, data, name, suff
         ("\n5 ", "\n3 ", "each image once"),
         (" 7 ab/3.png", " 8 ab/3.png", "image 3, camera"),
         (" 7 ab/3.png", " 7", "10 words"),
-        ("\n3 ", "\n3 nan ", "10 words"),
+        ("\n3 ", "\n3 nan ", "whole numbers"),
     ],
 )
 def test_faults_in_a_text_model_are_named(tmp_path, find, put, found):
@@ -407,3 +407,21 @@ def test_sigterm_keeps_its_handler_with_pycolmap(module):
     )
     ended = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     assert (ended.returncode, ended.stderr) == (7, "")
+
+
+@pytest.mark.parametrize("start", ["", "\ufeff"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("name", ["a b/00001_x.png", "a\\b\\00001 x.PNG", "a  b.png"])
+def test_names_and_line_ends_of_other_systems_are_read(tmp_path, start, end, name):
+    camera = "1 PINHOLE 64 48 50 50 32 24"
+    image = f"1 1 0 0 0 0 0 0 1 {name}"
+    (tmp_path / "cameras.txt").write_bytes((start + camera + end).encode())
+    (tmp_path / "images.txt").write_bytes((start + image + end + end).encode())
+    assert read_model(tmp_path).images[1].name == name.replace("\\", "/")
+
+
+def test_a_model_in_utf16_is_refused_by_name(tmp_path):
+    for name in ("cameras", "images"):
+        (tmp_path / f"{name}.txt").write_bytes("1 PINHOLE 64 48 50 50 32 24\n".encode("utf-16"))
+    with pytest.raises(InputError, match=r"cameras.txt: expected text in UTF-8, found UTF-16"):
+        read_model(tmp_path)

@@ -127,3 +127,26 @@ def test_deeply_nested_json_is_refused(tmp_path):
     path.write_text("[" * 100_000)
     with pytest.raises(InputError, match="deeper nesting"):
         read_transforms(path)
+
+
+def change_back(frame):
+    for key in ("file_path", "fg_mask_path", "flame_param_path"):
+        frame[key] = frame[key].replace("/", "\\")
+
+
+@pytest.mark.parametrize("suffix", [".PNG", ".jpg", ".JPG", ".jpeg", ".Jpeg", ""])
+def test_suffixes_of_images_are_read_in_any_case(capture, suffix):
+    entry = read_transforms(capture.union / "transforms_train.json")[0]
+    capture.each_frame(lambda frame: frame.update(file_path=frame["file_path"].removesuffix(".png") + suffix))
+    found = read_transforms(capture.union / "transforms_train.json")[0].image
+    assert found == entry.image.with_suffix(suffix or ".png")
+
+
+def test_paths_with_backslashes_and_a_byte_order_mark_are_read(capture):
+    path = capture.union / "transforms_train.json"
+    expected = [(entry.image, entry.mask, entry.parameters) for entry in read_transforms(path)]
+    capture.each_frame(change_back)
+    for file in capture.union.glob("*.json"):
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
+    assert [(entry.image, entry.mask, entry.parameters) for entry in read_transforms(path)] == expected
+    read_capture(capture.union)

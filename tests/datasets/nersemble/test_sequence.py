@@ -240,3 +240,23 @@ def test_a_real_video_and_its_truncations(pristine_videos, tmp_path):
         path.write_bytes(content[: int(fraction * len(content))])
         with pytest.raises(InputError):
             check_boxes(path)
+
+
+def test_a_rotation_that_a_video_asks_for_is_ignored(tmp_path):
+    frame = np.zeros((32, 64, 3), np.uint8)
+    frame[:8] = 255
+    path, turned = tmp_path / "a.mp4", tmp_path / "turned.mp4"
+    write_video(path, [frame] * 3, 25.0)
+    content = bytearray(path.read_bytes())
+    matrix = content.index(b"tkhd") + 4 + 40
+    for rotation in ((-1, 0, 0, -1), (0, 1, -1, 0)):
+        a, b, c, d = (65536 * number for number in rotation)
+        content[matrix : matrix + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 2**30)
+        turned.write_bytes(content)
+        assert probe_video(turned) == probe_video(path)
+        shown = []
+        for file in (path, turned):
+            capture = sequence_module.open_video(file)
+            shown.append(capture.read()[1])
+            capture.release()
+        assert np.array_equal(*shown)

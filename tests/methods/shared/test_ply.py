@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.methods.shared.ply import read_names, read_ply, write_ply
+from headbench.methods.shared.ply import LARGEST_LOGIT, read_names, read_ply, write_ply
 
 TABLE = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
 
@@ -67,3 +67,20 @@ def test_other_files_are_refused(tmp_path, content, says):
 def test_a_missing_file_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="none.ply"):
         read_ply(tmp_path / "none.ply", ("x",))
+
+
+def test_infinite_logits_of_opacities_are_cut(tmp_path):
+    table = TABLE[:, :2].copy()
+    table[:3, 1] = np.inf, -np.inf, 3
+    write_ply(tmp_path / "a.ply", ("x", "opacity"), table)
+    found = read_ply(tmp_path / "a.ply", ("x", "opacity"))
+    assert found[:3, 1].tolist() == [LARGEST_LOGIT, -LARGEST_LOGIT, 3]
+    assert 1 / (1 + np.exp(-np.float32(LARGEST_LOGIT))) == 1
+    for value, column in ((np.nan, 1), (np.inf, 0)):
+        table[4, column] = value
+        write_ply(tmp_path / "a.ply", ("x", "opacity"), table)
+        with pytest.raises(
+            InputError, match=f"vertex data, {('x', 'opacity')[column]}: .* {value} in vertex 4"
+        ):
+            read_ply(tmp_path / "a.ply", ("x", "opacity"))
+        table[4, column] = 0
