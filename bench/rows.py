@@ -289,6 +289,25 @@ class Rows:
         lacking = theirs[~pd.MultiIndex.from_frame(theirs).isin(pd.MultiIndex.from_frame(own))]
         return [" ".join(map(str, row)) for row in lacking.itertuples(index=False, name=None)]
 
+    def check_kept(self, path: Path, **planned: Iterable[str | int]) -> None:
+        """Refuse, before any work, to replace these rows, read from ``path``, by rows that lack some of them.
+
+        Parameters
+        ----------
+        planned : values that the new rows will have in columns of `Row`, by column.
+
+        Raises
+        ------
+        InputError : these rows have other values in one of the columns.
+        """
+        for column, values in planned.items():
+            named = list(map(str, values))
+            known = set(map(str, self._table[column].unique())) - {""}
+            if lost := sorted(known - set(named)):
+                expected = f"all that it has results for ({', '.join(sorted(known))}), and optionally more"
+                found = f"{', '.join(named)} without {', '.join(lost)}"
+                raise InputError(path, f"{column}s", expected, found, DISCARD)
+
     def check_protocols(self, source: Path | str, expected: Mapping[str, str] | None = None) -> None:
         """Raise `InputError` where rows of one task come from several protocols, or from another than ``expected``.
 
@@ -307,38 +326,21 @@ class Rows:
         return self.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
 
 
-def check_rows_kept(path: Path, cells: Iterable[tuple[str, str, int]], protocols: Iterable[str]) -> None:
-    """Refuse, before any work, to replace the rows at ``path`` by rows that lack some of them.
+DISCARD = "Choose another --out. To discard the results in this file, delete it: trained avatars are kept."
+"""What to do about rows that would be lost."""
 
-    Rows that cannot be read are no loss: a warning says that they are written again.
 
-    Parameters
-    ----------
-    path : file of rows that is going to be replaced, if there is one.
-    cells : method, subject and seed of everything that the new rows are of.
-    protocols : hashes of the protocols that the new rows are measured by.
-
-    Raises
-    ------
-    InputError : the file holds rows of another cell, or by another protocol.
-    """
+def earlier_rows(path: Path) -> Rows | None:
+    """The rows that are about to be replaced; None where there are none. For a damaged file a warning is logged."""
     if not path.exists():
-        return
+        return None
     try:
-        table = Rows.read(path)._table
+        return Rows.read(path)
     except InputError as error:
-        log.warning("%s The rows are written again.", error)
-        return
-    kept = "the rows of an earlier call among those of this one"
-    found = set(table[["method", "subject", "seed"]].drop_duplicates().itertuples(index=False, name=None))
-    lost = [f"{method} of {subject}, seed {seed}" for method, subject, seed in sorted(found - {*cells})]
-    if lost:
-        remedy = "Ask for these as well, or choose another --out."
-        raise InputError(path, "", kept, f"others: {'; '.join(lost)}", remedy)
-    others = sorted(set(table["protocol"]) - {*protocols, ""})
-    if others:
-        found_by = f"rows by another protocol, {others[0]}, of other frames or settings"
-        raise InputError(path, "", kept, found_by, "Choose another --out.")
+        if isinstance(error.__cause__, OSError) and error.__cause__.errno is not None:
+            raise  # not damaged: the disk or its permissions are at fault
+        log.warning("%s It is written again.", error)
+        return None
 
 
 def _read_table(path: Path) -> pa.Table:

@@ -73,8 +73,6 @@ def marks(
     found: Mapping[str, Mapping[str, Conditions]], trivial: Sequence[str]
 ) -> dict[tuple[str, str], str]:
     """The note for each metric and method whose time does not compare with the others of its column."""
-    loads = [each.others for by_method in found.values() for each in by_method.values() if each.loaded]
-    most = f"{max(loads):.1f}" if loads else ""
     notes = {}
     for metric, by_method in found.items():
         places = [each.places for method, each in by_method.items() if method not in trivial and each.places]
@@ -82,14 +80,20 @@ def marks(
         for method, each in by_method.items():
             note = []
             if each.loaded:
-                note.append(
-                    f"Measured under load: other processes kept more than {OTHERS_LIMIT} of a core busy, at most {most} cores."
-                )
+                note.append(f"Measured under load: other processes used up to {each.others:.2f} cores.")
             if differ and each.places and method not in trivial:
-                note.append(f"Measured on {each.text}; others of this column on others: they do not compare.")
+                note.append(f"Measured on {each.text}; not comparable with other machines or thread counts.")
             if note:
                 notes[metric, method] = " ".join(note)
     return notes
+
+
+def note_of(by_method: Mapping[str, Conditions]) -> str:
+    """One line on times of methods that do not compare with each other, by `marks`; "" where all do."""
+    methods: dict[str, list[str]] = {}
+    for (_, method), note in marks({"": by_method}, ()).items():
+        methods.setdefault(note, []).append(method)
+    return " ".join(f"{', '.join(names)}: {note}" for note, names in methods.items())
 
 
 def measured_on(by_method: Mapping[str, Conditions], trivial: Sequence[str], machine: str) -> str:

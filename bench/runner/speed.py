@@ -81,6 +81,8 @@ def measure_speed_again(
         finished = [job for job in jobs if job.name not in left_out]
         for job in finished:
             _check_avatar(job)
+        rows = _with_cells(rows, folder, metrics)
+        folder.write_rows(rows)
         for index, job in enumerate(finished):
             progress(index, len(finished), job.name)
             try:
@@ -92,7 +94,7 @@ def measure_speed_again(
                 continue
             found = list(_changes(job, metrics, rows, new))
             rows = rows.updated(new)
-            rows.write(folder.rows)
+            folder.write_rows(rows)
             changes += found
             for change in found:
                 log.info("%s", change.text)
@@ -133,6 +135,31 @@ def _jobs(
     protocols = {task: record.protocol(folder.manifest) for task, record in manifest.protocols.items()}
     use_device(config.device)
     return make_jobs(config, chosen, clips, protocols, folder), metrics
+
+
+def _with_cells(rows: Rows, folder: RunFolder, metrics: Sequence[MetricSpec]) -> Rows:
+    """The rows of a run with the speeds in the files of its cells.
+
+    They differ where an earlier call was killed after it had written a cell's file and before it wrote the run's.
+    """
+    table = rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    failed = set(_cells(table[table["status"] == "failed"]))
+    again: list[Rows] = []
+    for place in _cells(table):
+        cell = folder.cell(*place)
+        state = cell.step("measure") if place not in failed and cell.ended("measure") else None
+        if state is None or not state.get("earlier"):
+            continue  # its speed was not measured again
+        if not cell.damage({cell.name(cell.rows): state.get("rows", "")}):
+            again.append(Rows.read(cell.rows))
+    names = [metric.name for metric in metrics if is_speed(metric)]
+    return rows.updated(Rows.joined(again).of_metrics(names)) if again else rows
+
+
+def _cells(table: pd.DataFrame) -> list[tuple[str, str, int]]:
+    """Subject, method and seed of rows, each once."""
+    places = table[["subject", "method", "seed"]].drop_duplicates()
+    return [(str(subject), str(method), int(seed)) for subject, method, seed in places.to_numpy()]
 
 
 def _failed(rows: Rows, job: Job) -> bool:

@@ -396,6 +396,10 @@ def measure(
         else:
             parts.append(Rows.of([_avatar_row(job, spec, measured[spec.implementation])]))
     result = Rows.joined(parts)
+    if lost := result.values_lacking(old.of_metrics(replaced)):
+        raise UnavailableError(
+            f"There was a value of {lost[0]} and there is none now.", "The former is kept."
+        )
     others = sorted(old.metrics - fingerprints.keys())
     job.cell.begin(
         "measure", job.fit_fingerprint, **record

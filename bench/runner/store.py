@@ -33,7 +33,7 @@ from ..errors import InputError
 from ..io.documents import checked, read_json
 from ..io.files import digest_file, is_system_file, write_json
 from ..manifest import Manifest
-from ..rows import ALL, Rows
+from ..rows import DISCARD, Rows, earlier_rows
 
 log = logging.getLogger(__name__)
 
@@ -76,8 +76,6 @@ class StepState(TypedDict, total=False):
     derived_from: str
 
 
-DISCARD = "Choose another --out. To discard the results in this file, delete it: trained avatars are kept."
-"""What to do about rows that would be lost."""
 STAGES = ("fit", "digests", "measure")
 
 
@@ -236,20 +234,15 @@ class RunFolder:
 
         Raises `InputError` for a plan that would lose rows.
         """
-        earlier = self._earlier_rows()
+        earlier = earlier_rows(self.rows)
         if earlier is None:
             return
-        for key, known, named in (
-            ("methods", earlier.methods, [method.name for method in planned.methods]),
-            ("seeds", set(map(str, earlier.seeds(ALL))), list(map(str, planned.configuration.seeds))),
-            ("metrics", earlier.metrics, [metric.name for metric in planned.metrics]),
-        ):
-            lost = sorted(known - set(named))
-            if lost:
-                expected = f"all that it has results for ({', '.join(sorted(known))}), and optionally more"
-                raise InputError(
-                    self.rows, key, expected, f"{', '.join(named)} without {', '.join(lost)}", DISCARD
-                )
+        earlier.check_kept(
+            self.rows,
+            method=[method.name for method in planned.methods],
+            seed=planned.configuration.seeds,
+            metric=[metric.name for metric in planned.metrics],
+        )
         try:
             before = _kept_design(self.read_manifest())
         except InputError:
@@ -263,25 +256,13 @@ class RunFolder:
 
         Raises `InputError`, and leaves the file as it is, where it has values that ``rows`` lack.
         """
-        earlier = self._earlier_rows()
+        earlier = earlier_rows(self.rows)
         lost = [] if earlier is None else rows.values_lacking(earlier)
         if lost:
             expected = "new rows with a value for each one in this file"
             found = f"{len(lost)} without, such as {lost[0]}"
             raise InputError(self.rows, "", expected, found, f"The file is left unchanged. {DISCARD}")
         rows.write(self.rows)
-
-    def _earlier_rows(self) -> Rows | None:
-        """The rows in the folder; None where there are none. Of a damaged file a warning is logged."""
-        if not self.rows.exists():
-            return None
-        try:
-            return Rows.read(self.rows)
-        except InputError as error:
-            if isinstance(error.__cause__, OSError) and error.__cause__.errno is not None:
-                raise  # not damaged: the disk or its permissions are at fault
-            log.warning("%s It is written again.", error)
-            return None
 
     def read_manifest(self) -> Manifest:
         """Read ``run.json``. Raises `InputError` where there is none, or one of another format."""

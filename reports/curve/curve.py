@@ -17,12 +17,12 @@ from ...bench.io.files import write_text
 from ...bench.machine import check_device
 from ...bench.manifest import MethodRecord
 from ...bench.protocol import Protocol, make_protocols
-from ...bench.rows import ALL, Rows, check_rows_kept
+from ...bench.rows import ALL, Rows, earlier_rows
 from ...bench.runner.captures import open_run_clips, run_configuration
 from ...bench.runner.config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
 from ...bench.runner.run import describe, make_jobs, run_jobs, warn_of_missing_metrics
 from ...bench.runner.scoring import FULL
-from ...bench.runner.steps import Job
+from ...bench.runner.steps import VARIANT_MARK, Job
 from ...bench.runner.store import RunFolder
 from ...bench.specs import Findings, MetricSpec
 from ..aggregate import subject_means
@@ -77,13 +77,27 @@ def curve(settings: CurveSettings, out: Path) -> Findings:
     subjects: list[Clip] = [*held]
     protocols = make_protocols(tasks, subjects, settings.frames)
     folder = RunFolder(out)
+    hashes = [protocol.hash for protocol in protocols.values()]
+    earlier = earlier_rows(folder.rows)
+    if earlier is not None and settings.over == "tracking_error":
+        # Before the tracking of new levels is written.
+        names = [
+            f"{method.spec.name}{VARIANT_MARK}{_of_level(level)}"
+            for method, level in product(wanted, settings.tracking_errors)
+        ]
+        earlier.check_kept(folder.rows, method=names, protocol=hashes)
     trainings = _trainings(config, settings, wanted, held, protocols, run, folder)
     jobs = [job for training in trainings for job in training.jobs]
     for job in jobs:
         job.check()
         job.check_method()
-    cells = [(job.method.spec.name, job.clip.subject, job.seed) for job in jobs]
-    check_rows_kept(folder.rows, cells, [protocol.hash for protocol in protocols.values()])
+    if earlier is not None:
+        earlier.check_kept(
+            folder.rows,
+            method=dict.fromkeys(job.method.spec.name for job in jobs),
+            seed=config.seeds,
+            protocol=hashes,
+        )
     warn_of_missing_metrics(metrics, held[0])
     manifest = replace(
         describe(config, [], metrics, subjects, protocols),
@@ -205,10 +219,14 @@ def _given(settings: CurveSettings, config: RunConfig, held: Sequence[HeldOutCli
     elif settings.over == "tracking_error":
         for level, clips in clips_by_level(config, [clip.source for clip in held], settings.tracking_errors):
             found = [hold_out(clip, settings.camera, settings.every) for clip in clips]
-            yield _Given(f"tracking-{level:g}", Fraction(1), found)
+            yield _Given(_of_level(level), Fraction(1), found)
     else:
         for part in reversed(settings.parts):
             yield _Given(_named(part), part, [reduced(clip, settings.over, part) for clip in held])
+
+
+def _of_level(level: float) -> str:
+    return f"tracking-{level:g}"
 
 
 def _named(part: Fraction) -> str:

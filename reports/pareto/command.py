@@ -91,7 +91,7 @@ def pareto(settings: ParetoSettings, progress: Progress = no_progress) -> Findin
     from .points import Point, front_of, read_points
 
     out = Path(settings.out)
-    points, left_out, metric = read_points(
+    points, left_out, metric, note = read_points(
         [Path(r) for r in settings.runs], settings.task, settings.metric, settings.time
     )
     check_output_folder(out)
@@ -109,12 +109,23 @@ def pareto(settings: ParetoSettings, progress: Progress = no_progress) -> Findin
         labels["milliseconds"] = f"{settings.time.replace('_', ' ').capitalize()}, ms"
     quality = f"{metric.label}{unit}, {settings.task.replace('_', ' ')}"
     write_plot(out / "pareto.png", points, labels, quality, higher_is_better=rising)
-    data = {"out": out, "points": [asdict(point) for point in points], "fronts": fronts, "left_out": left_out}
-    return Findings(_text(points, fronts, left_out, metric.label, metric.digits), data)
+    data = {
+        "out": out,
+        "points": [asdict(point) for point in points],
+        "fronts": fronts,
+        "left_out": left_out,
+        "note": note,
+    }
+    return Findings(_text(points, fronts, left_out, metric.label, metric.digits, note), data)
 
 
 def _text(
-    points: Sequence[Point], fronts: dict[str, list[int]], left_out: Sequence[str], label: str, digits: int
+    points: Sequence[Point],
+    fronts: dict[str, list[int]],
+    left_out: Sequence[str],
+    label: str,
+    digits: int,
+    note: str,
 ) -> str:
     wide = max([16, *(len(point.method) + 2 for point in points)])
     lines = [f"{'method':<{wide}}{label:>10}{'MB':>12}{'ms':>12}  run (* on the front of size, of time)"]
@@ -126,6 +137,7 @@ def _text(
         lines.append(f"{point.method:<{wide}}{point.quality:>10.{digits}f}{''.join(cells)}  {point.run}")
     if any(point.derived_from for point in points):
         lines.append("METHOD+VARIANT was derived from the trained avatar, without training.")
+    lines += [f"Frame times: {note}"] if note else []
     return "\n".join([*lines, *(f"left out: {text}" for text in left_out)])
 
 

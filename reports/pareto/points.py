@@ -9,6 +9,7 @@ from pathlib import Path
 from ...bench.errors import InputError
 from ...bench.specs import MetricSpec
 from ..aggregate import summarise
+from ..conditions import Conditions, conditions, note_of
 from ..runs import RunData, check_same_protocol
 
 
@@ -67,9 +68,9 @@ def front_of(
 
 def read_points(
     folders: Sequence[Path], task: str, metric: str, time: str = ""
-) -> tuple[list[Point], list[str], MetricSpec]:
-    """Read every method of every run that is no trivial baseline; return points, what was left out and why, and the
-    metric.
+) -> tuple[list[Point], list[str], MetricSpec, str]:
+    """Read every method of every run that is no trivial baseline; return points, what was left out and why, the metric,
+    and a note on frame times that do not compare ("": all do).
 
     ``metric`` "" is the first of frames that the runs have; ``time`` names the metric of milliseconds; "" the median
     latency, or what the frames per second give. Raises `InputError` where runs were not scored on the same frames by
@@ -77,6 +78,7 @@ def read_points(
     """
     points: list[Point] = []
     left_out: list[str] = []
+    timings: dict[str, Conditions] = {}
     runs: list[RunData] = []
     spec = None
     for folder in folders:
@@ -95,6 +97,7 @@ def read_points(
         if time and time not in times:
             raise InputError(folder, "time", f"a metric in ms: {', '.join(times) or 'none'}", time)
         check_same_protocol(runs[0], data, task)
+        measured = conditions(data.rows, data.metrics, data.methods)
         for record in data.manifest.methods:
             if record.trivial:
                 continue
@@ -105,9 +108,12 @@ def read_points(
             if quality.value is None:
                 left_out.append(f"{record.name} of {folder}: {quality.reason}")
                 continue
-            milliseconds = latency.value
+            milliseconds, timed = latency.value, time or LATENCY
             if milliseconds is None and not time and speed.value:
-                milliseconds = 1000.0 / speed.value
+                milliseconds, timed = 1000.0 / speed.value, SPEED
+            if milliseconds is not None and record.name in measured.get(timed, {}):
+                label = record.name if len(folders) == 1 else f"{record.name} of {folder}"
+                timings[label] = measured[timed][record.name]
             derived = record.derived
             source, variant = (derived["from"], derived["variant"]) if derived else ("", "")
             costs = size.value, milliseconds
@@ -117,4 +123,4 @@ def read_points(
     if spec is None or not points:
         found_instead = "; ".join(left_out) or "none"
         raise InputError("runs", "", "a method, no trivial baseline, with a value", found_instead)
-    return points, left_out, spec
+    return points, left_out, spec, note_of(timings)

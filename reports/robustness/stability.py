@@ -33,7 +33,7 @@ from ...bench.io.files import write_json
 from ...bench.io.images import quantise, write_png
 from ...bench.io.provenance import RENDER
 from ...bench.protocol import Protocol, TaskWithoutTruth, make_protocol_without_truth
-from ...bench.rows import Row, Rows, check_rows_kept
+from ...bench.rows import Row, Rows, earlier_rows
 from ...bench.runner.adaptation import MethodNeeds
 from ...bench.runner.scoring import FULL
 from ...bench.runner.steps import Job
@@ -222,8 +222,15 @@ def checked_protocols(
             dict(case.condition for case in own),
         )
     jobs = [case.job for case in cases]
-    cells = [(job.method.spec.name, job.clip.subject, job.seed) for job in jobs]
-    check_rows_kept(out / ROWS_FILE, cells, [protocol.hash for protocol in protocols.values()])
+    earlier = earlier_rows(out / ROWS_FILE)
+    if earlier is not None:
+        earlier.check_kept(
+            out / ROWS_FILE,
+            method=dict.fromkeys(job.method.spec.name for job in jobs),
+            subject=dict.fromkeys(job.clip.subject for job in jobs),
+            seed=dict.fromkeys(job.seed for job in jobs),
+            protocol=[protocol.hash for protocol in protocols.values()],
+        )
     return protocols
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from itertools import combinations
+from itertools import chain, combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -58,7 +58,7 @@ class CompareSettings:
 
 FIELDS = (
     *("task", "metric", "first", "second", "difference", "low", "high", "effect", "p", "p_holm"),
-    *("family", "subjects", "wins", "seeds_first", "seeds_second", "verdict", "reason"),
+    *("family", "subjects", "wins", "seeds_first", "seeds_second", "verdict", "reason", "note"),
 )
 
 
@@ -75,6 +75,7 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
 
 def compare_methods(runs: RunSet, settings: CompareSettings, progress: Progress = no_progress) -> Findings:
     """`compare_runs` of runs that are read already; the settings' runs, region and sequences are not looked at."""
+    from ..conditions import conditions, note_of
     from ..table_report import COMPARISON
     from .comparisons import compare
 
@@ -95,10 +96,18 @@ def compare_methods(runs: RunSet, settings: CompareSettings, progress: Progress 
         what = {"task": task, "metric": spec.name}
         found.append((spec, compare(runs.rows, pairs, **what, higher_is_better=better, level=settings.level)))
         progress(index + 1, len(columns), spec.label)
-    every = [comparison for _, comparisons in found for comparison in comparisons]
-    text = _csv(every) if settings.format == "csv" else "\n\n".join(_text(spec, c) for spec, c in found)
-    text = f"{runs.part}\n\n{text}" if runs.part and settings.format == "text" else text
-    return Findings(text, {"level": settings.level, "comparisons": [_plain(c) for c in every]})
+    times = conditions(runs.rows, metrics, list(dict.fromkeys(chain(*pairs))))
+    every = []
+    for comparison in chain(*(comparisons for _, comparisons in found)):
+        own = times.get(comparison.metric, {})
+        note = note_of({name: own[name] for name in (comparison.first, comparison.second) if name in own})
+        every.append({**_plain(comparison), "note": note})
+    if settings.format == "csv":
+        text = _csv(every)
+    else:
+        text = "\n\n".join(_text(spec, c, note_of(times.get(spec.name, {}))) for spec, c in found)
+        text = f"{runs.part}\n\n{text}" if runs.part else text
+    return Findings(text, {"level": settings.level, "comparisons": every})
 
 
 def _pairs(runs: RunSet, against: str | None, trivial: bool) -> list[tuple[str, str]]:
@@ -115,7 +124,7 @@ def _pairs(runs: RunSet, against: str | None, trivial: bool) -> list[tuple[str, 
     return pairs
 
 
-def _plain(comparison: PairedComparison) -> dict[str, object]:
+def _plain(comparison: PairedComparison) -> dict[str, Any]:
     """Everything a comparison holds and says, as plain values."""
     return {
         **asdict(comparison),
@@ -126,19 +135,19 @@ def _plain(comparison: PairedComparison) -> dict[str, object]:
     }
 
 
-def _csv(comparisons: Sequence[PairedComparison]) -> str:
+def _csv(comparisons: Sequence[dict[str, Any]]) -> str:
     from ..writers import csv_text
 
     lines: list[list[object]] = [list(FIELDS)]
     for comparison in comparisons:
-        values = _plain(comparison)
-        values["seeds_first"], values["seeds_second"] = comparison.seeds
+        first, second = comparison["seeds"]
+        values = {**comparison, "seeds_first": first, "seeds_second": second}
         lines.append([values[name] for name in FIELDS])
     return csv_text(lines).rstrip()
 
 
-def _text(spec: MetricSpec, comparisons: Sequence[PairedComparison]) -> str:
-    """One metric's comparisons as a table for a terminal."""
+def _text(spec: MetricSpec, comparisons: Sequence[PairedComparison], note: str) -> str:
+    """One metric's comparisons as a table for a terminal, with a note below."""
     from ..tables import AVATAR_TITLE
     from .comparisons import counted
 
@@ -167,4 +176,4 @@ def _text(spec: MetricSpec, comparisons: Sequence[PairedComparison]) -> str:
         "  ".join(t.ljust(w) if i in (0, 1, 7) else t.rjust(w) for i, (t, w) in enumerate(zip(line, widths)))
         for line in lines
     ]
-    return "\n".join([head, *(f"  {line}".rstrip() for line in body)])
+    return "\n".join([head, *(f"  {line}".rstrip() for line in [*body, *([note] if note else [])])])

@@ -168,3 +168,25 @@ def test_reasons_are_bounded_alone_and_together(rows, tmp_path, monkeypatch):
 def test_no_rows_are_read_back_as_none(tmp_path):
     Rows.of([]).write(tmp_path / "rows.parquet")
     assert len(Rows.read(tmp_path / "rows.parquet")) == 0
+
+
+@pytest.mark.parametrize(
+    ("error", "is_damage"),
+    [
+        (ValueError("no Parquet"), True),
+        (OSError("unexpected end of stream"), True),  # pyarrow's of a damaged file
+        (OSError(5, "Input/output error"), False),
+    ],
+    ids=repr,
+)
+def test_rows_are_written_again_where_the_file_is_damaged(tmp_path, monkeypatch, error, is_damage):
+    def fail(path):
+        raise error
+
+    monkeypatch.setattr(module, "_read_table", fail)
+    (tmp_path / "rows.parquet").touch()
+    if is_damage:
+        assert module.earlier_rows(tmp_path / "rows.parquet") is None
+        return
+    with pytest.raises(InputError, match="Input/output error"):
+        module.earlier_rows(tmp_path / "rows.parquet")

@@ -44,6 +44,7 @@ class Writer:
 
 PAGE = "report.html"  # speeds stand on it
 MEASURED_FILES = ("measure.json", "points.csv", "pareto.png", "cost.*", PAGE)
+MEASURED_TABLES = ("measure.json", "tables/*", "contact_sheet.png", PAGE)
 MEASURED_CURVE = ("fit.json", "measure.json", "curve.csv", "curve.png", PAGE)
 WRITERS = [
     Writer("synth", "settings", f"synth {SYNTH} --out out"),
@@ -68,6 +69,7 @@ WRITERS = [
     Writer("extremes", "run", "extremes run --views 1 --dimensions 1 --methods ga ours"),
     Writer("reenact", "two_subjects", "reenact run --frames 1"),
     Writer("pareto", "run", "pareto run --out out"),
+    Writer("speed", "timed", "speed run", MEASURED_TABLES),
     Writer("gate", "baseline", "gate run --baseline baseline.json --junit a.xml --markdown a.md"),
     Writer("gate update", "baseline", "gate run --baseline baseline.json --update"),
     Writer(
@@ -243,10 +245,13 @@ class Kills:
         self.code, self.changes, self.text = start(writer, self.place, None)
         self.expected = tree(self.place, writer)
         self.place.restore()
-        code = start(writer, self.place, None)[0]
+        code, _, text = start(writer, self.place, None)
         faults = differences(self.expected, tree(self.place, writer))
         if code not in (0, 1) or code != self.code or faults:
-            self.findings.append((0, f"two unbroken runs: {self.code} and {code}; {'; '.join(faults[:3])}"))
+            why = "; ".join([*faults[:3], _last(text)])
+            self.findings.append((0, f"two unbroken runs: {self.code} and {code}; {why}"))
+            self.waiting: list[int] = []  # kills have nothing to be compared with
+            return
         every = [*range(1, self.changes + 1)]
         edges = every[:10] + every[-10:]
         rest = [n for n in every if n not in edges]
@@ -295,7 +300,7 @@ def kill_all(
     for writer in writers:
         if not kills or time.monotonic() - began < (end - began) / 2:
             kills.append(Kills(writer, samples, seed, skip))
-    if at is not None:
+    if at and kills[0].waiting:
         kills[0].kill(at)
     while at is None and any(k.waiting for k in kills) and time.monotonic() < end:
         for k in kills:
@@ -321,7 +326,8 @@ def describe(outcomes: Sequence[Outcome], left_out: Sequence[str]) -> str:
         for text, numbers in kinds.items():
             shown = ", ".join(map(str, numbers[:10])) + (", ..." if len(numbers) > 10 else "")
             command = f"python -m headbench.tests.fuzz.kills --command '{outcome.name}' --at {numbers[0]}"
-            lines.append(f"\n{outcome.name}, killed before {shown}: {text}\n  {command}")
+            killed = f", killed before {shown}" if numbers[0] else ""
+            lines.append(f"\n{outcome.name}{killed}: {text}\n  {command}")
     return "\n".join(lines)
 
 

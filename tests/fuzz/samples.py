@@ -150,6 +150,11 @@ def two_subjects(folder: Path, samples: Path) -> None:
     _run(folder, samples, ("mean-image", "ga"))
 
 
+def timed(folder: Path, samples: Path) -> None:
+    """A finished run with speeds."""
+    _run(folder, samples, ("mean-image", "ga"), ("psnr", "fps"))
+
+
 def checkpoint(folder: Path, samples: Path) -> None:
     """A checkpoint of a run called "run"."""
     state = {
@@ -240,7 +245,7 @@ def synthetic(folder: Path, samples: Path) -> None:
 SAMPLES: dict[str, Callable[[Path, Path], None]] = {
     sample.__name__: sample
     for sample in (
-        *(capture, heads, recording, videos, monocular, run, unfinished, two_subjects, checkpoint),
+        *(capture, heads, recording, videos, monocular, run, unfinished, two_subjects, timed, checkpoint),
         *(compact, ply, colmap, benchmark, exclusions, baseline, settings, weights, images, bundles),
         *(official, synthetic),
     )
@@ -287,10 +292,12 @@ def _sources() -> str:
     return digest(*(path.read_text() for name in folders for path in sorted((top / name).rglob("*.py"))))
 
 
-def _run(folder: Path, samples: Path, methods: tuple[str, ...]) -> None:
+def _run(
+    folder: Path, samples: Path, methods: tuple[str, ...], metrics: tuple[str, ...] = ("psnr", "storage")
+) -> None:
     if not (folder / "capture").exists():
         with_capture(folder, samples)
-    (folder / "config.json").write_text(json.dumps(configuration(methods)))
+    (folder / "config.json").write_text(json.dumps(configuration(methods, metrics)))
     with contextlib.chdir(folder):
         _main("run", "--config", "config.json")
 

@@ -47,12 +47,19 @@ def differs():
     Path("a.txt").write_bytes(os.urandom(8))
 
 
+def fails():
+    Path("a.txt").write_text("a")
+    os.write(2, b"headbench: there is no capture\n")
+    return 2
+
+
 COMMANDS = {
     "whole": (whole, ""),
     "leaves a file": (leaves_a_file, "left behind: .a-"),
     "refuses": (refuses, "exit code 2 instead of 0: headbench: a.txt is there"),
     "keeps half": (keeps_half, "differs: a.txt"),
     "differs": (differs, "two unbroken runs: 0 and 0; differs: a.txt"),
+    "fails": (fails, "two unbroken runs: 2 and 2; headbench: there is no capture"),
 }
 
 
@@ -64,7 +71,8 @@ def test_what_a_command_leaves_is_found(name, tmp_path, monkeypatch):
     tried = kills.Kills(kills.Writer(name, "sample", ""), tmp_path, 0)
     while tried.waiting:
         tried.kill(tried.waiting.pop(0))
-    assert tried.done == tried.changes > 0
+    assert tried.changes > 0
+    assert tried.done == (0 if "unbroken" in expected else tried.changes)
     found = " ".join(text for _, text in tried.findings)
     assert bool(found) == bool(expected)
     assert expected in found

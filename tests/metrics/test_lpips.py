@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.metrics.lpips import lpips
-from headbench.metrics.lpips_network import NETWORKS, VARIABLE, Lpips
+from headbench.metrics.lpips_network import NETWORKS, NO_WEIGHTS, VARIABLE, Lpips
 
 
 @pytest.fixture
@@ -116,8 +116,9 @@ def test_the_fingerprint_tells_weights_apart_and_not_files(random_weights, tmp_p
 def test_without_weights_every_call_is_unavailable_asking_once(bare_machine):
     a, b = frames(2)
     for _ in range(3):
-        with pytest.raises(UnavailableError, match=VARIABLE):
+        with pytest.raises(UnavailableError, match=VARIABLE) as caught:
             lpips(a, b)
+        assert caught.value.note == NO_WEIGHTS
     assert len(bare_machine) == 1
 
 

@@ -39,8 +39,11 @@ def test_a_named_place_without_weights_is_no_reason_to_look_on(bare_machine, tmp
     with pytest.raises(InputError, match="not there"):
         weights.find_backbone(SQUEEZE, tmp_path / "nowhere")
     monkeypatch.setenv(weights.VARIABLE, str(tmp_path))
-    with pytest.raises(UnavailableError, match=f"squeeze.*{weights.VARIABLE}.*Download {SQUEEZE.url}"):
+    with pytest.raises(
+        UnavailableError, match=f"squeeze.*{weights.VARIABLE}.*Download {SQUEEZE.url}"
+    ) as caught:
         weights.find_backbone(SQUEEZE)  # a folder may well hold those of another network
+    assert caught.value.note == weights.NO_WEIGHTS
     assert bare_machine == []
 
 

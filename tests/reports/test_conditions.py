@@ -16,8 +16,8 @@ BUSY = {**IDLE, "other_cores": 0.84}
 ONE = {**IDLE, "threads": 1}
 THERE = {**IDLE, "machine": "B (8 cores)"}
 UNKNOWN = {"machine": "A (2 cores)", "threads": 2}
-LOADED = "Measured under load: other processes kept more than 0.1 of a core busy, at most {} cores."
-ELSEWHERE = "Measured on {}; others of this column on others: they do not compare."
+LOADED = "Measured under load: other processes used up to {} cores."
+ELSEWHERE = "Measured on {}; not comparable with other machines or thread counts."
 
 
 def made(**conditions):
@@ -35,11 +35,11 @@ def made(**conditions):
     [
         ({"a": IDLE, "b": IDLE}, {}, "A (2 cores) with 2 threads"),
         ({"a": {**IDLE, "other_cores": OTHERS_LIMIT}, "b": IDLE}, {}, "A (2 cores) with 2 threads"),
-        ({"a": IDLE, "b": BUSY}, {"b": LOADED.format(0.8)}, "A (2 cores) with 2 threads"),
-        ({"a": [IDLE, BUSY], "b": [IDLE, IDLE]}, {"a": LOADED.format(0.8)}, "A (2 cores) with 2 threads"),
+        ({"a": IDLE, "b": BUSY}, {"b": LOADED.format(0.84)}, "A (2 cores) with 2 threads"),
+        ({"a": [IDLE, BUSY], "b": [IDLE, IDLE]}, {"a": LOADED.format(0.84)}, "A (2 cores) with 2 threads"),
         (
             {"a": BUSY, "b": {**IDLE, "other_cores": 1.26}, "floor": BUSY},
-            {name: LOADED.format(1.3) for name in ("a", "b", "floor")},
+            {"a": LOADED.format(0.84), "b": LOADED.format(1.26), "floor": LOADED.format(0.84)},
             "A (2 cores) with 2 threads",
         ),
         (

@@ -1,6 +1,9 @@
 """Lists of the frames to render: images named by them are scored; what does not fit is refused."""
 
 import csv
+import os
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -41,28 +44,44 @@ def test_the_ground_truth_by_the_listed_names_scores_perfectly(run, toy, tmp_pat
     assert (psnr >= 100).all()
 
 
-def test_cameras_and_sizes_are_the_captures(run, toy, tmp_path):
+def test_cameras_sizes_and_pose_files_are_the_captures(run, toy, tmp_path, monkeypatch):
+    moved = np.array([[0, -1, 0, 0.5], [1, 0, 0, 0.25], [0, 0, 1, 2], [0, 0, 0, 1]])
+
+    def read(path):
+        clip = toy.ToyClip(path)
+        K = np.array([[20.0, 0, 3], [0, 10, 2], [0, 0, 1]])
+        clip.cameras = {name: replace(c, K=K, world_to_camera=moved) for name, c in clip.cameras.items()}
+        return clip
+
+    def pose_files(path):
+        return {t: Path(os.path.relpath(path), f"{t}.npz") for t in range(3)}
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(toy, "read", read)
+    monkeypatch.setattr(toy, "pose_files", pose_files, raising=False)
+    monkeypatch.setattr(toy, "READER", replace(toy.READER, pose_files="toy_plugin:pose_files"))
     assert cli.main(["frames", str(run), "--out", str(tmp_path / "frames"), "--trust"]) == 0
-    clip = toy.read("subject1")
     for row in listed(tmp_path / "frames" / "frames.csv"):
-        camera = clip.cameras[row["camera"]]
-        assert (int(row["width"]), int(row["height"])) == (camera.width, camera.height)
+        assert (int(row["width"]), int(row["height"])) == toy.SIZE
         assert row["background"] == "#ffffff"
         pose = [[float(row[f"world_to_camera_{i}{j}"]) for j in range(4)] for i in range(3)]
-        np.testing.assert_array_equal(pose, camera.world_to_camera[:3])
-        assert float(row["fx"]) == camera.K[0, 0]
+        np.testing.assert_array_equal(pose, moved[:3])
+        assert [float(row[name]) for name in ("fx", "fy", "cx", "cy")] == [20, 10, 3, 2]
+        known = tmp_path / "data" / "subject1" / f"{row['timestep']}.npz"
+        assert row["pose_file"] == (str(known) if int(row["timestep"]) < 3 else "")
 
 
 @pytest.mark.parametrize(
-    ("others", "part"),
+    ("source", "others", "part"),
     [
-        (["--tasks", "novel_view"], "--tasks"),
-        (["--frames-per-task", "2"], "--frames-per-task"),
-        (["--reader", "ga"], "--reader"),
+        ("run", ["--tasks", "novel_view"], "--tasks"),
+        ("run", ["--frames-per-task", "2"], "--frames-per-task"),
+        ("run", ["--reader", "ga"], "--reader"),
+        ("data", ["--data", "data", "--reader", "toy_plugin:READER"], "--data"),
     ],
 )
-def test_options_of_a_capture_are_refused_for_a_run(run, tmp_path, capsys, others, part):
-    arguments = ["frames", str(run), "--out", str(tmp_path / "frames"), "--trust", *others]
+def test_options_that_do_not_fit_the_source_are_refused(run, tmp_path, capsys, source, others, part):
+    arguments = ["frames", str(tmp_path / source), "--out", str(tmp_path / "frames"), "--trust", *others]
     assert cli.main(arguments) == 2
     assert part in capsys.readouterr().err
     assert not (tmp_path / "frames").exists()
@@ -84,3 +103,6 @@ def test_a_capture_is_listed_as_its_run_is(run, tmp_path):
     reader = ["--reader", "toy_plugin:READER"]
     assert cli.main(["frames", str(tmp_path / "data"), "--out", str(tmp_path / "b"), *reader]) == 0
     assert listed(tmp_path / "a/frames.csv") == listed(tmp_path / "b/frames.csv")
+    options = ["--tasks", "novel_view", "--frames-per-task", "2"]
+    assert cli.main(["frames", str(tmp_path / "data"), "--out", str(tmp_path / "c"), *reader, *options]) == 0
+    assert [row["task"] for row in listed(tmp_path / "c/frames.csv")] == ["novel_view"] * 2

@@ -4,6 +4,7 @@ import os
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,6 +15,8 @@ from headbench.bench.io.files import write_json
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.captures import open_run_clips, run_configuration
 from headbench.bench.runner.config import RunOptions
+from headbench.bench.runner.store import RunFolder
+from headbench.reports.page.frames import open_truth
 
 TRUSTED = RunOptions(trust=True)
 
@@ -86,38 +89,39 @@ def test_what_is_gone_is_named_with_places_and_option(run, tmp_path, capsys, gon
         assert cli.main(["verify", str(run), "--trust", option, str(tmp_path / gone)]) == 0
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"methods": ["stranger:SPEC"]},
-        {"metrics": ["stranger:SPEC"]},
-        {"metric_profiles": ["stranger:SPEC"]},
-        {"reader": "stranger:SPEC"},
-    ],
-)
-def test_a_module_that_a_run_names_is_not_imported(run, monkeypatch, tmp_path, capsys, change):
+NEEDED = ("reader", "metrics", "metric_profiles")
+"""What those commands resolve that make images of no method."""
+
+
+@pytest.mark.parametrize("stored", ["avatars", "images"])
+@pytest.mark.parametrize("key", ["methods", *NEEDED])
+def test_a_module_that_a_run_names_is_not_imported(run, monkeypatch, tmp_path, capsys, key, stored):
     (tmp_path / "stranger.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
     record = read_json(run / "run.json")
     registered = {"methods": ["ga"], "metrics": ["psnr"], "reader": "ga", "reader_settings": {}}
-    record["configuration"] |= registered | change
+    record["configuration"] |= registered | {key: "stranger:SPEC" if key == "reader" else ["stranger:SPEC"]}
     for entry in (*record["metrics"], *record["methods"]):
         entry["implementation"] = "stranger:Class"
+    if stored == "images":
+        for entry in record["methods"]:
+            entry["implementation"] = ""
     write_json(run / "run.json", record)
-    for command, code in (
-        (["verify"], 3),
-        (["sweep"], 2),
-        (["extremes"], 2),
-        (["reenact"], 2),
-        (["evaluate", str(run), "--out", str(tmp_path / "out"), "--like"], 2),
+    every = ("methods", *NEEDED)
+    for command, code, needed in (
+        (["verify"], 3, every if stored == "avatars" else NEEDED),
+        (["sweep"], 2, every),
+        (["extremes"], 2, every),
+        (["reenact"], 2, every),
+        (["evaluate", str(run), "--out", str(tmp_path / "out"), "--like"], 2, NEEDED),
+        (["frames", "--out", str(tmp_path / "frames")], 2, NEEDED[:1]),
     ):
         assert cli.main([*command, str(run)]) == code
         shown = "".join(capsys.readouterr())
-        needs_no_method = (
-            command[0] == "evaluate" and "methods" in change
-        )  # it opens captures, and computes metrics
-        for words in (f"configuration.{next(iter(change))}", "--trust", "'stranger:SPEC'"):
-            assert needs_no_method or words in shown
+        told = all(words in shown for words in (f"configuration.{key}", "--trust", "'stranger:SPEC'"))
+        assert told == (key in needed), command
+    _, reason = open_truth(SimpleNamespace(runs=[SimpleNamespace(folder=RunFolder(run))]), RunOptions())
+    assert ("'stranger:SPEC'" in reason) == (key == "reader")
     assert cli.main(["table", str(run)]) in (0, 2)
     assert "stranger" not in sys.modules
 

@@ -65,6 +65,14 @@ def unavailable(image, truth):
     raise UnavailableError("no weights.", "Get some.")
 
 
+def noted(*images):
+    raise UnavailableError("no weights.", "Get some.", "Weights missing.")
+
+
+class NotedBatches(Difference):
+    batched = staticmethod(noted)
+
+
 def not_finite(image, truth):
     return math.inf
 
@@ -131,9 +139,18 @@ def test_a_temporal_metric_sees_the_neighbouring_frame(spec):
     assert "neighbouring" in scored[3].reason
 
 
-def test_what_cannot_be_had_is_missing_with_the_reason(spec):
-    scored = score_frames(KEYS, FRAMES, [spec("u", "unavailable")])["u"]
-    assert {(s.status, s.reason) for s in scored} == {("missing", "no weights. Get some.")}
+@pytest.mark.parametrize(
+    ("implementation", "fields", "reason"),
+    [
+        ("unavailable", {}, "no weights. Get some."),
+        ("noted", {}, "Weights missing."),
+        ("noted", {"kind": "temporal"}, "Weights missing."),
+        ("NotedBatches", {}, "Weights missing."),
+    ],
+)
+def test_what_cannot_be_had_is_missing_with_the_reason(spec, implementation, fields, reason):
+    scored = score_frames(KEYS[:3], FRAMES, [spec("u", implementation, **fields)])["u"]
+    assert {(s.status, s.reason) for s in scored} == {("missing", reason)}
     assert all(math.isnan(s.value) for s in scored)
 
 

@@ -94,7 +94,9 @@ def test_earlier_values_add_up_and_failed_cells_are_left_out(config, cell):
     assert findings.passed
 
 
-@pytest.mark.parametrize("error", [UnavailableError("gone", "find it"), RuntimeError("no ink")], ids=repr)
+@pytest.mark.parametrize(
+    "error", [UnavailableError("gone", "find it"), RuntimeError("no ink"), None], ids=repr
+)
 def test_an_avatar_that_cannot_be_measured_keeps_its_speed(config, toy, cell, monkeypatch, error):
     runner.run(config)
     before, files = read(config), [cell.rows.read_bytes(), cell.step("measure")]
@@ -102,9 +104,11 @@ def test_an_avatar_that_cannot_be_measured_keeps_its_speed(config, toy, cell, mo
 
     def once(avatar, workload):
         counted.append(1)
-        if len(counted) == 1:
+        if len(counted) == 1 and error is not None:
             raise error
-        return toy.Measurement(7.0, {"half": 3.5})
+        return toy.Measurement(
+            7.0, {"half": 3.5} if len(counted) > 1 else {}
+        )  # a metric of the run lacks its detail
 
     monkeypatch.setattr(toy, "clock_time", once)
     findings = again(config)
@@ -134,6 +138,29 @@ def test_a_kill_between_rows_and_record_loses_nothing(config, cell, monkeypatch,
     frames = before["metric"] == "psnr"
     assert read(config)[frames].equals(before[frames])
     assert cell.step("measure")["earlier"]
+
+
+def test_a_restart_with_other_methods_takes_speeds_from_cells(config, toy, cell, monkeypatch):
+    runner.run(config)
+    before, write = read(config), Rows.write
+    target = RunFolder(Path(config.out)).rows
+
+    def killed_before_the_runs_file(rows, path):
+        if path == target and cell.step("measure").get("earlier"):
+            raise KeyboardInterrupt
+        write(rows, path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Rows, "write", killed_before_the_runs_file)
+        with pytest.raises(KeyboardInterrupt):
+            again(config)
+    assert read(config).equals(before)
+    again(config, ("failing",))  # whose cells are left out
+    after = read(config)
+    own = (after["method"] == "toy") & (after["subject"] == "subject1")
+    assert after[own].reset_index(drop=True).equals(table(Rows.read(cell.rows)))
+    assert cell_value(after, "subject1") > cell_value(before, "subject1")
+    assert after[~own].equals(before[~own])
 
 
 def avatar_altered(out):

@@ -152,6 +152,9 @@ def test_tracking_error_changes_poses_alone(plugin, tmp_path):
     made = tmp_path / "run" / "curve-tracking-error" / "capture-tracking-2"
     for picture in capture.rglob("*.png"):
         assert (made / picture.relative_to(capture)).samefile(picture)
+    with pytest.raises(InputError, match=r"1 without noting\+tracking-0, noting\+tracking-2\."):
+        curve_run(settings(tmp_path / "run", over="tracking_error", levels=(1.0,), frames=2))
+    assert not made.with_name("capture-tracking-1").exists()
 
 
 def test_the_tracking_of_recordings_stays(make_run):
@@ -273,9 +276,9 @@ def test_other_frames_held_out_want_another_folder(make_run):
 @pytest.mark.parametrize(
     ("less", "found"),
     [
-        ({"methods": ("noting",)}, r"timed\+1 of ball-a, seed 0; timed\+1-4 of ball-a, seed 0"),
-        ({"fractions": ("1",)}, r"noting\+1-4 of ball-a"),
-        ({"frames": 1}, "another protocol"),
+        ({"methods": ("noting",)}, r"without timed\+1, timed\+1-4\."),
+        ({"fractions": ("1",)}, r"without noting\+1-4, timed\+1-4\."),
+        ({"frames": 1}, "protocols: .* without"),
     ],
 )
 def test_points_that_are_there_are_not_left_out(make_run, plugin, less, found):

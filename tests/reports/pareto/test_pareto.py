@@ -127,6 +127,30 @@ def test_frame_time_is_the_named_metric_or_else_the_median(make_run, tmp_path):
         assert float(table(tmp_path / "out")[0]["milliseconds"]) == expected
 
 
+@pytest.mark.parametrize("time", ["", "latency_p50"])
+@pytest.mark.parametrize("several", [False, True])
+def test_frame_times_that_do_not_compare_have_a_note(make_run, tmp_path, change_manifest, time, several):
+    methods = {"ours": (28.0, 0.1, 1.0, 200.0), "ga": (27.0, 0.1, 1.0, 9.0), "floor": (9.0, 0.9, 1.0, 9.0)}
+    folders = [make_run(name, **methods) for name in ("r", "other")[: 1 + several]]
+    for folder in folders:
+        rows = pd.read_parquet(RunFolder(Path(folder)).rows)
+        metric = {**plain(METRICS[3]), "name": time or "fps", "unit": "ms" if time else "FPS"}
+        change_manifest(
+            Path(folder), lambda m, new=metric: m["metrics"].__setitem__(3, new | {"machine_bound": True})
+        )
+        rows["metric"] = rows["metric"].replace("fps", time or "fps")
+        own = rows["metric"] == (time or "fps")
+        rows.loc[own, ["machine", "threads", "other_cores"]] = "A", 2, 0.0
+        rows.loc[own & (rows["method"] == "ga"), "other_cores"] = 0.75
+        rows.loc[own & (rows["method"] == "floor"), "threads"] = 1  # no point
+        Rows(rows).write(RunFolder(Path(folder)).rows)
+    found = pareto(ParetoSettings(tuple(folders), str(tmp_path / "out"), time=time))
+    names = ", ".join(f"ga of {folder}" for folder in folders) if several else "ga"
+    note = f"{names}: Measured under load: other processes used up to 0.75 cores."
+    assert found.data["note"] == note
+    assert found.text.splitlines()[-1] == f"Frame times: {note}"
+
+
 def test_derived_avatars_are_told_from_trained_ones(make_run, tmp_path, change_manifest):
     folder = make_run("r", **{"ga": (28.0, 0.1, 4.0, 100.0), "ga+half": (27.9, 0.1, 2.0, 100.0)})
     derived = {"from": "ga", "variant": "half", "change": "16-bit floats"}

@@ -55,6 +55,42 @@ def test_text_tells_size_interval_test_and_verdict(folder):
     assert "cannot be told apart" in size
 
 
+HERE = {"machine": "A (2 cores)", "threads": 2, "other_cores": 0.0}
+ELSEWHERE = "Measured on {}; not comparable with other machines or thread counts."
+
+
+@pytest.mark.parametrize(
+    ("bad", "floor", "note"),
+    [
+        (HERE, {**HERE, "threads": 1}, ""),  # the floor is not compared
+        (
+            {**HERE, "other_cores": 0.5},
+            HERE,
+            "bad: Measured under load: other processes used up to 0.50 cores.",
+        ),
+        (
+            {**HERE, "threads": 1},
+            HERE,
+            f"good: {ELSEWHERE.format('A (2 cores) with 2 threads')} bad: {ELSEWHERE.format('A (2 cores) with 1 thread')}",
+        ),
+    ],
+)
+def test_speeds_that_do_not_compare_have_a_note(folder, change_manifest, bad, floor, note):
+    change_manifest(folder, lambda m: m["metrics"][1].update(machine_bound=True))
+    rows = pd.read_parquet(RunFolder(folder).rows)
+    for method, given in (("good", HERE), ("bad", bad), ("floor", floor)):
+        own = (rows["metric"] == "size") & (rows["method"] == method)
+        rows.loc[own, list(given)] = list(given.values())
+    Rows(rows).write(RunFolder(folder).rows)
+    found = compare_runs(CompareSettings((str(folder),)))
+    *errors, size = found.text.split("\n\n")
+    assert size.splitlines()[3:] == ([f"  {note}"] if note else [])
+    assert all("Measured" not in text for text in errors)
+    assert [c["note"] for c in found.data["comparisons"]] == ["", "", note]
+    text = compare_runs(CompareSettings((str(folder),), format="csv")).text
+    assert [line["note"] for line in csv.DictReader(io.StringIO(text))] == ["", "", note]
+
+
 def test_json_has_every_subject(folder):
     (first, *_) = compare_runs(CompareSettings((str(folder),), metrics=("error",))).data["comparisons"]
     assert first["differences"] == pytest.approx({f"s{s}": -2 * (1 + s / 10) for s in range(SUBJECTS)})
