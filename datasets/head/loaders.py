@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
 from dataclasses import replace
 from os import PathLike
@@ -48,7 +49,7 @@ def load_head(
         or ICT-FaceKit npz.
     masks : ``FLAME_masks.pkl``, for a FLAME pickle; the derived regions are added.
     regions : JSON file ``{name: [vertex, ...]}`` with further regions, such as the lip rings.
-    eyelids : folder of ``l_eyelid.npy`` and ``r_eyelid.npy``, (V, 3) metres by which a closed lid moves, as Metrical
+    eyelids : folder of ``l_eyelid.npy`` and ``r_eyelid.npy`` (or one of these), (V, 3) metres by which a closed lid moves, as Metrical
         Tracker and SMIRK ship them.
     version : names the expression basis. Needed where the file name of a FLAME pickle does not tell
         ("flame2020", "flame2023"); must agree with what a npz of ours says.
@@ -88,7 +89,8 @@ def load_head(
     if masks is not None or regions is not None:
         head.validate(regions or masks or path)
     if eyelids is not None:
-        head = _with_eyelids(head, Path(eyelids), path)
+        folder = Path(eyelids)
+        head = _with_eyelids(head, folder.parent if folder.is_file() else folder, path)
     return with_derived_regions(head)
 
 
@@ -118,7 +120,7 @@ def _with_eyelids(head: HeadArrays, folder: Path, file: Path) -> HeadArrays:
 
 
 def flame_version(path: Path) -> str:
-    """Version of a FLAME pickle by its usual file name.
+    """Version of a FLAME pickle by its usual file name, or that of its folder, such as ``FLAME2020/male_model.pkl``.
 
     Raises
     ------
@@ -126,6 +128,12 @@ def flame_version(path: Path) -> str:
         Where the name leaves it open: the two files have the same layout, and confusing them goes unnoticed.
     """
     name = path.stem.lower().replace("-", "_")
+    if (
+        "20" not in name
+        and name != "generic_model"
+        and re.fullmatch("(?i)flame[-_ ]?20(20|23)", path.parent.name)
+    ):
+        name = path.parent.name
     if "2023" in name:
         return "flame2023_no_jaw" if "no_jaw" in name else "flame2023"
     if "2020" in name or name == "generic_model":

@@ -9,7 +9,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.arrays import RING_REGIONS, STORED, save_head
-from headbench.datasets.head.loaders import flame_version, load_head, read_masks
+from headbench.datasets.head.loaders import EYELID_FILES, flame_version, load_head, read_masks
 
 from .flame_files import flame_content, legacy_pickle, write_flame
 from .flame_stand_in import LID, lids, masks, write_stand_in
@@ -37,6 +37,9 @@ def test_flame_pickle(tmp_path, legacy):
         ("flame2023.pkl", "flame2023"),
         ("FLAME-2023.pkl", "flame2023"),
         ("flame2023_no_jaw.pkl", "flame2023_no_jaw"),
+        ("FLAME2020/male_model.pkl", "flame2020"),
+        ("flame_2023/model.pkl", "flame2023"),
+        ("FLAME2023/generic_model.pkl", "flame2020"),
     ],
 )
 def test_version_by_name(name, version):
@@ -76,6 +79,15 @@ def test_what_belongs_to_a_flame_pickle_is_found(tmp_path, place):
     np.testing.assert_array_equal(head.regions["mole"], [1, 3])
     np.testing.assert_array_equal(head.eyelid_basis, np.stack(lids(), axis=2))
     assert float(np.abs(head.eyelid_basis).max()) == pytest.approx(LID)
+
+
+def test_eyelids_of_another_folder_may_be_named(tmp_path):
+    path = write_stand_in(tmp_path / "a" / "b", with_eyelids=False)
+    write_stand_in(tmp_path / "lids")
+    for given in (tmp_path / "lids", tmp_path / "lids" / EYELID_FILES[1]):
+        np.testing.assert_array_equal(load_head(path, eyelids=given).eyelid_basis, np.stack(lids(), axis=2))
+    with pytest.raises(InputError, match="l_eyelid.npy"):
+        load_head(path, eyelids=tmp_path)
 
 
 def test_what_is_not_there_is_left_out(tmp_path):
