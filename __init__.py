@@ -43,6 +43,7 @@ if _TYPE_CHECKING:
         Variant,
     )
     from .bench.errors import HeadbenchError, InputError, UnavailableError
+    from .bench.options import DependentOptions
     from .bench.rows import ALL
     from .bench.runner.adaptation import AdaptedClip, MethodNeeds
     from .bench.runner.config import resolve_method
@@ -75,6 +76,7 @@ __all__ = [
     "CheckedMethod",
     "Clip",
     "DatasetSpec",
+    "DependentOptions",
     "Findings",
     "Frame",
     "FrameKey",
@@ -123,6 +125,7 @@ _HOMES = {
     "bench.conformance.methods": ("check_method",),
     "bench.conformance.metrics": ("check_metric",),
     "bench.conformance.readers": ("check_clip", "check_reader"),
+    "bench.options": ("DependentOptions",),
     "bench.errors": ("HeadbenchError", "InputError", "UnavailableError"),
     "bench.runner.config": ("resolve_method",),
     "bench.rows": ("ALL",),

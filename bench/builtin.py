@@ -181,12 +181,19 @@ def run(settings: RunSettings, progress: Progress) -> Findings:
     for key in ("data", "out"):
         if key not in values:
             raise InputError(source, key, f"--{key} or the key {key} in --config", "neither")
-    values = merge(values, parse_assignments(settings.set))
+    assigned = parse_assignments(settings.set)
+    values = merge(values, assigned)
     if "reader" not in values and isinstance(values["data"], str):
         from .runner.captures import reader_of  # which takes long to import
 
         values["reader"] = reader_of(values["data"])
-    execution = chosen_execution(values.pop("execution", {}), settings.executor, settings.workers, source)
+    execution = chosen_execution(
+        values.pop("execution", {}),
+        assigned.get("execution", {}),
+        settings.executor,
+        settings.workers,
+        source,
+    )
     config = build(RunConfig, values, source)
     check_kind(Path(config.out), "a run")  # before the log is written there
     with _log_file(Path(config.out)):

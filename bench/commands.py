@@ -17,6 +17,7 @@ import tyro
 from .errors import EXIT_CODES, ExitCode, HeadbenchError, InputError
 from .io.files import check_kind, expand_home, plain
 from .io.lock import locked
+from .options import check_dependent, given_options
 from .progress import log_to_terminal, progress
 from .registry import discover
 from .specs import CommandSpec
@@ -50,7 +51,7 @@ RENAMED_OPTIONS = {
 def call(words: Sequence[str]) -> int:
     """Call the command that the words of a command line name, or print its help; returns the exit code."""
     words = [with_home(word) for word in words]
-    offered = offered_commands()
+    offered = offered_commands(words)
     check_known(words, offered)
     first = ("demo", "run", "table")  # what a newcomer needs
     commands = with_groups({name: offered[name] for name in (*first, *sorted(offered.keys() - set(first)))})
@@ -77,9 +78,10 @@ def with_home(word: str) -> str:
     return match[1] + expand_home(match[2], "command line")
 
 
-def offered_commands() -> dict[str, Command | dict[str, Command]]:
+def offered_commands(words: Sequence[str]) -> dict[str, Command | dict[str, Command]]:
     """Commands by name; a word that several share ("prepare nersemble") leads to a table of its own.
 
+    ``words`` are those of the command line, which say what options are given.
     A command that cannot be loaded is offered where its name is free; it raises when it is called.
     """
     found: dict[str, Command | dict[str, Command]] = {}
@@ -87,7 +89,7 @@ def offered_commands() -> dict[str, Command | dict[str, Command]]:
         discover("commands").items(), key=lambda item: (item[1].spec is None, item[0])
     ):
         spec = plugin.spec
-        command = _broken(name, f"{plugin.origin}: {plugin.error}") if spec is None else _command(spec)
+        command = _broken(name, f"{plugin.origin}: {plugin.error}") if spec is None else _command(spec, words)
         first, _, second = name.partition(" ")
         place = found.setdefault(first, {} if second else command)
         if second and isinstance(place, dict):
@@ -136,10 +138,12 @@ def check_known(words: Sequence[str], commands: Mapping[str, Command | dict[str,
     raise InputError("command line", "", "a command of headbench", repr(word[:60]), remedy)
 
 
-def _command(spec: CommandSpec) -> Command:
+def _command(spec: CommandSpec, words: Sequence[str]) -> Command:
     settings_type: Any = Annotated[spec.settings, tyro.conf.OmitArgPrefixes]
 
     def command(settings: settings_type, json: bool = False) -> int:
+        dependent = getattr(spec.settings, "dependent", ())
+        check_dependent(dependent, given_options(words, spec.settings), settings)
         folder = getattr(settings, spec.writes) if spec.writes else None
         if folder:
             check_kind(Path(folder), *spec.kinds)

@@ -10,6 +10,7 @@ import tyro
 
 from ..contracts import Progress, TaskName, no_progress
 from ..errors import InputError
+from ..options import DependentOptions
 from ..runner.config import RunOptions
 from ..specs import LABEL, Findings, is_label, writes
 
@@ -118,7 +119,7 @@ class EvaluateSettings:
     """With --avatar: preset of the method, where the image size depends on it; default: that of the run, else fast."""
 
     device: str = "cpu"
-    """With --avatar: where to render."""
+    """Where metrics are computed that can use a GPU, and with --avatar where to render."""
 
     names: str = ""
     """How the images are named, if not by key: official-ga, official-tga (FOLDER is the model's, with test/ours_N/renders and
@@ -133,13 +134,13 @@ class EvaluateSettings:
     """Run whose protocols to follow: capture, reader and its settings, tasks, frames, metrics are taken from it."""
 
     tasks: tuple[TaskName, ...] = ("novel_view", "self_reenactment")
-    """What to score; with --like the run's."""
+    """What to score. Not with --like, whose run decides it."""
 
     metrics: tuple[str, ...] = ()
-    """By which metrics of frames; default: those of `headbench run`; with --like the run's."""
+    """By which metrics of frames; default: those of `headbench run`. Not with --like."""
 
     reader: str = ""
-    """Which dataset reader opens the capture; default: the one that finds it; with --like the run's."""
+    """Which dataset reader opens the capture; default: the one that finds it. Not with --like."""
 
     head: str | None = None
     """Head model for captures that bring none: FLAME pickle or npz."""
@@ -149,16 +150,19 @@ class EvaluateSettings:
     can run any code."""
 
     frames_per_task: int | None = None
-    """Score at most so many frames per subject and task, evenly spaced, as the run compared with did."""
+    """Score at most so many frames per subject and task, evenly spaced; default: all. Not with --like."""
+
+    dependent = (
+        DependentOptions(("tasks", "metrics", "reader", "frames_per_task"), "like", False),
+        DependentOptions(("trust",), "like"),
+        DependentOptions(("method", "preset"), "avatar"),
+        DependentOptions(("names", "any_background"), "avatar", False),
+    )
 
     def __post_init__(self) -> None:
         """Refuse what leaves open what to score against."""
         if self.clip is None and self.like is None:
             raise ValueError("say what to score against: --clip CAPTURE, or --like RUN")
-        if self.avatar and self.names:
-            raise ValueError("names tells how images are named; an avatar has none")
-        if not self.avatar and (self.method or self.preset):
-            raise ValueError("method and preset are those of an avatar: give --avatar as well")
 
 
 def evaluate(settings: EvaluateSettings, progress: Progress = no_progress) -> Findings:

@@ -70,8 +70,9 @@ def _open(settings: FramesSettings) -> tuple[RunConfig, list[Clip]]:
                     "command line", f"--{name.replace('_', '-')}", expected, str(getattr(settings, name))
                 )
         return open_run_clips(source, settings, out=Path(settings.out), used=())
-    if settings.data is not None:
-        raise InputError("command line", "--data", f"a run, with run.json, at {source}", "none")
+    for name in ("data", "trust"):
+        if getattr(settings, name):
+            raise InputError("command line", f"--{name}", f"a run, with run.json, at {source}", "none")
     options = {"tasks": settings.tasks} if settings.tasks else {}
     config = capture_configuration(
         settings.source,

@@ -13,6 +13,7 @@ from ..configuration import parse_assignments
 from ..contracts import Clip, Progress, no_progress
 from ..errors import InputError
 from ..machine import check_device
+from ..options import DependentOptions
 from ..registry import SPEC_TYPES, Group, discover, get, resolve
 from ..runner.adaptation import MethodNeeds, carry_out, plan
 from ..runner.config import DemoConfig, ResolvedMethod, RunConfig, resolve_method
@@ -49,6 +50,8 @@ class CheckPluginSettings:
 
     device: str = "cpu"
     """Where the method trains."""
+
+    dependent = (DependentOptions(("reader",), "data"),)
 
 
 KINDS: dict[Group, str] = {"methods": "method", "datasets": "reader", "metrics": "metric"}

@@ -11,26 +11,44 @@ import tyro
 
 from ..configuration import build, merge, parse_assignments
 from ..contracts import Progress
-from ..errors import InputError
+from ..options import DependentOptions, check_dependent
 from ..registry import unknown
 from ..runner.config import RunOptions
 from ..specs import Findings
 from .settings import Execution, ExecutorName
 
+DEPENDENT = (
+    DependentOptions(("workers", "threads"), "executor", ("processes",)),
+    DependentOptions(("restarts",), "executor", ("processes", "slurm")),
+    DependentOptions(("poll_s", "slurm"), "executor", ("slurm",)),
+)
+"""Settings of `Execution` that only some executors have."""
+
 
 def chosen_execution(
-    settings: Mapping[str, Any], executor: ExecutorName | None, workers: int | None, source: str
+    settings: Mapping[str, Any],
+    assigned: Mapping[str, Any],
+    executor: ExecutorName | None,
+    workers: int | None,
+    source: str,
 ) -> Execution:
-    """Settings of an executor with the options ``--executor`` and ``--workers``, None where not given, laid over them.
+    """Settings of an executor, with those of ``--set`` and the options ``--executor`` and ``--workers`` laid over them.
 
-    Raises `InputError` for settings that are none, and for workers of an executor that has none.
+    Parameters
+    ----------
+    settings : all of ``execution``, those in ``assigned`` included.
+    assigned : what ``--set`` gives of ``execution``.
+    executor, workers : None where not given.
+    source : file or option that the settings came from, for the error.
+
+    Raises `InputError` for settings that are none, and for given ones that have no effect with the executor.
     """
     options = {"executor": executor, "workers": workers}
-    given = {key: value for key, value in options.items() if value is not None}
-    execution = build(Execution, merge(settings, given), source, "execution.")
-    if workers is not None and execution.executor != "processes":
-        expected = "--executor processes, whose number of processes it is"
-        raise InputError("command line", "--workers", expected, f"--executor {execution.executor}")
+    options = {key: value for key, value in options.items() if value is not None}
+    values = merge(settings, options) if isinstance(settings, Mapping) else settings  # which `build` refuses
+    execution = build(Execution, values, source, "execution.")
+    given = {key: f"--set execution.{key}" for key in assigned} | {key: f"--{key}" for key in options}
+    check_dependent(DEPENDENT, given, execution)
     return execution
 
 
@@ -56,7 +74,8 @@ class ExecutionOptions:
         if stray := sorted(given.keys() - {"execution"}):
             raise unknown("command line", "--set", stray[0], ["execution"])
         executor = None if self.executor == "inline" else self.executor
-        return chosen_execution(given.get("execution", {}), executor, self.workers, "command line")
+        settings = given.get("execution", {})
+        return chosen_execution(settings, settings, executor, self.workers, "command line")
 
     @property
     def others(self) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import tyro
 from ..contracts import Progress, no_progress
 from ..errors import ExitCode, InputError
 from ..io.files import check_writable, write_text
+from ..options import DependentOptions
 from ..specs import Findings
 
 Captures = Literal["same", "remade"]
@@ -46,12 +47,10 @@ class GateSettings:
     markdown: str | None = None
     """Also write a Markdown summary."""
 
-    def __post_init__(self) -> None:
-        """Refuse what contradicts itself."""
-        if self.captures is not None and not self.update:
-            raise ValueError("--captures is written into the baseline: give it with --update")
-        if self.update and (self.judge_speed or self.junit is not None or self.markdown is not None):
-            raise ValueError("--update judges nothing: leave out --judge-speed, --junit and --markdown")
+    dependent = (
+        DependentOptions(("captures",), "update"),
+        DependentOptions(("judge_speed", "junit", "markdown"), "update", False),
+    )
 
 
 def gate(settings: GateSettings, progress: Progress = no_progress) -> Findings:

@@ -10,6 +10,7 @@ import tyro
 
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
+from ...bench.options import DependentOptions
 from ...bench.specs import Findings, writes
 from ..options import CaptureOptions
 
@@ -39,6 +40,8 @@ class ExportColmapSettings(CaptureOptions):
     names: Literal["nested", "flat"] = "nested"
     """Of images: SUBJECT/SEQUENCE/TIMESTEP/CAMERA.png, or SEQUENCE_TIMESTEP_CAMERA.png in one folder, as readers of 3D
     Gaussian splatting, GaussianAvatars, OpenSplat and nerfbaselines need it; masks are then NAME.png and NAME.png.png."""
+
+    dependent = (DependentOptions(("timesteps",), "all_timesteps", False),)
 
 
 @writes("out", "a COLMAP dataset")

@@ -13,6 +13,7 @@ import tyro
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.options import DependentOptions
 from ...bench.specs import Findings
 from ..options import CaptureOptions
 from .rules import SEVERITIES, Finding, apply, several
@@ -35,7 +36,7 @@ class LintSettings(CaptureOptions):
     """Codes not to report, such as HB406."""
 
     list: bool = False
-    """Explain every code and stop."""
+    """Explain every code and stop; without other options."""
 
     views: int = 48
     """Frames to decode for the checks of colour, masks and tracking, spread over timesteps and cameras."""
@@ -44,10 +45,22 @@ class LintSettings(CaptureOptions):
     """Images to decode in the search for near-duplicates between splits. Equal files are found among all."""
 
     thorough: bool = False
-    """Decode every image for both; minutes for a recording of thousands of timesteps."""
+    """Decode every image for both, instead of --views and --duplicates; minutes for a recording of thousands of timesteps."""
 
     min_test_timesteps: int = 10
     """Shortest self-reenactment sequence that raises no warning."""
+
+    dependent = (
+        DependentOptions(
+            (
+                *("strict", "ignore", "views", "duplicates", "thorough", "min_test_timesteps"),
+                *("reader", "head", "cy", "set"),
+            ),
+            "list",
+            False,
+        ),
+        DependentOptions(("views", "duplicates"), "thorough", False),
+    )
 
 
 _WIDTH = 100

@@ -11,6 +11,7 @@ import tyro
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind
+from ...bench.options import DependentOptions
 from ...bench.specs import Findings, writes
 from ..ga.layout import HEAD_FILE
 from ..head.arrays import save_head
@@ -66,9 +67,31 @@ class PrepareSettings:
     """Only look whether everything needed is there."""
     union_root: str = ""
     """Instead of preparing, check captures exported elsewhere: a folder of UNION folders, such as GaussianAvatars'
-    download."""
+    download. Of the other options only --subjects and --rejoin go with it."""
     rejoin: bool = False
     """With --union-root, also write unions of the paper's split (FREE held out) beside them; copies nothing."""
+
+    dependent = (
+        DependentOptions(
+            (
+                *(
+                    "out",
+                    "sequences",
+                    "split",
+                    "tracking",
+                    "head",
+                    "head_model",
+                    "cameras",
+                    "downscale",
+                    "source",
+                ),
+                *("every", "colour", "edges", "cut", "workers", "check"),
+            ),
+            "union_root",
+            False,
+        ),
+        DependentOptions(("rejoin",), "union_root"),
+    )
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.options import DependentOptions
 from ...bench.runner.config import AvatarFolder
 from ...bench.specs import Findings, writes
 from ...datasets.options import CaptureOptions
@@ -25,14 +26,16 @@ class CompactSettings(CaptureOptions):
     quality is measured on its held-out frames."""
 
     frames: int = 8
-    """Held-out frames to compare on, evenly spread over both held-out splits."""
+    """With --compare: held-out frames to compare on, evenly spread over both held-out splits."""
 
     scale: int = 1
-    """Enlarge the compared images so many times. Above 1 there is no ground truth to compare with, only the exact
+    """With --compare: enlarge the images so many times. Above 1 there is no ground truth to compare with, only the exact
     avatar."""
 
     precision: Precision = field(default_factory=Precision)
     """How finely each part is stored."""
+
+    dependent = (DependentOptions(("frames", "scale", "reader", "head", "cy", "set"), "compare"),)
 
     def __post_init__(self) -> None:
         if self.frames < 1 or self.scale < 1:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import tyro
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.options import DependentOptions
 from ...bench.runner.config import AvatarFolder
 from ...bench.specs import Findings, writes
 from ...datasets.options import CaptureOptions
@@ -30,9 +31,9 @@ class ExportOptions(CaptureOptions):
     directions: int = 96
     """Viewing directions, even over the sphere, at which colours that are not spherical harmonics are sampled."""
 
+    dependent = (DependentOptions(("timestep", "reader", "head", "cy", "set"), "capture"),)
+
     def __post_init__(self) -> None:
-        if self.timestep is not None and self.capture is None:
-            raise ValueError("timestep needs a capture")
         if self.directions < 32:
             raise ValueError(
                 f"directions must be at least 32, twice the coefficients, found {self.directions}"
@@ -72,7 +73,12 @@ class ImportGASettings(CaptureOptions):
     flame_param.npz beside the PLY, if there is one. "none" leaves it out."""
 
     subject: str = ""
-    """Name of the subject, where no capture tells it."""
+    """Name of the subject, without --capture, which tells it."""
+
+    dependent = (
+        DependentOptions(("reader", "cy", "set"), "capture"),
+        DependentOptions(("subject",), "capture", False),
+    )
 
 
 def export_ply(settings: ExportPlySettings, progress: Progress = no_progress) -> Findings:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.options import DependentOptions
 from ...bench.runner.config import AvatarFolder
 from ...bench.specs import Findings
 from ...datasets.options import CaptureOptions
@@ -33,6 +34,8 @@ class ExportHtmlSettings(CaptureOptions):
 
     title: str = ""
     """Of the page; default: the name of the subject."""
+
+    dependent = (DependentOptions(("reader", "head", "cy", "set"), "capture"),)
 
     def __post_init__(self) -> None:
         if not 0 <= self.degree <= 3:

@@ -13,6 +13,7 @@ import tyro
 from ...bench.contracts import Progress, no_progress
 from ...bench.io.files import check_kind, output_inside
 from ...bench.io.lock import locked
+from ...bench.options import DependentOptions
 from ...bench.runner.config import RunOptions
 from ...bench.specs import Findings
 
@@ -57,13 +58,12 @@ class CurveSettings(RunOptions):
     frames: int = 100
     """Score at most so many frames of each subject in the held-out camera, and as many of the held-out timesteps."""
 
+    dependent = (
+        DependentOptions(("levels",), "over", ("tracking_error",)),
+        DependentOptions(("fractions",), "over", ("budget", "cameras", "timesteps")),
+    )
+
     def __post_init__(self) -> None:
-        if self.levels and self.over != "tracking_error":
-            raise ValueError(f"--levels needs --over tracking_error; found --over {self.over}")
-        if self.fractions and self.over == "tracking_error":
-            raise ValueError(
-                "--fractions needs --over budget, cameras or timesteps; found --over tracking_error"
-            )
         if len(set(self.parts)) != len(self.parts):
             raise ValueError(f"fractions: each once; found {' '.join(self.fractions)}")
         if len(set(self.levels)) != len(self.levels):

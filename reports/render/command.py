@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.options import DependentOptions
 from ...bench.runner.config import AvatarFolder
 from ...bench.specs import Findings, writes
 
@@ -32,19 +33,19 @@ class RenderSettings:
     """Only these timesteps; for an orbit, the poses shown in turn (default: the first of training)."""
 
     views: int = 60
-    """Of the orbit."""
+    """Of the orbit, with --frames orbit."""
 
     beyond: float = 30.0
-    """How far the orbit goes on beyond the outermost cameras, degrees."""
+    """With --frames orbit: how far it goes on beyond the outermost cameras, degrees."""
 
     video: bool = False
     """Write videos, too: one for each sequence and camera. Needs PyAV (extra `video`)."""
 
     beside: bool = False
-    """Put the captured image beside each frame of the videos."""
+    """With --video of captured frames: put the captured image beside each."""
 
     fps: float = 25.0
-    """Frames per second of the videos."""
+    """With --video: frames per second."""
 
     method: str = ""
     """Method that reads the avatar; default: that of the run whose folder it lies in."""
@@ -61,13 +62,17 @@ class RenderSettings:
     device: str = "cpu"
     """Where to render."""
 
+    dependent = (
+        DependentOptions(("views", "beyond"), "frames", ("orbit",)),
+        DependentOptions(("fps", "beside"), "video"),
+        DependentOptions(("beside",), "frames", ("self_reenactment", "novel_view", "train")),
+    )
+
     def __post_init__(self) -> None:
         if self.views < 1 or not 0.0 <= self.beyond < 180.0:
             raise ValueError("views is at least 1, beyond from 0 to less than 180 degrees")
         if not 0.0 < self.fps <= 1000.0:
             raise ValueError(f"fps is {self.fps}; above 0, at most 1000")
-        if self.beside and (not self.video or self.frames == "orbit"):
-            raise ValueError("beside is for videos of captured frames; an orbit has none")
 
 
 @writes("out")

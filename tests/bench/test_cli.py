@@ -323,6 +323,7 @@ def test_a_run_takes_its_executor_from_options_and_settings(
         ("--set execution.workers=0", "at least 1"),
         ("--set execution.slurm.hours=0", "at least a minute"),
         ("--set execution.executor=dask", "inline"),
+        ("--set execution=3", "execution: expected a group of settings"),
         ("--workers 2", "--workers: expected --executor processes"),
     ],
 )

@@ -8,6 +8,7 @@ from typing import Literal
 import tyro
 
 from ....bench.contracts import Progress, no_progress
+from ....bench.options import DependentOptions
 from ....bench.runner.config import parse_size
 from ....bench.specs import Findings, writes
 
@@ -68,6 +69,11 @@ class ParitySettings:
 
     timesteps: int = 24
     """Timesteps of the synthetic capture."""
+
+    dependent = (
+        DependentOptions(("size", "cameras", "timesteps"), "data", False),
+        DependentOptions(("samples",), "method", ("gbs",)),
+    )
 
     def __post_init__(self) -> None:
         """Refuse what has no meaning."""

@@ -382,14 +382,6 @@ def test_wrong_usage_is_code_2(run, baseline, capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main(["gate", str(run)])
     assert stop.value.code == 2
-    for options in (
-        ["--captures", "remade"],
-        ["--update", "--judge-speed"],
-        ["--update", "--junit", "gate.xml"],
-    ):
-        with pytest.raises(SystemExit) as stop:
-            gate(run, baseline, *options)
-        assert stop.value.code == 2
 
 
 @pytest.mark.parametrize("option", ["--junit", "--markdown", "--baseline"])

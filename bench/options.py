@@ -1,0 +1,68 @@
+"""Options of a command that have no effect without, or with, another one: refused instead of ignored."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
+from typing import Any, NamedTuple, get_type_hints
+
+import tyro
+
+from .errors import InputError
+
+
+class DependentOptions(NamedTuple):
+    """Options that have an effect only if another setting has certain values.
+
+    A dataclass of settings lists its own in the class variable ``dependent``. Whether an option is given is read from the
+    words of the command line: its default stays in the dataclass, and an option that is given its default is refused, too.
+
+    Attributes
+    ----------
+    options : names of the attributes.
+    other : name of the attribute that they depend on.
+    values : those of ``other`` with which the options have an effect; True: ``other`` is given, False: it is not.
+    """
+
+    options: tuple[str, ...]
+    other: str
+    values: tuple[str, ...] | bool = True
+
+
+def given_options(words: Sequence[str], settings: type) -> dict[str, str]:
+    """The attributes of ``settings`` that the words of a command line give as options, and how an error names them."""
+    named = {word[2:].partition("=")[0].replace("-", "_") for word in words if word.startswith("--")}
+    return {field.name: _option(field.name) for field in fields(settings) if field.name in named}
+
+
+def check_dependent(dependent: Iterable[DependentOptions], given: Mapping[str, str], settings: Any) -> None:
+    """Raise `InputError` for an option that is given and has no effect with the other settings.
+
+    Parameters
+    ----------
+    given : names of the attributes that are given, and how the error names each.
+    settings : has the attributes `DependentOptions.other`.
+    """
+    for options, other, values in dependent:
+        value, name = getattr(settings, other), _shown(settings, other)
+        present = value not in (None, False, "", ())
+        if value in values if isinstance(values, tuple) else present == values:
+            continue
+        expected = (
+            f"{name} {' or '.join(values)}" if isinstance(values, tuple) else name if values else f"no {name}"
+        )
+        relation = "with" if values is False else "without"
+        found = "none" if not present else name if value is True else f"{name} {value}"
+        for option in (option for option in options if option in given):
+            wanted = f"{expected}, {relation} which it has no effect"
+            raise InputError("command line", given[option], wanted, found)
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _shown(settings: Any, name: str) -> str:
+    """A setting as help shows it: an option, or a positional argument."""
+    hint = get_type_hints(type(settings), include_extras=True)[name]
+    return name.upper() if tyro.conf.Positional in getattr(hint, "__metadata__", ()) else _option(name)

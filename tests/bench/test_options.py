@@ -1,0 +1,77 @@
+"""Options that have no effect without, or with, another option: refused before any work."""
+
+import pytest
+
+from headbench.bench import cli
+
+AVATAR = "{command} avatar --out out"
+PLY, GLB, SOG, HTML = (AVATAR.format(command=f"export {form}") for form in ("ply", "glb", "sog", "html"))
+COMPACT, EVALUATE = AVATAR.format(command="compact"), "evaluate images --out out"
+IMPORT = "import ga a.ply --out out"
+RENDER = "render avatar --capture c --out out"
+UNION = "prepare nersemble --union-root unions"
+RUN = "run --data d --out out"
+NO_EFFECT = "without which it has no effect, found"
+CASES = [
+    # An option at its default counts, too.
+    (f"{COMPACT} --frames 8", f"--frames: expected --compare, {NO_EFFECT} none"),
+    (f"{COMPACT} --scale=1", f"--scale: expected --compare, {NO_EFFECT} none"),
+    (f"{COMPACT} --head h.pkl", f"--head: expected --compare, {NO_EFFECT} none"),
+    (f"{COMPACT} --set a=b", f"--set: expected --compare, {NO_EFFECT} none"),
+    (f"{RENDER} --views 60", f"--views: expected --frames orbit, {NO_EFFECT} --frames self_reenactment"),
+    (f"{RENDER} --frames train --beyond 30", f"--beyond: expected --frames orbit, {NO_EFFECT} --frames train"),
+    (f"{RENDER} --fps 25", f"--fps: expected --video, {NO_EFFECT} none"),
+    (f"{RENDER} --beside", f"--beside: expected --video, {NO_EFFECT} none"),
+    (f"{RENDER} --frames orbit --video --beside", "--beside: expected --frames self_reenactment"),
+    (f"{EVALUATE} --like r --tasks novel_view", "--tasks: expected no --like, with which it has no effect, found --like r"),
+    (f"{EVALUATE} --like r --metrics psnr", "--metrics: expected no --like"),
+    (f"{EVALUATE} --like r --reader ga", "--reader: expected no --like"),
+    (f"{EVALUATE} --like r --frames_per_task 3", "--frames-per-task: expected no --like"),
+    (f"{EVALUATE} --clip c --trust", f"--trust: expected --like, {NO_EFFECT} none"),
+    (f"{EVALUATE} --like r --method ga", f"--method: expected --avatar, {NO_EFFECT} none"),
+    (f"{EVALUATE} --like r --preset fast", f"--preset: expected --avatar, {NO_EFFECT} none"),
+    (f"{EVALUATE} --like r --avatar --names official-ga", "--names: expected no --avatar"),
+    (f"{EVALUATE} --like r --avatar --any-background", "--any-background: expected no --avatar"),
+    (f"{RUN} --workers 2", f"--workers: expected --executor processes, {NO_EFFECT} --executor inline"),
+    (f"{RUN} --set execution.workers=2", "--set execution.workers: expected --executor processes"),
+    (f"{RUN} --set execution.threads=2", "--set execution.threads: expected --executor processes"),
+    (f"{RUN} --set execution.restarts=2", "--set execution.restarts: expected --executor processes or slurm"),
+    (f"{RUN} --set execution.slurm.gpus=1", f"--set execution.slurm: expected --executor slurm, {NO_EFFECT} --executor inline"),
+    (f"{RUN} --executor processes --set execution.poll_s=1", f"--set execution.poll_s: expected --executor slurm, {NO_EFFECT} --executor processes"),
+    ("synth --out out --set execution.slurm.hours=1", "--set execution.slurm: expected --executor slurm"),
+    ("suite --out out --workers 2", "--workers: expected --executor processes"),
+    ("extremes run --set execution.threads=1", "--set execution.threads: expected --executor processes"),
+    ("curve run --levels 1", f"--levels: expected --over tracking_error, {NO_EFFECT} --over budget"),
+    ("curve run --over tracking_error --fractions 1/2", "--fractions: expected --over budget or cameras or timesteps"),
+    ("gate run --baseline b --captures same", f"--captures: expected --update, {NO_EFFECT} none"),
+    ("gate run --baseline b --update --judge-speed", "--judge-speed: expected no --update"),
+    ("gate run --baseline b --update --junit j", "--junit: expected no --update"),
+    ("gate run --baseline b --update --markdown m", "--markdown: expected no --update"),
+    *((f"{export} --timestep 3", f"--timestep: expected --capture, {NO_EFFECT} none") for export in (PLY, GLB, SOG)),
+    (f"{PLY} --reader ga", f"--reader: expected --capture, {NO_EFFECT} none"),
+    (f"{HTML} --head h.pkl", f"--head: expected --capture, {NO_EFFECT} none"),
+    (f"{HTML} --cy auto", f"--cy: expected --capture, {NO_EFFECT} none"),
+    (f"{IMPORT} --set a=b", f"--set: expected --capture, {NO_EFFECT} none"),
+    (f"{IMPORT} --capture c --subject s", "--subject: expected no --capture"),
+    ("export colmap c --out out --all-timesteps --timesteps 1", "--timesteps: expected no --all-timesteps"),
+    (f"{UNION} --downscale 4", "--downscale: expected no --union-root"),
+    (f"{UNION} --check", "--check: expected no --union-root"),
+    (f"{UNION} --out out", "--out: expected no --union-root"),
+    ("prepare nersemble --root r --rejoin", f"--rejoin: expected --union-root, {NO_EFFECT} none"),
+    ("lint --list --strict", "--strict: expected no --list"),
+    ("lint c --thorough --views 48", "--views: expected no --thorough"),
+    ("lint c --thorough --duplicates 600", "--duplicates: expected no --thorough"),
+    ("parity ga --checkout c --out out --data d --size 96x136", "--size: expected no --data"),
+    ("parity ga --checkout c --out out --data d --timesteps 24", "--timesteps: expected no --data"),
+    ("parity ga --checkout c --out out --samples 5000", f"--samples: expected METHOD gbs, {NO_EFFECT} METHOD ga"),
+    ("frames c --out out --trust", "--trust: expected a run, with run.json, at c"),
+    ("check-plugin x:SPEC --reader ga", f"--reader: expected --data, {NO_EFFECT} none"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("line", "expected"), CASES, ids=[line for line, _ in CASES])
+def test_an_option_without_effect_is_refused_before_any_work(line, expected, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(line.split()) == 2
+    assert f"headbench: command line, {expected}" in " ".join(capsys.readouterr().err.split())
+    assert not any(tmp_path.iterdir())
