@@ -26,7 +26,7 @@ class Kernel:
 
     def __init__(self, module: str, label: str, substitute: str) -> None:
         self.module, self.label = module, label
-        self.remedy = f"Install a C++17 compiler and reinstall headbench; {substitute}."
+        self.remedy = f"Install a C++17 compiler and Python's headers, and reinstall headbench; {substitute}."
 
     @cached_property
     def imported(self) -> ModuleType | ImportError:

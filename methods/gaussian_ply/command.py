@@ -76,7 +76,7 @@ class ImportGASettings(CaptureOptions):
     """Name of the subject, without --capture, which tells it."""
 
     dependent = (
-        DependentOptions(("reader", "cy", "set"), "capture"),
+        DependentOptions(("reader", "cy"), "capture"),
         DependentOptions(("subject",), "capture", False),
     )
 

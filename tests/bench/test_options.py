@@ -51,7 +51,7 @@ CASES = [
     (f"{PLY} --reader ga", f"--reader: expected --capture, {NO_EFFECT} none"),
     (f"{HTML} --head h.pkl", f"--head: expected --capture, {NO_EFFECT} none"),
     (f"{HTML} --cy auto", f"--cy: expected --capture, {NO_EFFECT} none"),
-    (f"{IMPORT} --set a=b", f"--set: expected --capture, {NO_EFFECT} none"),
+    (f"{IMPORT} --cy top", f"--cy: expected --capture, {NO_EFFECT} none"),
     (f"{IMPORT} --capture c --subject s", "--subject: expected no --capture"),
     ("export colmap c --out out --all-timesteps --timesteps 1", "--timesteps: expected no --all-timesteps"),
     (f"{UNION} --downscale 4", "--downscale: expected no --union-root"),
