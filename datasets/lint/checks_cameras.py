@@ -16,7 +16,7 @@ from ..ga.principal_point import OutlineView, weigh_cy
 from ..ga.transforms import FrameEntry
 from ..images import read_mask
 from .checks_images import sound_mask
-from .evidence import Evidence, by_camera
+from .evidence import Evidence, first_entries
 from .rules import Hit, at, rule, several, some
 
 SAME_PLACE_M = 1e-3
@@ -49,11 +49,6 @@ def _not_rigid(evidence: Evidence) -> Iterator[Hit]:
             f"{broken[0].found}"
         )
         yield Hit(text, broken[0].file, broken[0].key)
-
-
-def first_entries(evidence: Evidence) -> dict[str, FrameEntry]:
-    """First frame of each camera, in the first sequence that has it."""
-    return {camera: frames[0] for camera, frames in by_camera(evidence.entries).items()}
 
 
 @rule("HB502", "error")

@@ -10,6 +10,7 @@ from ...bench.errors import InputError
 from ..ga import layout
 from ..ga.transforms import FrameEntry
 from .checks_images import unit_range
+from .checks_rig import dead_cameras
 from .evidence import Evidence, Slot
 from .rules import Hit, at, rule, several, some, spans
 from .views import Thumbnail, near_duplicates
@@ -304,11 +305,12 @@ def _same_images(evidence: Evidence) -> Iterator[Hit]:
     Take it out of one: a method is measured on what it was trained on.
     """
     # By content, hence also where one file is listed twice.
+    dead = dead_cameras(evidence)  # all of their images are the same
     contents: dict[str, dict[str, FrameEntry]] = {}
     for split, part in evidence.splits.items():
         held = contents.setdefault(split, {})
         for entry in part:
-            if entry.image in evidence.digests:
+            if entry.image in evidence.digests and entry.camera_id not in dead:
                 held.setdefault(evidence.digests[entry.image], entry)
     for one, other in combinations(contents, 2):
         shared = sorted(contents[one].keys() & contents[other].keys())
@@ -330,8 +332,10 @@ def _near_images(evidence: Evidence) -> Iterator[Hit]:
     if unit_range(evidence):
         return  # levels 0 and 1 are all nearly the same
     parts: dict[str, list[Thumbnail]] = defaultdict(list)
+    dead = dead_cameras(evidence)
     for thumbnail in evidence.thumbnails:
-        parts[thumbnail.split].append(thumbnail)
+        if thumbnail.entry.camera_id not in dead:
+            parts[thumbnail.split].append(thumbnail)
     for one, other in combinations(parts, 2):
         pairs = [
             (a, b)

@@ -43,8 +43,12 @@ class LintSettings(CaptureOptions):
     duplicates: int = 600
     """Images to decode in the search for near-duplicates between splits. Equal files are found among all."""
 
+    camera_timesteps: int = 8
+    """Timesteps on which each camera is measured against the others; 0 leaves that out."""
+
     thorough: bool = False
-    """Decode every image for both; minutes for a recording of thousands of timesteps."""
+    """Decode every image for the first two and measure cameras on 32 timesteps; minutes for a recording of thousands of
+    timesteps."""
 
     min_test_timesteps: int = 10
     """Shortest self-reenactment sequence that raises no warning."""

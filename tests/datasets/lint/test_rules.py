@@ -33,7 +33,7 @@ from .good_capture import (
     write_good_capture,
 )
 
-PLANTED_APART = {"HB115", "HB510", "HB511", "HB615"}
+PLANTED_APART = {"HB115", "HB510", "HB511", "HB513", "HB514", "HB515", "HB516", "HB517", "HB615"}
 
 
 @pytest.fixture(autouse=True, scope="module")
