@@ -148,7 +148,9 @@ def measure_cameras(
     compared = {camera: table.compared(camera, facts[camera], live) for camera in live}
     doubted = _doubted(compared)
     trusted = [camera for camera in live if camera not in doubted]
-    if doubted and len(trusted) >= FEWEST_CAMERAS - 1:  # what is wrong with one is no measure for the others
+    if len(trusted) < FEWEST_CAMERAS - 1:
+        trusted = live
+    elif doubted:  # what is wrong with one is no measure for the others
         compared = {camera: table.compared(camera, facts[camera], trusted) for camera in live}
     for camera in doubted:
         fits, match = table.fits(camera, trusted)
@@ -266,16 +268,17 @@ class _Table:
         face = regions.get("face", np.arange(len(subject.head.template)))
         face = np.setdiff1d(face, np.concatenate([regions.get(n, np.empty(0, np.int64)) for n in _NOT_SKIN]))
         self.members = face[:: max(1, -(-len(face) // MOST_VERTICES))]
-        self.shots = shots
-        self.around = {t: steps for t, steps in around.items() if steps[MAX_LAG] >= 0}
+        posed = self.around = {t: steps for t, steps in around.items() if steps[MAX_LAG] >= 0}
+        self.shots = {c: {t: s for t, s in taken.items() if t in posed} for c, taken in shots.items()}
+        self.shots = {camera: taken for camera, taken in self.shots.items() if taken}
         needed = sorted({t for steps in self.around.values() for t in steps if t >= 0})
         poses = [parameters[t].pose for t in needed]
         meshes = dict(zip(needed, subject.meshes([pose for pose in poses if pose is not None])))
         self.points = {t: mesh[self.members] for t, mesh in meshes.items()}
         self.normals = {t: vertex_normals(meshes[t], subject.head.faces)[self.members] for t in self.around}
         self.picked = {
-            camera: {t: self.pick(shot, t) for t, shot in taken.items() if t in self.around}
-            for camera, taken in shots.items()
+            camera: {t: self.pick(shot, t) for t, shot in taken.items()}
+            for camera, taken in self.shots.items()
         }
         self.values = {
             camera: _typical([(_sample(p.smooth, p.pixels), p.seen) for p in taken.values()])
@@ -318,7 +321,9 @@ class _Table:
 
     def compared(self, camera: str, plain: CameraFacts, trusted: Sequence[str]) -> CameraFacts:
         """The measurements of one camera against the trusted ones."""
-        others = [other for other in trusted if other != camera]
+        others = [other for other in trusted if other != camera and other in self.picked]
+        if camera not in self.picked or not others:
+            return plain
         wanted = _median([self.values[other] for other in others])
         found = {t: _register(picked, wanted) for t, picked in self.picked[camera].items()}
         known = {t: register for t, register in found.items() if register is not None}
@@ -365,7 +370,7 @@ class _Table:
 
     def fits(self, camera: str, trusted: Sequence[str]) -> tuple[str, float]:
         """The other camera whose calibration matches the camera's images best, and the correlation under it."""
-        wanted = _median([self.values[other] for other in trusted if other != camera])
+        wanted = _median([v for other, v in self.values.items() if other in trusted and other != camera])
         scores: dict[str, list[float]] = defaultdict(list)
         for timestep in [*self.picked[camera]][::3]:
             for other, taken in self.shots.items():
@@ -408,8 +413,7 @@ def _sample(image: FloatArray, pixels: FloatArray) -> FloatArray:
         pad = (-len(flat)) % rows
         flat = np.concatenate([flat, np.zeros((pad, 1, 2), np.float32)]).reshape(rows, -1, 2)
     out = cv2.remap(image, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    values: FloatArray = out.ravel()[: int(np.prod(shape))].reshape(shape)
-    return values
+    return np.asarray(out.ravel()[: int(np.prod(shape))].reshape(shape), dtype=np.float32)
 
 
 def _typical(rows: Sequence[tuple[FloatArray, np.ndarray]]) -> FloatArray:
@@ -417,7 +421,9 @@ def _typical(rows: Sequence[tuple[FloatArray, np.ndarray]]) -> FloatArray:
 
 
 def _median(rows: Sequence[FloatArray]) -> FloatArray:
-    """Median over rows without NaN; NaN where all are."""
+    """Median over rows without NaN; NaN where all are. No row at all is one that is empty."""
+    if not rows:
+        return np.empty(0)
     stack = np.sort(np.stack(rows), axis=0)  # NaN last
     count = np.isfinite(stack).sum(axis=0)
     low, high = np.maximum(count - 1, 0) // 2, count // 2

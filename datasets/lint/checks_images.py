@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -364,8 +365,21 @@ def _uncalibrated(evidence: Evidence) -> Iterator[Hit]:
 def _lossy(evidence: Evidence) -> Iterator[Hit]:
     """Ground truth is lossy.
 
-    Export PNG: metrics against JPEG reward its artefacts.
+    Export PNG: metrics against JPEG reward its artefacts, and another name does not make a JPEG a PNG.
     """
-    lossy = [path for path in evidence.digests if path.suffix.lower() in (".jpg", ".jpeg")]
+    lossy = [path for path in evidence.digests if _is_jpeg(path)]
     if lossy:
-        yield Hit(f"{len(lossy)} of {several(len(evidence.digests), 'image')} are JPEG", lossy[0])
+        named = [path for path in lossy if path.suffix.lower() == ".png"]
+        more = f"; {len(named)} of them are named .png" if named else ""
+        yield Hit(
+            f"{len(lossy)} of {several(len(evidence.digests), 'image')} are JPEG{more}", (named or lossy)[0]
+        )
+
+
+def _is_jpeg(path: Path) -> bool:
+    """By content; by name where the image is no file of its own."""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(2) == b"\xff\xd8"
+    except (OSError, ValueError):
+        return path.suffix.lower() in (".jpg", ".jpeg")

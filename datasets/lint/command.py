@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
@@ -82,6 +83,7 @@ def lint(settings: LintSettings, progress: Progress = no_progress) -> Findings:
         "counts": {severity: counts[severity] for severity in SEVERITIES},
         "looked_at": _looked_at(evidence),
         "skipped": _skipped(evidence),
+        "cameras": {camera: _finite(asdict(facts)) for camera, facts in evidence.cameras.items()},
         "findings": [asdict(finding) for finding in findings],
     }
     return Findings(_report(evidence, findings, passed), data, passed)
@@ -104,6 +106,17 @@ def lint_capture(settings: LintSettings, progress: Progress = no_progress) -> tu
         clip = settings.open(settings.clip, progress)
         evidence = gather_clip(Path(settings.clip), clip, settings, progress)
     return evidence, apply(RULES, evidence, settings.ignore, base=evidence.folder.parent)
+
+
+def _finite(values: dict[str, Any]) -> dict[str, Any]:
+    """Measurements with None for those that could not be made."""
+    return {
+        key: value if isinstance(value, str) or _is_finite(value) else None for key, value in values.items()
+    }
+
+
+def _is_finite(value: float | tuple[float, ...]) -> bool:
+    return all(map(math.isfinite, value if isinstance(value, tuple) else (value,)))
 
 
 def _looked_at(evidence: Evidence) -> dict[str, Any]:

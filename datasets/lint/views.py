@@ -344,6 +344,8 @@ def difference(one: Thumbnail, other: Thumbnail) -> float:
 def structure(grey: FloatArray, shown: np.ndarray) -> float:
     """Standard deviation in levels of an image (H, W) over the pixels ``shown``, after smoothing and without what white
     noise leaves of it: about 0 for noise alone."""
+    if not shown.any():
+        shown = np.ones_like(shown)
     size = max(3, len(grey) // 24)
     weight = cv2.blur(shown.astype(np.float32), (size, size))
     smooth = cv2.blur(grey * shown, (size, size)) / np.maximum(weight, 1e-6)
