@@ -52,7 +52,11 @@ def check_images(
 
 def _probe_referenced(entry: FrameEntry, path: Path, key: str, decode: bool) -> ImageInfo:
     if not os.path.exists(path):  # unlike Path.exists, False for names no file can have
-        raise InputError(entry.file, f"{entry.where}.{key}", "an existing file", f"no {path}")
+        where = f"{entry.where}.{key}"
+        if not path.is_relative_to(entry.file.parent):
+            remedy = "Write relative paths: absolute ones of the machine that exported the capture do not hold on another."
+            raise InputError(entry.file, where, "a path relative to the JSON's folder", f"no {path}", remedy)
+        raise InputError(entry.file, where, "an existing file", f"no {path}")
     return probe_image(path, decode=decode)
 
 

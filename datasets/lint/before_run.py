@@ -66,6 +66,7 @@ def errors(clip: Clip) -> list[str]:
         subject=subject,
         views=look(chosen, pixels, subject, parameters, background, "top"),
         thumbnails=(),
+        cameras={},
         expression_fit=None,
     )
     rules = [rule for rule in RULES if rule.code in CODES]

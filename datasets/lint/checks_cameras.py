@@ -16,7 +16,7 @@ from ..ga.principal_point import OutlineView, weigh_cy
 from ..ga.transforms import FrameEntry
 from ..images import read_mask
 from .checks_images import sound_mask
-from .evidence import Evidence, by_camera
+from .evidence import Evidence, first_entries
 from .rules import Hit, at, rule, several, some
 
 SAME_PLACE_M = 1e-3
@@ -31,6 +31,9 @@ OFF_CENTRE = 0.25
 
 TELLING_PX = 1.0
 """From this offset of cy on the two readings are so far apart (twice as much) that outlines may accuse one."""
+
+TELLING_AGREEMENT = 0.1
+"""Outlines that agree less under both readings of cy are not of one head: the fault is another."""
 
 EXACT = 1e-4
 """Pixels; a principal point this close to (w - 1) / 2 was computed as that."""
@@ -49,11 +52,6 @@ def _not_rigid(evidence: Evidence) -> Iterator[Hit]:
             f"{broken[0].found}"
         )
         yield Hit(text, broken[0].file, broken[0].key)
-
-
-def first_entries(evidence: Evidence) -> dict[str, FrameEntry]:
-    """First frame of each camera, in the first sequence that has it."""
-    return {camera: frames[0] for camera, frames in by_camera(evidence.entries).items()}
 
 
 @rule("HB502", "error")
@@ -167,18 +165,24 @@ def _size(evidence: Evidence, entry: FrameEntry) -> tuple[int, int] | None:
     return (info.width, info.height) if info else None
 
 
-@rule("HB506", "error", of_layout=True)
-def _focal(evidence: Evidence) -> Iterator[Hit]:
-    """Focal length and angle of view disagree.
-
-    Scale fl_x with the images; codes that read only camera_angle_x would see another camera.
-    """
+def _contradicted(evidence: Evidence) -> list[tuple[str, FrameEntry, float]]:
+    """Cameras whose focal length is not the one their angle of view implies, and that one in pixels."""
     wrong = []
     for camera, entry in first_entries(evidence).items():
         size = _size(evidence, entry)
         implied = contradicted_focal(entry, size[0]) if size else None
         if implied is not None:
             wrong.append((camera, entry, implied))
+    return wrong
+
+
+@rule("HB506", "error", of_layout=True)
+def _focal(evidence: Evidence) -> Iterator[Hit]:
+    """Focal length and angle of view disagree.
+
+    Scale fl_x with the images; codes that read only camera_angle_x would see another camera.
+    """
+    wrong = _contradicted(evidence)
     if wrong:
         camera, entry, implied = wrong[0]
         yield Hit(
@@ -296,12 +300,14 @@ def _other_edge(evidence: Evidence) -> Iterator[Hit]:
     matters = any(abs(offset[1]) > TELLING_PX for offset in principal_offsets(evidence).values())
     if convention not in ("top", "bottom") or not matters or evidence.subject is None:
         return
-    if misplaced(evidence):
+    if misplaced(evidence) or _contradicted(evidence):
         return
     views = cy_evidence_views(evidence)
     if not views:
         return
     found = weigh_cy(views, evidence.subject.head.faces)
+    if max(found.top, found.bottom) < TELLING_AGREEMENT:
+        return
     if found.decision is not None and found.decision != convention:
         text = (
             f"cy is read from the {convention}; outlines of mesh and foreground agree better with the "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from itertools import combinations, pairwise
@@ -11,9 +12,12 @@ from ...bench.io.files import entries
 from ..ga import layout
 from ..ga.transforms import FrameEntry
 from .checks_images import unit_range
+from .checks_rig import dead_cameras
 from .evidence import Evidence, Slot
 from .rules import Hit, at, rule, several, some, spans
 from .views import Thumbnail, near_duplicates
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 GA_WIDTH = 1600
 """Wider images are rescaled by the code of GaussianAvatars, unless it is told otherwise."""
@@ -36,8 +40,10 @@ def _refused(evidence: Evidence) -> Iterator[Hit]:
 
     Fix what the other findings name; `headbench run` would stop at this one.
     """
-    if evidence.refusal is not None:
-        error = evidence.refusal
+    # A fault that another rule reports is left to that rule (see `apply` for those at the same place).
+    error = evidence.refusal
+    missing = error is not None and any(str(fault.file) in error.found for fault in evidence.file_faults)
+    if error is not None and not missing:
         text = f"expected {error.expected}, found {error.found}"
         yield Hit(f"{text}. {error.remedy}" if error.remedy else text, error.file, error.key)
 
@@ -68,18 +74,51 @@ def _missing_file(evidence: Evidence) -> Iterator[Hit]:
     Copy or export the file again; a copy that was broken off leaves such files.
     """
     groups: dict[tuple[str, str], list[InputError]] = defaultdict(list)
+    elsewhere = _absolute_elsewhere(evidence)
     for error in evidence.file_faults:
-        groups[(error.expected, error.found)].append(error)
+        if str(error.file) not in elsewhere:
+            groups[(error.expected, error.found)].append(error)
     for (expected, found), group in groups.items():
         count = f" ({several(len(group), 'file')})" if len(group) > 1 else ""
         yield Hit(f"expected {expected}, found {found}{count}", group[0].file)
     damaged = [view.error for view in evidence.views if view.error is not None]
     if damaged:
         yield Hit(f"{several(len(damaged), 'image')} do not decode: {damaged[0].found}", damaged[0].file)
-    paths = {p.path: p.error for p in evidence.parameters.values() if p.error is not None and not p.arrays}
+    paths = {
+        p.path: p.error
+        for p in evidence.parameters.values()
+        if p.error is not None and not p.arrays and str(p.path) not in elsewhere
+    }
     for error in list(paths.values())[:1]:
         yield Hit(
             f"expected {error.expected}, found {error.found} ({several(len(paths), 'file')})", error.file
+        )
+
+
+def _absolute_elsewhere(evidence: Evidence) -> dict[str, tuple[FrameEntry, str]]:
+    """Files that are named by absolute paths and are not there, with the frame and the key that name them."""
+    found: dict[str, tuple[FrameEntry, str]] = {}
+    for entry in evidence.entries:
+        named = {"file_path": entry.image, "fg_mask_path": entry.mask, "flame_param_path": entry.parameters}
+        for key, path in named.items():
+            if path is not None and not path.is_relative_to(entry.file.parent) and not os.path.exists(path):
+                found.setdefault(str(path), (entry, key))
+    return found
+
+
+@rule("HB116", "error", of_layout=True)
+def _absolute_paths(evidence: Evidence) -> Iterator[Hit]:
+    """Paths are absolute and of another machine.
+
+    Write paths relative to the folder of the JSON, such as ../SEQUENCE/images/00000_00.png: an export that was copied
+    keeps them.
+    """
+    found = _absolute_elsewhere(evidence)
+    if found:
+        path, (entry, key) = next(iter(found.items()))
+        yield Hit(
+            f"{several(len(found), 'file')} named by absolute paths that this machine does not have, such as {path}",
+            *at(entry, key),
         )
 
 
@@ -257,14 +296,13 @@ def _orphans(evidence: Evidence) -> Iterator[Hit]:
     # Frames that do not parse name images too, and which is not known.
     if evidence.unread or evidence.frame_faults or evidence.json_faults:
         return
-    suffixes = {path.suffix for path in named}
     known = {path.resolve() for path in named}
     orphans = sorted(
         path
         for folder in folders
         if folder.is_dir()
         for path in entries(folder)
-        if path.suffix in suffixes and path.resolve() not in known
+        if path.suffix.lower() in IMAGE_SUFFIXES and path.resolve() not in known
     )
     if orphans:
         yield Hit(f"{several(len(orphans), 'image')} that no split names", orphans[0])
@@ -305,11 +343,12 @@ def _same_images(evidence: Evidence) -> Iterator[Hit]:
     Take it out of one: a method is measured on what it was trained on.
     """
     # By content, hence also where one file is listed twice.
+    dead = dead_cameras(evidence)  # all of their images are the same
     contents: dict[str, dict[str, FrameEntry]] = {}
     for split, part in evidence.splits.items():
         held = contents.setdefault(split, {})
         for entry in part:
-            if entry.image in evidence.digests:
+            if entry.image in evidence.digests and entry.camera_id not in dead:
                 held.setdefault(evidence.digests[entry.image], entry)
     for one, other in combinations(contents, 2):
         shared = sorted(contents[one].keys() & contents[other].keys())
@@ -331,8 +370,10 @@ def _near_images(evidence: Evidence) -> Iterator[Hit]:
     if unit_range(evidence):
         return  # levels 0 and 1 are all nearly the same
     parts: dict[str, list[Thumbnail]] = defaultdict(list)
+    dead = dead_cameras(evidence)
     for thumbnail in evidence.thumbnails:
-        parts[thumbnail.split].append(thumbnail)
+        if thumbnail.entry.camera_id not in dead:
+            parts[thumbnail.split].append(thumbnail)
     for one, other in combinations(parts, 2):
         pairs = [
             (a, b)

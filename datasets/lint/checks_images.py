@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 
-from .evidence import Evidence
+from .checks_rig import blank_cameras, faulty_cameras
+from .evidence import Evidence, first_entries
 from .rules import Hit, rule, several, some
 from .views import BACKGROUND_LEVELS, MaskFacts, ViewFacts
 
@@ -37,7 +39,8 @@ def unit_range(evidence: Evidence) -> bool:
 
 
 def _masks(evidence: Evidence) -> list[tuple[ViewFacts, MaskFacts]]:
-    return [(view, view.mask) for view in evidence.views if view.mask is not None]
+    blank = blank_cameras(evidence)
+    return [(v, v.mask) for v in evidence.views if v.mask is not None and v.entry.camera_id not in blank]
 
 
 def _unit_mask(mask: MaskFacts) -> bool:
@@ -112,15 +115,33 @@ def _inverted_masks(evidence: Evidence) -> Iterator[Hit]:
 def _blank_images(evidence: Evidence) -> Iterator[Hit]:
     """An image is of one colour.
 
-    Export the frame again, or exclude it with a reason.
+    Export the frame again, or exclude it with a reason; leave a camera out of which every image is so.
     """
-    faulty = [view for view in evidence.views if view.error is None and view.low == view.high > 1]
-    if faulty:
+    if unit_range(evidence):
+        return
+    faulty = [view for view in evidence.views if view.blank]
+    cameras = blank_cameras(evidence)
+    if cameras:
         yield Hit(
-            f"{len(faulty)} of {several(len(evidence.views), 'frame')} looked at are of one colour, level "
-            f"{faulty[0].low}",
-            faulty[0].entry.image,
+            f"every image looked at of {several(len(cameras), 'camera')} is of one colour: "
+            + some(f"{camera} (level {_level(evidence, camera):.0f})" for camera in cameras),
+            first_entries(evidence)[cameras[0]].image,
         )
+    single = [view for view in faulty if view.entry.camera_id not in cameras]
+    if single:
+        yield Hit(
+            f"{len(single)} of {several(len(evidence.views), 'frame')} looked at are of one colour, level "
+            f"{single[0].low}",
+            single[0].entry.image,
+        )
+
+
+def _level(evidence: Evidence, camera: str) -> float:
+    """Mean grey level of a camera."""
+    if camera in evidence.cameras:
+        return evidence.cameras[camera].level
+    levels = [view.low for view in evidence.views if view.entry.camera_id == camera and view.error is None]
+    return float(np.mean(levels))
 
 
 def outside_colours(evidence: Evidence) -> list[tuple[ViewFacts, np.ndarray, float]]:
@@ -128,7 +149,7 @@ def outside_colours(evidence: Evidence) -> list[tuple[ViewFacts, np.ndarray, flo
     there that are not of the declared background's colour. Images with alpha show none."""
     found = []
     for view in evidence.views:
-        if view.error is not None or view.has_alpha or view.low == view.high:
+        if view.error is not None or view.has_alpha or view.blank:
             continue
         if view.mask is None and view.corners is not None:
             found.append((view, np.asarray(view.corners), view.corners_off))
@@ -218,7 +239,7 @@ def limited_range(evidence: Evidence) -> bool:
     They reach both ends, in whole images or (where the background was put in afterwards) in the subject alone;
     or the background has the level that the declared one has in that range.
     """
-    views = [view for view in evidence.views if view.error is None and view.low != view.high]
+    views = [view for view in evidence.views if view.error is None and not view.blank]
     if not views:
         return False
     whole = (min(view.low for view in views), max(view.high for view in views))
@@ -255,7 +276,7 @@ def _limited(evidence: Evidence) -> Iterator[Hit]:
     Decode the video again with full range (for ffmpeg -vf scale=in_range=tv:out_range=pc): white is 255.
     """
     if limited_range(evidence):
-        views = [view for view in evidence.views if view.error is None and view.low != view.high]
+        views = [view for view in evidence.views if view.error is None and not view.blank]
         low, high = min(view.subject_low for view in views), max(view.subject_high for view in views)
         text = f"the subject's levels lie from {low} to {high}, within the limited range of video, 16 to 235"
         yield Hit(text, views[0].entry.image)
@@ -277,9 +298,7 @@ def _grey(evidence: Evidence) -> Iterator[Hit]:
 
     Export the colour images, if there are any.
     """
-    views = [
-        view for view in evidence.views if view.error is None and view.low != view.high and view.high > 1
-    ]
+    views = [view for view in evidence.views if view.error is None and not view.blank and view.high > 1]
     grey = [view for view in views if view.grey]
     if grey:
         yield Hit(
@@ -290,7 +309,8 @@ def _grey(evidence: Evidence) -> Iterator[Hit]:
 def skin_by_camera(evidence: Evidence) -> dict[str, np.ndarray]:
     """Median colour of the face's visible skin, (3,) levels, by camera; cameras that see enough of the face."""
     colours: dict[str, list[np.ndarray]] = defaultdict(list)
-    for view in evidence.views:
+    faulty = faulty_cameras(evidence)
+    for view in (view for view in evidence.views if view.entry.camera_id not in faulty):
         outside = view.mesh.face_outside if view.mesh is not None else None
         if view.mesh is not None and view.mesh.skin is not None and (outside or 0.0) < 0.1 and not view.grey:
             colours[view.entry.camera_id].append(np.asarray(view.mesh.skin))
@@ -345,8 +365,21 @@ def _uncalibrated(evidence: Evidence) -> Iterator[Hit]:
 def _lossy(evidence: Evidence) -> Iterator[Hit]:
     """Ground truth is lossy.
 
-    Export PNG: metrics against JPEG reward its artefacts.
+    Export PNG: metrics against JPEG reward its artefacts, and another name does not make a JPEG a PNG.
     """
-    lossy = [path for path in evidence.digests if path.suffix.lower() in (".jpg", ".jpeg")]
+    lossy = [path for path in evidence.digests if _is_jpeg(path)]
     if lossy:
-        yield Hit(f"{len(lossy)} of {several(len(evidence.digests), 'image')} are JPEG", lossy[0])
+        named = [path for path in lossy if path.suffix.lower() == ".png"]
+        more = f"; {len(named)} of them are named .png" if named else ""
+        yield Hit(
+            f"{len(lossy)} of {several(len(evidence.digests), 'image')} are JPEG{more}", (named or lossy)[0]
+        )
+
+
+def _is_jpeg(path: Path) -> bool:
+    """By content; by name where the image is no file of its own."""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(2) == b"\xff\xd8"
+    except (OSError, ValueError):
+        return path.suffix.lower() in (".jpg", ".jpeg")

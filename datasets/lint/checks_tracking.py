@@ -15,6 +15,7 @@ from ..ga import layout
 from ..novelty import displacement_metric, novelty
 from .checks_cameras import misplaced
 from .checks_images import sound_mask
+from .checks_rig import faulty_cameras
 from .evidence import Evidence
 from .mesh import MeshFacts
 from .rules import Hit, rule, several, some, spans
@@ -318,7 +319,7 @@ def _unexplained(evidence: Evidence) -> Iterator[Hit]:
     and images are of the same timesteps; refit the tracking to the model that is to be used.
     """
     fit = evidence.expression_fit
-    if fit is None or misplaced(evidence) or mesh_misses(evidence):
+    if fit is None or misplaced(evidence) or mesh_misses(evidence) or fit.camera in faulty_cameras(evidence):
         return
     if fit.ratio > WORSE:
         text = (
@@ -339,10 +340,14 @@ def _laid(evidence: Evidence) -> list[tuple[ViewFacts, MeshFacts, float]]:
     """Frames whose mesh can be held against a sound mask, with the share of the face outside."""
     if misplaced(evidence):
         return []
+    faulty = faulty_cameras(evidence)
     return [
         (view, view.mesh, view.mesh.face_outside)
         for view in evidence.views
-        if view.mesh is not None and view.mesh.face_outside is not None and sound_mask(view)
+        if view.mesh is not None
+        and view.mesh.face_outside is not None
+        and sound_mask(view)
+        and view.entry.camera_id not in faulty
     ]
 
 

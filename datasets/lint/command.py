@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
@@ -44,8 +45,12 @@ class LintSettings(CaptureOptions):
     duplicates: int = 600
     """Images to decode in the search for near-duplicates between splits. Equal files are found among all."""
 
+    camera_timesteps: int = 8
+    """Timesteps on which each camera is measured against the others; 0 leaves that out."""
+
     thorough: bool = False
-    """Decode every image for both, instead of --views and --duplicates; minutes for a recording of thousands of timesteps."""
+    """Decode every image, instead of --views and --duplicates, and measure cameras on 32 timesteps instead of
+    --camera-timesteps; minutes for a recording of thousands of timesteps."""
 
     min_test_timesteps: int = 10
     """Shortest self-reenactment sequence that raises no warning."""
@@ -53,13 +58,13 @@ class LintSettings(CaptureOptions):
     dependent = (
         DependentOptions(
             (
-                *("strict", "ignore", "views", "duplicates", "thorough", "min_test_timesteps"),
-                *("reader", "head", "cy", "set"),
+                *("strict", "ignore", "views", "duplicates", "camera_timesteps", "thorough"),
+                *("min_test_timesteps", "reader", "head", "cy", "set"),
             ),
             "list",
             False,
         ),
-        DependentOptions(("views", "duplicates"), "thorough", False),
+        DependentOptions(("views", "duplicates", "camera_timesteps"), "thorough", False),
     )
 
 
@@ -91,6 +96,7 @@ def lint(settings: LintSettings, progress: Progress = no_progress) -> Findings:
         "counts": {severity: counts[severity] for severity in SEVERITIES},
         "looked_at": _looked_at(evidence),
         "skipped": _skipped(evidence),
+        "cameras": {camera: _finite(asdict(facts)) for camera, facts in evidence.cameras.items()},
         "findings": [asdict(finding) for finding in findings],
     }
     return Findings(_report(evidence, findings, passed), data, passed)
@@ -113,6 +119,17 @@ def lint_capture(settings: LintSettings, progress: Progress = no_progress) -> tu
         clip = settings.open(settings.clip, progress)
         evidence = gather_clip(Path(settings.clip), clip, settings, progress)
     return evidence, apply(RULES, evidence, settings.ignore, base=evidence.folder.parent)
+
+
+def _finite(values: dict[str, Any]) -> dict[str, Any]:
+    """Measurements with None for those that could not be made."""
+    return {
+        key: value if isinstance(value, str) or _is_finite(value) else None for key, value in values.items()
+    }
+
+
+def _is_finite(value: float | tuple[float, ...]) -> bool:
+    return all(map(math.isfinite, value if isinstance(value, tuple) else (value,)))
 
 
 def _looked_at(evidence: Evidence) -> dict[str, Any]:

@@ -29,10 +29,14 @@ from ..ga.transforms import FrameEntry, parse_frame
 from ..ga.validate import sequence_names
 from ..ga.writer import pose_to_parameters
 from ..head.arrays import HeadArrays
+from .camera_table import CameraFacts, measure_cameras
 from .command import LintSettings
 from .expression_fit import ExpressionFit, weigh_expression
 from .mesh import Parameters, TrackedSubject, not_finite, read_parameters
 from .views import Pixels, Thumbnail, ViewFacts, look, make_thumbnails, pick_views, pixels_of_files
+
+THOROUGH_TIMESTEPS = 32
+"""Timesteps on which cameras are measured with ``--thorough``."""
 
 
 class Slot(NamedTuple):
@@ -62,6 +66,7 @@ class Evidence:
     views : decoded sample frames.
     thumbnails : of the images searched for near-duplicates.
     expression_fit : how well expressions explain the images; None where that cannot be told.
+    cameras : measurements of each camera by its id.
     refusal : why `read_capture` refuses the capture, None where it does not.
     """
 
@@ -77,6 +82,7 @@ class Evidence:
     views: Sequence[ViewFacts]
     thumbnails: Sequence[Thumbnail]
     expression_fit: ExpressionFit | None
+    cameras: Mapping[str, CameraFacts]
     declaration: layout.Declaration | None = None
     unread: frozenset[Slot] = frozenset()
     declaration_faults: Sequence[InputError] = ()
@@ -220,6 +226,15 @@ def _looked_at(
         "views": views,
         "thumbnails": make_thumbnails(there, pixels.image, limit, progress=progress),
         "expression_fit": weigh_expression(whole, views, pixels, subject, parameters, cy),
+        "cameras": measure_cameras(
+            whole,
+            pixels,
+            subject,
+            parameters,
+            cy,
+            timesteps=THOROUGH_TIMESTEPS if settings.thorough else settings.camera_timesteps,
+            progress=progress,
+        ),
     }
 
 
@@ -341,3 +356,8 @@ def by_camera(entries: Iterable[FrameEntry]) -> dict[str, list[FrameEntry]]:
     for entry in sorted(entries, key=lambda e: (e.camera_index, e.timestep)):
         found.setdefault(entry.camera_id, []).append(entry)
     return found
+
+
+def first_entries(evidence: Evidence) -> dict[str, FrameEntry]:
+    """First frame of each camera, in the first sequence that has it."""
+    return {camera: frames[0] for camera, frames in by_camera(evidence.entries).items()}

@@ -91,7 +91,22 @@ def apply(
         if rule.code not in ignore and (evidence.of_layout or not rule.of_layout)
         for hit in rule.check(evidence)
     ]
+    findings = [finding for finding in findings if not _said_again(finding, findings)]
     return sorted(findings, key=lambda f: (SEVERITIES.index(f.severity), f.code))
+
+
+REFUSAL = "HB100"
+"""The one rule that says what `read_capture` says, whatever it is."""
+
+
+def _said_again(finding: Finding, findings: Sequence[Finding]) -> bool:
+    """Whether it is the reader's refusal, and another rule reports an error at the same place."""
+    return finding.code == REFUSAL and any(
+        other.code != REFUSAL
+        and other.severity == "error"
+        and (other.file, other.key) == (finding.file, finding.key)
+        for other in findings
+    )
 
 
 def several(count: int, noun: str) -> str:

@@ -26,6 +26,9 @@ from .mesh import MeshFacts, Parameters, TrackedSubject, lay_mesh
 BACKGROUND_LEVELS = 12
 """A pixel is of the background's colour where no channel differs by more; JPEG changes flat areas by less."""
 
+BLANK_LEVELS = 2.0
+"""Images with less `structure` are of one colour."""
+
 FAR = 0.02
 """Distance from the foreground, as a share of the image's height, from which a pixel should be background."""
 
@@ -71,6 +74,7 @@ class ViewFacts:
     grey : whether no pixel has any colour.
     corners : median colour (3,) of the upper corners.
     corners_off : share of their pixels that are not of the declared background's colour.
+    blank : whether its pixels (where there is a mask, the subject's) have no more contrast than noise has.
     has_alpha : whether the image has an alpha channel, which then is its mask.
     mask : None without a mask, or where the mask does not decode or is of another size.
     mesh : None where the frame has no pose or no head.
@@ -85,6 +89,7 @@ class ViewFacts:
     grey: bool = False
     corners: FloatArray | None = None
     corners_off: float = 0.0
+    blank: bool = False
     has_alpha: bool = False
     mask: MaskFacts | None = None
     mesh: MeshFacts | None = None
@@ -195,10 +200,19 @@ def _facts(
         grey=bool((np.ptp(image, axis=2) == 0).all()),
         corners=np.median(image[corners], axis=0),
         corners_off=float(off[corners].mean()),
+        blank=_blank(image, shown, off),
         has_alpha=info.has_alpha,
         mask=None if mask is None else _mask_facts(image, mask, off, ground),
         mesh=mesh,
     )
+
+
+def _blank(image: ByteArray, shown: np.ndarray, off: np.ndarray) -> bool:
+    """Whether the subject's pixels are of one colour, and not of the background's (where a mask is wrong)."""
+    grey = image.astype(np.float32).mean(axis=2)
+    if structure(grey, np.ones_like(shown)) < BLANK_LEVELS:
+        return True
+    return bool(shown.any() and off[shown].mean() > 0.5 and structure(grey, shown) < BLANK_LEVELS)
 
 
 def _mask_facts(image: ByteArray, mask: ByteArray, off: np.ndarray, ground: FloatArray) -> MaskFacts:
@@ -325,3 +339,15 @@ def difference(one: Thumbnail, other: Thumbnail) -> float:
     if not shown.any():
         return float("inf")
     return float(np.percentile(np.abs(one.grey - other.grey)[shown], 95))
+
+
+def structure(grey: FloatArray, shown: np.ndarray) -> float:
+    """Standard deviation in levels of an image (H, W) over the pixels ``shown``, after smoothing and without what white
+    noise leaves of it: about 0 for noise alone."""
+    if not shown.any():
+        shown = np.ones_like(shown)
+    size = max(3, len(grey) // 24)
+    weight = cv2.blur(shown.astype(np.float32), (size, size))
+    smooth = cv2.blur(grey * shown, (size, size)) / np.maximum(weight, 1e-6)
+    noise = float(np.var((grey - smooth)[shown])) / (size * size)
+    return float(np.sqrt(max(0.0, float(np.var(smooth[shown])) - 2 * noise)))

@@ -77,6 +77,16 @@ def _orphan(good):
     path.with_name("00777_00.png").write_bytes(path.read_bytes())
 
 
+def _orphan_jpeg(good):
+    path = good.files("images")[0]
+    cv2.imwrite(str(path.with_suffix(".jpg")), read_rgb(path))
+
+
+def _absolute(frame):
+    for key in ("file_path", "fg_mask_path", "flame_param_path"):
+        frame[key] = "/export/rig7/" + frame[key].lstrip("./")
+
+
 # ------------------------------------------------------------------ splits
 
 
@@ -175,6 +185,12 @@ def _jpeg(good):
         cv2.imwrite(str(path.with_suffix(".jpg")), read_rgb(path)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
         path.unlink()
     good.each_frame(lambda frame: frame.update(file_path=frame["file_path"].replace(".png", ".jpg")))
+
+
+def _jpeg_as_png(good):
+    for path in good.files("images"):
+        options = [cv2.IMWRITE_JPEG_QUALITY, 95]
+        path.write_bytes(cv2.imencode(".jpg", read_rgb(path)[..., ::-1], options)[1].tobytes())
 
 
 # ------------------------------------------------------------------ cameras
@@ -297,6 +313,8 @@ FAULTS = (
     Fault("empty split", "HB111", _edit(VAL, lambda v: v.update(frames=[])), ("HB113",)),
     Fault("no declaration", "HB112", lambda good: (good.union / "headbench.json").unlink()),
     Fault("orphan", "HB113", _orphan),
+    Fault("orphan of another format", "HB113", _orphan_jpeg),
+    Fault("absolute paths", "HB116", _each(_absolute), ("HB602",)),
     Fault("one mask less", "HB114", _edit(TRAIN, lambda v: v["frames"][2].pop("fg_mask_path") and None)),
     Fault("image copied to the test", "HB201", _copy_to_test, ("HB702",)),
     Fault("image nearly copied to the test", "HB202", _nearly_copy_to_test),
@@ -319,6 +337,7 @@ FAULTS = (
     Fault("BGR", "HB404", _images(lambda image, mask: image[..., ::-1])),
     Fault("one camera tinted", "HB405", _tint_one_camera),
     Fault("JPEG", "HB406", _jpeg),
+    Fault("JPEG named PNG", "HB406", _jpeg_as_png),
     Fault(
         "stretched rotation",
         "HB501",

@@ -101,4 +101,4 @@ def test_only_one_json_left(good):
     for path in good.files("flame_param"):
         path.unlink()
     found = outcome(good)
-    assert {"HB100", "HB101", "HB103", "HB602"} <= set(found)
+    assert {"HB101", "HB103", "HB602"} <= set(found)

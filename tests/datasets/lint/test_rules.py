@@ -33,7 +33,7 @@ from .good_capture import (
     write_good_capture,
 )
 
-PLANTED_APART = {"HB115", "HB510", "HB511", "HB615"}
+PLANTED_APART = {"HB115", "HB510", "HB511", "HB513", "HB514", "HB515", "HB516", "HB517", "HB615"}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -85,6 +85,24 @@ def test_cy_from_the_other_edge(tmp_path):
     assert "HB511" in found
     assert set(found) <= {"HB511", "HB510", "HB702", "HB701"}
     assert "HB511" not in codes(capture, cy="bottom")
+
+
+def test_halved_intrinsics_are_not_taken_for_the_other_edge(tmp_path):
+    """The outlines agree under neither reading of cy, and by chance a little better under the wrong one."""
+    capture = write_good_capture(tmp_path, good_plan(cameras=cameras(WIDTH / 2, HEIGHT / 2 - 12.0)))
+    keys = ("fl_x", "fl_y", "cx", "cy")
+    capture.each_frame(lambda frame: frame.update({key: frame[key] / 2 for key in keys}))
+    found = codes(capture)
+    assert "HB506" in found
+    assert not {"HB100", "HB511"} & set(found)
+
+
+@pytest.mark.parametrize(
+    "fault", [f for f in FAULTS if f.code in ("HB101", "HB102", "HB103", "HB104", "HB602")]
+)
+def test_a_fault_of_a_file_is_reported_once(fault, good):
+    fault.plant(good)
+    assert codes(good) == [fault.code]
 
 
 def test_a_width_beyond_the_limit_of_gaussian_avatars(pristine):
