@@ -21,7 +21,7 @@ BETTER = 0.05
 LEAST_OFFSET = (1.5, 0.01)
 """Smallest limit of an offset: working pixels, and share of the image's height."""
 
-LEAST_POOR, LEAST_SOFT, LEAST_UNSTEADY = 0.3, 1.0, 0.5
+LEAST_POOR, LEAST_SOFT, LEAST_UNSTEADY = 0.3, 0.6, 0.5
 """Smallest distances of the limit from the median: correlation, factors of two in contrast, pixels over time."""
 
 SYNCHRONOUS = 0.7
