@@ -74,7 +74,7 @@ class CameraFacts:
     metres_per_pixel, degrees_per_pixel : at the head's distance.
     height, scale : of the images in pixels; over that of the images measured.
     lag : frames by which its images are late (positive) or early, whole.
-    unsteady, unsteady_at_lag : mean distance in pixels of the offsets over time from their median, without a lag and with it.
+    unsteady, unsteady_at_lag : median distance in pixels of the offsets over time from their median, without a lag and with it.
     sharpness : log2 of the contrast of fine details of the face over that in the other cameras.
     fits : where its own calibration is in doubt, the camera whose calibration matches the images better, "" for none.
     fits_match : the correlation under that calibration.
@@ -364,7 +364,7 @@ class _Table:
                 rest.append(offset - np.median(moved, axis=0))
             if len(rest) > len(offsets) / 2:
                 middle = np.median(rest, axis=0)
-                residuals[lag] = (float(np.linalg.norm(rest - middle, axis=1).mean()), middle)
+                residuals[lag] = (float(np.median(np.linalg.norm(rest - middle, axis=1))), middle)
         best = min(residuals, key=lambda lag: (residuals[lag][0], abs(lag)))
         return best, residuals[0][0], residuals[best][0], residuals[best][1]
 

@@ -21,10 +21,10 @@ BETTER = 0.05
 LEAST_OFFSET = (1.5, 0.01)
 """Smallest limit of an offset: working pixels, and share of the image's height."""
 
-LEAST_POOR, LEAST_SOFT, LEAST_UNSTEADY = 0.3, 1.0, 0.5
+LEAST_POOR, LEAST_SOFT, LEAST_UNSTEADY = 0.3, 0.6, 0.5
 """Smallest distances of the limit from the median: correlation, factors of two in contrast, pixels over time."""
 
-SYNCHRONOUS = 0.7
+SYNCHRONOUS = 0.6
 """A lag has to lower the change of the offsets over time to this share."""
 
 OFFSET_SPREADS, SPREADS = 4, 6
@@ -122,6 +122,7 @@ def late_cameras(evidence: Evidence) -> dict[str, float]:
         for c, f in facts.items()
         if f.lag != usual
         and f.lag
+        and f.match > TELLING_MATCH
         and f.unsteady > middle + distance
         and f.unsteady_at_lag < SYNCHRONOUS * f.unsteady
         and c not in taken

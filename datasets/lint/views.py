@@ -29,6 +29,9 @@ BACKGROUND_LEVELS = 12
 BLANK_LEVELS = 2.0
 """Images with less `structure` are of one colour."""
 
+SENSOR_NOISE = 20.0
+"""Levels; what varies more from pixel to pixel is a texture."""
+
 FAR = 0.02
 """Distance from the foreground, as a share of the image's height, from which a pixel should be background."""
 
@@ -349,5 +352,5 @@ def structure(grey: FloatArray, shown: np.ndarray) -> float:
     size = max(3, len(grey) // 24)
     weight = cv2.blur(shown.astype(np.float32), (size, size))
     smooth = cv2.blur(grey * shown, (size, size)) / np.maximum(weight, 1e-6)
-    noise = float(np.var((grey - smooth)[shown])) / (size * size)
+    noise = min(float(np.var((grey - smooth)[shown])), SENSOR_NOISE**2) / (size * size)
     return float(np.sqrt(max(0.0, float(np.var(smooth[shown])) - 2 * noise)))
