@@ -207,7 +207,7 @@ class TableSettings:
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of the runs."""
     format: Literal["md", "csv", "latex", "html", "json"] | None = None
-    """Markdown, CSV, LaTeX (booktabs), a page of HTML, or JSON. Default: by the suffix of --out, else md."""
+    """Markdown, CSV, LaTeX (booktabs), a page of HTML, or JSON. Default: by the suffix of --out, md without it."""
     layout: str = "comparison"
     """Which table: comparison, speed (latency, throughput, stages), cost (storage, training), or the paper's: paper-1
     (all methods), paper-3 (INSTA and ours), paper-4 (what an expression may change: a run each)."""
@@ -225,8 +225,8 @@ class TableSettings:
     """File to write the table to, instead of printing it."""
 
 
-SUFFIXES = {".tex": "latex", ".html": "html", ".csv": "csv", ".json": "json"}
-"""Formats of tables by the suffix of a file; Markdown otherwise."""
+SUFFIXES = {".md": "md", ".txt": "md", ".tex": "latex", ".html": "html", ".csv": "csv", ".json": "json"}
+"""Formats of tables by the suffix of a file."""
 
 
 def table(settings: TableSettings, progress: Progress) -> Findings:
@@ -235,8 +235,10 @@ def table(settings: TableSettings, progress: Progress) -> Findings:
     out = options.pop("out")
     if out is not None:
         check_writable(Path(out), "--out")
-    suffix = Path(out or "").suffix.lower()
-    options["format"] = settings.format or SUFFIXES.get(suffix, "md")
+        if settings.format is None and Path(out).suffix.lower() not in SUFFIXES:
+            expected = f"a suffix that names a format ({', '.join(SUFFIXES)}), or --format"
+            raise InputError("command line", "--out", expected, out)
+    options["format"] = settings.format or (SUFFIXES[Path(out).suffix.lower()] if out else "md")
     text = _table(**options)
     data = {"format": options["format"], "table": text}
     if out is None:

@@ -73,7 +73,10 @@ def call(words: Sequence[str]) -> int:
 def with_home(word: str) -> str:
     """A word of the command line with the home folder for ``~``, which shells leave as it is behind ``=`` and in quotes."""
     match = re.fullmatch(r"((?:[^=]*=)*?)(~.*)", word)
-    if match is None or (match[2] == "~" and match[1] and not match[1].startswith("--")):  # null in YAML
+    if match is None:
+        return word
+    option = match[1].startswith("--") and match[1].count("=") == 1
+    if match[2] == "~" and match[1] and not option:  # null in YAML
         return word
     return match[1] + expand_home(match[2], "command line")
 

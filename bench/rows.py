@@ -303,6 +303,10 @@ class Rows:
         for column, values in planned.items():
             named = list(map(str, values))
             known = set(map(str, self._table[column].unique())) - {""}
+            if column == "protocol" and known - set(named):
+                expected = f"{', '.join(sorted(known))}, that of its results"
+                found = f"{', '.join(named)}: other frames or settings make another protocol"
+                raise InputError(path, column, expected, found, DISCARD)
             if lost := sorted(known - set(named)):
                 expected = f"all that it has results for ({', '.join(sorted(known))}), and optionally more"
                 found = f"{', '.join(named)} without {', '.join(lost)}"
@@ -328,6 +332,17 @@ class Rows:
 
 DISCARD = "Choose another --out. To discard the results in this file, delete it: trained avatars are kept."
 """What to do about rows that would be lost."""
+
+
+def replace_rows(path: Path, rows: Rows) -> None:
+    """Write rows in place of those of a file. Raises `InputError`, and leaves it as it is, where it has values that they lack."""
+    earlier = earlier_rows(path)
+    lost = [] if earlier is None else rows.values_lacking(earlier)
+    if lost:
+        expected = "new rows with a value for each one in this file"
+        found = f"{len(lost)} without, such as {lost[0]}"
+        raise InputError(path, "", expected, found, f"The file is left unchanged. {DISCARD}")
+    rows.write(path)
 
 
 def earlier_rows(path: Path) -> Rows | None:

@@ -285,7 +285,7 @@ class DatasetSpec:
     listing: str = ""
     pose_files: str = ""
     needs: str = ""
-    errors: str = "headbench.datasets.lint.before_run:errors"
+    errors: str = ""
 
 
 @dataclass(frozen=True)

@@ -171,7 +171,7 @@ class CaptureClip:
             image, mask = self._source.image(recorded), self._source.mask(recorded)
         else:
             image = read_image(files.image, ground)
-            mask = None if files.mask is None else read_mask(files.mask)
+            mask = None if files.mask is None else read_mask(files.mask, own=files.mask == files.image)
         pixels = FramePixels(_unit_range(image), None if mask is None else _unit_range(mask))
         for change in self.pixel_steps:
             pixels = change(files.recorded or key, pixels)

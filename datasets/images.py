@@ -96,20 +96,20 @@ def read_image(path: Path, background: Iterable[float]) -> ByteArray:
     return result
 
 
-def read_mask(path: Path, size: tuple[int, int] | None = None) -> ByteArray:
-    """Decode a mask to (H, W) 8-bit coverage.
+def read_mask(path: Path, size: tuple[int, int] | None = None, *, own: bool = False) -> ByteArray:
+    """Decode a mask to (H, W) 8-bit coverage; ``own``: the alpha channel of the image that it belongs to.
 
     It is the alpha channel where there is one, else the level of grey, else the largest of the three channels. The
     entries of a colour table are labels where they are not all grey: whatever is not black then covers fully. So a
-    mask covers what a viewer shows as not black. An alpha channel that is opaque everywhere beside grey is no mask, but
-    that of an editor that always saves one. ``size`` and errors are those of `read_pixels`.
+    mask covers what a viewer shows as not black. An alpha channel that is opaque everywhere is no mask, but that of an
+    editor that always saves one, unless it is the image's ``own``. ``size`` and errors are those of `read_pixels`.
     """
     pixels = read_pixels(path, size)
     if pixels.ndim == 2:
         return pixels
     blue, green, red, *alpha = (channel.astype(np.uint8, copy=False) for channel in cv2.split(pixels))
     grey = np.array_equal(blue, green) and np.array_equal(green, red)
-    if alpha and not (grey and alpha[0].min() == 255):
+    if alpha and (own or alpha[0].min() < 255):
         return alpha[0]
     if not grey and probe_image(path).table:
         return np.where((blue | green | red) > 0, 255, 0).astype(np.uint8)

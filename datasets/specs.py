@@ -2,10 +2,13 @@
 
 from ..bench.specs import DatasetSpec
 
+ERRORS = "headbench.datasets.lint.before_run:errors"
+
 GA_LAYOUT = DatasetSpec(
     name="ga",
     summary="A capture in the GaussianAvatars/VHAP layout: a UNION folder or a single sequence.",
     implementation="headbench.datasets.ga.reader:read_capture",
+    errors=ERRORS,
     find="headbench.datasets.ga.reader:find_captures",
     listing="headbench.datasets.ga.reader:listed_frames",
     pose_files="headbench.datasets.ga.reader:pose_files",
@@ -15,6 +18,7 @@ COLMAP = DatasetSpec(
     name="colmap",
     summary="A COLMAP dataset with tracked FLAME parameters beside its model, as `export colmap --tracking` writes.",
     implementation="headbench.datasets.colmap.reader:read_dataset",
+    errors=ERRORS,
     find="headbench.datasets.colmap.reader:find_datasets",
     pose_files="headbench.datasets.colmap.reader:pose_files",
 )
@@ -23,6 +27,7 @@ MONOCULAR = DatasetSpec(
     name="monocular",
     summary="A tracked video of one camera, as INSTA and Metrical Tracker or IMavatar and PointAvatar lay it out.",
     implementation="headbench.datasets.monocular.reader:read_video",
+    errors=ERRORS,
     find="headbench.datasets.monocular.reader:find_videos",
 )
 

@@ -52,7 +52,7 @@ class Columns:
         return tuple(dict.fromkeys(name for name in self.names if name in names)) or names
 
     def check(self, metrics: Iterable[str], tasks: Iterable[str]) -> None:
-        """Raise `InputError` for a name that is neither a metric nor a task of the layout, and for digits that are none."""
+        """Raise `InputError` for a name that is neither a metric nor a task of the layout, and for digits that are no numbers from 0 to 9."""
         metrics = tuple(metrics)
         for name in self.names:
             if name not in (*metrics, *tasks):
@@ -72,7 +72,7 @@ class Columns:
         found = {}
         for word in self.digits:
             metric, _, number = word.rpartition("=")
-            if not re.fullmatch("[0-9]", number):
+            if not re.fullmatch("([^=]+=)?[0-9]", word):
                 raise InputError("command line", "--digits", "N or METRIC=N with N from 0 to 9", word)
             found[metric] = int(number)
         return found

@@ -150,7 +150,7 @@ class EvaluateSettings:
     can run any code."""
 
     frames_per_task: int | None = None
-    """Score at most so many frames per subject and task, evenly spaced; default: all. Not with --like."""
+    """Largest number of frames scored per subject and task, evenly spaced; default: all. Not with --like."""
 
     dependent = (
         DependentOptions(("tasks", "metrics", "reader", "frames_per_task"), "like", False),

@@ -41,7 +41,7 @@ def chosen_execution(
     executor, workers : None where not given.
     source : file or option that the settings came from, for the error.
 
-    Raises `InputError` for settings that are none, and for given ones that have no effect with the executor.
+    Raises `InputError` for invalid settings, and for given ones that have no effect with the executor.
     """
     options = {"executor": executor, "workers": workers}
     options = {key: value for key, value in options.items() if value is not None}

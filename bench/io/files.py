@@ -325,6 +325,10 @@ def check_writable(path: Path, option: str) -> None:
 
     Raises `InputError`, naming the ``option`` that asked for the file.
     """
+    marks = {pattern.rpartition("/")[2] for patterns in KINDS.values() for pattern in patterns}
+    if path.is_symlink() or (path.exists() and path.name in marks | RESULTS):
+        found = "a link" if path.is_symlink() else "a file of a run or a capture"
+        raise InputError(path, option, "a file that is new or was written so", found, "Nothing was written.")
     with _writable(path, option, "a file"):
         _check_target(path)
         if not path.parent.is_dir():
@@ -359,6 +363,8 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     "an avatar": ("subject.npz",),
 }
 """What marks a folder as one of a kind: patterns of files and folders in it."""
+RESULTS = {"rows.parquet", "headbench.json", "measure.json", "head_model.npz"}
+"""Files that hold results or captures and that no option names to be written."""
 
 
 def check_kind(folder: Path, *kinds: str) -> None:
@@ -370,7 +376,7 @@ def check_kind(folder: Path, *kinds: str) -> None:
     for kind, patterns in KINDS.items():
         marks = (path for pattern in patterns for path in folder.glob(pattern)) if kind not in kinds else ()
         for mark in marks:
-            expected = " or ".join(["a new folder", *(f"that of {kind}" for kind in kinds)])
+            expected = " or ".join(["a new folder", *(f"one that holds {kind}" for kind in kinds)])
             found = f"{kind} ({mark.relative_to(folder)})"
             raise InputError(folder, "--out", expected, found, "Nothing was written. Name another folder.")
 

@@ -136,9 +136,9 @@ def _decode(path: Path, stream: BinaryIO, info: ImageInfo, end: int) -> ByteArra
 
 def _grey_with_alpha(grey: ByteArray, content: bytes) -> ByteArray:
     """Apply the chunk tRNS of a grey PNG, one level that is transparent; OpenCV ignores it."""
-    depth = content[24]
-    place = content.index(b"tRNS") + 4
-    level = int.from_bytes(content[place : place + 2], "big") % 2**depth * 255 // (2**depth - 1)
+    depth, stream = content[24], io.BytesIO(content)
+    next(name for name, _ in _chunks(stream) if name == b"tRNS")
+    level = int.from_bytes(stream.read(2), "big") % 2**depth * 255 // (2**depth - 1)
     return np.dstack([grey, grey, grey, np.where(grey == level, 0, 255)]).astype(np.uint8)
 
 

@@ -398,7 +398,7 @@ def measure(
     result = Rows.joined(parts)
     if lost := result.values_lacking(old.of_metrics(replaced)):
         raise UnavailableError(
-            f"There was a value of {lost[0]} and there is none now.", "The former is kept."
+            f"The new measurement has no value of {lost[0]}, and the former has one.", "The former is kept."
         )
     others = sorted(old.metrics - fingerprints.keys())
     job.cell.begin(

@@ -33,7 +33,7 @@ from ..errors import InputError
 from ..io.documents import checked, read_json
 from ..io.files import digest_file, is_system_file, write_json
 from ..manifest import Manifest
-from ..rows import DISCARD, Rows, earlier_rows
+from ..rows import DISCARD, Rows, earlier_rows, replace_rows
 
 log = logging.getLogger(__name__)
 
@@ -256,13 +256,7 @@ class RunFolder:
 
         Raises `InputError`, and leaves the file as it is, where it has values that ``rows`` lack.
         """
-        earlier = earlier_rows(self.rows)
-        lost = [] if earlier is None else rows.values_lacking(earlier)
-        if lost:
-            expected = "new rows with a value for each one in this file"
-            found = f"{len(lost)} without, such as {lost[0]}"
-            raise InputError(self.rows, "", expected, found, f"The file is left unchanged. {DISCARD}")
-        rows.write(self.rows)
+        replace_rows(self.rows, rows)
 
     def read_manifest(self) -> Manifest:
         """Read ``run.json``. Raises `InputError` where there is none, or one of another format."""

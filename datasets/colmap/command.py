@@ -10,6 +10,8 @@ import tyro
 
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
+from ...bench.io.files import write_json
+from ...bench.io.lock import LOCK_FILE
 from ...bench.options import DependentOptions
 from ...bench.specs import Findings, writes
 from ..options import CaptureOptions
@@ -44,6 +46,10 @@ class ExportColmapSettings(CaptureOptions):
     dependent = (DependentOptions(("timesteps",), "all_timesteps", False),)
 
 
+MARKER = "headbench-export.json"
+"""File that a folder written by `export_colmap` is recognised by: another may be somebody's own model and images."""
+
+
 @writes("out", "a COLMAP dataset")
 def export_colmap(settings: ExportColmapSettings, progress: Progress) -> Findings:
     """Write frames of a capture as a COLMAP dataset: images, masks and a sparse model.
@@ -54,7 +60,13 @@ def export_colmap(settings: ExportColmapSettings, progress: Progress) -> Finding
     from .writer import export_model, export_tracking
 
     clip = settings.open(settings.capture, progress)
-    check_apart(clip, Path(settings.out))
+    out = Path(settings.out)
+    check_apart(clip, out)
+    present = {path.name for path in out.glob("[!.]*")} - {LOCK_FILE}
+    if present and MARKER not in present:
+        expected = "a new folder, or one that this command wrote"
+        found = "one with other files"
+        raise InputError(out, "--out", expected, found, "Nothing was written. Name another folder.")
     chosen = set(settings.timesteps) or {clip.timesteps("train")[0]}
     if settings.all_timesteps:
         chosen = set(clip.poses)
@@ -63,7 +75,7 @@ def export_colmap(settings: ExportColmapSettings, progress: Progress) -> Finding
         expected = f"timesteps of the capture, {min(clip.poses)} to {max(clip.poses)}"
         raise InputError("--timesteps", "", expected, ", ".join(map(str, unknown)))
     keys = [key for key in clip.files if key.timestep in chosen]
-    out = Path(settings.out)
+    write_json(out / MARKER, {"capture": clip.subject, "fingerprint": clip.fingerprint})
     written = export_model(
         clip, keys, out, model_format=settings.format, naming=settings.names, progress=progress
     )

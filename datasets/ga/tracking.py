@@ -136,14 +136,9 @@ def read_tracking(
         "change_of_static_offset_ignored_m": deviation["static_offset_m"],
         "dynamic_offset_ignored_m": deviation["dynamic_offset_m"],
     }
-    if closed:
-        used = head.eyelid_basis is not None
-        notes["eyelids"] = f"closed by up to {closed:.2f}" + (
-            "" if used else ", left out: the head model has no basis"
-        )
-        if not used:
-            log.warning("%s: eyelids: %s. %s", min(files.values()).parent, notes["eyelids"], EYELIDS_REMEDY)
-    return Tracking(head, poses, shape, static_offset, notes)
+    return Tracking(
+        head, poses, shape, static_offset, notes | _eyelids(min(files.values()).parent, head, closed)
+    )
 
 
 def read_animation(
@@ -175,7 +170,20 @@ def read_animation(
         static_offset[:rows] = static[:rows]
     check_motion(dict.fromkeys(poses, path), head, identity, static_offset, poses)
     dynamic = _array(path, arrays, "dynamic_offset") if "dynamic_offset" in arrays else None
-    return Tracking(head, poses, identity, static_offset, {"dynamic_offset_ignored_m": _largest(dynamic)})
+    closed = _largest(_array(path, arrays, "eyelids")) if "eyelids" in arrays else 0.0
+    notes = {"dynamic_offset_ignored_m": _largest(dynamic), **_eyelids(path, head, closed)}
+    return Tracking(head, poses, identity, static_offset, notes)
+
+
+def _eyelids(where: Path, head: HeadArrays, closed: float) -> dict[str, str]:
+    """What becomes of eyelids that files close by up to ``closed``: a note, and a warning where they are lost."""
+    if not closed:
+        return {}
+    note = f"closed by up to {closed:.2f}"
+    if head.eyelid_basis is None:
+        note += ", left out: the head model has no basis"
+        log.warning("%s: eyelids: %s. %s", where, note, EYELIDS_REMEDY)
+    return {"eyelids": note}
 
 
 def resolve_teeth(

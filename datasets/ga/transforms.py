@@ -74,7 +74,7 @@ def check_lenses(path: Path, document: Mapping[str, Any]) -> None:
         else []
     )
     for where, part in parts:
-        for key in part.keys() & LENS_KEYS:
+        for key in [key for key in part if key.lower() in LENS_KEYS]:
             value = part[key]
             if key == "camera_model":
                 fits = str(value).upper() in PINHOLES
@@ -91,17 +91,8 @@ def check_lenses(path: Path, document: Mapping[str, Any]) -> None:
 
 
 LENS_KEYS = {
-    "k1",
-    "k2",
-    "k3",
-    "k4",
-    "k5",
-    "k6",
-    "p1",
-    "p2",
-    "distortion_params",
-    "is_fisheye",
-    "camera_model",
+    *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion_params", "is_fisheye", "camera_model"),
+    *("distortion", "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "skew"),
 }
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 """Camera models that are a pinhole where their coefficients of distortion are 0."""

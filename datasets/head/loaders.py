@@ -55,7 +55,7 @@ def load_head(
         ("flame2020", "flame2023"); must agree with what a npz of ours says.
 
     For a FLAME pickle, files that are not given are used where they lie in one of `PLACES` under their usual names:
-    ``FLAME_masks.pkl``, ``regions.json``, ``l_eyelid.npy`` and ``r_eyelid.npy``.
+    ``FLAME_masks.pkl``, ``l_eyelid.npy`` and ``r_eyelid.npy``; and ``regions.json`` beside the pickle.
 
     Raises
     ------
@@ -75,13 +75,18 @@ def load_head(
             raise InputError(path, "version", repr(version), repr(head.version))
     elif start[:1] not in _PICKLES or path.suffix.lower() in MESHES:
         expected = "a head model with its bases: a FLAME pickle, or an npz file"
-        found = "a mesh" if path.suffix.lower() in MESHES else "neither"
-        raise InputError(path, "", expected, found, "A mesh alone has no expressions and no joints.")
+        if path.suffix.lower() in MESHES:
+            raise InputError(path, "", expected, "a mesh", "A mesh alone has no expressions and no joints.")
+        raise InputError(
+            path, "", expected, f"a file that starts with {start!r}" if start else "an empty file"
+        )
     else:
         head = _flame(path, version or flame_version(path))
         masks = masks or _beside(path, MASKS_FILE)
-        regions = regions or _beside(path, REGIONS_FILE)
-        eyelids = eyelids or (_beside(path, EYELID_FILES[0]) or _beside(path, EYELID_FILES[1]) or path).parent
+        own = path.with_name(REGIONS_FILE)  # a name that others use, too
+        regions = regions or (own if own.is_file() else None)
+        lid = next(filter(None, (_beside(path, name) for name in EYELID_FILES)), None)
+        eyelids = eyelids or (lid.parent if lid else None)
     if masks is not None:
         head = replace(head, regions={**head.regions, **read_masks(masks)})
     if regions is not None:
@@ -101,16 +106,14 @@ MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".fbx")
 
 def _beside(path: Path, name: str) -> Path | None:
     """A file that belongs to a FLAME pickle, or None."""
-    return next(
-        (path.parent / place / name for place in PLACES if (path.parent / place / name).is_file()), None
-    )
+    folders = dict.fromkeys((path.parent, path.resolve().parent))  # that of a link, then that of the file
+    files = (folder / place / name for folder in folders for place in PLACES)
+    return next(filter(Path.is_file, files), None)
 
 
 def _with_eyelids(head: HeadArrays, folder: Path, file: Path) -> HeadArrays:
-    """The head with the eyelid basis of a folder; as it is where the folder is the head's own and has none."""
+    """The head with the eyelid basis of a folder."""
     files = [folder / name for name in EYELID_FILES]
-    if not any(path.is_file() for path in files) and folder == file.parent:
-        return head
     bases = [read_npy(path) for path in files]
     for path, basis in zip(files, bases):
         if basis.shape != head.template.shape or basis.dtype.kind != "f":
@@ -127,22 +130,21 @@ def flame_version(path: Path) -> str:
     InputError
         Where the name leaves it open: the two files have the same layout, and confusing them goes unnoticed.
     """
-    name = path.stem.lower().replace("-", "_")
-    if (
-        "20" not in name
-        and name != "generic_model"
-        and re.fullmatch("(?i)flame[-_ ]?20(20|23)", path.parent.name)
-    ):
-        name = path.parent.name
-    if "2023" in name:
-        return "flame2023_no_jaw" if "no_jaw" in name else "flame2023"
-    if "2020" in name or name == "generic_model":
+    stem = path.stem.lower().replace("-", "_")
+    folder = re.fullmatch("flame[-_ ]?(2020|2023)", path.parent.name.lower())
+    years = set(re.findall(r"(?<!\d)(2020|2023)(?!\d)", stem))
+    if stem == "generic_model":
+        years.add("2020")
+    if folder and (not years or stem == "generic_model"):
+        years.add(folder[1])
+    if years == {"2023"}:
+        return "flame2023_no_jaw" if "no_jaw" in stem else "flame2023"
+    if years == {"2020"}:
         return "flame2020"
-    expected = "a file name with FLAME's version (generic_model.pkl, flame2020.pkl, flame2023.pkl)"
-    remedy = (
-        "Say which it is: version='flame2020' or 'flame2023'. Their coefficients are not interchangeable."
-    )
-    raise InputError(path, "version", expected, repr(path.name), remedy)
+    expected = "a name that tells FLAME's version (generic_model.pkl, flame2020.pkl, flame2023.pkl)"
+    found = path.name if not folder else f"{path.parent.name}/{path.name}"
+    remedy = "Rename the file, or in Python give version='flame2020' or 'flame2023'. Their coefficients are not interchangeable."
+    raise InputError(path, "version", expected, repr(found), remedy)
 
 
 def read_masks(path: str | PathLike[str]) -> dict[str, IntArray]:

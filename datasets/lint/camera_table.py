@@ -201,7 +201,7 @@ def _pick_timesteps(
             steps = [timestep - lag for lag in range(-MAX_LAG, MAX_LAG + 1)]
             around[timestep] = [t if t in present and _posed(parameters, t) else -1 for t in steps]
     chosen = []
-    for part in np.array_split(sorted(around), min(count, len(around)) or 1):
+    for part in np.array_split(sorted(around), max(1, min(count, len(around)))):
         if len(part):
             few = part[np.unique(np.linspace(0, len(part) - 1, _CANDIDATES).round().astype(int))].tolist()
             chosen.append(max(few, key=lambda t: _speed(subject, parameters, around[t])))

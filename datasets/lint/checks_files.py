@@ -42,7 +42,9 @@ def _refused(evidence: Evidence) -> Iterator[Hit]:
     """
     # A fault that another rule reports is left to that rule (see `apply` for those at the same place).
     error = evidence.refusal
+    reported = not {"HB103", "HB116"} & {*evidence.settings.ignore}
     missing = error is not None and any(str(fault.file) in error.found for fault in evidence.file_faults)
+    missing = missing and reported
     if error is not None and not missing:
         text = f"expected {error.expected}, found {error.found}"
         yield Hit(f"{text}. {error.remedy}" if error.remedy else text, error.file, error.key)

@@ -55,6 +55,10 @@ class LintSettings(CaptureOptions):
     min_test_timesteps: int = 10
     """Shortest self-reenactment sequence that raises no warning."""
 
+    def __post_init__(self) -> None:
+        if self.camera_timesteps < 0:
+            raise ValueError(f"camera_timesteps is {self.camera_timesteps}; 0 or more")
+
     dependent = (
         DependentOptions(
             (

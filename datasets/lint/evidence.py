@@ -226,7 +226,9 @@ def _looked_at(
         "views": views,
         "thumbnails": make_thumbnails(there, pixels.image, limit, progress=progress),
         "expression_fit": weigh_expression(whole, views, pixels, subject, parameters, cy),
-        "cameras": measure_cameras(
+        "cameras": {}
+        if not (settings.thorough or settings.camera_timesteps)
+        else measure_cameras(
             whole,
             pixels,
             subject,

@@ -176,7 +176,7 @@ def _mask(headers: Mapping[Path, ImageInfo], entry: FrameEntry) -> ByteArray | N
     header = headers.get(path) if path is not None else None
     if path is None or header is None or (header.width, header.height) != (info.width, info.height):
         return None
-    return read_mask(path)
+    return read_mask(path, own=path == entry.image)
 
 
 def _facts(

@@ -29,7 +29,7 @@ class CompactSettings(CaptureOptions):
     """With --compare: held-out frames to compare on, evenly spread over both held-out splits."""
 
     scale: int = 1
-    """With --compare: enlarge the images so many times. Above 1 there is no ground truth to compare with, only the exact
+    """With --compare: factor by which the images are enlarged. Above 1 there is no ground truth to compare with, only the exact
     avatar."""
 
     precision: Precision = field(default_factory=Precision)

@@ -73,7 +73,7 @@ class ImportGASettings(CaptureOptions):
     flame_param.npz beside the PLY, if there is one. "none" leaves it out."""
 
     subject: str = ""
-    """Name of the subject, without --capture, which tells it."""
+    """Name of the subject, without --capture, which names it."""
 
     dependent = (
         DependentOptions(("reader", "cy"), "capture"),

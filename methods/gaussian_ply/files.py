@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from ...bench.configuration import parse_assignments
+from ...bench.configuration import build, parse_assignments
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_name, entries
 from ...bench.io.lock import LOCK_FILE
-from ...bench.registry import unknown
 from ...bench.runner.stored import SAME_SHAPE
 from ...bench.specs import Findings
 from ...datasets.clip import CaptureClip
-from ...datasets.ga.tracking import Tracking, find_head, read_animation
+from ...datasets.ga.tracking import TeethPolicy, Tracking, find_head, read_animation
 from ...datasets.head.arrays import HeadArrays
 from ..ga.method import DRIVING_FILE
 from ..ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
@@ -33,8 +32,16 @@ from ..shared.avatar_files import (
 from .command import ImportGASettings
 
 FLAME_PARAM_FILE = "flame_param.npz"
-HEAD_SETTINGS = ("masks", "regions", "eyelids")
-"""Settings of readers that an import without a capture takes for its head model, beside ``teeth``."""
+
+
+@dataclass(frozen=True)
+class HeadSettings:
+    """Settings of readers that an import without a capture takes for its head model."""
+
+    masks: str | None = None
+    regions: str | None = None
+    eyelids: str | None = None
+    teeth: TeethPolicy = "auto"
 
 
 def import_avatar(settings: ImportGASettings, progress: Progress) -> Findings:
@@ -87,13 +94,10 @@ def _identity(
         raise InputError("command line", "--head", "the head model of the avatar", "none", remedy)
     if clip is None:
         name = settings.subject or ply.stem
-        files = parse_assignments(settings.set)
-        teeth = files.pop("teeth", "auto")
-        if stray := sorted(files.keys() - {*HEAD_SETTINGS}):
-            raise unknown("command line", "--set", stray[0], (*HEAD_SETTINGS, "teeth"))
-        tracking = read_animation(
-            path, find_head(path.parent, None, settings.head, **files), name, teeth=teeth
-        )
+        files = asdict(build(HeadSettings, parse_assignments(settings.set), "--set"))
+        teeth = files.pop("teeth")
+        head = find_head(path.parent, None, settings.head, **files)
+        tracking = read_animation(path, head, name, teeth=teeth)
         subject = Subject(
             check_name(name, "command line", "--subject"),
             tracking.head.version,

@@ -108,7 +108,7 @@ def curve(settings: CurveSettings, out: Path) -> Findings:
     for job in jobs:
         _drop_interrupted(job)
     rows = run_jobs(jobs, metrics)
-    rows.write(folder.rows)
+    folder.write_rows(rows)
     replace(manifest, status="done").write(folder.manifest)
 
     names, order = [m.spec.name for m in wanted], [clip.subject for clip in clips]

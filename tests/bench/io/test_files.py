@@ -19,6 +19,7 @@ from headbench.bench.io.files import (
     atomic_path,
     check_kind,
     check_name,
+    check_writable,
     digest,
     digest_file,
     entries,
@@ -334,6 +335,21 @@ def test_a_folder_of_another_kind_is_refused(tmp_path, kind, mark):
         with pytest.raises(InputError, match="--out: expected a new folder") as caught:
             check_kind(tmp_path, *own)
         assert caught.value.found == f"{kind} ({place.relative_to(tmp_path)})"
+
+
+@pytest.mark.parametrize(
+    "name", ["run.json", "rows.parquet", "transforms_test.json", "cameras.bin", "link.md"]
+)
+def test_results_are_not_written_over_by_a_named_file(tmp_path, name):
+    (tmp_path / "target.md").write_text("notes")
+    if name == "link.md":
+        (tmp_path / name).symlink_to(tmp_path / "target.md")
+    else:
+        check_writable(tmp_path / name, "--out")  # nothing is there yet
+        (tmp_path / name).write_text("{}")
+    with pytest.raises(InputError, match="--out: expected a file that is new"):
+        check_writable(tmp_path / name, "--out")
+    check_writable(tmp_path / "target.md", "--out")  # a table of an earlier time
 
 
 def test_files_of_operating_systems_are_no_entries(tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import (
@@ -245,8 +245,24 @@ MASKS = {
     ),
     "one bit": (saved(Image.fromarray(ON)), 255 * ON),
     "grey in opaque RGBA": (saved(picture("L").convert("RGBA")), np.array(picture("L"))),
-    "colours in opaque RGBA": (saved(picture("RGB").convert("RGBA")), 255 + 0 * NOISE[..., 0]),
+    "colours in opaque RGBA": (saved(picture("RGB").convert("RGBA")), np.array(picture("RGB")).max(axis=2)),
 }
+
+
+def test_a_comment_is_not_taken_for_the_transparent_level(tmp_path):
+    comment = PngImagePlugin.PngInfo()
+    comment.add_text("Comment", "a tRNS chunk follows")
+    path = tmp_path / "image.png"
+    picture("L").save(path, transparency=7, pnginfo=comment)
+    level = np.array(picture("L"))
+    assert np.array_equal(read_pixels(path)[..., 3], np.where(level == 7, 0, 255))
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB"])
+def test_an_opaque_alpha_channel_of_an_image_covers_it(tmp_path, mode):
+    """Its own, where no mask is named: brightness is no coverage."""
+    (tmp_path / "image.png").write_bytes(saved(picture(mode).convert("RGBA")))
+    assert (read_mask(tmp_path / "image.png", own=True) == 255).all()
 
 
 @pytest.mark.parametrize("name", MASKS)

@@ -301,6 +301,21 @@ def dataset(clip, tmp_path):
     return with_tracking(clip, tmp_path / "dataset")
 
 
+def test_a_model_of_somebody_else_is_not_overwritten(capture, tmp_path):
+    """A folder that the command wrote itself is continued."""
+    for name in ("mine", "theirs"):
+        settings = ExportColmapSettings(str(capture.union), str(tmp_path / name))
+        if name == "theirs":
+            (tmp_path / name / "images").mkdir(parents=True)
+            (tmp_path / name / "images" / "1.png").write_bytes(b"theirs")
+            with pytest.raises(
+                InputError, match="--out: expected a new folder, or one that this command wrote"
+            ):
+                export_colmap(settings, no_progress)
+        else:
+            assert export_colmap(settings, no_progress) == export_colmap(settings, no_progress)
+
+
 def test_flat_names_lie_where_other_readers_look(clip, tmp_path):
     out = with_tracking(clip, tmp_path / "flat", naming="flat")
     images = theirs(out).images.values()

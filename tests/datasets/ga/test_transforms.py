@@ -60,6 +60,8 @@ def test_any_value_of_a_frame_is_read_or_refused(capture, key, value):
         ({"distortion_params": [0.0, 0.1]}, "distortion_params"),
         ({"is_fisheye": True}, "is_fisheye"),
         ({"k1": "0.1"}, "k1"),
+        ({"K1": 0.1}, "K1"),
+        ({"dist_coeffs": [0.1, 0, 0, 0]}, "dist_coeffs"),
         ({"camera_model": "OPENCV", "k1": 0, "k2": 0.0, "p1": 0, "p2": 0, "is_fisheye": False}, None),
         ({"camera_model": "PINHOLE", "k3": None, "distortion_params": [0, 0, 0]}, None),
     ],

@@ -39,11 +39,28 @@ def test_flame_pickle(tmp_path, legacy):
         ("flame2023_no_jaw.pkl", "flame2023_no_jaw"),
         ("FLAME2020/male_model.pkl", "flame2020"),
         ("flame_2023/model.pkl", "flame2023"),
-        ("FLAME2023/generic_model.pkl", "flame2020"),
+        ("FLAME2020/generic_model.pkl", "flame2020"),
+        ("generic_model_20231005_flame2020.pkl", "flame2020"),
     ],
 )
 def test_version_by_name(name, version):
     assert flame_version(Path("some/where") / name) == version
+
+
+@pytest.mark.parametrize(
+    "name", ["FLAME2023/generic_model.pkl", "generic_20231005.pkl", "2020_to_2023.pkl", "FLAME_NEUTRAL.pkl"]
+)
+def test_version_is_not_guessed(name):
+    with pytest.raises(InputError, match="Rename the file"):
+        flame_version(Path("some/where") / name)
+
+
+def test_files_beside_what_a_link_leads_to_are_found(tmp_path):
+    path = write_stand_in(tmp_path / "real")
+    (tmp_path / "linked").mkdir()
+    link = tmp_path / "linked" / path.name
+    link.symlink_to(path)
+    assert load_head(link).fingerprint() == load_head(path).fingerprint()
 
 
 def test_version_is_asked_for_where_the_name_is_silent(tmp_path):
@@ -73,7 +90,8 @@ def test_what_belongs_to_a_flame_pickle_is_found(tmp_path, place):
     path = write_stand_in(tmp_path / "assets" / "FLAME2020", with_masks=False, with_eyelids=False)
     folder = path.parent / place
     write_stand_in(folder, "other.pkl")
-    (folder / "regions.json").write_text(json.dumps({"mole": [3, 1]}))
+    (path.parent / "regions.json").write_text(json.dumps({"mole": [3, 1]}))
+    (path.parent.parent / "regions.json").write_text(json.dumps({"countries": ["DE"]}))  # of something else
     head = load_head(path)
     np.testing.assert_array_equal(head.regions["lips"], masks()["lips"])
     np.testing.assert_array_equal(head.regions["mole"], [1, 3])

@@ -276,7 +276,7 @@ def test_other_frames_held_out_want_another_folder(make_run):
     [
         ({"methods": ("noting",)}, r"without timed\+1, timed\+1-4\."),
         ({"fractions": ("1",)}, r"without noting\+1-4, timed\+1-4\."),
-        ({"frames": 1}, "protocols: .* without"),
+        ({"frames": 1}, "protocol: expected .* another protocol"),
     ],
 )
 def test_points_that_are_there_are_not_left_out(make_run, plugin, less, found):

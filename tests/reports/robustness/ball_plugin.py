@@ -148,7 +148,7 @@ class SplattyMethod(BallMethod):
     avatar = staticmethod(Splatty)
 
 
-READER = DatasetSpec("balls", "balls", "ball_plugin:BallClip", find="ball_plugin:find", errors="")
+READER = DatasetSpec("balls", "balls", "ball_plugin:BallClip", find="ball_plugin:find")
 BALL, BURSTING, BROKEN, SPLATTY, LISTED = (
     MethodSpec(name, name, f"ball_plugin:{name.capitalize()}Method")
     for name in ("ball", "bursting", "broken", "splatty", "listed")
