@@ -485,13 +485,22 @@ def with_slashes(path: str) -> str:
 
 
 def is_system_file(name: str) -> bool:
-    """Whether an operating system or a tool left a file of that name, hidden ones like ``._a.png`` included."""
-    return name.startswith(".") or name.lower() in ("thumbs.db", "desktop.ini", "__macosx")
+    """Whether an operating system left a file of that name, as ``.DS_Store`` or ``._a.png``."""
+    return name.startswith("._") or name.lower() in (".ds_store", "thumbs.db", "desktop.ini", "__macosx")
 
 
 def entries(folder: Path, pattern: str = "*") -> list[Path]:
-    """What a folder holds that fits a pattern, sorted, without files of operating systems; [] where it is none."""
-    return sorted(path for path in folder.glob(pattern) if not is_system_file(path.name))
+    """What a folder holds that fits a pattern, sorted, without hidden files and files of operating systems.
+
+    For reading; empty where the folder does not exist.
+    """
+    return [path for path in user_files(folder, pattern) if not path.name.startswith(".")]
+
+
+def user_files(folder: Path, pattern: str = "*") -> list[Path]:
+    """As `entries`, with hidden files other than those of interrupted writes: what a command must not mix with."""
+    found = sorted(path for path in folder.glob(pattern) if not is_system_file(path.name))
+    return [path for path in found if not path.name.startswith(TEMPORARY)]
 
 
 def expand_home(text: str, source: str) -> str:

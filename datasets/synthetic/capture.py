@@ -29,7 +29,7 @@ from ...bench.errors import HeadbenchError, InputError
 from ...bench.executors.settings import Execution
 from ...bench.executors.task import TASK_LOG, Task
 from ...bench.io.documents import read_json
-from ...bench.io.files import entries, grouped_writes, write_bytes, write_json, write_text
+from ...bench.io.files import grouped_writes, user_files, write_bytes, write_json, write_text
 from ...bench.io.provenance import PATH_TRACED, xmp
 from ...bench.machine import processor_count
 from ...bench.start import end_with_parent, starting_workers
@@ -333,7 +333,7 @@ def _claim(out: Path, wanted: Mapping[str, Any]) -> None:
                 )
                 raise InputError(manifest, key, expected, f"{found.get(key)!r}", remedy)
     else:
-        if any(_is_foreign(path) for path in entries(out)):
+        if any(_is_foreign(path) for path in user_files(out)):
             raise InputError(out, "", "an empty folder or an earlier synthetic capture", "other files")
         write_json(manifest, wanted)
     if not readme.exists():

