@@ -87,8 +87,9 @@ def demo(settings: DemoSettings, progress: Progress) -> Findings:
 
 @dataclass(frozen=True)
 class SynthSettings(ExecutionOptions):
-    """Path-traced heads with expression-dependent wrinkles and blush, on NeRSemble's camera rig, with sequences
-    named as there. Frames already rendered with the same settings are kept.
+    """Ray-traced heads of people of all ages, lit by eight large panels, on NeRSemble's camera rig, with sequences named as
+    there. Skin folds and blushes with expressions, with hysteresis and delay. The same settings give the same bytes on
+    every processor; frames that exist are kept. Needs the compiled kernel.
     """
 
     out: str
@@ -115,10 +116,6 @@ class SynthSettings(ExecutionOptions):
     tracking_error: float = 0.0
     """Level of the errors that trackers make: shrunk and mixed expressions, drift; 1 is 0.5 to 1 mm on the face, 2 to 3 mm
     on lips and lids. 0 to 4."""
-    edition: Literal[1, 2] = 1
-    """1 has five distant lamps with hard shadows, and skin that follows the expression at once. 2 has eight large panels with
-    soft shadows and one bounce, folds that buckle, blood with delay, all ages, beards, glasses, hair in the tracked mesh, and
-    pictures whose bytes are the same on every processor; it needs the compiled kernel."""
 
 
 def synth(settings: SynthSettings, progress: Progress) -> Findings:

@@ -21,7 +21,7 @@ from .registry import resolve
 from .specs import MAX_LABEL
 
 OPENCV = "opencv-contrib-python-headless"
-RECORDED_PACKAGES = ("headbench", "torch", "gsplat", "numpy", OPENCV, "scikit-image", "mitsuba")
+RECORDED_PACKAGES = ("headbench", "torch", "gsplat", "numpy", OPENCV, "scikit-image")
 ACCELERATOR_FIELDS = ("name", "driver_version", "memory.total", "power.limit", "clocks.sm", "clocks.max.sm")
 RUSAGE_UNIT = 1 if sys.platform == "darwin" else 1024
 STATUS, RESET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")

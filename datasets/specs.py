@@ -33,7 +33,7 @@ MONOCULAR = DatasetSpec(
 
 SYNTHETIC = DatasetSpec(
     name="synthetic",
-    summary="A path-traced procedural head with exact tracking, written in the same layout.",
+    summary="A ray-traced procedural head with exact tracking, written in the same layout.",
     implementation="headbench.datasets.synthetic.capture:synthesize",
     reads=False,
     needs="headbench.datasets.synthetic.needs:needs",

@@ -157,7 +157,7 @@ def test_binary_files_are_read_where_sizes_are_checked(pattern):
     assert users <= READ_IN_ONE_PLACE[pattern]
 
 
-IMPORTED_IN_FUNCTIONS = {"drjit", "mitsuba", "nlopt", "pycolmap", "pymeshlab"}
+IMPORTED_IN_FUNCTIONS = {"nlopt", "pycolmap", "pymeshlab"}
 """Packages that only few commands use, each slow to import; not by any module, but by the functions that use them."""
 
 

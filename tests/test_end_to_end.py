@@ -1,4 +1,4 @@
-"""The main job on real input, small: a path-traced capture, all methods, every metric, tables and pictures.
+"""The main job on real input, small: a synthetic capture, all methods, every metric, tables and pictures.
 
 Then every command that the command line lists, over the folder of that run and from another directory.
 """

@@ -15,7 +15,7 @@ RENDER = "trainedAlgorithmicMedia"
 """Made by a model trained on recordings: a render of an avatar."""
 COMPOSITE = "compositeWithTrainedAlgorithmicMedia"
 """Renders beside other pictures: sheets, pages, videos with the captured image."""
-PATH_TRACED = "algorithmicMedia"
+SYNTHETIC = "algorithmicMedia"
 """Made by a program without training data: a synthetic capture."""
 
 _SCHEME = "http://cv.iptc.org/newscodes/digitalsourcetype/"

@@ -21,12 +21,13 @@ class Kernel:
     ----------
     module : absolute name of the module, built by ``bench/native/kernel.cmake``.
     label : what messages call it.
-    substitute : what is used where it is missing.
+    substitute : what is used where it is missing; "" for nothing, so that what needs the module is refused.
     """
 
-    def __init__(self, module: str, label: str, substitute: str) -> None:
-        self.module, self.label = module, label
-        self.remedy = f"Install a C++17 compiler and Python's headers, and reinstall headbench; {substitute}."
+    def __init__(self, module: str, label: str, substitute: str = "") -> None:
+        self.module, self.label, self.required = module, label, not substitute
+        remedy = "Install a C++17 compiler and Python's headers, and reinstall headbench"
+        self.remedy = f"{remedy}; {substitute}." if substitute else f"{remedy}."
 
     @cached_property
     def imported(self) -> ModuleType | ImportError:
@@ -50,9 +51,9 @@ class Kernel:
         return self.imported
 
     def need(self) -> Need:
-        """Whether this machine has it, for `MethodSpec.needs`; a substitute works meanwhile."""
+        """Whether this machine has it, for ``needs`` of a spec; not required where a substitute works meanwhile."""
         found = "" if isinstance(self.imported, ImportError) else ", ".join(self.instruction_sets) or "there"
-        return Need(self.label, found, self.remedy, required=False)
+        return Need(self.label, found, self.remedy, required=self.required)
 
     @cached_property
     def instruction_sets(self) -> tuple[str, ...]:

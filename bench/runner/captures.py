@@ -143,7 +143,10 @@ def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dic
         expected = "a folder, as only synthetic captures of the procedural head can be made again"
         raise InputError("--data", where, expected, "none", "Name the folder of the capture with --data.")
     return build_arguments(
-        make, {key: value for key, value in recorded.items() if key != "style"}, where, harness=given
+        make,
+        {key: value for key, value in recorded.items() if key not in ("style", "edition")},
+        where,
+        harness=given,
     )
 
 

@@ -246,7 +246,6 @@ def _lip_outline(head: HeadAsset, landmarks: Mapping[str, int], vertices: FloatA
 SKIN = ("#eac6b2", "#e2b49a", "#d3a083", "#b98363", "#8f5f43", "#6a4430")
 HAIR = ("#2a1d16", "#14100e", "#4a3020", "#7b5836", "#b08a56", "#8c4322", "#8f8a86")
 IRIS = ("#5b3a1e", "#3f6f8f", "#6d7f45", "#7d7468", "#3a2414")
-STYLES = ("short", "bob", "crop", "swept")
 
 
 def linear(color: str | FloatArray) -> FloatArray:
@@ -261,7 +260,7 @@ class Person:
     """Traits of one subject. Colours are linear-light RGB.
 
     ``freckles``, ``stubble`` and ``lines`` (how strongly skin folds) are in [0, 1]-ish shares; ``dynamics`` scales all
-    that expressions do to skin beyond moving it: 0 for nothing, 1 as drawn. The rest is the second edition's: ``lines_at_rest``,
+    that expressions do to skin beyond moving it: 0 for nothing, 1 as drawn. ``lines_at_rest``,
     ``sag`` and ``spots`` of age, and ``oil``, are in [0, 1]-ish shares; ``recession`` of the hairline and length of the
     ``beard`` in metres; ``glasses`` are "metal", "plastic" or none.
     """
@@ -285,32 +284,3 @@ class Person:
     recession: float = 0.0
     beard: float = 0.0
     glasses: str = ""
-
-
-def person(name: str, index: int, seed: int, dynamics: float = 1.0) -> Person:
-    """Draw subject number ``index`` of a capture made with ``seed``.
-
-    Tones and hair styles walk through their lists, so that a few subjects already differ; the rest is drawn.
-    """
-    rng = np.random.default_rng([seed, index])
-    start = int(np.random.default_rng([seed]).integers(0, 6))
-    tone = (start + 2 * index + index // 3) % len(SKIN)
-    skin = linear(SKIN[tone]) * rng.uniform(0.95, 1.05, 3)
-    # Darker skin goes with darker hair and eyes more often than not.
-    hair = linear(HAIR[rng.integers(0, 2 if tone >= 4 else len(HAIR))]) * rng.uniform(0.85, 1.15)
-    iris = linear(IRIS[rng.choice([0, 4] if tone >= 4 else len(IRIS))])
-    lips = skin * np.array([0.86, 0.50, 0.50]) * rng.uniform(0.9, 1.1)
-    return Person(
-        name=name,
-        seed=int(rng.integers(1, 2**31)),
-        skin=skin,
-        lips=lips,
-        hair=hair,
-        iris=iris,
-        style=STYLES[(index + start) % len(STYLES)],
-        brow_thickness=float(rng.uniform(0.85, 1.25)),
-        freckles=float(rng.choice([0.0, 0.3, 1.0])) if tone < 3 else 0.0,
-        stubble=float(rng.choice([0.0, 0.5, 1.0])),
-        lines=float(rng.uniform(0.85, 1.25)),
-        dynamics=dynamics,
-    )

@@ -3,9 +3,7 @@
 A folder belongs to one set of settings. Each image is written whole or not at all and depends on nothing but
 those settings, so a killed run continues where it stopped and ends with the same capture.
 
-Everything but the pictures has the same bytes on every x86-64 machine (see `rounding`). So do the pictures
-of edition 2, by the light of `panels`. Those by lamps have them with any number of threads and whatever numpy, BLAS, torch and libm use, but
-not on every kind of processor: see `renderer`.
+Every file has the same bytes on every x86-64 machine, with any number of threads (see `rounding` and `panels`).
 """
 
 from __future__ import annotations
@@ -30,13 +28,13 @@ from ...bench.executors.settings import Execution
 from ...bench.executors.task import TASK_LOG, Task
 from ...bench.io.documents import read_json
 from ...bench.io.files import grouped_writes, user_files, write_bytes, write_json, write_text
-from ...bench.io.provenance import PATH_TRACED, xmp
+from ...bench.io.provenance import SYNTHETIC, xmp
 from ...bench.machine import processor_count
 from ...bench.start import end_with_parent, starting_workers
 from ..images import is_whole
-from . import panels, renderer
+from .panels import KERNEL, default_samples, sample_count
 from .performance import KINDS, Kind, share_out
-from .plan import EDITIONS, SERIALS, Edition, SubjectPlan, SynthSettings, load_geometry, plan_subject
+from .plan import SERIALS, SubjectPlan, SynthSettings, load_geometry, plan_subject
 from .renderer import CaptureRenderer
 
 MANIFEST, MARK = "synthesis.json", "provenance.xmp"
@@ -66,7 +64,6 @@ def synthesize(
     performance: Kind = "full",
     dynamics: float = 1.0,
     tracking_error: float = 0.0,
-    edition: Edition = 1,
     pictures: str | Path | None = None,
     workers: int | None = None,
     execution: Execution | None = None,
@@ -86,8 +83,6 @@ def synthesize(
     samples_per_pixel : rounded up to a count that the sampler takes; by default enough for 40 dB between two
         renders of a frame.
     tracking_error : level of the errors that trackers make, see `tracking.with_tracking_error`; 0 to 4.
-    edition : 1 has five distant lamps without a bounce, as Mitsuba renders them. 2 has eight large ones and one bounce, see
-        `panels`, skin with a `history`, `people` of all ages, and hair in the tracked mesh, see `volume`.
     performance : see `performance.Kind`; with less than all of it, captures for which less has to be modelled.
     dynamics : scales wrinkles and blush, 0 to 3: 0 leaves skin as it is at rest, wherever it moves.
     pictures : folder of an earlier capture that differs in its tracking alone: its pictures are linked (copied where links
@@ -101,14 +96,11 @@ def synthesize(
         Before rendering, for settings out of range, a folder that holds a capture of other settings, and ``pictures`` of
         other settings or not whole.
     UnavailableError
-        For edition 2 where the compiled kernel is missing.
+        Where the compiled kernel is missing.
     HeadbenchError
         A task of ``execution`` failed.
     """
-    counts = panels if edition == 2 else renderer
-    samples = (
-        counts.default_samples(*size) if samples_per_pixel is None else counts.sample_count(samples_per_pixel)
-    )
+    samples = default_samples(*size) if samples_per_pixel is None else sample_count(samples_per_pixel)
     pixels = (size[0], size[1])
     settings = SynthSettings(
         subjects,
@@ -122,11 +114,9 @@ def synthesize(
         performance,
         dynamics,
         tracking_error,
-        edition,
     )
     _check(settings)
-    if edition == 2:
-        panels.KERNEL.load()
+    KERNEL.load()
     geometry = load_geometry(head)
     out = Path(out)
     wanted = _manifest(settings, geometry.head.fingerprint())
@@ -269,7 +259,6 @@ def _check(settings: SynthSettings) -> None:
         ("--cameras", 2 <= count <= most, f"2 to {most}, as the frontal one is held out", count),
         ("--performance", settings.performance in KINDS, f"one of {kinds}", repr(settings.performance)),
         ("--dynamics", 0.0 <= settings.dynamics <= 3.0, "0 to 3", settings.dynamics),
-        ("--edition", settings.edition in EDITIONS, "1 or 2", settings.edition),
         ("--size", min(size) >= 16, "at least 16 pixels each way", "x".join(map(str, size))),
         ("--tracking-error", np.isfinite(error) and 0.0 <= error <= 4.0, "0 to 4", error),
         ("--tracking-noise", np.isfinite(noise) and noise >= 0.0, "a number from 0 up", noise),
@@ -339,7 +328,7 @@ def _claim(out: Path, wanted: Mapping[str, Any]) -> None:
     if not readme.exists():
         write_text(readme, _README)
     if not (out / MARK).exists():
-        write_text(out / MARK, xmp(PATH_TRACED))
+        write_text(out / MARK, xmp(SYNTHETIC))
 
 
 def _is_foreign(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""State of the skin over a sequence, in the second edition: hysteresis of folds, delay of blood flow, lips that dry.
+"""State of the skin over a sequence: hysteresis of folds, delay of blood flow, lips that dry.
 
 A state is a function of the exact controls of a sequence up to its moment, which begins at rest, and of nothing that a tracker
 stores: tracked parameters alone do not determine it.
@@ -15,7 +15,7 @@ from ...bench.contracts import FloatArray
 from ..rounding import COEFFICIENT_BITS, on_grid
 from .anatomy import SIDES, Person
 from .performance import Activations
-from .skin import FLUSHES, FOLDS, flush_strengths, fold_strengths
+from .skin import FLUSHES, FOLDS, flush_strengths
 
 BUCKLES = (0.30, 0.55)
 """Range of the strength at which a fold buckles, drawn for each subject and fold."""
@@ -39,11 +39,6 @@ class SkinState:
     folds: FloatArray
     flushes: FloatArray
     wet: float = 0.0
-
-
-def at_once(activations: Activations) -> SkinState:
-    """The state of skin that follows the controls without hysteresis or delay: the first edition's."""
-    return SkinState(fold_strengths(activations), flush_strengths(activations))
 
 
 def over_time(activations: Sequence[Activations], seconds: float, person: Person) -> list[SkinState]:

@@ -1,4 +1,4 @@
-"""Who is recorded in the second edition: every tone of skin, age, hair style and beard, with glasses or without."""
+"""Who is recorded: every tone of skin, age, hair style and beard, with glasses or without."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def _spread(seed: int, index: int) -> FloatArray:
     return (tenths + rng.random((_BLOCK, _TRAITS)))[index % _BLOCK] / _BLOCK
 
 
-def person_of_any_age(name: str, index: int, seed: int, dynamics: float = 1.0) -> Person:
-    """Draw subject number ``index`` of a capture of the second edition made with ``seed``."""
+def draw_person(name: str, index: int, seed: int, dynamics: float = 1.0) -> Person:
+    """Draw subject number ``index`` of a capture made with ``seed``."""
     rng = np.random.default_rng([seed, index, 22])
     tone, years, style, growth, eyewear = _spread(seed, index)
     age = AGES[0] + (AGES[1] - AGES[0]) * years

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,10 +20,10 @@ from ..head.ict import expression_names, ict_head, is_ict
 from ..head.model import HeadModel
 from ..head.procedural.model import procedural_head
 from ..rounding import ANGLE_BITS, COEFFICIENT_BITS, LENGTH_BITS, on_grid
-from .anatomy import Anatomy, Person, measure, person
+from .anatomy import Anatomy, Person, measure
 from .hair import STYLES, Style
 from .parts import MouthPart, procedural_parts, share_that_shows, tongue
-from .people import person_of_any_age
+from .people import draw_person
 from .performance import (
     HELD_OUT,
     ICT_TARGETS,
@@ -45,8 +45,8 @@ _IDENTITY_SPREAD = 0.65  # standard deviations of the identity basis; 1 would dr
 _LOOK_BELOW = 0.004  # metres below the middle of the head
 
 
-Edition = Literal[1, 2]
-EDITIONS: tuple[Edition, ...] = get_args(Edition)
+EDITION = 2
+"""Of what a capture shows, recorded with it: captures of one edition and the same settings have the same content."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,11 @@ class SynthSettings:
     performance: Kind = "full"
     dynamics: float = 1.0
     tracking_error: float = 0.0
-    edition: Edition = 1
 
     def described(self) -> dict[str, Any]:
         """The settings for records; those that came later are left out where they have their default."""
-        described = asdict(self)
-        usual = {"performance": "full", "dynamics": 1.0, "tracking_error": 0.0, "edition": 1}
+        described = {**asdict(self), "edition": EDITION}
+        usual = {"performance": "full", "dynamics": 1.0, "tracking_error": 0.0}
         for name, value in usual.items():
             if described[name] == value:
                 del described[name]
@@ -104,8 +103,7 @@ class SubjectPlan:
 def plan_subject(out: Path, index: int, geometry: Geometry, settings: SynthSettings) -> SubjectPlan:
     """Plan subject number ``index``: nothing is rendered or written."""
     name = f"{FIRST_SUBJECT + index}"
-    draw = person if settings.edition == 1 else person_of_any_age
-    who = draw(name, index, settings.seed, settings.dynamics)
+    who = draw_person(name, index, settings.seed, settings.dynamics)
     rng = np.random.default_rng([settings.seed, index, 3])
     head = geometry.head
     drawn = rng.standard_normal(head.shape_basis.shape[2]) * _IDENTITY_SPREAD
@@ -136,14 +134,11 @@ def plan_subject(out: Path, index: int, geometry: Geometry, settings: SynthSetti
     )
     every = [pose for sequence in tracked_by_name.values() for pose in sequence]
     tracked = iter(with_tracking_noise(every, settings.tracking_noise, settings.seed + 101 * index))
-    offset: FloatArray = np.zeros(head.template.shape)
-    if settings.edition == 2:
-        offset = tracked_volume(who, anatomy, head, neutral)
     plan = CapturePlan(
         subject=name,
         head=head,
         shape=shape,
-        static_offset=offset,
+        static_offset=tracked_volume(who, anatomy, head, neutral),
         cameras=list(views.values()),
         sequences=[
             SequencePlan(sequence, [next(tracked) for _ in exact], performed[sequence].excluded)
@@ -190,14 +185,6 @@ _FRAME_WIDTH = 0.270
 _SPREAD = (8, 0, 15, 3, 12, 6, 5, 10, 1, 14, 7, 9, 2, 13, 4, 11)
 
 
-@dataclass(frozen=True, eq=False)
-class Light:
-    """A distant lamp: unit direction towards it, (3,), and linear RGB irradiance, (3,)."""
-
-    direction: FloatArray
-    irradiance: FloatArray
-
-
 def cameras(count: int, width: int, height: int, target: FloatArray, seed: int = 0) -> dict[str, Camera]:
     """``count`` cameras by serial, in canonical order, looking at ``target`` (3,).
 
@@ -239,26 +226,6 @@ def _look_at(azimuth: float, elevation: float, target: FloatArray) -> FloatArray
     # Along the rounded axis, and summed in one order: the JSONs state these numbers to the last digit.
     matrix[:3, 3] = -(rotation * (target - CAMERA_DISTANCE * rotation[2])).sum(axis=1) + 0.0
     return matrix
-
-
-def lights() -> tuple[Light, ...]:
-    """Five lamps: key, fill, one from the camera's side, and two from behind that draw the outline.
-
-    Five because the default 25 samples per pixel fall evenly on them (see `renderer.SAMPLE_COUNTS`).
-    """
-    placed = (
-        ((-38.0, 38.0), 1.9, (1.0, 0.97, 0.93)),
-        ((42.0, 20.0), 1.35, (0.96, 0.98, 1.0)),
-        ((3.0, 2.0), 1.15, (1.0, 1.0, 1.0)),
-        ((-105.0, 30.0), 0.95, (1.0, 0.98, 0.96)),
-        ((112.0, 45.0), 1.05, (0.97, 0.98, 1.0)),
-    )
-    made = []
-    for (azimuth, elevation), strength, tint in placed:
-        a, e = np.radians(azimuth), np.radians(elevation)
-        direction = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
-        made.append(Light(direction, strength * np.array(tint)))
-    return tuple(made)
 
 
 PROCEDURAL = ("procedural", "procedural2020", "procedural2023")

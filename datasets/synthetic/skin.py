@@ -6,7 +6,6 @@ Painting is a function of the neutral shape and the subject's traits alone; what
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -271,34 +270,6 @@ FLUSHES = {
     "anger": (1.04, 0.84, 0.85),
     "nose": (1.04, 0.80, 0.82),
 }
-
-
-def fold_strengths(a: Activations) -> FloatArray:
-    """(G,) activation of each group of folds, from semantic controls."""
-    smile = {side: np.clip(a[f"smile_{side}"], 0.0, 1.2) for side in SIDES}
-    raised = {side: a[f"cheek_raise_{side}"] for side in SIDES}
-    squint = {side: max(a[f"squint_{side}"], 0.7 * smile[side], raised[side]) for side in SIDES}
-    sneer = 0.5 * (a["nose_sneer_left"] + a["nose_sneer_right"])
-    strengths: Mapping[str, float] = {
-        "forehead_mid": max(a["brow_inner_up"], 0.0),
-        "forehead_left": max(a["brow_outer_up_left"], 0.0),
-        "forehead_right": max(a["brow_outer_up_right"], 0.0),
-        "glabella": 0.5 * (a["brow_down_left"] + a["brow_down_right"]) + 0.35 * sneer,
-        **{f"crow_{side}": squint[side] for side in SIDES},
-        **{
-            f"nasolabial_{side}": smile[side]
-            + 0.7 * a[f"nose_sneer_{side}"]
-            + 0.35 * a[f"mouth_stretch_{side}"]
-            for side in SIDES
-        },
-        "bunny": sneer,
-        **{f"under_eye_{side}": squint[side] for side in SIDES},
-        "chin": max(a["chin_raise"], 0.8 * a["lip_press"], 0.6 * a["mouth_frown"]),
-        **{f"dimple_{side}": smile[side] for side in SIDES},
-        "lip_lines": a["pucker"],
-        "neck": 0.5 * (a["mouth_stretch_left"] + a["mouth_stretch_right"]),
-    }
-    return np.clip([strengths[name] for name in FOLDS], 0.0, 1.3)
 
 
 def flush_strengths(a: Activations) -> FloatArray:

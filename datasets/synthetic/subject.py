@@ -15,7 +15,7 @@ from ..head.rotations import axis_angle_to_matrix
 from .anatomy import SIDES, Anatomy, Person, measure
 from .glasses import make_glasses
 from .hair import RootedStrands, ear_share, make_beard, make_brows_and_lashes, make_hair
-from .history import SkinState, at_once
+from .history import SkinState
 from .parts import eye_mesh, tracked_parts
 from .performance import Activations
 from .plan import Geometry
@@ -108,10 +108,9 @@ class RenderedSubject:
             return self._model(shape=torch.from_numpy(self.shape), **arguments)[0].numpy()
 
     def posed_meshes(
-        self, pose: HeadPose, activations: Activations, skin: SkinState | None = None
+        self, pose: HeadPose, activations: Activations, state: SkinState
     ) -> dict[str, PosedMesh]:
-        """All meshes in a pose; wrinkles and colour are those of the state given, or follow ``activations`` at once."""
-        state = skin or at_once(activations)
+        """All meshes in a pose, with the tongue of the ``activations``, and wrinkles and colour of a state of skin."""
         tracked = self.tracked(pose)
         joints = self._joint_motions(pose)
         points = self._fine.positions(tracked)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
@@ -71,9 +71,6 @@ class SuiteSettings(ExecutionOptions):
 
     size: str = "144x208"
     """Width x height of the images in pixels."""
-
-    edition: Literal[2, 1] = 2
-    """As for `headbench synth`."""
 
     tracking_error: float = 1.0
     """As for `headbench synth`."""

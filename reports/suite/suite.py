@@ -70,7 +70,6 @@ def run_suite(settings: SuiteSettings, progress: Progress) -> Findings:
         size=parse_size(settings.size),
         seed=SEED,
         performance="parts",
-        edition=settings.edition,
         tracking_error=settings.tracking_error,
         execution=execution,
         progress=progress,

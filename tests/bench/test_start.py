@@ -176,9 +176,7 @@ COMMAND_LINE = {"numpy", "tyro", "yaml", "headbench.bench.commands"}
 USED_BY_COMMANDS = {
     *(
         "cv2",
-        "drjit",
         "matplotlib",
-        "mitsuba",
         "nlopt",
         "pandas",
         "PIL",

@@ -48,7 +48,7 @@ def test_one_frame_is_learnt_by_heart(clip, tmp_path, spec, iterations, enough_d
     [(GBS, 136, 500, {}), (GHA, 138, 600, {"expression_noise": 0.0}), (INSTA, 136, 600, {})],
     ids=lambda value: getattr(value, "name", None),
 )
-def test_single_frame_overfit_of_a_path_traced_capture(tmp_path, spec, height, iterations, settings):
+def test_single_frame_overfit_of_a_synthetic_capture(tmp_path, spec, height, iterations, settings):
     """Adapted to each method."""
     (union,) = synthesize(tmp_path / "capture", cameras=2, timesteps=8, size=(96, height), workers=1)
     clip = read_capture(union)

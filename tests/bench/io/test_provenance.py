@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from headbench.bench.io.images import read_png, write_png
-from headbench.bench.io.provenance import COMPOSITE, PATH_TRACED, RENDER, mark_png, note
+from headbench.bench.io.provenance import COMPOSITE, RENDER, SYNTHETIC, mark_png, note
 from headbench.bench.io.video import write_webm
 from headbench.methods.gaussian_ply.formats import STANDARD
 from headbench.methods.shared.ply import read_ply, write_ply
@@ -36,7 +36,7 @@ def pixels():
     return np.random.default_rng(0).integers(0, 256, (12, 9, 3), dtype=np.uint8)
 
 
-@pytest.mark.parametrize("kind", [RENDER, COMPOSITE, PATH_TRACED])
+@pytest.mark.parametrize("kind", [RENDER, COMPOSITE, SYNTHETIC])
 def test_marks_stand_beside_unchanged_pixels(tmp_path, pixels, kind):
     write_png(tmp_path / "a.png", pixels, kind)
     assert source_of(tmp_path / "a.png") == (f"headbench {version('headbench')}", TERMS + kind)

@@ -106,7 +106,7 @@ def test_no_camera_of_a_healthy_capture_is_blamed(cameras, seed, noise, tracking
 
 
 @pytest.mark.slow
-def test_no_camera_of_a_path_traced_capture_is_blamed(tmp_path):
+def test_no_camera_of_a_synthetic_capture_is_blamed(tmp_path):
     synthesize(
         tmp_path,
         cameras=4,

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
+from headbench.datasets.synthetic.history import over_time
+from headbench.datasets.synthetic.panels import default_samples
 from headbench.datasets.synthetic.performance import CONTROLS
 from headbench.datasets.synthetic.plan import SynthSettings, load_geometry, plan_subject
-from headbench.datasets.synthetic.renderer import default_samples
 from headbench.datasets.synthetic.subject import RenderedSubject
 
 
@@ -31,6 +32,11 @@ def subject(plan):
 @pytest.fixture
 def rest():
     return dict.fromkeys(CONTROLS, 0.0)
+
+
+def settled(controls, person):
+    """The state of the skin of a person who has held an expression for a minute."""
+    return over_time([controls], 60.0, person)[0]
 
 
 def hull_faces(points):

@@ -8,8 +8,9 @@ import pytest
 from headbench.bench.contracts import Camera
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.mesh_pictures import rasterize_mesh
-from headbench.datasets.synthetic.anatomy import front_depth, measure, person
+from headbench.datasets.synthetic.anatomy import front_depth, measure
 from headbench.datasets.synthetic.parts import HIDES, share_that_shows
+from headbench.datasets.synthetic.people import draw_person
 from headbench.datasets.synthetic.plan import load_geometry
 
 ICT = Path(__file__).parents[3].parent / "shared/data/ict_facekit/ict_facekit_f16.npz"
@@ -19,7 +20,7 @@ def mouth_of(geometry, seed, shape):
     """Parts in the mouth, anatomy and neutral mesh of a subject."""
     neutral = PosedSubject(geometry.head, shape, np.zeros_like(geometry.head.template)).neutral
     anatomy = measure(geometry.head, neutral)
-    return geometry.mouth(person("900", 0, seed), anatomy, shape), anatomy, neutral
+    return geometry.mouth(draw_person("900", 0, seed), anatomy, shape), anatomy, neutral
 
 
 @pytest.mark.parametrize("share", [0.5, 0.75, 1.0])

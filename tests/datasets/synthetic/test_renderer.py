@@ -9,9 +9,10 @@ from skimage.data import lbp_frontal_face_cascade_filename
 from skimage.draw import polygon2mask
 from skimage.feature import Cascade
 
-from headbench.datasets.synthetic.panels import KERNEL
 from headbench.datasets.synthetic.plan import FRONTAL, SynthSettings, plan_subject
 from headbench.datasets.synthetic.renderer import CaptureRenderer
+
+from .conftest import settled
 
 
 @pytest.fixture(scope="module")
@@ -42,20 +43,24 @@ def test_mask_is_clean(renderer, plan):
     solid = mask > 127
     outline = binary_dilation(solid, iterations=2) & ~binary_erosion(solid, iterations=2, border_value=1)
     partial = (mask > 0) & (mask < 255)
-    assert (partial & ~outline).sum() < 0.1 * partial.sum()
+    assert (partial & ~outline).sum() < 0.25 * partial.sum()  # the background shows through curls
     assert picture[mask == 255].max(1).mean() < 235
 
 
-@pytest.mark.parametrize("size", [(72, 104), (69, 100)])  # the shapes of 144 x 208 and of 550 x 802
-def test_every_camera_holds_the_whole_head_with_a_margin(geometry, rest, size):
-    plan = plan_subject(Path("unused"), 0, geometry, SynthSettings(1, 16, 8, size, "procedural", 0, 0.0, 9))
-    assert plan.person.style == "bob"  # the widest hair
+@pytest.mark.parametrize(
+    ("size", "index", "style"),  # the shapes of 144 x 208 and of 550 x 802, the widest hair and the longest
+    [((72, 104), 0, "curly"), ((69, 100), 7, "long")],
+)
+def test_every_camera_holds_the_whole_head_with_a_margin(geometry, rest, size, index, style):
+    settings = SynthSettings(8, 16, 8, size, "procedural", 0, 0.0, 9)
+    plan = plan_subject(Path("unused"), index, geometry, settings)
+    assert plan.person.style == style
     renderer = CaptureRenderer(plan)
-    renderer.set_pose(plan.geometry.translation.pose(rest, "900", None), rest)
+    renderer.set_pose(plan.geometry.translation.pose(rest, "900", None), rest, settled(rest, plan.person))
     for camera in plan.cameras:
         _, mask = renderer.render(camera, 1)
         assert mask[: size[1] // 20].max() == 0, camera
-        assert max(mask[:, :2].max(), mask[:, -2:].max()) == 0, camera
+        assert mask[:, [0, -1]].max() < 10, camera
         # The bust is cut by the frame, not by its own end.
         assert (mask[-1] > 200).sum() > size[0] // 8, camera
 
@@ -97,40 +102,30 @@ def test_expression_is_seen_in_the_picture(renderer, plan):
     raised = {**rest, "brow_inner_up": 1.0, "brow_outer_up_left": 1.0, "brow_outer_up_right": 1.0}
     pictures = []
     for activations in (rest, raised):
-        renderer.set_pose(pose, activations)
+        renderer.set_pose(pose, activations, settled(activations, plan.person))
         pictures.append(renderer.render(FRONTAL, 1)[0].astype(int))
     assert (np.abs(pictures[0] - pictures[1]).max(2) >= 6).sum() >= 10
 
 
-NEEDS_KERNEL = pytest.mark.skipif(not KERNEL.instruction_sets, reason="no kernel")
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("edition", "seed", "subjects", "moments", "samples", "factor", "least"),
-    [
-        (1, 0, 4, range(8), 25, 1.2, 0.95),
-        # Not tuned on this seed. Of its first six moments' 60 frames two are missed: a beard, mouth open.
-        pytest.param(2, 4700, 10, (0, 2, 6), 9, 1.08, 0.95, marks=NEEDS_KERNEL),
-    ],
-)
-def test_a_detector_finds_the_face(geometry, edition, seed, subjects, moments, samples, factor, least):
-    """scikit-image's LBP cascade, trained on photographs, finds the one face in most frames."""
+def test_a_detector_finds_the_face(geometry):
+    """scikit-image's LBP cascade, trained on photographs, finds the one face in most frames.
+
+    The skin was not tuned on this seed. Of its first six moments' 60 frames two are missed: a beard, mouth open.
+    """
     detector = Cascade(lbp_frontal_face_cascade_filename())
     found = []
-    for index in range(subjects):
-        settings = SynthSettings(
-            subjects, 2, 8, (275, 401), "procedural", seed, 0.0, samples, edition=edition
-        )
+    for index in range(10):
+        settings = SynthSettings(10, 2, 8, (275, 401), "procedural", 4700, 0.0, 9)
         plan = plan_subject(Path("unused"), index, geometry, settings)
         renderer = CaptureRenderer(plan)
         every = list(plan.moments())
-        for sequence, timestep in (every[moment] for moment in moments):
+        for sequence, timestep in (every[moment] for moment in (0, 2, 6)):
             renderer.pose_at(sequence, timestep)
             picture, _ = renderer.render(FRONTAL, 1)
             boxes = detector.detect_multi_scale(
-                img=picture, scale_factor=factor, step_ratio=1, min_size=(120, 120), max_size=(260, 260)
+                img=picture, scale_factor=1.08, step_ratio=1, min_size=(120, 120), max_size=(260, 260)
             )
             middles = [(box["c"] + box["width"] / 2, box["r"] + box["height"] / 2) for box in boxes]
             found.append(bool(middles) and all(abs(x - 137) < 40 and 110 < y < 270 for x, y in middles))
-    assert np.mean(found) >= least, found
+    assert np.mean(found) >= 0.95, found

@@ -10,7 +10,7 @@ from headbench.bench.runner.config import resolve_method
 from headbench.reports.suite import suite as module
 from headbench.reports.suite.command import ABLATIONS
 
-SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16x16", "--edition", "1")
+SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16x16")
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The whole detector on a path-traced subject that no constant was chosen on, with 1 mm of tracking error."""
+"""The whole detector on a synthetic subject that no constant was chosen on, with 1 mm of tracking error."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def with_tracking_error(clip, rms_mm, seed=0):
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_path_traced_subject_is_decided_as_labelled(tmp_path):
+def test_a_synthetic_subject_is_decided_as_labelled(tmp_path):
     (union,) = synthesize(tmp_path, cameras=2, timesteps=40, size=(96, 136), seed=50, workers=1)
     clip = read_capture(union)
     labelled = {key.timestep for key in clip.excluded}

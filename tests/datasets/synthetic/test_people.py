@@ -1,4 +1,4 @@
-"""People, skin and tracked mesh of the second edition."""
+"""People, the skin's history, the tracked mesh."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,15 +12,17 @@ from headbench.datasets.head.model import HeadModel
 from headbench.datasets.synthetic.anatomy import linear
 from headbench.datasets.synthetic.hair import STYLES
 from headbench.datasets.synthetic.history import coupled_strengths, over_time
-from headbench.datasets.synthetic.people import person_of_any_age
+from headbench.datasets.synthetic.people import draw_person
 from headbench.datasets.synthetic.plan import SynthSettings, plan_subject
 from headbench.datasets.synthetic.skin import FLUSHES, FOLDS
 from headbench.datasets.synthetic.subject import RenderedSubject
 
+from .conftest import settled
+
 
 @pytest.mark.parametrize("seed", [0, 7, 14])
 def test_ten_subjects_are_of_all_kinds(seed):
-    people = [person_of_any_age(str(index), index, seed) for index in range(10)]
+    people = [draw_person(str(index), index, seed) for index in range(10)]
     assert {who.style for who in people} == set(STYLES)
     assert {"", "metal", "plastic"} == {who.glasses for who in people}
     assert 2 <= sum(who.beard > 0 for who in people) <= 6
@@ -37,7 +39,7 @@ def test_ten_subjects_are_of_all_kinds(seed):
 @pytest.fixture(scope="module")
 def bearded(geometry):
     """A subject with everything that there is."""
-    settings = SynthSettings(1, 2, 8, (48, 70), "procedural", 0, 0.0, 16, edition=2)
+    settings = SynthSettings(1, 2, 8, (48, 70), "procedural", 0, 0.0, 16)
     plan = plan_subject(Path("unused"), 0, geometry, settings)
     return replace(plan, person=replace(plan.person, beard=0.015, glasses="plastic", sag=1.0))
 
@@ -113,7 +115,7 @@ def test_beard_and_glasses_lie_on_the_face_and_move_with_it(bearded, rest):
     subject = RenderedSubject(bearded.person, bearded.geometry, bearded.shape)
     assert {"beard", "glasses"} <= subject.rest_meshes().keys()
     pose = bearded.geometry.translation.pose(rest, "900", 0)
-    calm = subject.posed_meshes(pose, rest)
+    calm = subject.posed_meshes(pose, rest, settled(rest, bearded.person))
     skin = calm["skin"].vertices
     assert cKDTree(skin).query(calm["beard"].vertices)[0].max() < 0.025
     assert 0.001 < cKDTree(skin).query(calm["glasses"].vertices)[0].max() < 0.04
@@ -121,7 +123,8 @@ def test_beard_and_glasses_lie_on_the_face_and_move_with_it(bearded, rest):
     middle = np.abs(calm["beard"].vertices - mouth)[:, :2] < np.array([0.012, 0.002])
     assert middle.all(axis=1).mean() < 0.002  # hardly any hair lies over the lips
     opened = {**rest, "jaw_open": 1.0}
-    moved = subject.posed_meshes(bearded.geometry.translation.pose(opened, "900", 0), opened)
+    pose = bearded.geometry.translation.pose(opened, "900", 0)
+    moved = subject.posed_meshes(pose, opened, settled(opened, bearded.person))
     fall = calm["beard"].vertices[:, 1] - moved["beard"].vertices[:, 1]
     assert np.percentile(fall, 90) > 0.01
     np.testing.assert_array_equal(moved["glasses"].vertices, calm["glasses"].vertices)
@@ -131,7 +134,9 @@ def test_stretched_skin_shines_more(bearded, rest):
     subject = RenderedSubject(bearded.person, bearded.geometry, bearded.shape)
     puffed = {**rest, "cheek_puff": 1.0}
     gloss = [
-        subject.posed_meshes(bearded.geometry.translation.pose(a, "900", 0), a)["skin"].gloss
+        subject.posed_meshes(bearded.geometry.translation.pose(a, "900", 0), a, settled(a, bearded.person))[
+            "skin"
+        ].gloss
         for a in (rest, puffed)
     ]
     cheek = np.linalg.norm(subject._rest_points - subject.anatomy["left_cheek"], axis=1) < 0.025
