@@ -181,7 +181,7 @@ def content(path):
     return path.read_bytes()
 
 
-def test_a_small_capture_has_the_bytes_that_it_has_on_every_machine(capture):
+def test_a_small_capture_has_the_same_bytes_on_every_machine(capture):
     """A change of what captures show is a new `EDITION`, with new digests here. XMP states headbench's version."""
     out, found = capture[0], {}
     for path in sorted(path for path in out.rglob("*.*") if path.suffix != ".xmp"):
