@@ -23,11 +23,8 @@ from ..shared.avatar_files import SUBJECT_FILE, RefinedTracking, read_shared_hea
 from ..shared.device_frame import to_device
 from ..shared.rendering import Drawn, LastPose, PosedSplats, posed_splats, read_back
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
-from ..shared.threads import torch_on_one_thread
-from . import kernel
 from .config import GHAConfig
-from .device_frame import DeviceSplats
-from .driving import Driver, code_size
+from .driving import Driver, HeadMotion, code_size
 from .gaussian_head import POINTS, FeatureSplats, GaussianHead
 
 DRIVING_FILE = "driving.npz"
@@ -56,8 +53,8 @@ class GHAAvatar:
         self._tensors, self._corrected = tensors, corrected
         self._last = LastPose(self._computed)
         self._ground = tensors["background"].cpu().numpy()
-        on_device = tensors["points"].device.type != "cpu"
-        self._on_device = DeviceSplats(head, tensors) if on_device else None
+        with torch.no_grad():
+            self._inputs = head.inputs(tensors)
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GHAAvatar:
@@ -85,8 +82,7 @@ class GHAAvatar:
         the difference to the one asked for is added.
         """
         trained = self._tensors["background"]
-        with torch_on_one_thread(kernel.available()):
-            drawn = self._head.draw(self._posed(pose), camera, trained)
+        drawn = self._head.draw(self._posed(pose), camera, trained)
         image = self._head.sharpen(self._tensors, drawn, trained, bounded=True)
         image = image[: camera.height, : camera.width]
         alpha = drawn.alpha
@@ -117,9 +113,15 @@ class GHAAvatar:
     def _computed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> FeatureSplats:
         signal = self._driver.signals(self._driver.arguments([pose]))[0]
         motion = self._driver.motion(signal)
-        if self._on_device is not None:
-            return self._on_device(signal, motion)
-        return self._head.splats(self._tensors, signal, motion)
+        # One vector, so that one copy takes it to a device.
+        parts = signal.expression, *motion
+        numbers = to_device(
+            torch.cat([part.flatten() for part in parts]).numpy(), self._tensors["points"].device
+        )
+        sent = numbers.split([part.numel() for part in parts])
+        expression, *moved = (values.view(part.shape) for values, part in zip(sent, parts))
+        signal, motion = signal._replace(expression=expression), HeadMotion(*moved)
+        return self._head.splats(self._tensors, signal, motion, inputs=self._inputs)
 
 
 AVATAR_FILE = "avatar.safetensors"

@@ -25,7 +25,6 @@ from ...datasets.head.rotations import (
 )
 from ..shared.avatar_files import Subject
 from ..shared.rendering import View, scene_center, view_of
-from . import kernel
 from .config import GHAConfig
 
 POSE_SIZE = 6
@@ -54,7 +53,7 @@ class HeadMotion(NamedTuple):
     quaternion: Tensor  # (4,) of the rotation
 
 
-def reference_motion(tracked: Tensor, correction: Tensor) -> tuple[Tensor, ...]:
+def head_motion(tracked: Tensor, correction: Tensor) -> tuple[Tensor, ...]:
     """A `HeadMotion` of (6, 3) rotation, neck, translation, root and neck joint, and origin, and a (6,) correction."""
     turn, bend, shift, base, joint, origin = tracked
     root, neck = axis_angle_to_matrix(torch.stack([turn + correction[:3], bend]))
@@ -127,8 +126,7 @@ class Driver:
         if correction is None:
             correction = signal.rotation.new_zeros(POSE_SIZE)
         parts = signal.rotation, signal.neck, signal.translation, *signal.joints, self.origin
-        found = kernel.motion if kernel.usable(signal.rotation) else reference_motion
-        motion = HeadMotion(*found(torch.stack(parts), correction))
+        motion = HeadMotion(*head_motion(torch.stack(parts), correction))
         return motion._replace(code=motion.code - self._code_shift)
 
     def rest_arguments(self, codes: Tensor) -> dict[str, Tensor]:
@@ -221,16 +219,6 @@ def influences(
     Expression rules up to ``near_squared`` from the nearest of the (L, 3) landmarks, pose from ``far_squared`` on,
     and in between the weights are linear in the squared distance.
     """
-    if not kernel.usable(points):
-        return reference_influences(points, landmarks, near_squared, far_squared)
-    near, near_weights, far, far_weights = kernel.influences(points, landmarks, near_squared, far_squared)
-    return Influence(near, near_weights), Influence(far, far_weights)
-
-
-def reference_influences(
-    points: Tensor, landmarks: Tensor, near_squared: float, far_squared: float
-) -> tuple[Influence, Influence]:
-    """What `influences` gives, by torch's functions."""
     with torch.no_grad():
         # |a - b|^2 without |a|^2, which is the same for all landmarks of a point. `min` is three times as fast as
         # `argmin` on the CPU.

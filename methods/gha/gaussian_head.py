@@ -13,12 +13,10 @@ from torch import Tensor
 from ...bench.contracts import Camera
 from ..shared.binding import WorldSplats, left_products
 from ..shared.rendering import view_of
-from ..shared.threads import torch_on_one_thread
 from ..splats import rasterize
-from . import kernel
 from .config import GHAConfig
 from .driving import HeadMotion, Signal, influences
-from .networks import ATTRIBUTES, Controllers, Weights, encode_pose, uniform
+from .networks import ATTRIBUTES, Controllers, Influences, Weights, encode, encode_pose, uniform
 
 POINTS = {"points": 3, "log_scales": 3, "quats": 4, "opacities": 1}
 """What a Gaussian has besides its features, with columns: canonical position and scale, rotation, opacity logit."""
@@ -53,10 +51,15 @@ class FeatureImage(NamedTuple):
     @classmethod
     def of(cls, features: Tensor, alpha: Tensor) -> FeatureImage:
         """With the colours of the features."""
-        if kernel.usable(features) and features.requires_grad:
-            features, colors = kernel.with_colors(features)
-            return cls(features, alpha, colors)
         return cls(features, alpha, features[..., :3])
+
+
+class PointInputs(NamedTuple):
+    """Influences of the controllers, and (N, 27) encoded points and (N, F) features within (-1, 1)."""
+
+    parts: Influences
+    encoded: Tensor
+    features: Tensor
 
 
 @dataclass(frozen=True)
@@ -78,27 +81,37 @@ class GaussianHead:
         shapes = self.super_resolution.shapes()
         return {n: s for mlp in self.controllers.of_gaussians for n, s in mlp.shapes().items()} | shapes
 
+    def inputs(self, tensors: Weights) -> PointInputs:
+        """What all poses share: inputs of the networks that follow from the points and their features alone."""
+        c, points = self.config, tensors["points"]
+        parts = influences(points, tensors["landmarks"].detach(), c.near_squared, c.far_squared)
+        return PointInputs(parts, encode(points), torch.tanh(tensors["features"]))
+
     def splats(
-        self, tensors: Weights, signal: Signal, motion: HeadMotion, noise: Tensor | None = None
+        self,
+        tensors: Weights,
+        signal: Signal,
+        motion: HeadMotion,
+        noise: Tensor | None = None,
+        inputs: PointInputs | None = None,
     ) -> FeatureSplats:
         """Pose all Gaussians; differentiable in every tensor but the landmarks and bounds, and in the motion.
 
         Colour and attributes see the expression code within the bounds "code_low" and "code_high", and (E,) ``noise``
-        on it.
+        on it. ``inputs`` are known beforehand where the tensors do not change.
         """
         c, nets = self.config, self.controllers
-        points, features = tensors["points"], tanh(tensors["features"])
-        landmarks = tensors["landmarks"].detach()
-        parts = influences(points, landmarks, c.near_squared, c.far_squared)
+        points = tensors["points"]
+        parts, encoded, features = inputs or self.inputs(tensors)
         pose, code = encode_pose(motion.code), signal.expression
-        moves = nets.displacements(tensors, points, parts, code, pose)
+        moves = nets.displacements(tensors, encoded, parts, code, pose)
         seen = torch.minimum(torch.maximum(code, tensors["code_low"]), tensors["code_high"])
         if noise is not None:
             seen = seen + noise
         changes = nets.attributes(tensors, features, parts, seen, pose)
-        scales = kernel.Scales(c.unit, c.displacement_scale, c.attribute_scale, LARGEST_LOG_SCALE)
+        scales = Scales(c.unit, c.displacement_scale, c.attribute_scale, LARGEST_LOG_SCALE)
         turn = left_products(motion.quaternion[None])[0]
-        placed = (kernel.posed if kernel.usable(points) else posed)(
+        placed = posed(
             *(scales, motion.rotation, motion.translation, turn, points, moves),
             *(tensors["log_scales"], tensors["quats"], tensors["opacities"], changes),
         )
@@ -205,15 +218,13 @@ class SuperResolution:
     def __call__(self, weights: Weights, drawn: FeatureImage, background: Tensor) -> Tensor:
         """(u H, u W, 3) colours of an (H, W) feature image, within (0, 1) without ``residual``; ``background`` where
         nothing is drawn near."""
-        features = drawn.features
-        convolution = kernel.normalised_convolution if kernel.usable(features) else normalised_convolution
-        values = features
+        values = drawn.features
         for block in range(len(self.widths)):
             if block:
                 size = 2 * values.shape[0], 2 * values.shape[1]
                 values = _resized(values, size, align_corners=True)
             for layer in range(2):
-                values = convolution(values, weights[f"sr.conv_{block}_{layer}"])
+                values = normalised_convolution(values, weights[f"sr.conv_{block}_{layer}"])
         return self._image(weights, values, drawn, background)
 
     @torch.no_grad()
@@ -230,8 +241,7 @@ class SuperResolution:
         before = (self.channels, *self.widths[:-1])
         largest = [4**b * max(pair) * height * width for b, pair in enumerate(zip(before, self.widths))]
         if max(largest) <= at_once:
-            with torch_on_one_thread(kernel.available()):
-                return self(weights, drawn, background)
+            return self(weights, drawn, background)
         planes = features.permute(2, 0, 1)[None]
 
         def given(first: int, last: int) -> Tensor:
@@ -255,12 +265,6 @@ class SuperResolution:
     def _image(self, weights: Weights, values: Tensor, drawn: FeatureImage, background: Tensor) -> Tensor:
         """(u H, u W, 3) image of the last block's (u H, u W, D) output."""
         layer = weights["sr.color"].flatten(1), weights["sr.color_bias"]
-        if self.residual and kernel.usable(values):
-            near = kernel.near_drawn(drawn.alpha.detach(), REACH, COVERED)
-            plain, covered = self._plain(drawn)
-            return kernel.residual_image(
-                values, *layer, plain, covered, enlarged(near, self.upscale), background
-            )
         return self._finished(F.linear(values, *layer), drawn, background)
 
     def _finished(self, colors: Tensor, drawn: FeatureImage, background: Tensor) -> Tensor:
@@ -286,13 +290,17 @@ def residual_image(colors: Tensor, plain: Tensor, alpha: Tensor, near: Tensor, b
     return torch.where(near[..., None] > 0, plain + alpha[..., None] * colors, background)
 
 
-def tanh(values: Tensor) -> Tensor:
-    """Hyperbolic tangent, by the kernel where it can be."""
-    return kernel.tanh(values) if kernel.usable(values) else torch.tanh(values)
+class Scales(NamedTuple):
+    """How numbers become lengths; see `GHAConfig`, and `LARGEST_LOG_SCALE` for the last."""
+
+    unit: float
+    displacement: float
+    attribute: float
+    largest_log_scale: float
 
 
 def posed(
-    scales: kernel.Scales,
+    scales: Scales,
     rotation: Tensor,
     translation: Tensor,
     turn: Tensor,
@@ -334,6 +342,8 @@ def _resized(values: Tensor, size: Sequence[int], *, align_corners: bool) -> Ten
 def normalised_convolution(values: Tensor, weight: Tensor) -> Tensor:
     """(H, W, D) 3x3 convolution, padded with zeros, of an (H, W, C) image by (D, C, 3, 3) weights, each channel normalised
     to mean 0 and variance 1 over the image, and rectified."""
+    # The image's memory has the channels last; a convolution is faster where the weights' have, too.
+    weight = weight.contiguous(memory_format=torch.channels_last)
     raw = F.conv2d(values.permute(2, 0, 1)[None], weight, padding=1)
     # Of one image, instance normalisation is what batch normalisation does, and torch's kernel for it takes an image of one
     # pixel too (which becomes 0).

@@ -27,8 +27,6 @@ from ..shared.avatar_files import TRACKED, RefinedTracking, Subject, finish_fit
 from ..shared.loop import Fit, Outcome, train
 from ..shared.method import TrainedMethod
 from ..shared.schedule import ShuffledEpochs
-from ..shared.threads import torch_on_one_thread
-from . import kernel
 from .avatar import AVATAR_FILE, DRIVING_FILE, GHAAvatar, write_avatar
 from .config import GHAConfig
 from .driving import TrainingScene, training_scene
@@ -55,10 +53,6 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
         self._clock = clock
 
     def _train(self, fit: Fit, config: GHAConfig) -> None:
-        with torch_on_one_thread(kernel.available()):
-            self._train_phases(fit, config)
-
-    def _train_phases(self, fit: Fit, config: GHAConfig) -> None:
         clip, out = fit.clip, fit.out
         scene = training_scene(clip, config, fit.device, fit.seed)
         size = len(scene.signals[0].expression)

@@ -16,9 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..shared.networks import ENCODING_SIZE
-from ..shared.networks import encode as reference_encode
-from . import kernel
+from ..shared.networks import ENCODING_SIZE, encode
 from .config import GHAConfig
 from .driving import POSE_SIZE, Influence
 
@@ -94,34 +92,9 @@ class Mlp:
     ) -> Tensor:
         """(N, outputs) of (N, point_inputs) and (condition_inputs,); (B, N, outputs) for (B, condition_inputs).
 
-        ``outputs`` asks for so many of the first outputs only. By the compiled kernel where it can be.
+        ``outputs`` asks for so many of the first outputs only.
         """
-        several = condition is not None and condition.ndim == 2
-        if not kernel.usable(points) or (several and points.requires_grad):
-            return self.reference(weights, points, condition, outputs)
-        part = self.part(weights, torch.arange(len(points)), None, condition)
-        return kernel.perceptron(points, part, outputs or self.outputs, SLOPE)
 
-    def part(
-        self,
-        weights: Weights,
-        rows: Tensor,
-        influence: Tensor | None,
-        condition: Tensor | None,
-        *,
-        squashed: bool = False,
-    ) -> kernel.Part:
-        """The network as the kernel takes it."""
-        layers = range(len(self.widths) - 1)
-        matrices, biases = (
-            [weights[f"{self.name}.{kind}_{layer}"] for layer in layers] for kind in ("weight", "bias")
-        )
-        return kernel.Part(rows, influence, condition, matrices, biases, self._again, squashed)
-
-    def reference(
-        self, weights: Weights, points: Tensor, condition: Tensor | None = None, outputs: int | None = None
-    ) -> Tensor:
-        """What calling gives, by torch's layers."""
         count, size = len(self.widths) - 1, self.point_inputs
         values = points
         for layer in range(count):
@@ -224,16 +197,11 @@ class Controllers:
         return blended(networks, weights, features, influences, (expression, pose))
 
     def displacements(
-        self, weights: Weights, points: Tensor, influences: Influences, expression: Tensor, pose: Tensor
+        self, weights: Weights, encoded: Tensor, influences: Influences, expression: Tensor, pose: Tensor
     ) -> Tensor:
-        """(N, 3) displacements of (N, 3) points, each within (-1, 1), before their factor."""
+        """(N, 3) displacements of points, whose (N, 27) encoding is given, each within (-1, 1), before their factor."""
         networks = (self.expression_deform, self.pose_deform)
-        return blended(networks, weights, encode(points), influences, (expression, pose), squashed=True)
-
-
-def encode(points: Tensor) -> Tensor:
-    """(N, 27) positional encoding of (N, 3) points."""
-    return kernel.encode(points) if kernel.usable(points) else reference_encode(points)
+        return blended(networks, weights, encoded, influences, (expression, pose), squashed=True)
 
 
 def encoded_size(size: int) -> int:
@@ -243,7 +211,7 @@ def encoded_size(size: int) -> int:
 
 def encode_pose(code: Tensor) -> Tensor:
     """(54,) of the (6,) code of a head pose."""
-    return reference_encode(code[None])[0]
+    return encode(code[None])[0]
 
 
 def blended(
@@ -257,30 +225,8 @@ def blended(
     channels: int | None = None,
 ) -> Tensor:
     """(N, C) sum of two networks' outputs, their tanh if ``squashed``, at (N, F) inputs by their influences."""
-    if not kernel.usable(inputs):
-        return blended_reference(
-            networks, weights, inputs, influences, conditions, squashed=squashed, channels=channels
-        )
     parts = [
-        network.part(weights, part.rows, part.weights, condition, squashed=squashed)
-        for network, part, condition in zip(networks, influences, conditions)
-    ]
-    return kernel.blended(inputs, parts, channels or networks[0].outputs, SLOPE)
-
-
-def blended_reference(
-    networks: tuple[Mlp, Mlp],
-    weights: Weights,
-    inputs: Tensor,
-    influences: Influences,
-    conditions: tuple[Tensor, Tensor],
-    *,
-    squashed: bool = False,
-    channels: int | None = None,
-) -> Tensor:
-    """What `blended` gives, by torch's layers."""
-    parts = [
-        network.reference(weights, inputs.index_select(0, part.rows), condition, channels)
+        network(weights, inputs.index_select(0, part.rows), condition, channels)
         for network, part, condition in zip(networks, influences, conditions)
     ]
     total = parts[0].new_zeros(len(inputs), parts[0].shape[1])

@@ -33,11 +33,3 @@ def insta(config: Any, device: str) -> Iterator[Need]:
     if not device.startswith("cpu"):
         yield Need(f"code for {device}", "", f"INSTA does not compute on {device!r}: run it with device=cpu.")
     yield KERNEL.need()
-
-
-def gha(config: Any, device: str) -> Iterator[Need]:
-    """GHA's kernel, and the splat renderer."""
-    from ..gha.kernel import KERNEL
-
-    yield KERNEL.need()
-    yield from splats(config, device)

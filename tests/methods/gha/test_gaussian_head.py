@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from headbench.datasets.head.rotations import matrix_to_quaternion
-from headbench.methods.gha.device_frame import DeviceSplats
 from headbench.methods.gha.driving import HeadMotion, Signal
 from headbench.methods.gha.gaussian_head import FeatureImage, GaussianHead, enlarged, near_drawn
 from headbench.methods.gha.gaussian_training import Zoom, reduced, zoomed
@@ -209,17 +208,3 @@ def test_noise_is_for_colours_and_attributes_alone():
     torch.testing.assert_close(noisy.features, moved.features)
     torch.testing.assert_close(noisy.opacities, moved.opacities)
     assert not torch.allclose(noisy.features, plain.features, atol=1e-4)
-
-
-@pytest.mark.parametrize("hidden", [(), (16,), (16, 12, 8)])
-def test_splats_in_few_operations_are_those_of_the_definition(hidden):
-    kinds = ("color", "deform", "attribute")
-    head, tensors, signal, motion, _ = model(**{f"expression_{kind}_hidden": hidden for kind in kinds})
-    tensors["code_high"] = tensors["code_high"].clone().fill_(0.1)
-    expected = head.splats(tensors, signal, motion)
-    single = {name: value.float() for name, value in tensors.items()}
-    found = DeviceSplats(head, single)(
-        Signal(*(value.float() for value in signal)), HeadMotion(*(value.float() for value in motion))
-    )
-    for one, other in zip((*found.world, *found[1:]), (*expected.world, *expected[1:])):
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
