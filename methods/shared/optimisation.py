@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from ...bench.contracts import FloatArray
 from ...datasets.head.rotations import quaternion_to_matrix
-from .avatar_kernel import call, usable
 from .config import DensifiedTraining
 from .device_frame import sent
 from .schedule import DensifySchedule, torch_generator
@@ -20,7 +18,7 @@ EPS = 1e-15
 
 
 class Optimiser:
-    """One Adam (eps 1e-15, dense) over named parameters: the kernel's where it takes all of them, else torch's.
+    """One Adam (eps 1e-15, dense) over named parameters.
 
     Densification replaces per-splat parameters by longer or shorter ones; `select` and `append` keep the moments, with
     zeros for new rows. A replaced parameter has no gradient, so it sits out the step that follows, as in the published
@@ -40,9 +38,7 @@ class Optimiser:
         betas: tuple[float, float] = (0.9, 0.999),
     ):
         groups = [{"params": [p], "lr": learning_rates[name], "name": name} for name, p in parameters.items()]
-        self._betas = betas
         self._adam = torch.optim.Adam(groups, betas=betas, eps=EPS, fused=True)
-        self._flat: dict[str, _Flat] = {}
         self._groups: dict[str, dict[str, Any]] = {g["name"]: g for g in self._adam.param_groups}
 
     def __getitem__(self, name: str) -> nn.Parameter:
@@ -60,38 +56,7 @@ class Optimiser:
 
     def step(self) -> None:
         """Update every parameter that has a gradient; Kingma and Ba 2015, algorithm 1."""
-        named = [(name, g) for name, g in self._groups.items() if g["params"][0].grad is not None]
-        if not named or not all(_takes(group["params"][0]) for _, group in named):
-            self._adam.step()
-            return
-        flat = [self._arrays(name) for name, _ in named]
-        for each in flat:
-            each.step.add_(1)
-        call(
-            *("adam", [each.value for each in flat]),
-            [group["params"][0].grad.contiguous().view(-1).numpy() for _, group in named],
-            *([each.first for each in flat], [each.second for each in flat]),
-            *([float(group["lr"]) for _, group in named], [each.step.item() for each in flat]),
-            *(*self._betas, EPS),
-            backend="cpu",
-        )
-
-    def _arrays(self, name: str) -> _Flat:
-        """The memory of a parameter and its moments; these begin as torch's do."""
-        parameter = self[name]
-        known = self._flat.get(name)
-        if known is None or known.of is not parameter:
-            state = self._adam.state[parameter]
-            if not state:
-                state["step"] = torch.zeros(())
-                state |= {moment: torch.zeros_like(parameter) for moment in ("exp_avg", "exp_avg_sq")}
-            value, first, second = (
-                values.view(-1).numpy()
-                for values in (parameter.detach(), state["exp_avg"], state["exp_avg_sq"])
-            )
-            known = _Flat(parameter, value, first, second, state["step"])
-            self._flat[name] = known
-        return known
+        self._adam.step()
 
     def select(self, names: Iterable[str], keep: Tensor) -> None:
         """Keep only the rows where the (N,) mask is true, in parameters and moments."""
@@ -149,20 +114,6 @@ class Optimiser:
             group["lr"] = entry["lr"]
             if entry["moments"]:
                 self._adam.state[new] = {k: v.to(old.device) for k, v in entry["moments"].items()}
-
-
-class _Flat(NamedTuple):
-    """A parameter, and as flat arrays what a step changes: its values and moments; and the number of its steps."""
-
-    of: Tensor
-    value: FloatArray
-    first: FloatArray
-    second: FloatArray
-    step: Tensor
-
-
-def _takes(parameter: Tensor) -> bool:
-    return usable(parameter) and parameter.is_contiguous()
 
 
 CHILDREN = 2

@@ -15,10 +15,11 @@ from ..splats.request import Rendering
 from .binding import Frames, WorldSplats
 from .config import DensifiedTraining, SplatTraining
 from .loop import Fit, Outcome, TrainingImages, train
+from .losses import position_penalty, scale_penalty
 from .optimisation import Densifier, Optimiser
 from .rendering import View, scene_center, scene_extent, view_of
 from .schedule import DensifySchedule, Sampler, Timeline, log_linear
-from .training_kernel import photometric_loss, splat_penalties
+from .training_kernel import photometric_loss
 
 Initial = Mapping[str, tuple[Tensor, float]]
 """Initial tensors with their learning rates, by name."""
@@ -253,12 +254,16 @@ class BoundTraining(SplatTrainer):
             placed.world, placed.opacities, placed.colors, view, frames.size.detach()
         )
         means, log_scales = optimiser["means"], optimiser["log_scales"]
-        loss = photometric_loss(rendering.image, truth, settings.ssim_weight) + splat_penalties(
-            *(means, log_scales, visible),
-            position=(settings.position_weight, settings.position_threshold),
-            scale=(settings.scale_weight, settings.scale_threshold),
-        )
+        loss = photometric_loss(rendering.image, truth, settings.ssim_weight)
+        loss = loss + splat_penalties(means, log_scales, visible, settings)
         return loss if placed.penalty is None else loss + placed.penalty
+
+
+def splat_penalties(means: Tensor, log_scales: Tensor, visible: Tensor, settings: SplatTraining) -> Tensor:
+    """Weighted sum of the penalties on local positions and scales, GaussianAvatars, section 3.4."""
+    of_position = position_penalty(means, visible, settings.position_threshold)
+    of_scale = scale_penalty(log_scales, visible, settings.scale_threshold)
+    return settings.position_weight * of_position + settings.scale_weight * of_scale
 
 
 def _initial_geometry(

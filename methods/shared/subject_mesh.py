@@ -16,7 +16,7 @@ from ...datasets.head.arrays import check_size
 from ...datasets.head.model import HeadModel
 from . import device_frame
 from .binding import Frames
-from .training_kernel import PosedMesh, triangle_frames
+from .training_kernel import triangle_frames
 
 Value = TypeVar("Value")
 
@@ -42,7 +42,6 @@ class SubjectMesh:
         self._canonical = self.model.canonical(
             torch.as_tensor(np.asarray(shape)).to(like), torch.as_tensor(np.asarray(static_offset)).to(like)
         )
-        self._posed = PosedMesh(self.model, self._canonical)
         check_size(
             "subject", "shape, static_offset", self._canonical[0].cpu().numpy(), np.asarray(head.faces)
         )
@@ -63,7 +62,7 @@ class SubjectMesh:
 
     def posed(self, arguments: Mapping[str, Tensor]) -> Tensor:
         """(V, 3) vertices in the world for one timestep's arguments; differentiable in them."""
-        return self._posed(arguments)[0]
+        return self.model(canonical=self._canonical, **arguments)[0]
 
     def unposed(self, arguments: Mapping[str, Tensor]) -> Tensor:
         """(V, 3) with expression, jaw and eyes (and eyelids) alone: no rotation, neck or translation."""

@@ -7,14 +7,12 @@ of threads.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ...datasets.head.model import HeadModel
 from . import device_frame, losses
 from .avatar_kernel import call, splats_to_world, triangles, usable
 from .binding import Frames, WorldSplats
@@ -53,122 +51,6 @@ class _Photometric(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
         return (gradient if grad == 1 else gradient * grad), None, None, None
-
-
-def splat_penalties(
-    means: Tensor,
-    log_scales: Tensor,
-    visible: Tensor,
-    position: tuple[float, float],
-    scale: tuple[float, float],
-    backend: str = "cpu",
-) -> Tensor:
-    """Weighted sum of `losses.position_penalty` and `losses.scale_penalty`; (weight, threshold) of each."""
-    if not usable(means):
-        of_position = position[0] * losses.position_penalty(means, visible, position[1])
-        return of_position + scale[0] * losses.scale_penalty(log_scales, visible, scale[1])
-    return _Penalties.apply(means, log_scales, visible, position, scale, backend)  # type: ignore[no-untyped-call]
-
-
-class _Penalties(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        means: Tensor,
-        log_scales: Tensor,
-        visible: Tensor,
-        position: tuple[float, float],
-        scale: tuple[float, float],
-        backend: str,
-    ) -> Tensor:
-        by_means, by_log_scales = torch.empty_like(means), torch.empty_like(log_scales)
-        thresholds_and_weights = (position[1], scale[1], position[0], scale[0])
-        found = call(
-            *("penalties", means, log_scales, visible, *thresholds_and_weights, by_means, by_log_scales),
-            backend=backend,
-        )
-        ctx.save_for_backward(by_means, by_log_scales)
-        return means.new_tensor(position[0] * found[0] + scale[0] * found[1])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        gradients = ctx.saved_tensors if grad == 1 else [gradient * grad for gradient in ctx.saved_tensors]
-        return *gradients, None, None, None, None
-
-
-class PosedMesh:
-    """Vertices of a head of one identity, differentiable in the driving signal: compiled form of `HeadModel.forward`.
-
-    Parameters
-    ----------
-    model : the head.
-    canonical : (1, V, 3), what `HeadModel.canonical` gave for the identity.
-    """
-
-    def __init__(self, model: HeadModel, canonical: Tensor):
-        self._model, self._canonical = model, canonical
-        self._head: tuple[Tensor, ...] | None = None
-
-    def __call__(self, arguments: Mapping[str, Tensor], backend: str = "cpu") -> Tensor:
-        """(B, V, 3) vertices in the world; compiled where there is one pose and a gradient is asked for."""
-        wanted = torch.is_grad_enabled() and any(value.requires_grad for value in arguments.values())
-        single = all(value.ndim == 2 and len(value) == 1 for value in arguments.values())
-        if (
-            not (wanted and single and usable(self._canonical))
-            or arguments.get("eyelids", _NONE).requires_grad
-        ):
-            return self._model(canonical=self._canonical, **arguments)
-        angles = torch.cat([arguments[name] for name in ("rotation", "neck", "jaw", "eyes")], dim=1)
-        lids = self._canonical.new_empty(0, 3)
-        if self._model.eyelid_matrix is not None and "eyelids" in arguments:
-            lids = (arguments["eyelids"] @ self._model.eyelid_matrix).view(-1, 3)
-        inputs = arguments["expression"][0], angles.view(-1, 3), arguments["translation"][0]
-        return _Pose.apply(*inputs, lids, self._arrays(), backend)[None]  # type: ignore[no-untyped-call]
-
-    def _arrays(self) -> tuple[Tensor, ...]:
-        if self._head is None:
-            model, neutral = self._model, self._canonical[0]
-            expressions = model.expression_matrix.view(-1, len(neutral), 3)
-            correctives = model.pose_matrix.view(-1, len(neutral), 3)
-            by_expression = torch.einsum("jv,evk->jke", model.joint_regressor, expressions).contiguous()
-            self._head = (
-                *(neutral, torch.cat([expressions, correctives]), model.skinning_weights),
-                *(torch.tensor(model.parents), model.joint_regressor @ neutral, by_expression),
-            )
-        return self._head
-
-
-_NONE = torch.empty(0)
-
-
-class _Pose(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        expression: Tensor,
-        angles: Tensor,
-        translation: Tensor,
-        lids: Tensor,
-        head: tuple[Tensor, ...],
-        backend: str,
-    ) -> Tensor:
-        unposed, posed = torch.empty_like(head[0]), torch.empty_like(head[0])
-        call("pose", *head, expression, angles, translation, lids, unposed, posed, backend=backend)
-        ctx.save_for_backward(expression, angles, translation, lids, unposed)
-        ctx.head, ctx.backend = head, backend
-        return posed
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        expression, angles, translation, lids, unposed = ctx.saved_tensors
-        gradients = [torch.empty_like(value) for value in (expression, angles, translation)]
-        call(
-            *("pose_backward", *ctx.head, expression, angles, lids, unposed, grad, *gradients),
-            backend=ctx.backend,
-        )
-        return *gradients, None, None, None
 
 
 def triangle_frames(vertices: Tensor, faces: Tensor, backend: str = "cpu") -> Frames:

@@ -213,24 +213,6 @@ struct OffsetNetwork {
 
 // What training computes of splats beside the rasteriser; gradients are named by what they are taken by.
 
-// A posed head, datasets/head/model.py: V vertices of J joints, K rows of expressions and pose correctives.
-constexpr int kMotion = 12;  // of a joint: 3 rows of a rotation and an offset
-
-struct Posing {
-  std::int64_t vertices;
-  int joints, rows;
-  const float* neutral;       // (V, 3)
-  const float* basis;         // (K, V, 3)
-  const float* coefficients;  // (K,)
-  const float* weights;       // (V, J)
-  const float* motions;       // (J, 3, 4)
-  const float* lids;          // (V, 3) added after they are rotated, or null
-  float lid_rotation[9];
-  float translation[3];
-  float* unposed;  // (V, 3)
-  float* posed;    // (V, 3)
-};
-
 struct TrianglesBackward {
   const float* vertices;        // (V, 3)
   const std::int64_t* faces;    // (F, 3)
@@ -263,17 +245,6 @@ struct ToWorldBackward {
   float* by_frames;        // (N, kFrameNumbers) or null
 };
 
-// Means over visible splats of how far local means and scales exceed a threshold, as in methods/shared/losses.py.
-struct Penalties {
-  const float* means;       // (N, 3)
-  const float* log_scales;  // (N, 3)
-  const bool* visible;      // (N,)
-  float position_threshold, scale_threshold;
-  float by_position, by_scale;  // weights over the number of visible splats
-  float* by_means;          // (N, 3)
-  float* by_log_scales;     // (N, 3)
-};
-
 // As `Harmonics`, with coefficients as training holds them.
 struct TrainedHarmonics {
   int degree;
@@ -298,16 +269,6 @@ struct Photometric {
   float* gradient;   // (H, W, 3)
   double* row_l1;    // (H,) sums
   double* row_ssim;  // (H,)
-};
-
-// A step of Adam on one tensor; see `methods/shared/optimisation.py`.
-struct AdamStep {
-  float* values;           // (n,)
-  const float* gradients;  // (n,)
-  float* first;            // (n,) moments
-  float* second;           // (n,)
-  float first_weight, second_decay, second_weight;  // 1 - beta_1, beta_2, 1 - beta_2
-  float step, root_scale, eps;                      // rate / (1 - beta_1^t), 1 / sqrt(1 - beta_2^t)
 };
 
 // The functions compiled for one instruction set.
@@ -338,19 +299,14 @@ struct Kernels {
   void (*color_network)(const ColorNetwork&, std::int64_t begin, std::int64_t end);
   std::size_t (*offset_scratch)(const OffsetNetwork&);
   void (*offset_network)(const OffsetNetwork&, std::int64_t begin, std::int64_t end, float* scratch);
-  // Of training, for vertices, triangles, splats or rows [begin, end).
-  void (*pose_vertices)(const Posing&, std::int64_t begin, std::int64_t end);
-  void (*pose_backward)(const Posing&, const float* by_posed, std::int64_t begin, std::int64_t end, float* scratch,
-                        float* sums);
+  // Of training, for triangles, splats or rows [begin, end).
   void (*triangles_backward)(const TrianglesBackward&, std::int64_t begin, std::int64_t end);
   void (*activate)(const Activation&, std::int64_t begin, std::int64_t end);
   void (*to_world_backward)(const ToWorldBackward&, std::int64_t begin, std::int64_t end);
-  void (*penalties)(const Penalties&, std::int64_t begin, std::int64_t end, double* sums);
   void (*harmonics)(const TrainedHarmonics&, std::int64_t begin, std::int64_t end);
   void (*harmonics_backward)(const TrainedHarmonics&, std::int64_t begin, std::int64_t end);
   std::size_t (*photometric_scratch)(int width);
   void (*photometric)(const Photometric&, int begin, int end, float* scratch);
-  void (*adam)(const AdamStep&, std::int64_t begin, std::int64_t end);
 };
 
 }  // namespace headbench

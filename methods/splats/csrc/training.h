@@ -125,88 +125,6 @@ inline void triangles_backward(const TrianglesBackward& in, std::int64_t begin, 
   }
 }
 
-// A posed head.
-
-// Sum of `count` products.
-HEADBENCH_INLINE float dot(const float* a, const float* b, int count) {
-  Real sum = 0.0f;
-  int i = 0;
-  for (; i + W <= count; i += W) sum = fma(load(a + i), load(b + i), sum);
-  alignas(64) float lanes[W];
-  store(lanes, sum);
-  float total = 0.0f;
-  for (int lane = 0; lane < W; ++lane) total += lanes[lane];
-  for (; i < count; ++i) total += a[i] * b[i];
-  return total;
-}
-
-// Blend the joints' motions at one vertex.
-HEADBENCH_INLINE void blend_joints(const Posing& in, std::int64_t vertex, float* out) {
-  for (int k = 0; k < kMotion; ++k) out[k] = 0.0f;
-  const float* weights = in.weights + vertex * in.joints;
-  for (int joint = 0; joint < in.joints; ++joint)
-    for (int k = 0; k < kMotion; ++k) out[k] += weights[joint] * in.motions[kMotion * joint + k];
-}
-
-// Vertices [begin, end): unposed ones with expression and pose correctives, and posed ones.
-inline void pose_vertices(const Posing& in, std::int64_t begin, std::int64_t end) {
-  const std::int64_t first = 3 * begin, count = 3 * (end - begin), all = 3 * in.vertices;
-  float* unposed = in.unposed + first;
-  for (std::int64_t i = 0; i < count; ++i) unposed[i] = in.neutral[first + i];
-  for (int row = 0; row < in.rows; ++row) {
-    const float coefficient = in.coefficients[row];
-    if (coefficient == 0.0f) continue;
-    const float* basis = in.basis + row * all + first;
-    std::int64_t i = 0;
-    for (; i + W <= count; i += W) store(unposed + i, fma(Real(coefficient), load(basis + i), load(unposed + i)));
-    for (; i < count; ++i) unposed[i] += coefficient * basis[i];
-  }
-  float motion[kMotion];
-  for (std::int64_t vertex = begin; vertex < end; ++vertex) {
-    blend_joints(in, vertex, motion);
-    const float* x = in.unposed + 3 * vertex;
-    for (int row = 0; row < 3; ++row) {
-      const float* m = motion + 4 * row;
-      float sum = m[0] * x[0] + m[1] * x[1] + m[2] * x[2] + m[3] + in.translation[row];
-      if (in.lids)
-        for (int k = 0; k < 3; ++k) sum += in.lid_rotation[3 * row + k] * in.lids[3 * vertex + k];
-      in.posed[3 * vertex + row] = sum;
-    }
-  }
-}
-
-// What vertices [begin, end) add to the gradients by coefficients, motions, lids' rotation and translation, in that order.
-// `scratch` has 3 (end - begin) floats.
-inline void pose_backward(const Posing& in, const float* by_posed, std::int64_t begin, std::int64_t end, float* scratch,
-                          float* sums) {
-  const int count = static_cast<int>(3 * (end - begin));
-  float* by_motions = sums + in.rows;
-  float* by_lids = by_motions + kMotion * in.joints;
-  float* by_translation = by_lids + 9;
-  for (int i = 0; i < kMotion * in.joints + 9 + 3; ++i) by_motions[i] = 0.0f;
-  float motion[kMotion];
-  for (std::int64_t vertex = begin; vertex < end; ++vertex) {
-    blend_joints(in, vertex, motion);
-    const float *g = by_posed + 3 * vertex, *x = in.unposed + 3 * vertex;
-    float* out = scratch + 3 * (vertex - begin);
-    float outer[kMotion];
-    for (int row = 0; row < 3; ++row) {
-      for (int k = 0; k < 3; ++k) outer[4 * row + k] = g[row] * x[k];
-      outer[4 * row + 3] = g[row];
-      by_translation[row] += g[row];
-    }
-    for (int k = 0; k < 3; ++k) out[k] = motion[k] * g[0] + motion[4 + k] * g[1] + motion[8 + k] * g[2];
-    const float* weights = in.weights + vertex * in.joints;
-    for (int joint = 0; joint < in.joints; ++joint)
-      for (int k = 0; k < kMotion; ++k) by_motions[kMotion * joint + k] += weights[joint] * outer[k];
-    if (in.lids)
-      for (int row = 0; row < 3; ++row)
-        for (int k = 0; k < 3; ++k) by_lids[3 * row + k] += g[row] * in.lids[3 * vertex + k];
-  }
-  for (int row = 0; row < in.rows; ++row)
-    sums[row] = dot(in.basis + row * 3 * in.vertices + 3 * begin, scratch, count);
-}
-
 HEADBENCH_INLINE Real exponential(Real x) { return exp2(max(min(x * Real(kLog2e), Real(127.0f)), Real(-126.0f))); }
 
 // Local splats [begin, end) as training holds them, prepared for `to_world`.
@@ -296,50 +214,6 @@ inline void to_world_backward(const ToWorldBackward& in, std::int64_t begin, std
       scale.put(in.by_log_scales + 3 * (first + lane), lane);
       quat.put(in.by_raw_quats + 4 * (first + lane), lane);
       if (in.by_frames) by_frame.put(in.by_frames + kFrameNumbers * (first + lane), lane);
-    }
-  }
-}
-
-// Penalties on visible local splats [begin, end) that lie far out or are large; adds to `sums` (position, scale).
-inline void penalties(const Penalties& in, std::int64_t begin, std::int64_t end, double* sums) {
-  Gathered<3> mean, scale;
-  const Real zero = 0.0f, smallest = 1e-30f;
-  alignas(64) float seen[W], far[W], large[W];
-  for (std::int64_t first = begin; first < end; first += W) {
-    const int used = lanes_used(first, end);
-    bool some = false;
-    for (int lane = 0; lane < W; ++lane) {
-      const std::int64_t splat = first + (lane < used ? lane : 0);
-      seen[lane] = lane < used && in.visible[splat];
-      some |= seen[lane] != 0.0f;
-      mean.set(in.means + 3 * splat, lane);
-      scale.set(in.log_scales + 3 * splat, lane);
-    }
-    if (!some) {
-      for (int i = 0; i < 3 * used; ++i) in.by_means[3 * first + i] = in.by_log_scales[3 * first + i] = 0.0f;
-      continue;
-    }
-    Real m[3], s[3], excess[3];
-    for (int k = 0; k < 3; ++k) {
-      m[k] = mean[k];
-      s[k] = exponential(scale[k]);
-      excess[k] = max(s[k] - Real(in.scale_threshold), zero);
-    }
-    const Real weight = load(seen), length = sqrt(dot3(m, m)), beyond = max(length - Real(in.position_threshold), zero);
-    const Real size = sqrt(dot3(excess, excess));
-    store(far, weight * beyond);
-    store(large, weight * size);
-    const Real by_mean = zero_unless(beyond > zero, weight * Real(in.by_position) / max(length, smallest));
-    const Real by_scale = zero_unless(size > zero, weight * Real(in.by_scale) / max(size, smallest));
-    for (int k = 0; k < 3; ++k) {
-      mean.keep(k, by_mean * m[k]);
-      scale.keep(k, by_scale * excess[k] * s[k]);
-    }
-    for (int lane = 0; lane < used; ++lane) {
-      mean.put(in.by_means + 3 * (first + lane), lane);
-      scale.put(in.by_log_scales + 3 * (first + lane), lane);
-      sums[0] += static_cast<double>(far[lane]);
-      sums[1] += static_cast<double>(large[lane]);
     }
   }
 }
@@ -639,35 +513,6 @@ inline void photometric(const Photometric& in, int begin, int end, float* scratc
     in.row_l1[row] = sum_of(difference, count);
     for (std::size_t i = 0; i < stride; i += W) store(products + i, Real(0.0f));
   }
-}
-
-// Adam.
-
-// One vector of numbers. Where gradient and moments are 0 nothing would change, and nothing is written: half of what planes
-// hold lies where no splat does.
-HEADBENCH_INLINE void adam_vector(const AdamStep& in, const float* gradients, float* values, float* firsts, float* seconds) {
-  const Real zero = 0.0f, g = load(gradients), m = load(firsts), v = load(seconds);
-  const Mask still = (g >= zero) & (zero >= g) & (m >= zero) & (zero >= m) & (zero >= v);
-  if (!any(select(still, zero, Real(1.0f)) > zero)) return;
-  const Real first = fma(in.first_weight, g - m, m), second = fma(in.second_decay, v, in.second_weight * g * g);
-  store(firsts, first);
-  store(seconds, second);
-  store(values, fnma(in.step, first / fma(sqrt(second), in.root_scale, in.eps), load(values)));
-}
-
-inline void adam(const AdamStep& in, std::int64_t begin, std::int64_t end) {
-  std::int64_t i = begin;
-  for (; i + W <= end; i += W) adam_vector(in, in.gradients + i, in.values + i, in.first + i, in.second + i);
-  if (i == end) return;
-  alignas(64) float rest[4][W] = {};
-  float* const from[3] = {in.values + i, in.first + i, in.second + i};
-  for (std::int64_t k = 0; k < end - i; ++k) {
-    rest[3][k] = in.gradients[i + k];
-    for (int part = 0; part < 3; ++part) rest[part][k] = from[part][k];
-  }
-  adam_vector(in, rest[3], rest[0], rest[1], rest[2]);
-  for (std::int64_t k = 0; k < end - i; ++k)
-    for (int part = 0; part < 3; ++part) from[part][k] = rest[part][k];
 }
 
 }  // namespace headbench::HEADBENCH_ISA

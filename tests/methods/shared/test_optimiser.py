@@ -1,17 +1,10 @@
 """Adam with growing tensors against the textbook update."""
 
 import numpy as np
-import pytest
 import torch
 from torch import nn
 
-from headbench.methods.shared import optimisation
-from headbench.methods.shared.avatar_kernel import available, call
 from headbench.methods.shared.optimisation import Optimiser
-from headbench.methods.splats.cpu import instruction_sets
-from headbench.tests.benchmarks.timing import torch_threads
-
-needs_kernel = pytest.mark.skipif(not available(), reason="needs the compiled kernel")
 
 
 def textbook(values, gradients, rate):
@@ -45,45 +38,6 @@ def test_steps_are_adams():
         step(optimiser, gradient)
     np.testing.assert_allclose(optimiser["a"].detach(), textbook(start, gradients, 0.1), rtol=1e-12)
     assert (optimiser["b"] == 0).all()  # no gradient, no step
-
-
-@needs_kernel
-@pytest.mark.parametrize("backend", instruction_sets())
-@pytest.mark.parametrize("size", [1, 16, 37, 40_000])
-def test_compiled_steps_are_adams(monkeypatch, backend, size):
-    monkeypatch.setattr(optimisation, "call", lambda *values, backend: call(*values, backend=chosen))
-    chosen, numbers = backend, np.random.default_rng(size)
-    start, gradients = numbers.normal(size=size), numbers.normal(size=(6, size))
-    gradients[:, : size // 3] = 0  # where nothing changes
-    gradients[3:, size // 2 :] = 0  # moments alone
-    found = []
-    for threads in (1, 3):
-        optimiser = Optimiser({"a": nn.Parameter(torch.from_numpy(start).float())}, {"a": 0.1})
-        with torch_threads(threads):
-            for gradient in gradients:
-                step(optimiser, torch.from_numpy(gradient).float())
-        found.append(optimiser["a"].detach())
-    np.testing.assert_allclose(found[0], textbook(start, gradients, 0.1), rtol=2e-6, atol=2e-6)
-    assert torch.equal(found[0][: size // 3], torch.from_numpy(start).float()[: size // 3])
-    assert torch.equal(*found)
-    assert optimiser.moments("a")["step"] == len(gradients)
-
-
-@needs_kernel
-def test_compiled_steps_do_not_hide_what_is_not_a_number():
-    optimiser = Optimiser({"a": nn.Parameter(torch.ones(20))}, {"a": 0.1})
-    step(optimiser, torch.zeros(20).index_fill(0, torch.tensor([3, 19]), torch.nan))
-    assert optimiser["a"].isnan().nonzero().flatten().tolist() == [3, 19]
-
-
-@needs_kernel
-def test_torch_and_the_kernel_go_on_from_each_other(monkeypatch):
-    start, gradients = np.ones(5), np.random.default_rng(3).normal(size=(6, 5))
-    optimiser = Optimiser({"a": nn.Parameter(torch.ones(5))}, {"a": 0.1})
-    for number, gradient in enumerate(gradients):
-        monkeypatch.setattr(optimisation, "usable", lambda _, compiled=number % 2: bool(compiled))
-        step(optimiser, torch.from_numpy(gradient).float())
-    np.testing.assert_allclose(optimiser["a"].detach(), textbook(start, gradients, 0.1), rtol=2e-6)
 
 
 def test_select_keeps_rows_with_their_moments():
