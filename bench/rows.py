@@ -17,8 +17,8 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from .errors import InputError, shortened
-from .io.files import atomic_path
+from .errors import InputError, is_damage, shortened
+from .io.files import atomic_path, reading
 from .specs import LABEL, RENAMED_METRICS, is_label
 
 log = logging.getLogger(__name__)
@@ -121,14 +121,10 @@ class Rows:
         for a column that is missing or of another type, an empty entry, an unknown status, and a measured value that
         is not finite.
         """
-        try:
+        if not path.exists():
+            raise InputError(path, "", "the rows of a finished run", "no such file", "Start the run again.")
+        with reading(path, "a Parquet file of rows"):
             table = _read_table(path)
-        except FileNotFoundError as error:
-            raise InputError(
-                path, "", "the rows of a finished run", "no such file", "Start the run again."
-            ) from error
-        except (OSError, ValueError, pa.ArrowException) as error:
-            raise InputError(path, "", "a Parquet file of rows", " ".join(str(error).split())) from error
         rows = _checked(table, path)
         return cls(rows.assign(metric=rows["metric"].replace(RENAMED_METRICS)))
 
@@ -352,8 +348,8 @@ def earlier_rows(path: Path) -> Rows | None:
     try:
         return Rows.read(path)
     except InputError as error:
-        if isinstance(error.__cause__, OSError) and error.__cause__.errno is not None:
-            raise  # not damaged: the disk or its permissions are at fault
+        if not is_damage(error):
+            raise
         log.warning("%s It is written again.", error)
         return None
 

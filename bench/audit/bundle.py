@@ -6,7 +6,6 @@ import re
 import shutil
 import tempfile
 import zipfile
-import zlib
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from itertools import product
@@ -16,7 +15,7 @@ from typing import Literal
 from ..contracts import Progress, no_progress
 from ..errors import InputError
 from ..io.documents import MAX_JSON_BYTES, checked, parse_json
-from ..io.files import atomic_path, check_writable, digest_file, write_json
+from ..io.files import atomic_path, check_writable, digest_file, reading, write_json
 from ..io.provenance import RENDER, source_type
 from ..manifest import Manifest
 from ..runner.steps import DIGESTS
@@ -30,8 +29,6 @@ MAX_BYTES = 8 * 2**30
 MAX_RATIO = 200
 """How many times its own size a bundle may hold; JSON shrinks to a thirtieth."""
 
-_DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, ValueError)
-"""What reading a damaged archive raises, a password included."""
 _CELL = r"[^/\\]+/[^/\\]+/seed-\d+"
 _NAMES = re.compile(
     rf"run\.json|rows\.parquet|{_CELL}/({'|'.join(STAGES)})\.json|{_CELL}/renders/[^/\\]+/[^/\\]+\.png"
@@ -169,15 +166,8 @@ def read_bundle(path: Path, into: Path) -> Bundle:
         For what is no bundle, files that are not as listed or that no bundle has, and content that is larger or of
         more files than a bundle may have.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return _unpack(archive, path, into)
-    except _DAMAGED as error:
-        raise InputError(
-            path, "", "a bundle of `headbench bundle`", f"a damaged ZIP file ({error})"
-        ) from error
-    except FileNotFoundError as error:
-        raise InputError(path, "", "a bundle of `headbench bundle`", "no such file") from error
+    with reading(path, "a bundle of `headbench bundle`"), zipfile.ZipFile(path) as archive:
+        return _unpack(archive, path, into)
 
 
 def _unpack(archive: zipfile.ZipFile, path: Path, into: Path) -> Bundle:

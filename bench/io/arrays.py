@@ -14,7 +14,7 @@ from typing import IO
 import numpy as np
 
 from ..errors import InputError
-from .files import open_regular
+from .files import open_regular, reading
 
 MOST_BYTES, MOST_PER_BYTE = 2**28, 20
 """All arrays of a file may take 256 MiB, and 20 bytes for each byte of the file: ten times any head model, which
@@ -126,29 +126,17 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     large, or anything else than an npz of such arrays.
     """
     expected = "an npz file of plain arrays"
-    with open_regular(path, expected) as stream:
-        try:
-            with zipfile.ZipFile(stream) as archive:
-                return _members(path, archive, stream.seek(0, io.SEEK_END))
-        except InputError:
-            raise
-        # A damaged archive makes zipfile and numpy raise almost anything.
-        except Exception as error:
-            raise InputError(path, "", expected, f"unreadable content ({error})"[:400]) from error
+    with reading(path, expected), open_regular(path, expected) as stream, zipfile.ZipFile(stream) as archive:
+        return _members(path, archive, stream.seek(0, io.SEEK_END))
 
 
 def read_npy(path: Path) -> np.ndarray:
     """Read the array of an npy file, as `read_npz` reads its members; raises `InputError` as it does."""
     expected = "an npy file of a plain array"
-    with open_regular(path, expected) as stream:
+    with reading(path, expected), open_regular(path, expected) as stream:
         size = stream.seek(0, io.SEEK_END)
         stream.seek(0)
-        try:
-            return _array(path, "", stream, size)
-        except InputError:
-            raise
-        except Exception as error:  # a damaged header makes numpy raise almost anything
-            raise InputError(path, "", expected, f"unreadable content ({error})"[:400]) from error
+        return _array(path, "", stream, size)
 
 
 def _members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str, np.ndarray]:

@@ -7,7 +7,6 @@ import re
 import shutil
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -19,7 +18,7 @@ import numpy as np
 
 from ....bench.contracts import ByteArray, Progress
 from ....bench.errors import InputError
-from ....bench.io.files import atomic_path, check_writable
+from ....bench.io.files import atomic_path, check_writable, reading
 from ....bench.io.images import probe_image, read_png
 from ....bench.io.video import encode_h264, ffmpeg
 from ..sequence import open_video, probe_video
@@ -29,7 +28,6 @@ MOST_ENTRIES = 10_000
 MOST_VIDEO_BYTES = 2**32
 MOST_PER_BYTE = 20
 """Bytes that an entry may unpack to for each of its own: videos do not compress."""
-_DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, ValueError)
 COMPARED = 24
 """Frames of a video that are compared with what was encoded, evenly spaced."""
 _FRAME = re.compile(r"(?P<sequence>.+)_(?P<timestep>\d{5,})_(?P<camera>[^_]+)\.png")
@@ -255,12 +253,8 @@ def check_submission(file: Path, data: Path | None, name: str, progress: Progres
 
 
 def _open(file: Path) -> zipfile.ZipFile:
-    if not file.is_file():
-        raise InputError(file, "", "the zip of a submission", "no such file")
-    try:
+    with reading(file, "the zip of a submission"):
         archive = zipfile.ZipFile(file)
-    except (*_DAMAGED, OSError) as error:
-        raise InputError(file, "", "the zip of a submission", f"no zip ({error})") from error
     if len(archive.infolist()) > MOST_ENTRIES:
         archive.close()
         raise InputError(file, "", f"at most {MOST_ENTRIES} entries", f"{len(archive.infolist())}")
@@ -280,13 +274,9 @@ def _unpack(file: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: 
     most = min(MOST_VIDEO_BYTES, MOST_PER_BYTE * entry.compress_size)
     if entry.file_size > most:
         raise InputError(file, entry.filename, f"a video of at most {most} bytes", f"{entry.file_size}")
-    try:
-        with archive.open(entry) as source, path.open("wb") as target:
-            shutil.copyfileobj(source, target, 1 << 20)
-    except (*_DAMAGED, OSError) as error:
-        raise InputError(
-            file, entry.filename, "an entry that unpacks", str(error) or type(error).__name__
-        ) from error
+    unpacking = reading(file, "an entry that unpacks", entry.filename)
+    with unpacking, archive.open(entry) as source, path.open("wb") as target:
+        shutil.copyfileobj(source, target, 1 << 20)
 
 
 def _check_video(path: Path, video: Video, track: Track, issues: Issues) -> int:

@@ -313,7 +313,7 @@ def test_what_the_server_would_refuse_is_named(track, tmp_path, change, says):
 
 def test_a_bomb_and_what_is_no_zip_are_bad_input(track, tmp_path):
     (tmp_path / "no.zip").write_bytes(b"PK nothing")
-    with pytest.raises(InputError, match="no zip"):
+    with pytest.raises(InputError, match="the zip of a submission"):
         check_submission(tmp_path / "no.zip", None, "", no_progress)
     with pytest.raises(InputError, match="no such file"):
         check_submission(tmp_path / "nowhere.zip", None, "", no_progress)
