@@ -129,7 +129,7 @@ def test_no_code_contains(what):
 READ_IN_ONE_PLACE = {
     r"\bnp\.load\(|\bzipfile\.ZipFile\(": {
         "bench/audit/bundle.py",
-        "bench/io/arrays.py",
+        "bench/io/archives.py",
         "datasets/nersemble/benchmark/submission.py",
         "methods/gaussian_ply/formats.py",  # an archive just made in memory
         "metrics/torch_file.py",

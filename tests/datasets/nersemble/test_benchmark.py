@@ -319,7 +319,7 @@ def test_a_bomb_and_what_is_no_zip_are_bad_input(track, tmp_path):
         check_submission(tmp_path / "nowhere.zip", None, "", no_progress)
     with zipfile.ZipFile(tmp_path / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(next(track.videos()).name, bytes(10**7))
-    with pytest.raises(InputError, match="a video of at most"):
+    with pytest.raises(InputError, match="at most .* bytes"):
         check_submission(tmp_path / "bomb.zip", None, "", no_progress)
 
 
