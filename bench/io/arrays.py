@@ -20,7 +20,7 @@ MOST_BYTES, MOST_PER_BYTE = 2**28, 20
 """All arrays of a file may take 256 MiB, and 20 bytes for each byte of the file: ten times any head model, which
 compresses well, and tracked parameters of any length, which do not."""
 
-MAX_MEMBERS, MAX_DIMENSIONS = 1000, 8
+MAX_MEMBERS = 1000
 MAX_MAGNITUDE = 1e4
 """Most that a number of a head model or its tracking may be: metres, radians, coefficients."""
 
