@@ -71,6 +71,13 @@ class InputError(HeadbenchError):
         super().__init__(f"{message} {self.remedy}" if remedy else message)
 
 
+def is_damage(error: BaseException) -> bool:
+    """Whether an error of reading tells of the file, and not of the disk, its permissions, or too little memory."""
+    cause = error.__cause__
+    machine = isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno is not None)
+    return not machine and (cause is None or is_damage(cause))
+
+
 class UnavailableError(HeadbenchError):
     """Something optional is not there (a package, weights, a compiler); says how to get it.
 

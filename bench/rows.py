@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -17,8 +18,8 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from .errors import InputError, shortened
-from .io.files import atomic_path
+from .errors import InputError, is_damage, shortened
+from .io.files import atomic_path, open_regular, reading
 from .specs import LABEL, RENAMED_METRICS, is_label
 
 log = logging.getLogger(__name__)
@@ -67,8 +68,13 @@ TYPES = {
     "other_cores": "float64",
 }
 
+ROWS = "a Parquet file of rows"
 MAX_FILE_BYTES = 256 * 2**20
 MAX_TEXT_BYTES = 256 * 2**20
+MAX_UNPACKED_BYTES = 512 * 2**20
+"""Of all columns, as the file declares them."""
+THRIFT_LIMITS: Any = {"thrift_string_size_limit": 2**20, "thrift_container_size_limit": 2**16}
+"""Longest text and list in what describes the columns; a list takes its declared length in memory."""
 SPARE_ROWS = 100_000
 """Rows that a file may have beyond one a byte: repeated rows, such as those of a metric that is missing, pack well."""
 JOINED_AT_ONCE = 64
@@ -121,14 +127,10 @@ class Rows:
         for a column that is missing or of another type, an empty entry, an unknown status, and a measured value that
         is not finite.
         """
-        try:
+        if not path.exists():
+            raise InputError(path, "", "the rows of a finished run", "no such file", "Start the run again.")
+        with reading(path, ROWS):
             table = _read_table(path)
-        except FileNotFoundError as error:
-            raise InputError(
-                path, "", "the rows of a finished run", "no such file", "Start the run again."
-            ) from error
-        except (OSError, ValueError, pa.ArrowException) as error:
-            raise InputError(path, "", "a Parquet file of rows", " ".join(str(error).split())) from error
         rows = _checked(table, path)
         return cls(rows.assign(metric=rows["metric"].replace(RENAMED_METRICS)))
 
@@ -352,37 +354,38 @@ def earlier_rows(path: Path) -> Rows | None:
     try:
         return Rows.read(path)
     except InputError as error:
-        if isinstance(error.__cause__, OSError) and error.__cause__.errno is not None:
-            raise  # not damaged: the disk or its permissions are at fault
+        if not is_damage(error):
+            raise
         log.warning("%s It is written again.", error)
         return None
 
 
 def _read_table(path: Path) -> pa.Table:
     """Read the columns of `Row`, text as dictionaries, so that what repeats takes no memory."""
-    if path.exists() and not path.is_file():
-        raise InputError(path, "", "a Parquet file of rows", "something that is no file")
-    size = path.stat().st_size
-    if size > MAX_FILE_BYTES:
-        raise InputError(path, "", f"rows of at most {MAX_FILE_BYTES} bytes", f"{size}")
-    about = pq.read_metadata(path)
-    if about.num_rows > size + SPARE_ROWS:
-        found = f"{about.num_rows} rows"
-        raise InputError(path, "", f"at most {size + SPARE_ROWS} rows in {size} bytes", found)
-    names = Counter(about.schema.column(index).path for index in range(about.num_columns))
-    wrong = [
-        f"{names[name] or 'no'} {name}"
-        for name in COLUMNS
-        if names[name] != 1 and (names[name] or name not in LATER)
-    ]
-    if wrong:
-        raise InputError(path, "columns", f"once each {', '.join(COLUMNS)}", ", ".join(wrong))
-    others = column_codecs(path) - {UNCOMPRESSED, SNAPPY}
-    if others:  # which can make a gigabyte of a small file
-        raise InputError(path, "compression", "SNAPPY or none", f"codec {min(others)} of the format")
-    present = [name for name in COLUMNS if names[name]]
-    texts = [name for name in TEXTS if names[name]]
-    with pq.ParquetFile(path, read_dictionary=texts) as file:
+    with open_regular(path, ROWS) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        if size > MAX_FILE_BYTES:
+            raise InputError(path, "", f"rows of at most {MAX_FILE_BYTES} bytes", f"{size}")
+        about = pq.ParquetFile(stream, **THRIFT_LIMITS).metadata
+        names = Counter(about.schema.column(index).path for index in range(about.num_columns))
+        wrong = [
+            f"{names[name] or 'no'} {name}"
+            for name in COLUMNS
+            if names[name] != 1 and (names[name] or name not in LATER)
+        ]
+        if wrong:
+            raise InputError(path, "columns", f"once each {', '.join(COLUMNS)}", ", ".join(wrong))
+        groups = [about.row_group(index) for index in range(about.num_row_groups)]
+        rows = max(about.num_rows, sum(group.num_rows for group in groups))
+        if rows > size + SPARE_ROWS:
+            raise InputError(path, "", f"at most {size + SPARE_ROWS} rows in {size} bytes", f"{rows} rows")
+        # Of a group, not of its columns: pyarrow ends the process where it is asked about a damaged column.
+        unpacked = sum(max(0, group.total_byte_size) for group in groups)
+        if unpacked > MAX_UNPACKED_BYTES:
+            raise InputError(path, "", f"columns of at most {MAX_UNPACKED_BYTES} bytes", f"{unpacked}")
+        present = [name for name in COLUMNS if names[name]]
+        texts = [name for name in TEXTS if names[name]]
+        file = pq.ParquetFile(stream, metadata=about, read_dictionary=texts, **THRIFT_LIMITS)
         table = file.read(columns=present, use_threads=False, use_pandas_metadata=False)
         table.validate(full=True)
         return table
@@ -437,80 +440,3 @@ def _texts(column: Any, path: Path, name: str) -> pd.Series[str]:
     if total > MAX_TEXT_BYTES:
         raise InputError(path, name, f"at most {MAX_TEXT_BYTES} bytes of text", f"{total}")
     return pd.Series(np.array(words, dtype=object)[indices], dtype="str")
-
-
-UNCOMPRESSED, SNAPPY = 0, 1
-"""Numbers of codecs in ``parquet.thrift``."""
-
-_ROW_GROUPS, _COLUMNS, _COLUMN_DATA, _CODEC = 4, 1, 3, 4  # ids of the fields that lead to a codec
-
-
-def column_codecs(path: Path) -> set[int]:
-    """Numbers of the codecs that the columns of a file name.
-
-    Raises `ValueError` for a footer that is not laid out as the format says. Give it what pyarrow took the metadata of.
-    """
-    content = path.read_bytes()
-    length = int.from_bytes(content[-8:-4], "little")
-    try:
-        footer, _ = _struct(content[-8 - length : -8], 0)
-        groups = [group[_COLUMNS] for group in footer[_ROW_GROUPS]]
-        return {int(column[_COLUMN_DATA][_CODEC]) for columns in groups for column in columns}
-    except (IndexError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"a footer that does not parse ({error!r})") from error
-
-
-def _struct(data: bytes, at: int) -> tuple[dict[int, Any], int]:
-    """Fields by id, and where the struct ends."""
-    fields: dict[int, Any] = {}
-    number = 0
-    while head := data[at]:
-        at += 1
-        number += head >> 4
-        if not head >> 4:
-            number, at = _integer(data, at)
-        kind = head & 15
-        fields[number], at = (kind == 1, at) if kind in (1, 2) else _value(data, at, kind)
-    return fields, at + 1
-
-
-def _value(data: bytes, at: int, kind: int) -> tuple[Any, int]:
-    """A value of one of Thrift's types, and where it ends; all have at least one byte."""
-    if kind in (1, 2, 3):
-        return data[at], at + 1
-    if kind in (4, 5, 6):
-        return _integer(data, at)
-    if kind == 7:
-        return None, at + 8  # a double
-    if kind == 8:
-        size, at = _unsigned(data, at)
-        return data[at : at + size], at + size
-    if kind in (9, 10):
-        size, inner = data[at] >> 4, data[at] & 15
-        at += 1
-        if size == 15:
-            size, at = _unsigned(data, at)
-        values = []
-        for _ in range(size):
-            value, at = _value(data, at, inner)
-            values.append(value)
-        return values, at
-    if kind == 12:
-        return _struct(data, at)
-    raise KeyError(f"type {kind}")
-
-
-def _unsigned(data: bytes, at: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
-        byte = data[at]
-        at += 1
-        value |= (byte & 127) << shift
-        shift += 7
-        if byte < 128:
-            return value, at
-
-
-def _integer(data: bytes, at: int) -> tuple[int, int]:
-    value, at = _unsigned(data, at)
-    return (value >> 1) ^ -(value & 1), at

@@ -23,7 +23,7 @@ import importlib.util
 import os
 import shutil
 import urllib.request
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from http.client import HTTPException
 from itertools import groupby, islice
@@ -292,7 +292,7 @@ def load_backbone(spec: NetworkSpec, path: Path) -> dict[str, Tensor]:
 
     Raises `InputError` for a file that is none, lacks a parameter, or has one of another shape or not finite.
     """
-    return _read(path, {name: tuple(value.shape) for name, value in spec.build().state_dict().items()})
+    return read_weights(path, {name: tuple(value.shape) for name, value in spec.build().state_dict().items()})
 
 
 def load_linear(spec: NetworkSpec, path: Path | None = None) -> list[Tensor]:
@@ -310,7 +310,7 @@ def load_linear(spec: NetworkSpec, path: Path | None = None) -> list[Tensor]:
         folder = Path(package.submodule_search_locations[0]) / "functional" / "image" / "lpips_models"
         path = folder / f"{spec.name}.pth"
     shapes = {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(spec.channels)}
-    return list(_read(path, shapes).values())
+    return list(read_weights(path, shapes).values())
 
 
 def _named(spec: NetworkSpec, path: Path, option: str) -> Path:
@@ -347,8 +347,3 @@ def _fetch(url: str, sha256_prefix: str, target: Path) -> str:
     except (OSError, HTTPException) as error:
         return f"{url}: {error}"
     return ""
-
-
-def _read(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
-    found = read_weights(path, shapes)
-    return {name: torch.from_numpy(values).to(torch.float32) for name, values in found.items()}

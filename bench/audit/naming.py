@@ -15,7 +15,7 @@ import numpy as np
 from ..contracts import ByteArray, Clip, FrameKey
 from ..errors import InputError
 from ..io.documents import read_text
-from ..io.files import with_slashes
+from ..io.files import reading, with_slashes
 from ..io.images import read_pixels, read_png
 from ..registry import get, resolve, unknown
 from ..runner.captures import found_captures
@@ -233,12 +233,10 @@ def _listed(path: Path, folder: Path, clips: Sequence[Clip]) -> Renders:
     """Images that a CSV file names, relative to ``folder``; a column ``subject`` is needed with several captures."""
     text = read_text(path, "CSV", MAX_MAP_BYTES)
     needed = {*COLUMNS, *(["subject"] if len(clips) > 1 else [])}
-    try:
+    with reading(path, "a CSV file"):
         reader = csv.reader(io.StringIO(text, newline=""), strict=True)
         header = next(reader, [])
         rows = [(reader.line_num, row) for row in reader if row]
-    except csv.Error as error:
-        raise InputError(path, "", "a CSV file", str(error)) from error
     allowed = needed | {"subject"}
     if len(set(header)) != len(header) or not needed <= set(header) <= allowed:
         raise InputError(path, "line 1", f"the columns {', '.join(sorted(needed))}", ", ".join(header))

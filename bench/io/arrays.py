@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import math
-import zipfile
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -14,17 +13,21 @@ from typing import IO
 import numpy as np
 
 from ..errors import InputError
-from .files import open_regular
+from .archives import open_archive
+from .files import open_regular, reading
 
 MOST_BYTES, MOST_PER_BYTE = 2**28, 20
 """All arrays of a file may take 256 MiB, and 20 bytes for each byte of the file: ten times any head model, which
 compresses well, and tracked parameters of any length, which do not."""
 
-MAX_MEMBERS, MAX_DIMENSIONS = 1000, 8
+MAX_MEMBERS = 1000
 MAX_MAGNITUDE = 1e4
 """Most that a number of a head model or its tracking may be: metres, radians, coefficients."""
 
-_DEFLATE_RATIO = 1040  # bytes out of one that went in are 1032 at most
+MAX_HEADER = 10_000
+"""Characters of what describes an array, which numpy parses as Python's literals."""
+
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _KINDS = "biufU"
 _LARGEST_ITEM = 8
 
@@ -125,104 +128,40 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     anything is unpacked; nothing is ever unpickled. Raises `InputError` for a file that is missing, damaged, too
     large, or anything else than an npz of such arrays.
     """
-    expected = "an npz file of plain arrays"
-    with open_regular(path, expected) as stream:
-        try:
-            with zipfile.ZipFile(stream) as archive:
-                return _members(path, archive, stream.seek(0, io.SEEK_END))
-        except InputError:
-            raise
-        # A damaged archive makes zipfile and numpy raise almost anything.
-        except Exception as error:
-            raise InputError(path, "", expected, f"unreadable content ({error})"[:400]) from error
+    bounds = {"members": MAX_MEMBERS, "spare_bytes": MOST_BYTES, "per_byte": MOST_PER_BYTE}
+    content: dict[str, np.ndarray] = {}
+    with open_archive(path, "an npz file of plain arrays", **bounds) as archive:
+        for entry in archive.infolist():
+            name = entry.filename.removesuffix(".npy")
+            if name == entry.filename:
+                raise InputError(path, name, "members .npy", "another")
+            with archive.open(entry) as stream:
+                content[name] = _array(path, name, stream, entry.file_size)
+    return content
 
 
 def read_npy(path: Path) -> np.ndarray:
     """Read the array of an npy file, as `read_npz` reads its members; raises `InputError` as it does."""
-    expected = "an npy file of a plain array"
-    with open_regular(path, expected) as stream:
-        size = stream.seek(0, io.SEEK_END)
-        stream.seek(0)
-        try:
-            return _array(path, "", stream, size)
-        except InputError:
-            raise
-        except Exception as error:  # a damaged header makes numpy raise almost anything
-            raise InputError(path, "", expected, f"unreadable content ({error})"[:400]) from error
-
-
-def _members(path: Path, archive: zipfile.ZipFile, size: int) -> dict[str, np.ndarray]:
-    limit = MOST_BYTES + MOST_PER_BYTE * size
-    unpacked = 0
-    entries = archive.infolist()
-    if len(entries) > MAX_MEMBERS:
-        raise InputError(path, "", f"at most {MAX_MEMBERS} arrays", f"{len(entries)}")
-    for entry in entries:
-        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise InputError(path, entry.filename[:80], "a stored or deflated member", "another compression")
-        ratio = 1 if entry.compress_type == zipfile.ZIP_STORED else _DEFLATE_RATIO
-        unpacked += entry.file_size
-        if entry.compress_size > size or entry.file_size > ratio * entry.compress_size:
-            found = f"{entry.file_size} bytes in {entry.compress_size} of {size}"
-            raise InputError(path, entry.filename[:80], "a member that fits into the file", found)
-        if unpacked > limit:
-            raise InputError(path, "", f"at most {limit} bytes of arrays", f"{unpacked} bytes or more")
-    content: dict[str, np.ndarray] = {}
-    for entry in entries:
-        name = entry.filename.removesuffix(".npy")
-        if name == entry.filename or name in content:
-            raise InputError(
-                path, entry.filename[:80], "members .npy, each name once", "another or a second one"
-            )
-        with archive.open(entry) as stream:
-            content[name] = _array(path, name, stream, entry.file_size)
-    return content
+    with open_regular(path, "an npy file of a plain array") as stream:
+        return _array(path, "", stream, os.fstat(stream.fileno()).st_size)
 
 
 def _array(path: Path, name: str, stream: IO[bytes], size: int) -> np.ndarray:
     """One array in npy format, ``size`` bytes with its header."""
-    counted = _Counted(stream)
-    version = np.lib.format.read_magic(counted)
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in readers:
-        raise InputError(path, name, "the npy format 1.0 or 2.0", f"{version[0]}.{version[1]}")
-    shape, fortran, dtype = readers[version](counted)
+    with reading(path, "an array in npy format", name):
+        version = np.lib.format.read_magic(stream)
+        shape, _, dtype = _HEADERS[version](stream, max_header_size=MAX_HEADER)
     plain = dtype.kind in _KINDS and dtype.subdtype is None and dtype.names is None
     if not plain or (dtype.kind != "U" and dtype.itemsize > _LARGEST_ITEM):
         raise InputError(path, name, "numbers of at most 8 bytes, or text", f"dtype {dtype}"[:100])
-    wanted = math.prod(shape) * dtype.itemsize if len(shape) <= MAX_DIMENSIONS else -1
-    if wanted != size - counted.read_bytes or any(side < 0 or side > 2**48 for side in shape):
-        found = f"{size - counted.read_bytes} bytes"
-        raise InputError(path, name, f"the bytes of {dtype} of shape {shape}"[:200], found)
-    raw = stream.read(wanted)
-    if len(raw) != wanted or stream.read(1):
-        raise InputError(path, name, f"{wanted} bytes", "another number")
-    values = np.frombuffer(raw, np.uint8 if dtype.kind == "b" else dtype)
-    if dtype.kind == "b":
-        values = values != 0
-    if dtype.kind == "U":
-        _check_text(path, name, values, dtype)
-    values = values.reshape(shape, order="F" if fortran else "C")
-    return np.array(values, dtype=values.dtype.newbyteorder("="), order="K")
-
-
-def _check_text(path: Path, name: str, values: np.ndarray, dtype: np.dtype) -> None:
-    """Numbers in place of characters that are none make Python raise wherever the text is used."""
-    if not dtype.itemsize:
-        return
-    codes = values.view(np.dtype(np.uint32).newbyteorder(dtype.byteorder))
-    if codes.size and (int(codes.max()) > 0x10FFFF or bool(((codes >= 0xD800) & (codes < 0xE000)).any())):
-        raise InputError(path, name, "text", "numbers that are no characters")
-
-
-class _Counted:
-    """A stream that counts what was read of it."""
-
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._stream, self.read_bytes = stream, 0
-
-    def read(self, size: int = -1, /) -> bytes:
-        """Read up to ``size`` bytes."""
-        content = self._stream.read(size)
-        self.read_bytes += len(content)
-        return content
+    left = size - stream.tell()
+    if math.prod(shape) * dtype.itemsize != left:
+        raise InputError(path, name, f"the bytes of {dtype} of shape {shape}"[:200], f"{left} bytes")
+    stream.seek(0)
+    with reading(path, "an array in npy format", name):
+        values = np.lib.format.read_array(stream, allow_pickle=False, max_header_size=MAX_HEADER)
+        if dtype.kind == "U":  # numbers that are no characters would raise wherever the text is used
+            "".join(values.ravel().tolist()).encode()
+        if dtype.kind == "b":  # other bytes than 0 and 1 would count as several
+            values = values.view(np.uint8) != 0
+        return values.astype(dtype.newbyteorder("="), copy=False)

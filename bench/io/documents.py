@@ -22,6 +22,7 @@ import yaml
 
 from ..errors import InputError
 from ..registry import unknown
+from .files import read_bytes, reading
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -145,24 +146,10 @@ def read_text(path: Path, what: str, limit: int) -> str:
     ``limit`` bytes, or has another encoding.
     """
     article = f"a {what} file"
-    try:
-        if path.exists() and not path.is_file():
-            raise InputError(path, "", f"a readable {what} file", "something that is no file")
-        with path.open("rb") as stream:
-            content = stream.read(limit + 1)
-        if len(content) > limit:
-            raise InputError(path, "", f"{article} of at most {limit} bytes", "a larger one")
-        refuse_utf16(content, path, f"{article} in UTF-8")
+    content = read_bytes(path, article, limit)
+    refuse_utf16(content, path, f"{article} in UTF-8")
+    with reading(path, f"{article} in UTF-8"):
         return content.decode("utf-8-sig")
-    except FileNotFoundError as error:
-        raise InputError(path, "", article, "no such file") from error
-    except UnicodeDecodeError as error:
-        found = f"content that does not parse (no UTF-8 at byte {error.start})"
-        raise InputError(path, "", f"valid {what}", found) from error
-    except OSError as error:
-        raise InputError(path, "", f"a readable {what} file", error.strerror or str(error)) from error
-    except ValueError as error:  # a name that no file can have
-        raise InputError(path, "", f"a readable {what} file", str(error)) from error
 
 
 def refuse_utf16(content: bytes, source: Source, expected: str) -> None:

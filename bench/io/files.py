@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ..errors import InputError, UnavailableError
+from ..errors import HeadbenchError, InputError, UnavailableError
 
 MAX_NAME_BYTES = 120
 """Longest name of a subject, a sequence or a camera; a file name made of several has to fit into 255 bytes."""
@@ -434,17 +434,48 @@ def _check_target(path: Path) -> None:
 
 
 @contextmanager
+def reading(path: str | os.PathLike[str], expected: str, key: str = "", remedy: str = "") -> Iterator[None]:
+    """Turn any exception of a library that reads a file into one `InputError` with the library's words.
+
+    Errors of headbench pass, and so does a full disk. The block should call the library and nothing else, since a fault
+    of the program in it would be taken for one of the file.
+
+    Parameters
+    ----------
+    path : the file that is read; ``key`` is the entry in it.
+    expected : what is being read, such as "a NumPy archive".
+    remedy : what to do about a file that cannot be read.
+    """
+    try:
+        yield
+    except HeadbenchError:
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise InputError(path, key, expected, _words(error), remedy) from error
+
+
+def _words(error: Exception) -> str:
+    """What an exception says, in one line."""
+    if isinstance(error, FileNotFoundError):
+        return "no such file"
+    if isinstance(error, MemoryError):
+        return "too little memory to read it"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    lines = str(error).strip().splitlines()
+    return f"unreadable content ({': '.join([type(error).__name__, *lines[:1]])})"
+
+
+@contextmanager
 def open_regular(path: Path, expected: str) -> Iterator[BinaryIO]:
     """Open a file for reading bytes. Raises `InputError`, which names what was ``expected``, for anything else.
 
     A pipe or a device of that name, which might never end, is refused without being waited for.
     """
-    try:
+    with reading(path, expected):
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-    except FileNotFoundError as error:
-        raise InputError(path, "", expected, "no such file") from error
-    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        raise InputError(path, "", expected, getattr(error, "strerror", "") or str(error)) from error
     kind = os.fstat(handle).st_mode
     if not stat.S_ISREG(kind):
         os.close(handle)
@@ -459,10 +490,8 @@ def read_bytes(path: Path, expected: str, limit: int) -> bytes:
         size = os.fstat(stream.fileno()).st_size
         if size > limit:
             raise InputError(path, "", f"{expected} of at most {limit} bytes", f"{size}")
-        try:
+        with reading(path, expected):
             return stream.read(size)
-        except OSError as error:
-            raise InputError(path, "", expected, error.strerror or str(error)) from error
 
 
 def check_name(name: str, file: str | os.PathLike[str], key: str) -> str:

@@ -27,7 +27,7 @@ from ..contracts import (
     PreparedMethod,
     Progress,
 )
-from ..errors import HeadbenchError, InputError, UnavailableError
+from ..errors import HeadbenchError, InputError, UnavailableError, is_damage
 from ..io.files import check_name, digest, digest_file, grouped_writes, refuse_links
 from ..io.images import quantise, read_png, write_png
 from ..machine import PeakMemory, ProcessorLoad, machine_name, processor_seconds, use_device
@@ -190,7 +190,11 @@ def fit(job: Job) -> Avatar:
                 _train(job, method, report)
             except InputError as error:
                 kept = Path(error.file)
-                if earlier is None or not (job.cell.avatar in kept.parents and kept.is_file()):
+                if (
+                    earlier is None
+                    or not is_damage(error)
+                    or not (job.cell.avatar in kept.parents and kept.is_file())
+                ):
                     raise
                 log.warning("%s: %s It is trained from the start.", job.name, error)
                 job.cell.set_aside(job.cell.avatar)

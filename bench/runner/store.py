@@ -29,7 +29,7 @@ from typing import Any, Literal, Required
 from typing_extensions import TypedDict
 
 from ..contracts import FrameKey
-from ..errors import InputError
+from ..errors import InputError, is_damage
 from ..io.documents import checked, read_json
 from ..io.files import digest_file, is_system_file, write_json
 from ..manifest import Manifest
@@ -114,8 +114,8 @@ class Cell:
             try:
                 self.step(name)
             except InputError as error:
-                if isinstance(error.__cause__, OSError):
-                    raise  # not damaged: the disk or its permissions are at fault
+                if not is_damage(error):
+                    raise
                 log.warning("%s What it records is made again.", error)
                 (self.folder / f"{name}.json").unlink()
 

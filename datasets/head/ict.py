@@ -24,6 +24,7 @@ from skimage.measure import points_in_poly
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, Member, check_arrays
+from ...bench.io.files import reading
 from ..rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from .arrays import HeadArrays
 from .geometry import border_edges, even_weights, fit_sphere, mesh_edges, smoothstep
@@ -81,11 +82,8 @@ def ict_head(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> He
         Where a member is missing or does not fit the others, or the mesh has not the kit's parts.
     """
     _check(file, content)
-    try:
+    with reading(file, "the mesh of ICT-FaceKit, whose parts can be told apart"):
         return _rigged(file, content).validate(file)
-    except (ValueError, IndexError, ArithmeticError, np.linalg.LinAlgError) as error:
-        expected = "the mesh of ICT-FaceKit, whose parts can be told apart"
-        raise InputError(file, "", expected, f"one whose rig cannot be fitted ({error})"[:400]) from error
 
 
 def _rigged(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> HeadArrays:

@@ -29,7 +29,7 @@ from ...bench.contracts import Camera, FloatArray, HeadPose, Progress
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers
 from ...bench.io.documents import checked, read_json, read_text
-from ...bench.io.files import with_slashes
+from ...bench.io.files import reading, with_slashes
 from ...bench.io.images import probe_image
 from ..ga.layout import ALL_FRAMES_FILE, SPLIT_FILES
 from ..ga.transforms import check_lenses, read_rigid
@@ -274,10 +274,8 @@ class _Meshes:
 
     def _numbers(self, path: Path) -> FloatArray:
         text = read_text(path, "text", MAX_TEXT)
-        try:
+        with reading(path, "numbers, one a line"):
             values = np.array([float(word) for word in text.split()])  # no array of the longest word
-        except ValueError as error:
-            raise InputError(path, "", "numbers, one a line", "other text") from error
         check_numbers(path, "", values, MAX_MAGNITUDE)
         self.files.add(path)
         return values

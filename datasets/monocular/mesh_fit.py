@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers
-from ...bench.io.files import read_bytes
+from ...bench.io.files import read_bytes, reading
 from ..head.arrays import JOINT_NAMES, HeadArrays
 
 MAX_BYTES = 2**26
@@ -44,12 +44,8 @@ def read_vertices(path: Path, count: int) -> FloatArray:
     if len(found) != count:
         remedy = "Give the head model the video was tracked with."
         raise InputError(path, "v", f"{count} vertices, as the head model has", f"{len(found)}", remedy)
-    try:
-        vertices = np.array(
-            [[float(word) for word in vertex] for vertex in found]
-        )  # no array of the longest word
-    except ValueError as error:
-        raise InputError(path, "v", "three numbers for each vertex", "text that is none") from error
+    with reading(path, "three numbers for each vertex", "v"):  # no array of the longest word
+        vertices = np.array([[float(word) for word in vertex] for vertex in found])
     check_numbers(path, "v", vertices, MAX_MAGNITUDE)
     return vertices
 

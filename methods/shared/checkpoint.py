@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ...bench.errors import InputError
 from ...bench.io.documents import parse_json
-from ...bench.io.files import write_bytes
+from ...bench.io.files import reading, write_bytes
 from .tensor_files import read_safetensors
 
 LAYOUT = 2
@@ -65,12 +65,10 @@ def load_checkpoint(path: Path, run: str, device: str) -> dict[str, Any] | None:
         )
     if content.get("digest") != _digest(content.get("state"), tensors):
         raise InputError(path, "digest", "what was written", "damaged data", REMEDY)
-    try:
-        # Copies, since the alignment of numbers in memory, too, decides how sums are rounded.
-        copies = {name: value.to(device, copy=True) for name, value in tensors.items()}
+    # Copies, since the alignment of numbers in memory, too, decides how sums are rounded.
+    copies = {name: value.to(device, copy=True) for name, value in tensors.items()}
+    with reading(path, "containers and tensors of the file", "state", REMEDY):
         state = _unpacked(content["state"], copies)
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        raise InputError(path, "state", "containers and tensors of the file", str(error), REMEDY) from error
     if not isinstance(state, dict):
         raise InputError(path, "state", "a dictionary", type(state).__name__, REMEDY)
     return state

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ...bench.contracts import Budget, ByteArray, Clip, FrameKey, Progress
 from ...bench.errors import InputError
+from ...bench.io.files import reading
 from .avatar_kernel import available
 from .checkpoint import REMEDY, load_checkpoint, save_checkpoint
 from .device_frame import pinned, sent
@@ -135,14 +136,11 @@ def train(
                 total = _estimate(trainable, sampler, left, published_length, clock, wait)
         trainable.begin(Timeline(total, published_length))
     else:
-        try:
+        with reading(path, "the state of this method", "state", REMEDY):
             iteration, total, spent = int(saved["iteration"]), int(saved["total"]), float(saved["seconds"])
             trainable.begin(Timeline(total, published_length))
             trainable.load_state(saved["trainable"])
             losses += [(int(at), float(value)) for at, value in saved["losses"]]
-        except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            found = f"another ({type(error).__name__}: {error})"
-            raise InputError(path, "state", "the state of this method", found, REMEDY) from error
     estimated = "" if budget.iterations else f"{total} iterations estimated; "
 
     def seconds() -> float:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member, check_arrays
-from ...bench.io.files import open_regular
+from ...bench.io.files import open_regular, reading
 
 MAX_HEADER = 2**24
 """Bytes of names, shapes and metadata; the largest of ours, a checkpoint's, has some ten thousand."""
@@ -34,14 +34,9 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     header = struct.unpack("<Q", first)[0] if len(first) == 8 else size
     if header > min(size, MAX_HEADER):
         raise InputError(path, "", expected, f"{size} bytes, {header} of them names and shapes")
-    try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-            metadata = dict(file.metadata() or {})
-    except MemoryError:
-        raise  # says nothing of the file
-    except Exception as error:  # for a damaged file, safetensors and torch raise errors of many types
-        raise InputError(path, "", expected, f"{type(error).__name__}: {error}") from error
+    with reading(path, expected), safe_open(path, framework="pt", device="cpu") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        metadata = dict(file.metadata() or {})
     for name, value in tensors.items():
         if any(side >= 2**31 for side in value.shape):  # a tensor without numbers may have any shape
             raise InputError(path, name, "sides below 2^31", f"shape {tuple(value.shape)}")

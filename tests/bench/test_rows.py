@@ -116,8 +116,8 @@ def twice(path, frame):
     [
         (lambda p, f: p.write_bytes(b""), "a Parquet file of rows"),
         (lambda p, f: p.write_bytes(p.read_bytes()[:-400]), "a Parquet file of rows"),
-        (lambda p, f: (p.unlink(), p.mkdir()), "no file"),
-        (lambda p, f: (p.unlink(), os.mkfifo(p)), "no file"),
+        (lambda p, f: (p.unlink(), p.mkdir()), "a folder"),
+        (lambda p, f: (p.unlink(), os.mkfifo(p)), "a pipe"),
         (lambda p, f: written(p, f.drop(columns="protocol")), "no protocol"),
         (lambda p, f: written(p, f.assign(other_cores=-0.5)), "other_cores: expected a number from 0"),
         (twice, "2 task"),
@@ -132,16 +132,17 @@ def twice(path, frame):
         (lambda p, f: written(p, f.assign(status="good")), "'good'"),
         (lambda p, f: written(p, f.assign(value=float("inf"))), "a finite value"),
         (lambda p, f: written(p, f.assign(value=float("nan"))), "a finite value"),
-        (lambda p, f: written(p, f, compression="gzip"), "codec 2 of the format"),
+        (lambda p, f: replaced(p, b"\x08protocol\x15\x02", b"\x08protocol\x15\x03"), "a Parquet file"),
         (
-            lambda p, f: replaced(p, b"\x08protocol\x15\x02", b"\x08protocol\x15\x03"),
-            "codec -2 of the format",
+            lambda p, f: written(p, f.assign(reason=[f"{i:0100000}" for i in range(len(f))])),
+            "at most 2000000",
         ),
         (lambda p, f: replaced(p, b"\x08protocol", b"\x08p\xecotocol"), "a Parquet file of rows"),
         (lambda p, f: written(p, pd.concat([f] * 5000)), "at most"),
     ],
 )
-def test_a_file_that_holds_no_rows_is_refused(rows, tmp_path, spoil, found):
+def test_a_file_that_holds_no_rows_is_refused(rows, tmp_path, monkeypatch, spoil, found):
+    monkeypatch.setattr(module, "MAX_UNPACKED_BYTES", 2_000_000)
     path = tmp_path / "rows.parquet"
     rows.write(path)
     spoil(path, rows.select(**NAMED))

@@ -1,13 +1,13 @@
-"""Files of ``torch.save`` read without torch: equal to what torch reads, and never more than is in the file."""
+"""Files of ``torch.save``: what is read of them, and what is refused."""
 
 from __future__ import annotations
 
 import io
+import os
 import struct
 import tracemalloc
 import zipfile
 
-import numpy as np
 import pytest
 import torch
 
@@ -46,8 +46,8 @@ def test_tensors_are_those_that_torch_reads(tmp_path, layout):
         found = read_weights(path, wanted)
         assert [*found] == [*wanted]
         for name, values in found.items():
-            np.testing.assert_array_equal(values, state[name].detach().numpy())
-            assert values.dtype == state[name].detach().numpy().dtype
+            assert torch.equal(values, state[name].detach().float())
+            assert values.dtype == torch.float32
 
 
 def lie(content: bytes, was: bytes, now: bytes) -> bytes:
@@ -63,13 +63,27 @@ def lie(content: bytes, was: bytes, now: bytes) -> bytes:
     return stream.getvalue()
 
 
+class Call:
+    """Pickles as a call."""
+
+    def __reduce__(self):
+        return os.mkdir, ("made-by-a-pickle",)
+
+
 ONE = {"plain": torch.zeros(200)}
 LARGE = b"J" + struct.pack("<i", 2**31 - 1)
 DAMAGED = {
     "a storage of more numbers than the file has": lie(saved(ONE, NEW), b"K\xc8", LARGE),
     "a storage of fewer": lie(saved(ONE, NEW), b"K\xc8", b"K\x07"),
     "the same in the old layout": saved(ONE, OLD).replace(b"K\xc8", LARGE),
-    "a stride of zero": saved({"plain": torch.zeros(1).expand(200)}, NEW),
+    "a sparse tensor": saved({"plain": torch.zeros(200).to_sparse()}, NEW),
+    "another shape": saved({"plain": torch.zeros(201)}, NEW),
+    "integers": saved({"plain": torch.zeros(200, dtype=torch.int32)}, NEW),
+    "infinite numbers": saved({"plain": torch.full((200,), torch.inf)}, NEW),
+    "no tensor": saved({"plain": 1}, NEW),
+    "another name": saved({"other": torch.zeros(200)}, NEW),
+    "a call": saved({"plain": Call()}, NEW),
+    "a call in the old layout": saved({"plain": Call()}, OLD),
     "negative sizes": lie(saved(ONE, NEW), b"K\xc8", b"J\xff\xff\xff\xff"),
     "an archive without a pickle": b"PK\x05\x06" + bytes(18),
     "a compressed archive": b"",  # made in the test
@@ -80,7 +94,8 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("name", DAMAGED)
-def test_what_a_file_declares_is_compared_with_what_it_has(tmp_path, name):
+def test_other_files_are_refused_and_nothing_is_run(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
     path = tmp_path / "w.pth"
     path.write_bytes(DAMAGED[name])
     if name == "a compressed archive":
@@ -93,18 +108,5 @@ def test_what_a_file_declares_is_compared_with_what_it_has(tmp_path, name):
     tracemalloc.stop()
     assert peak < 2**20
     assert caught.value.file == str(path)
-
-
-@pytest.mark.parametrize("layout", [OLD, NEW])
-def test_damage_is_refused_or_gives_numbers(tmp_path, layout):
-    path, whole, rng = tmp_path / "w.pth", saved(STATE, layout), np.random.default_rng(0)
-    for _ in range(300):
-        damaged = bytearray(whole)
-        for position in rng.integers(0, len(whole), 3):
-            damaged[position] = rng.integers(256)
-        path.write_bytes(damaged[: rng.choice([len(whole), rng.integers(len(whole))])])
-        try:
-            found = read_weights(path, WANTED)
-        except InputError:
-            continue
-        assert all(values.shape == WANTED[name] for name, values in found.items())
+    assert "weights_only" not in str(caught.value)
+    assert [*tmp_path.iterdir()] == [path]

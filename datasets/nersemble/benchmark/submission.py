@@ -7,7 +7,6 @@ import re
 import shutil
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -19,7 +18,8 @@ import numpy as np
 
 from ....bench.contracts import ByteArray, Progress
 from ....bench.errors import InputError
-from ....bench.io.files import atomic_path, check_writable
+from ....bench.io.archives import open_archive
+from ....bench.io.files import atomic_path, check_writable, reading
 from ....bench.io.images import probe_image, read_png
 from ....bench.io.video import encode_h264, ffmpeg
 from ..sequence import open_video, probe_video
@@ -28,8 +28,7 @@ from .tracks import CRF, TRACKS, Track, Video
 MOST_ENTRIES = 10_000
 MOST_VIDEO_BYTES = 2**32
 MOST_PER_BYTE = 20
-"""Bytes that an entry may unpack to for each of its own: videos do not compress."""
-_DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, ValueError)
+"""Bytes that entries may unpack to for each of the zip: videos do not compress."""
 COMPARED = 24
 """Frames of a video that are compared with what was encoded, evenly spaced."""
 _FRAME = re.compile(r"(?P<sequence>.+)_(?P<timestep>\d{5,})_(?P<camera>[^_]+)\.png")
@@ -230,10 +229,10 @@ def check_submission(file: Path, data: Path | None, name: str, progress: Progres
         For a file that is no zip, or whose entries are too many or too large to be looked at.
     """
     issues = Issues()
-    with _open(file) as archive, tempfile.TemporaryDirectory() as scratch:
+    bounds = {"members": MOST_ENTRIES, "spare_bytes": 0, "per_byte": MOST_PER_BYTE}
+    opened = open_archive(file, "the zip of a submission", **bounds)
+    with opened as archive, tempfile.TemporaryDirectory() as scratch:
         entries = {entry.filename: entry for entry in archive.infolist()}
-        if len(entries) != len(archive.infolist()):
-            issues.refused.append("Entries of the zip have the same name.")
         track = TRACKS[name] if name else _track_of(entries)  # type: ignore[index]
         wanted = {video.name: video for video in track.videos(data)}
         issues.refused += [f"{missing}: missing." for missing in wanted if missing not in entries]
@@ -254,39 +253,17 @@ def check_submission(file: Path, data: Path | None, name: str, progress: Progres
     return track, issues
 
 
-def _open(file: Path) -> zipfile.ZipFile:
-    if not file.is_file():
-        raise InputError(file, "", "the zip of a submission", "no such file")
-    try:
-        archive = zipfile.ZipFile(file)
-    except (*_DAMAGED, OSError) as error:
-        raise InputError(file, "", "the zip of a submission", f"no zip ({error})") from error
-    if len(archive.infolist()) > MOST_ENTRIES:
-        archive.close()
-        raise InputError(file, "", f"at most {MOST_ENTRIES} entries", f"{len(archive.infolist())}")
-    return archive
-
-
 def _track_of(names: Sequence[str] | dict[str, zipfile.ZipInfo]) -> Track:
     return max(TRACKS.values(), key=lambda track: sum(video.name in names for video in track.videos()))
 
 
 def _unpack(file: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) -> None:
-    if entry.compress_type not in (
-        zipfile.ZIP_STORED,
-        zipfile.ZIP_DEFLATED,
-    ):  # others take memory without bound
-        raise InputError(file, entry.filename, "stored or deflated", f"compression {entry.compress_type}")
-    most = min(MOST_VIDEO_BYTES, MOST_PER_BYTE * entry.compress_size)
-    if entry.file_size > most:
-        raise InputError(file, entry.filename, f"a video of at most {most} bytes", f"{entry.file_size}")
-    try:
-        with archive.open(entry) as source, path.open("wb") as target:
-            shutil.copyfileobj(source, target, 1 << 20)
-    except (*_DAMAGED, OSError) as error:
-        raise InputError(
-            file, entry.filename, "an entry that unpacks", str(error) or type(error).__name__
-        ) from error
+    if entry.file_size > MOST_VIDEO_BYTES:
+        expected = f"a video of at most {MOST_VIDEO_BYTES} bytes"
+        raise InputError(file, entry.filename, expected, f"{entry.file_size}")
+    unpacking = reading(file, "an entry that unpacks", entry.filename)
+    with unpacking, archive.open(entry) as source, path.open("wb") as target:
+        shutil.copyfileobj(source, target, 1 << 20)
 
 
 def _check_video(path: Path, video: Video, track: Track, issues: Issues) -> int:

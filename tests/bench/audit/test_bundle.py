@@ -110,7 +110,7 @@ def listing(**changes):
         (lambda files: relisted({**files, "../x/seed-0/fit.json": b"{}"}), "expected files of a run"),
         (lambda files: relisted({**files, "a/b/seed-0/avatar.pkl": b""}), "expected files of a run"),
         (lambda files: {n: c for n, c in files.items() if n != INDEX}, "bundle.json: expected a list of the files"),
-        (lambda files: [*files.items(), ("run.json", b"{}")], "each once"),
+        (lambda files: [*files.items(), ("run.json", b"{}")], "each name once"),
         (listing(link="javascript:alert(1)"), "link: expected an address"),
         (listing(by="x" * 200), "by: expected at most 120 printable characters"),
         (listing(files=[]), "files"),
@@ -137,9 +137,9 @@ def test_content_much_larger_than_the_file_is_refused(packed, tmp_path):
         # Within the deflated run.json, past names and sizes.
         (
             lambda data, at: data[: at + 20] + bytes([data[at + 20] ^ 255]) + data[at + 21 :],
-            "a damaged ZIP file",
+            "unreadable content",
         ),
-        (lambda data, at: data[: len(data) // 2], "a damaged ZIP file"),
+        (lambda data, at: data[: len(data) // 2], "unreadable content"),
     ],
 )
 def test_damaged_archives_are_refused(packed, tmp_path, change, words):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.bench.errors import InputError
+from headbench.bench.errors import InputError, UnavailableError, is_damage
 from headbench.bench.io import files
 from headbench.bench.io.files import (
     GROUP_FILES,
@@ -27,6 +27,7 @@ from headbench.bench.io.files import (
     flush_renames,
     grouped_writes,
     output_inside,
+    reading,
     refuse_links,
     remove_dead_temporaries,
     write_json,
@@ -382,3 +383,46 @@ def test_a_tilde_is_the_home_folder(monkeypatch, text, expected):
             expand_home(text, "run.yaml")
     else:
         assert expand_home(text, "run.yaml") == expected
+
+
+@pytest.mark.parametrize(
+    ("error", "found", "damage"),
+    [
+        (ValueError("first line\nsecond"), "unreadable content (ValueError: first line)", True),
+        (KeyError(), "unreadable content (KeyError)", True),
+        (RecursionError("too deep"), "unreadable content (RecursionError: too deep)", True),
+        (OSError("of a library"), "unreadable content (OSError: of a library)", True),
+        (ValueError("\x1b" + "x" * 10_000), None, True),
+        (MemoryError(), "too little memory to read it", False),
+        (FileNotFoundError(errno.ENOENT, "gone"), "no such file", False),
+        (OSError(errno.EIO, "Input/output error"), "Input/output error", False),
+    ],
+    ids=repr,
+)
+def test_what_a_library_raises_becomes_one_input_error(tmp_path, error, found, damage):
+    with pytest.raises(InputError) as caught, reading(tmp_path / "a.npz", "a NumPy archive", "x", "Remedy."):
+        raise error
+    refused = caught.value
+    assert refused.__cause__ is error
+    assert is_damage(refused) is damage
+    assert (refused.file, refused.key, refused.expected) == (str(tmp_path / "a.npz"), "x", "a NumPy archive")
+    assert refused.remedy == "Remedy."
+    assert str(refused).isprintable()
+    assert len(str(refused)) < 1000
+    assert found in (None, refused.found)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        InputError("a", "", "one thing", "another"),
+        UnavailableError("A package is not installed.", "Install it."),
+        OSError(errno.ENOSPC, "No space left on device"),
+        KeyboardInterrupt(),
+    ],
+    ids=repr,
+)
+def test_what_says_nothing_of_the_file_passes(tmp_path, error):
+    with pytest.raises(type(error)) as caught, reading(tmp_path / "a.npz", "a NumPy archive"):
+        raise error
+    assert caught.value is error
