@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,8 +14,8 @@ from .errors import InputError
 from .io.documents import checked, read_json, shown
 from .io.files import check_name, digest, write_json
 from .protocol import Protocol
-from .runner.config import RunConfig, stored_settings
-from .specs import LABEL, RENAMED_METRICS, MetricSpec, is_label
+from .runner.config import RunConfig
+from .specs import LABEL, MetricSpec, is_label
 
 Derived = TypedDict("Derived", {"from": str, "variant": str, "change": str})
 """From which method's avatar one was derived without training, which variant it is, and what was changed."""
@@ -25,7 +25,7 @@ Derived = TypedDict("Derived", {"from": str, "variant": str, "change": str})
 class MethodRecord:
     """A method as it ran; see `ResolvedMethod.record`. ``needs`` are those of a form other than the clip's own.
 
-    ``code`` is the digest of its code, see `bench.source`; None in runs of an earlier version.
+    ``code`` is the digest of its code, see `bench.source`; None for a folder of images, which has none.
     """
 
     name: str
@@ -97,38 +97,6 @@ class ProtocolRecord:
         return digest(record)[:12]
 
 
-def _renewed(record: dict[str, Any]) -> dict[str, Any]:
-    """A record with metrics as they are described and named today, from one that an earlier version wrote."""
-    record = dict(record)
-    if isinstance(record.get("metrics"), list):
-        record["metrics"] = [_renewed_metric(metric) for metric in record["metrics"]]
-    configuration = record.get("configuration")
-    if isinstance(configuration, dict) and isinstance(configuration.get("metrics"), list):
-        names = [
-            RENAMED_METRICS.get(name, name) if isinstance(name, str) else name
-            for name in configuration["metrics"]
-        ]
-        record["configuration"] = {**configuration, "metrics": names}
-    return record
-
-
-def _renewed_metric(metric: Any) -> Any:
-    if not isinstance(metric, dict):
-        return metric
-    metric = dict(metric)
-    if isinstance(metric.get("name"), str):
-        metric["name"] = RENAMED_METRICS.get(metric["name"], metric["name"])
-    if isinstance(metric.get("per_frame"), bool):
-        of_frame, training, regions, temporal = (
-            metric.pop(key, False) for key in ("per_frame", "training", "regions", "temporal")
-        )
-        if not of_frame:
-            metric["kind"] = "training" if training else "avatar"
-        else:
-            metric["kind"] = "temporal" if temporal else "regional" if regions else "frame"
-    return metric
-
-
 @dataclass(frozen=True)
 class Manifest:
     """Everything that made the numbers of a run.
@@ -136,7 +104,7 @@ class Manifest:
     Attributes
     ----------
     paths : files and folders that the configuration names, by dotted key, relative to the run folder;
-        None where an earlier version wrote it.
+        None in a bundle, which names no folders of the machine that made it.
     metrics, methods, protocols : in the order of the configuration; protocols by task.
     machine : processor, cores, memory in bytes, system, versions of packages, accelerators; of a run on a CUDA device that
         device, CUDA's version and whether TF32 was on, since there is a record of it. See `machine_record`.
@@ -174,7 +142,7 @@ class Manifest:
         record = read_json(path)
         if record.get("format") != 1:
             raise InputError(path, "format", "1", shown(record.get("format")))
-        manifest = checked(_renewed(record), cls, path)
+        manifest = checked(record, cls, path)
         named: dict[str, set[str]] = {
             "methods": {method.name for method in manifest.methods},
             "metrics, tables": {table for metric in manifest.metrics for table in metric.tables},
@@ -197,20 +165,7 @@ class Manifest:
             twice = [name for name, number in count.items() if number > 1]
             if twice:
                 raise InputError(path, key, "each name once", ", ".join(twice))
-        return manifest._renamed()
-
-    def _renamed(self) -> Manifest:
-        """With settings of methods by the names that they have now."""
-        settings = {name: stored_settings(name, each) for name, each in self.configuration.settings.items()}
-        methods = (
-            method
-            if method.config is None
-            else replace(method, config=stored_settings(method.name, method.config))
-            for method in self.methods
-        )
-        return replace(
-            self, configuration=replace(self.configuration, settings=settings), methods=tuple(methods)
-        )
+        return manifest
 
     def _printed(self) -> dict[str, list[str]]:
         """What tables and errors print beside names, by key."""

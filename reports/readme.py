@@ -6,7 +6,6 @@ python -m headbench.reports.readme suite suite-output README.md
 
 from __future__ import annotations
 
-import shutil
 import sys
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import cv2
 
 from ..bench.audit.bundle import without_paths
 from ..bench.errors import InputError
-from ..bench.io.files import atomic_path, write_bytes, write_text
+from ..bench.io.files import write_bytes, write_text
 from ..bench.io.images import encode_image, read_png
 from ..bench.rows import ALL, Rows
 from ..bench.runner.scoring import FULL
@@ -52,8 +51,7 @@ def _copy(source: RunFolder, target: RunFolder) -> None:
     manifest = source.read_manifest()
     target.root.mkdir(parents=True, exist_ok=True)
     without_paths(manifest, tuple(method.name for method in manifest.methods)).write(target.manifest)
-    with atomic_path(target.rows) as temporary:
-        shutil.copyfile(source.rows, temporary)
+    Rows.read(source.rows).in_single_precision().write(target.rows)
 
 
 def marks(name: str) -> tuple[str, str]:
