@@ -41,16 +41,16 @@ def publish_suite(out: Path, readme: Path) -> None:
     """Copy manifest and rows of each run of a suite beside the README, and write its tables and the block made of them."""
     target = readme.parent / SUITE
     for folder in _runs(out):
-        _copy(RunFolder(folder), RunFolder(target / folder.name))
+        _copy(RunFolder(folder), RunFolder(target / folder.name), target)
     write_text(target / RESULTS, suite_results(target))
     _write(readme, "suite", suite_block(target))
 
 
-def _copy(source: RunFolder, target: RunFolder) -> None:
-    """Manifest, without this machine's folders, and rows of a run."""
+def _copy(source: RunFolder, target: RunFolder, shared: Path | None = None) -> None:
+    """Manifest, without this machine's folders, and rows of a run; protocols into the folder of several runs, ``shared``."""
     manifest = source.read_manifest()
     target.root.mkdir(parents=True, exist_ok=True)
-    without_paths(manifest, tuple(method.name for method in manifest.methods)).write(target.manifest)
+    without_paths(manifest, tuple(method.name for method in manifest.methods)).write(target.manifest, shared)
     Rows.read(source.rows).in_single_precision().write(target.rows)
 
 
