@@ -41,12 +41,6 @@ _OF_OTHERS = {
 WORDS_OF_OTHERS = {word: name for name, words in _OF_OTHERS.items() for word in words.split()}
 """What other toolkits call their commands, and which of ours does it."""
 
-RENAMED_OPTIONS = {
-    "compare": {"--floors": "--trivial"},
-    "steps": {"--classes": "--clusters", "--compatibility": "--variant"},
-}
-"""Options by command and by what they were called before."""
-
 
 def call(words: Sequence[str]) -> int:
     """Call the command that the words of a command line name, or print its help; returns the exit code."""
@@ -109,14 +103,11 @@ def with_groups(commands: Mapping[str, Command | dict[str, Command]]) -> dict[st
 
 
 def check_known(words: Sequence[str], commands: Mapping[str, Command | dict[str, Command]]) -> None:
-    """Raise `InputError` where a command line names none of ``commands``, or an option as it was called before.
+    """Raise `InputError` where a command line names none of ``commands``.
 
     Raises `HeadbenchError` where it names a command that cannot be loaded: nobody knows what options that has.
     """
     word = next(iter(words), "-")
-    for option, new in RENAMED_OPTIONS.get(word, {}).items():
-        if any(each.partition("=")[0] == option for each in words[1:]):
-            raise InputError("command line", option, f"its new name, {new}", "the old one")
     table = commands.get(word)
     named = table.get(words[1]) if isinstance(table, dict) and words[1:] else table
     if getattr(named, "broken", False):

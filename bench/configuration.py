@@ -7,7 +7,7 @@ import inspect
 import math
 import types
 import typing
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -15,7 +15,6 @@ from .errors import InputError
 from .io.documents import parse_setting, shown
 from .io.files import expand_home
 from .registry import unknown
-from .specs import Renamed
 
 T = TypeVar("T")
 
@@ -76,10 +75,6 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
     arguments: dict[str, Any] = {}
     for key, value in values.items():
-        new = _new_names(cls, str(key), value)
-        if new:
-            expected = " or ".join(f"{prefix}{entry.new}" for entry in new.values())
-            raise InputError(source, f"{prefix}{key}", f"its new name, {expected}", "the old one")
         if key not in fields:
             raise unknown(source, f"{prefix}{key}", str(key), fields)
         arguments[key] = _convert(hints[key], value, source, f"{prefix}{key}")
@@ -93,75 +88,20 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
         raise InputError(source, prefix.rstrip(".") or cls.__name__, "valid settings", str(error)) from error
 
 
-def with_new_names(cls: type, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of ``cls`` as an earlier version stored them, by the names that they have now (`Renamed`)."""
-    hints = get_type_hints(cls)
-    result: dict[str, Any] = {}
-    for key, value in values.items():
-        new = _new_names(cls, key, value)
-        hint = hints.get(key)
-        if not new:
-            if isinstance(value, Mapping) and isinstance(hint, type) and dataclasses.is_dataclass(hint):
-                value = with_new_names(hint, value)
-            result = merge(result, {key: value})
-        for old, entry in new.items():
-            element = old.partition(":")[2]
-            renamed = _exchanged(value, entry.values)
-            if element:
-                listed = isinstance(value, (list, tuple)) and element in value
-                renamed = "official" if listed else "paper"
-            for name in reversed(entry.new.split(".")):
-                renamed = {name: renamed}
-            result = merge(result, renamed)
-    return result
+def deciding_settings(config: Any) -> Any:
+    """The settings of a dataclass that decide results, as plain values, for digests; other values, None say, as they are.
 
-
-def with_first_names(config: Any) -> Any:
-    """The settings of a dataclass by the names that they first had: digests of them outlive a change of names.
-
-    A setting that came later is left out where it has the value that means what was so before, which the class variable
-    ``added`` gives by name; so are those named in ``places``, which say where something lies on this machine.
+    Settings named in the class variable ``places`` are left out: they say where something lies on this machine.
     """
     if isinstance(config, tuple):
-        return tuple(map(with_first_names, config))
+        return tuple(map(deciding_settings, config))
     if not dataclasses.is_dataclass(config):
         return config
-    added: Mapping[str, Any] = getattr(config, "added", {})
-    result = {
-        field.name: with_first_names(getattr(config, field.name))
+    return {
+        field.name: deciding_settings(getattr(config, field.name))
         for field in dataclasses.fields(config)
         if field.name not in getattr(config, "places", ())
-        and (field.name not in added or getattr(config, field.name) != added[field.name])
     }
-    first: dict[str, Any] = {}
-    for old, entry in getattr(config, "renamed", {}).items():
-        *path, last = entry.new.split(".")
-        group = result
-        for name in path:
-            group = group[name]
-        value = group.pop(last)
-        old, _, element = old.partition(":")
-        if element:
-            first[old] = (*first.get(old, ()), *((element,) if value == "official" else ()))
-        else:
-            first[old] = _exchanged(value, {new: before for before, new in entry.values.items()})
-        if path and not group:
-            del result[path[0]]
-    return {f"{name}." if name in first else name: value for name, value in result.items()} | first
-
-
-def _new_names(cls: type, key: str, value: Any) -> dict[str, Renamed]:
-    """What became of a setting, by old name; nothing where ``key`` is none that was renamed."""
-    entries: Mapping[str, Renamed] = getattr(cls, "renamed", {})
-    if isinstance(value, Mapping):  # a group that is called like a setting once was
-        return {}
-    return {old: entry for old, entry in entries.items() if old.partition(":")[0] == key}
-
-
-def _exchanged(value: Any, values: Mapping[Any, Any]) -> Any:
-    if isinstance(value, (list, tuple)):
-        return type(value)(_exchanged(each, values) for each in value)
-    return values.get(value, value) if isinstance(value, Hashable) else value
 
 
 def build_arguments(

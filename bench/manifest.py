@@ -1,7 +1,13 @@
-"""``run.json``: what made the numbers of a run. Written by a run, read by everything that looks at one."""
+"""``run.json``: what made the numbers of a run. Written by a run, read by everything that looks at one.
+
+It names protocols by their hashes; each lies in a file of its own, ``protocols/<hash>.json`` in the run folder or, shared
+by several runs, in the folder above.
+"""
 
 from __future__ import annotations
 
+import json
+import os
 from collections import Counter
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -12,10 +18,10 @@ from typing_extensions import TypedDict
 from .contracts import FrameKey
 from .errors import InputError
 from .io.documents import checked, read_json, shown
-from .io.files import check_name, digest, write_json
+from .io.files import check_name, digest, write_json, write_text
 from .protocol import Protocol
-from .runner.config import RunConfig, stored_settings
-from .specs import LABEL, RENAMED_METRICS, MetricSpec, is_label
+from .runner.config import RunConfig
+from .specs import LABEL, MetricSpec, is_label
 
 Derived = TypedDict("Derived", {"from": str, "variant": str, "change": str})
 """From which method's avatar one was derived without training, which variant it is, and what was changed."""
@@ -25,7 +31,7 @@ Derived = TypedDict("Derived", {"from": str, "variant": str, "change": str})
 class MethodRecord:
     """A method as it ran; see `ResolvedMethod.record`. ``needs`` are those of a form other than the clip's own.
 
-    ``code`` is the digest of its code, see `bench.source`; None in runs of an earlier version.
+    ``code`` is the digest of its code, see `bench.source`; None for a folder of images, which has none.
     """
 
     name: str
@@ -97,36 +103,34 @@ class ProtocolRecord:
         return digest(record)[:12]
 
 
-def _renewed(record: dict[str, Any]) -> dict[str, Any]:
-    """A record with metrics as they are described and named today, from one that an earlier version wrote."""
-    record = dict(record)
-    if isinstance(record.get("metrics"), list):
-        record["metrics"] = [_renewed_metric(metric) for metric in record["metrics"]]
-    configuration = record.get("configuration")
-    if isinstance(configuration, dict) and isinstance(configuration.get("metrics"), list):
-        names = [
-            RENAMED_METRICS.get(name, name) if isinstance(name, str) else name
-            for name in configuration["metrics"]
-        ]
-        record["configuration"] = {**configuration, "metrics": names}
+PROTOCOLS = "protocols"
+"""Folder of the protocols of one run, or of several."""
+
+
+def protocol_path(folder: Path, protocol: str) -> Path:
+    """The file of the protocol with a hash, in a run folder or in the folder of several runs."""
+    return folder / PROTOCOLS / f"{protocol}.json"
+
+
+def _read_protocol(run: Path, task: str, name: str) -> ProtocolRecord:
+    """Read the protocol with the hash ``name``. Raises `InputError` where it is not in the run's folder nor in the one above."""
+    check_name(name, run, f"protocols.{task}")
+    home = Path(os.path.abspath(run)).parent  # "." has no parent
+    path = protocol_path(run.parent, name)
+    if not path.exists():
+        shared = protocol_path(home.parent, name)
+        if not shared.exists():
+            expected = f"the protocol of {task} that {run.name} names, here or as {shared}"
+            raise InputError(path, "", expected, "no such file", "Copy it from where the run was made.")
+        path = shared
+    record = checked(read_json(path), ProtocolRecord, path)
+    if (record.task, record.hash) != (task, name):
+        raise InputError(path, "task, hash", f"{task}, {name}", f"{record.task}, {record.hash}")
+    for part in sorted({part for key in record.keys for part in (key.subject, key.sequence, key.camera)}):
+        check_name(part, path, "keys")
+    if not is_label(record.id):
+        raise InputError(path, "id", LABEL, repr(record.id))
     return record
-
-
-def _renewed_metric(metric: Any) -> Any:
-    if not isinstance(metric, dict):
-        return metric
-    metric = dict(metric)
-    if isinstance(metric.get("name"), str):
-        metric["name"] = RENAMED_METRICS.get(metric["name"], metric["name"])
-    if isinstance(metric.get("per_frame"), bool):
-        of_frame, training, regions, temporal = (
-            metric.pop(key, False) for key in ("per_frame", "training", "regions", "temporal")
-        )
-        if not of_frame:
-            metric["kind"] = "training" if training else "avatar"
-        else:
-            metric["kind"] = "temporal" if temporal else "regional" if regions else "frame"
-    return metric
 
 
 @dataclass(frozen=True)
@@ -136,8 +140,8 @@ class Manifest:
     Attributes
     ----------
     paths : files and folders that the configuration names, by dotted key, relative to the run folder;
-        None where an earlier version wrote it.
-    metrics, methods, protocols : in the order of the configuration; protocols by task.
+        None in a bundle, which names no folders of the machine that made it.
+    metrics, methods, protocols : in the order of the configuration; protocols by task, in files of their own.
     machine : processor, cores, memory in bytes, system, versions of packages, accelerators; of a run on a CUDA device that
         device, CUDA's version and whether TF32 was on, since there is a record of it. See `machine_record`.
     adapted : clips that were brought into another form for a method.
@@ -167,24 +171,21 @@ class Manifest:
 
     @classmethod
     def read(cls, path: Path) -> Manifest:
-        """Read ``run.json``. Raises `InputError` naming what is missing, unknown or of the wrong type.
+        """Read ``run.json`` and its protocols. Raises `InputError` naming what is missing, unknown or of the wrong type.
 
         Names that folders and files are found by are checked as `check_name` does.
         """
         record = read_json(path)
         if record.get("format") != 1:
             raise InputError(path, "format", "1", shown(record.get("format")))
-        manifest = checked(_renewed(record), cls, path)
+        hashes = checked(record.get(PROTOCOLS), dict[str, str], path, PROTOCOLS)
+        manifest = checked({**record, PROTOCOLS: {}}, cls, path)
         named: dict[str, set[str]] = {
             "methods": {method.name for method in manifest.methods},
             "metrics, tables": {table for metric in manifest.metrics for table in metric.tables},
             "clips": {clip.subject for clip in manifest.clips},
-            "protocols": set(manifest.protocols),
+            PROTOCOLS: set(hashes),
         }
-        for task, protocol in manifest.protocols.items():
-            named[f"protocols.{task}.keys"] = {
-                part for key in protocol.keys for part in (key.subject, key.sequence, key.camera)
-            }
         for key, names in named.items():
             for name in sorted(names):
                 check_name(name, path, key)
@@ -197,34 +198,30 @@ class Manifest:
             twice = [name for name, number in count.items() if number > 1]
             if twice:
                 raise InputError(path, key, "each name once", ", ".join(twice))
-        return manifest._renamed()
-
-    def _renamed(self) -> Manifest:
-        """With settings of methods by the names that they have now."""
-        settings = {name: stored_settings(name, each) for name, each in self.configuration.settings.items()}
-        methods = (
-            method
-            if method.config is None
-            else replace(method, config=stored_settings(method.name, method.config))
-            for method in self.methods
-        )
         return replace(
-            self, configuration=replace(self.configuration, settings=settings), methods=tuple(methods)
+            manifest, protocols={task: _read_protocol(path, task, name) for task, name in hashes.items()}
         )
 
     def _printed(self) -> dict[str, list[str]]:
         """What tables and errors print beside names, by key."""
-        protocols = self.protocols.values()
         return {
             "methods, version": [method.version for method in self.methods],
             "clips, fingerprint": [clip.fingerprint for clip in self.clips],
-            "protocols, id, hash": [text for protocol in protocols for text in (protocol.id, protocol.hash)],
             "machine, processor": [str(self.machine.get("processor", ""))],
         }
 
-    def write(self, path: Path) -> None:
-        """Write ``run.json``, atomically."""
-        record = {name: value for name, value in asdict(self).items() if value is not None}
+    def write(self, path: Path, shared: Path | None = None) -> None:
+        """Write the protocols and ``run.json``, each file atomically.
+
+        ``shared`` is the folder of the protocols' folder where several runs share it, the one above the run's; None: the
+        run's own folder.
+        """
+        for protocol in self.protocols.values():
+            file = protocol_path(shared or path.parent, protocol.hash)
+            write_text(file, json.dumps(asdict(protocol), separators=(",", ":")) + "\n")
+        own = replace(self, protocols={})
+        record = {name: value for name, value in asdict(own).items() if value is not None}
+        record[PROTOCOLS] = {task: protocol.hash for task, protocol in self.protocols.items()}
         for method in record["methods"]:
             for name in ("needs", "derived", "code"):
                 if method[name] is None:

@@ -85,23 +85,6 @@ class ResolutionRule:
 
 
 @dataclass(frozen=True)
-class Renamed:
-    """The name of a setting that once had another.
-
-    A settings class lists them in a class variable ``renamed``, by old name, or ``old:element`` where a list of names
-    became settings of their own. The old name is refused with the new one; what was stored under it is still read.
-
-    Attributes
-    ----------
-    new : dotted, relative to that class.
-    values : new values by old one, of those that changed; "official" stands for an element that was listed.
-    """
-
-    new: str
-    values: Mapping[Any, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class MethodSpec:
     """What listing a method needs. Loading a spec imports neither torch nor the implementation.
 
@@ -129,8 +112,6 @@ class MethodSpec:
     devices : kinds of devices that it computes on, such as "cpu"; empty means any. A run on another refuses it.
     needs : "package.module:function" of ``(config, device) -> Iterable[Need]``: what a machine has to have, each looked
         for without long work, network or changes of the disk; "" for nothing but what headbench is installed with.
-    first_implementation : what ``implementation`` was when the first runs were made, "" for the same: digests of what an
-        avatar was made of outlive a move of the class.
     """
 
     name: str
@@ -149,7 +130,6 @@ class MethodSpec:
     variants: str = ""
     devices: tuple[str, ...] = ()
     needs: str = ""
-    first_implementation: str = ""
     resolution: ResolutionRule = ResolutionRule()
     preset_resolutions: Mapping[str, ResolutionRule] = field(default_factory=dict)
 
@@ -172,13 +152,6 @@ MAX_DIGITS = 12
 
 
 MetricKind = Literal["frame", "regional", "temporal", "avatar", "training"]
-
-RENAMED_METRICS = {
-    "driving_rate": "driving_bitrate",
-    "latency_still": "latency_static",
-    "stage_raster": "stage_rasterize",
-}
-"""Names of metrics by what they were called before: results with those are read, settings are refused."""
 
 
 @dataclass(frozen=True)

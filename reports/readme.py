@@ -6,7 +6,6 @@ python -m headbench.reports.readme suite suite-output README.md
 
 from __future__ import annotations
 
-import shutil
 import sys
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import cv2
 
 from ..bench.audit.bundle import without_paths
 from ..bench.errors import InputError
-from ..bench.io.files import atomic_path, write_bytes, write_text
+from ..bench.io.files import write_bytes, write_text
 from ..bench.io.images import encode_image, read_png
 from ..bench.rows import ALL, Rows
 from ..bench.runner.scoring import FULL
@@ -42,18 +41,17 @@ def publish_suite(out: Path, readme: Path) -> None:
     """Copy manifest and rows of each run of a suite beside the README, and write its tables and the block made of them."""
     target = readme.parent / SUITE
     for folder in _runs(out):
-        _copy(RunFolder(folder), RunFolder(target / folder.name))
+        _copy(RunFolder(folder), RunFolder(target / folder.name), target)
     write_text(target / RESULTS, suite_results(target))
     _write(readme, "suite", suite_block(target))
 
 
-def _copy(source: RunFolder, target: RunFolder) -> None:
-    """Manifest, without this machine's folders, and rows of a run."""
+def _copy(source: RunFolder, target: RunFolder, shared: Path | None = None) -> None:
+    """Manifest, without this machine's folders, and rows of a run; protocols into the folder of several runs, ``shared``."""
     manifest = source.read_manifest()
     target.root.mkdir(parents=True, exist_ok=True)
-    without_paths(manifest, tuple(method.name for method in manifest.methods)).write(target.manifest)
-    with atomic_path(target.rows) as temporary:
-        shutil.copyfile(source.rows, temporary)
+    without_paths(manifest, tuple(method.name for method in manifest.methods)).write(target.manifest, shared)
+    Rows.read(source.rows).in_single_precision().write(target.rows)
 
 
 def marks(name: str) -> tuple[str, str]:

@@ -112,9 +112,10 @@ def test_the_manifest_lets_one_repeat_it(run):
     record = read_json(run.manifest)
     assert record["status"] == "done"
     assert record["peak_memory_bytes"] > 0
-    for protocol in record["protocols"].values():
-        assert protocol["hash"]
-        assert not {tuple(k) for k in protocol["keys"]} & {tuple(k) for k, _ in protocol["excluded"]}
+    protocols = run.read_manifest().protocols
+    assert record["protocols"] == {task: protocol.hash for task, protocol in protocols.items()}
+    for protocol in protocols.values():
+        assert not set(protocol.keys) & {key for key, _ in protocol.excluded}
 
 
 def test_the_result_is_there_for_machines(run, capsys, monkeypatch):

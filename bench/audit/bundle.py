@@ -18,7 +18,7 @@ from ..io.archives import open_archive
 from ..io.documents import MAX_JSON_BYTES, checked, parse_json
 from ..io.files import atomic_path, check_writable, digest_file, write_json
 from ..io.provenance import RENDER, source_type
-from ..manifest import Manifest
+from ..manifest import PROTOCOLS, Manifest, protocol_path
 from ..runner.steps import DIGESTS
 from ..runner.store import STAGES, RunFolder
 from ..specs import Findings
@@ -32,7 +32,7 @@ MAX_RATIO = 200
 
 _CELL = r"[^/\\]+/[^/\\]+/seed-\d+"
 _NAMES = re.compile(
-    rf"run\.json|rows\.parquet|{_CELL}/({'|'.join(STAGES)})\.json|{_CELL}/renders/[^/\\]+/[^/\\]+\.png"
+    rf"run\.json|rows\.parquet|{PROTOCOLS}/[^/\\]+\.json|{_CELL}/({'|'.join(STAGES)})\.json|{_CELL}/renders/[^/\\]+/[^/\\]+\.png"
 )
 _TIME = (1980, 1, 1, 0, 0, 0)  # of every file, so that the same results make the same bytes
 _MODE = 0o100644 << 16
@@ -82,6 +82,8 @@ def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> 
         without_paths(manifest, methods).write(staged.manifest)
         rows.of_methods(methods).write(staged.rows)
         sources = {"run.json": staged.manifest, "rows.parquet": staged.rows}
+        protocols = (protocol_path(staged.root, each.hash) for each in manifest.protocols.values())
+        sources |= {path.relative_to(staged.root).as_posix(): path for path in protocols}
         sources |= _cell_files(folder, manifest, methods, renders=settings.renders)
         files = {name: digest_file(path) for name, path in sorted(sources.items())}
         index = staged.root / INDEX

@@ -17,7 +17,7 @@ from ..io.files import check_name, write_json
 from ..rows import ALL, FRAME
 from ..runner.scoring import FULL
 from ..runner.store import RunFolder
-from ..specs import MAX_DIGITS, RENAMED_METRICS, MetricSpec
+from ..specs import MAX_DIGITS, MetricSpec
 from .command import Captures
 
 AVATAR = "avatar"
@@ -246,10 +246,8 @@ class Baseline:
         """
         record = read_json(path)
         if record.get("format") != FORMAT:
-            lacking = 'Formats 1 and 2 lack "frames": make the file again, and copy its tolerances.'
-            remedy = lacking if record.get("format") in (1, 2) else ""
-            raise InputError(path, "format", str(FORMAT), shown(record.get("format")), remedy)
-        file = checked(_with_new_names(record), _File, path)
+            raise InputError(path, "format", str(FORMAT), shown(record.get("format")))
+        file = checked(record, _File, path)
         if file.count != len(file.values) or not file.values:
             expected = f"as many as count says, {file.count}" if file.count > 0 else "at least one number"
             raise InputError(path, "values", expected, str(len(file.values)))
@@ -287,22 +285,6 @@ class Baseline:
             "values": values,
         }
         write_json(path, record)
-
-
-def _with_new_names(record: Mapping[str, Any]) -> dict[str, Any]:
-    """The record of a file with metrics, the last part of keys, by the names that they have now."""
-
-    def renamed(key: str) -> str:
-        *place, metric = key.split("/")
-        return "/".join((*place, RENAMED_METRICS.get(metric, metric)))
-
-    by_metric = ("tolerances", "values", "frames", "unavailable")
-    return {
-        name: {renamed(key): value for key, value in group.items()}
-        if name in by_metric and isinstance(group, dict)
-        else group
-        for name, group in record.items()
-    }
 
 
 def _place(key: str, path: Path, group: str) -> Place:

@@ -12,13 +12,13 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from ..configuration import build, merge, with_first_names, with_new_names
+from ..configuration import build, deciding_settings, merge
 from ..contracts import Budget, TaskName
-from ..errors import HeadbenchError, InputError
+from ..errors import InputError
 from ..io.files import check_name
 from ..registry import discover, get, resolve, unknown
 from ..source import code_digest, forget_code, is_outside
-from ..specs import RENAMED_METRICS, MethodSpec, MetricSpec, ProfileSpec
+from ..specs import MethodSpec, MetricSpec, ProfileSpec
 from .adaptation import MethodNeeds
 
 CANONICAL = "canonical"
@@ -120,33 +120,14 @@ class ResolvedMethod:
         }
 
     def identity(self) -> dict[str, Any]:
-        """The same for fingerprints, which change neither with names of settings nor with where the class is.
+        """The same for fingerprints, without settings that say where something lies on this machine.
 
         The code of a method of this package is left out: its version says whether results change.
         """
         record = self.record()
         if not is_outside(self.spec.implementation):
             record.pop("code", None)
-        implementation = self.spec.first_implementation or self.spec.implementation
-        return {**record, "implementation": implementation, "config": with_first_names(self.config)}
-
-
-def stored_settings(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a method as an earlier version stored them, by their names now.
-
-    As they are for a method that is unknown here, or whose settings' class cannot be imported: tables need neither.
-    """
-    specs = (plugin.spec for plugin in discover("methods").values())
-    spec = next((spec for spec in specs if spec is not None and spec.name == method), None)
-    try:
-        known = resolve(spec.config) if spec is not None and spec.config else None
-    except HeadbenchError:
-        known = None
-    if known is None:
-        return dict(settings)
-    budget = {key: value for key, value in settings.items() if key == "budget"}
-    own = {key: value for key, value in settings.items() if key != "budget"}
-    return {**budget, **with_new_names(known, own)}
+        return {**record, "config": deciding_settings(self.config)}
 
 
 def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:
@@ -209,8 +190,6 @@ def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
     defined = {metric.name for metric in get("profiles", CANONICAL).metrics}
     found: list[MetricSpec] = []
     for name in config.metrics:
-        if name in RENAMED_METRICS:
-            raise InputError("metrics", name, f"its new name, {RENAMED_METRICS[name]}", "the former one")
         spec: MetricSpec = get("metrics", name)
         if spec.name not in defined:
             found.append(spec)

@@ -238,7 +238,7 @@ def log_kept(job: Job) -> None:
 
 
 def _age(state: StepState) -> str:
-    """How long ago a training ended; in records of earlier versions and of unfinished trainings there is no time."""
+    """How long ago a training ended; records of unfinished trainings have no time."""
     if "finished_at" not in state:
         return "in an earlier run"
     return f"{duration(max(0.0, datetime.now(UTC).timestamp() - state['finished_at']))} ago"

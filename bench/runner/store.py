@@ -2,7 +2,8 @@
 
 ::
 
-    run.json                      resolved configuration, machine, protocols, fingerprints
+    run.json                      resolved configuration, machine, hashes of protocols, fingerprints
+    protocols/<hash>.json         frames and rules of a task; also found in the folder above, for several runs
     run.log
     rows.parquet                  one row per method, seed, frame and metric
     <subject>/<method>/seed-<n>/

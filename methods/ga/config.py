@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
 
 from ..shared.config import Capacity, SplatTraining
 
@@ -31,8 +29,6 @@ class GAConfig:
     expression_lr: float = 1e-3
     pose_lr: float = 1e-5
     translation_lr: float = 1e-6
-
-    added: ClassVar[Mapping[str, Any]] = {"capacity": Capacity(mode="fixed")}
 
     def __post_init__(self) -> None:
         if not 0 <= self.sh_degree <= 3:

@@ -17,7 +17,6 @@ GA = MethodSpec(
     version="3",
     summary="GaussianAvatars: splats with spherical harmonics rigged to the triangles of the tracked mesh.",
     implementation="headbench.methods.ga.method:GA",
-    first_implementation="headbench.methods.ga:GA",
     config="headbench.methods.ga.config:GAConfig",
     needs="headbench.methods.shared.needs:splats",
     variants="headbench.methods.derived.ga_variants:variants",

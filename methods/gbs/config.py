@@ -5,11 +5,9 @@ The defaults are the published values; times are on the scale of the published r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Literal
 
-from ...bench.specs import Renamed
 from ..shared.config import Capacity, DensifiedTraining
 
 
@@ -87,12 +85,6 @@ class GBSConfig:
     teeth_weight: float = 100.0
     correctives_variant: Literal["paper", "official"] = "paper"
     lower_teeth_variant: Literal["paper", "official"] = "paper"
-
-    added: ClassVar[Mapping[str, Any]] = {"capacity": Capacity(mode="fixed")}
-    renamed: ClassVar[Mapping[str, Renamed]] = {
-        "departures:triple_correctives": Renamed("correctives_variant"),
-        "departures:blended_lower_teeth": Renamed("lower_teeth_variant"),
-    }
 
     def __post_init__(self) -> None:
         if self.samples < 1 or self.teeth_samples < 0:

@@ -148,7 +148,7 @@ RENDERING = (
 """Settings that rendering depends on."""
 
 FRAME = ("origin", "center", "background", "expression_scale", "code_low", "code_high")
-"""Small tensors: (3,) metres, (3,) metres (absent in avatars of earlier versions: 0), (3,) colour that was trained on, (E,) divisors of the expression code, (E,) bounds of it
+"""Small tensors: (3,) metres, (3,) metres, (3,) colour that was trained on, (E,) divisors of the expression code, (E,) bounds of it
 that colour and attributes follow."""
 
 
@@ -171,7 +171,6 @@ def read_avatar(path: Path, expression_size: int, device: str) -> tuple[Gaussian
     float32.
     """
     tensors, metadata = read_safetensors(path)
-    tensors = {"center": torch.zeros(3), **tensors}
     head = GaussianHead.of(_settings(path, metadata.get(CONFIG, "")), expression_size)
     columns = sum(POINTS.values()) + head.config.features
     shapes: dict[str, tuple[int | None, ...]] = {

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
-
-from ...bench.specs import Renamed
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -124,11 +121,6 @@ class GHAConfig:
     low_image_variant: Literal["paper", "official"] = "paper"
     augment: bool = True
     checkpoint_every_s: float = 120.0
-
-    renamed: ClassVar[Mapping[str, Renamed]] = {
-        "low_truth": Renamed("low_image_variant", {"mean": "paper", "gha": "official"}),
-        "at_rest": Renamed("zero_initialised"),
-    }
 
     def __post_init__(self) -> None:
         counts = (

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.configuration import build, with_new_names
+from ...bench.configuration import build
 from ...bench.contracts import Camera, Frame, HeadPose
 from ...bench.errors import HeadbenchError, InputError
 from ...bench.io.arrays import Member, read_arrays
@@ -121,7 +121,7 @@ OCCUPIED = "occupied"
 def read_settings(path: Path) -> InstaConfig:
     """Read the settings as JSON. Raises `InputError` for settings that are unknown or out of range."""
     try:
-        config: InstaConfig = build(InstaConfig, with_new_names(InstaConfig, read_json(path)), str(path))
+        config: InstaConfig = build(InstaConfig, read_json(path), str(path))
     except InputError:
         raise
     except (HeadbenchError, TypeError, ValueError) as error:

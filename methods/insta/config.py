@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
-
-from ...bench.specs import Renamed
+from typing import Literal
 
 INSTANT_NGP_STEP = math.sqrt(3) / 1024
 SMALLEST = 1e-12
@@ -126,12 +123,6 @@ class InstaConfig:
     mesh_cache_mb: int = 512
     image_cache_mb: int = 512
     checkpoint_every_s: float = 120.0
-
-    renamed: ClassVar[Mapping[str, Renamed]] = {
-        "warp_compatibility": Renamed("warp_variant", {"": "paper", "code": "official"}),
-        "target_compatibility": Renamed("target_variant", {"": "paper", "code": "official"}),
-        "fog_weight": Renamed("opacity_weight"),
-    }
 
     def __post_init__(self) -> None:
         if self.level_features not in (1, 2, 4, 8):

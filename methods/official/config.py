@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,6 @@ class OfficialConfig:
     device: Literal["cuda", "cpu-shim"] = "cuda"
     order: Literal["published", "native"] = "published"
 
-    added: ClassVar[Mapping[str, Any]] = {"order": "published"}
     places: ClassVar[tuple[str, ...]] = ("checkout", "python")
 
     @property

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Literal
 
-from ...bench.specs import Renamed
 from ..shared.config import SplatTraining
 
 Dynamic = Literal["opacity", "position", "rotation", "scale", "color"]
@@ -48,12 +46,6 @@ class Planes:
     move_splats: bool = True
     direction_smoothing: float = 0.0
     residual_lr: float = 0.0
-
-    added: ClassVar[Mapping[str, Any]] = {
-        "direction_smoothing": 0.0,
-        "move_splats": True,
-        "residual_lr": 0.0,
-    }
 
     def __post_init__(self) -> None:
         if self.resolution < 2 or min(self.channels) < 1:
@@ -187,9 +179,6 @@ class Capacity:
             raise ValueError("tolerance (pixels) and detail must be above 0")
 
 
-VARIANT = {"": "paper", "tga": "official"}
-
-
 @dataclass(frozen=True)
 class OursConfig:
     """Compact tensorial Gaussian avatars (CVPR 2025): tri-plane colour, feature lines for opacity.
@@ -223,51 +212,6 @@ class OursConfig:
     sh_dc_lr: float = 0.0025
     sh_rest_lr: float = 0.000125
     storage: Literal["exact", "compact"] = "exact"
-
-    renamed: ClassVar[Mapping[str, Renamed]] = {
-        "plane_resolution": Renamed("planes.resolution"),
-        "plane_channels": Renamed("planes.channels"),
-        "plane_bounds": Renamed("planes.bounds_variant", {"published": "paper"}),
-        "plane_lr": Renamed("planes.lr"),
-        "color_mlp_lr": Renamed("planes.network_lr"),
-        "direction_noise": Renamed("direction_jitter"),
-        "lines": Renamed("lines.enabled"),
-        "dynamic": Renamed("lines.dynamic"),
-        "line_resolution": Renamed("lines.resolution"),
-        "line_channels": Renamed("lines.channels"),
-        "expressions": Renamed("lines.expressions"),
-        "jaw_bases": Renamed("lines.jaw_bases"),
-        "jaw_compatibility": Renamed("lines.jaw_bases_variant", VARIANT),
-        "line_bounds": Renamed("lines.bounds"),
-        "lines_from": Renamed("lines.start"),
-        "line_lr": Renamed("lines.lr"),
-        "line_mlp_lr": Renamed("lines.network_lr"),
-        "penalty": Renamed("penalty.weight"),
-        "penalty_softness": Renamed("penalty.softness"),
-        "penalty_face_mm": Renamed("penalty.face_mm"),
-        "penalty_other_mm": Renamed("penalty.other_mm"),
-        "penalty_other_weight": Renamed("penalty.other_weight"),
-        "shells": Renamed("outer_layers.count"),
-        "shell_gap": Renamed("outer_layers.gap"),
-        "shell_opacity": Renamed("outer_layers.opacity"),
-        "balanced_sampling": Renamed("sampling.balanced"),
-        "expression_classes": Renamed("sampling.expression_clusters"),
-        "expression_compatibility": Renamed("sampling.clusters_variant", VARIANT),
-        "capacity": Renamed("capacity.mode"),
-        "capacity_tolerance": Renamed("capacity.tolerance"),
-        "capacity_detail": Renamed("capacity.detail"),
-        "capacity_keep": Renamed(
-            "capacity.keep",
-            {
-                "expressions": "lines.expressions",
-                "jaw_bases": "lines.jaw_bases",
-                "line_bounds": "lines.bounds",
-                "line_resolution": "lines.resolution",
-                "plane_resolution": "planes.resolution",
-                "max_splats": "splats.max_splats",
-            },
-        ),
-    }
 
     def __post_init__(self) -> None:
         if self.hidden < 1:

@@ -31,7 +31,6 @@ OURS = MethodSpec(
     version="3",
     summary="Mesh-bound splats with tri-plane colour and expression-driven opacity along feature lines.",
     implementation="headbench.methods.ours.method:Ours",
-    first_implementation="headbench.methods.ours:Ours",
     config="headbench.methods.ours.config:OursConfig",
     needs="headbench.methods.shared.needs:splats",
     variants="headbench.methods.derived.ours_variants:variants",

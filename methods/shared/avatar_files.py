@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...bench.configuration import with_first_names
+from ...bench.configuration import deciding_settings
 from ...bench.contracts import Budget, Clip, FloatArray, HeadAsset, HeadPose
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
@@ -144,7 +144,7 @@ class RefinedTracking:
 
 def run_digest(method: str, version: str, config: Any, clip: Clip, budget: Budget, seed: int) -> str:
     """Digest of everything that decides how training goes."""
-    return digest(method, version, with_first_names(config), clip.fingerprint, budget, seed)
+    return digest(method, version, deciding_settings(config), clip.fingerprint, budget, seed)
 
 
 def is_finished(folder: Path, run: str) -> bool:

@@ -11,9 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
-
-from ...bench.specs import Renamed
+from typing import Any, Literal
 
 
 @dataclass(frozen=True)
@@ -71,10 +69,6 @@ class DensifiedTraining:
     min_settle: int = 300
     mesh_cache_mb: int = 512
     checkpoint_every_s: float = 120.0
-
-    renamed: ClassVar[Mapping[str, Renamed]] = {
-        "split_offsets": Renamed("split_variant", {"local": "paper", "world": "official"})
-    }
 
     def __post_init__(self) -> None:
         for name in (

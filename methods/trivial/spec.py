@@ -22,7 +22,6 @@ MEAN_IMAGE = MethodSpec(
     demo=True,
     summary="The mean of all training images, whatever is asked for: the trivial baseline of every table.",
     implementation="headbench.methods.trivial.method:MeanImage",
-    first_implementation="headbench.methods.trivial:MeanImage",
     trivial=True,
     presets=PRESETS,
 )
@@ -33,7 +32,6 @@ NEAREST_CAMERA = MethodSpec(
     demo=True,
     summary="The training image of the nearest pose and camera, as it is: what memorising alone achieves.",
     implementation="headbench.methods.trivial.method:NearestCamera",
-    first_implementation="headbench.methods.trivial:NearestCamera",
     trivial=True,
     config="headbench.methods.trivial.spec:NearestCameraConfig",
     presets=PRESETS,

@@ -13,7 +13,7 @@ import tyro
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.protocol import TASK_TITLES
-from ...bench.specs import RENAMED_METRICS, Findings, MetricSpec
+from ...bench.specs import Findings, MetricSpec
 
 if TYPE_CHECKING:
     from ..runs import RunSet
@@ -83,9 +83,7 @@ def compare_methods(runs: RunSet, settings: CompareSettings, progress: Progress 
     known = {spec.name: spec for spec in runs.metrics}
     for name in settings.metrics:
         if name not in known:
-            new = RENAMED_METRICS.get(name)
-            expected = f"its new name, {new}" if new in known else f"metrics of the runs: {', '.join(known)}"
-            raise InputError("command line", "--metrics", expected, name)
+            raise InputError("command line", "--metrics", f"metrics of the runs: {', '.join(known)}", name)
     asked = settings.metrics or [name for name, spec in known.items() if COMPARISON in spec.tables]
     metrics = [spec for name, spec in known.items() if name in asked]
     columns = [(task, spec) for task in runs.tasks for spec in metrics if spec.per_frame]

@@ -166,18 +166,6 @@ def test_words_of_other_toolkits_lead_to_commands_that_exist():
     assert not set(commands.WORDS_OF_OTHERS) & names
 
 
-@pytest.mark.parametrize(
-    ("command", "old", "new"),
-    [(c, *names) for c, names in commands.RENAMED_OPTIONS.items() for names in names.items()],
-)
-def test_a_former_name_of_an_option_is_refused_with_the_new_one(capsys, command, old, new):
-    for words in ([old, "x"], [f"{old}=x"]):
-        assert cli.main([command, "folder", *words]) == 2
-        assert f"{old}: expected its new name, {new}" in capsys.readouterr().err
-    settings = registry.get("commands", command).settings
-    assert new.removeprefix("--") in {field.name for field in dataclasses.fields(settings)}
-
-
 def test_help_starts_with_demo_and_run(capsys):
     with pytest.raises(SystemExit):
         cli.main(["--help"])

@@ -1,13 +1,12 @@
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.bench.configuration import build, merge, parse_assignments, with_first_names, with_new_names
+from headbench.bench.configuration import build, deciding_settings, merge, parse_assignments
 from headbench.bench.errors import InputError
-from headbench.bench.specs import Renamed
 
 
 @dataclass(frozen=True)
@@ -80,71 +79,13 @@ def test_merging_with_itself_or_nothing_changes_nothing(values):
 
 
 @dataclass(frozen=True)
-class Group:
-    on: bool = True
-    variant: Literal["paper", "official"] = "paper"
-    later: int = 0
-
-
-@dataclass(frozen=True)
-class Now:
-    """Once flat: ``group`` was the switch, ``how`` and the list ``odd`` what the variants were chosen by."""
-
+class Placed:
     inner: Inner = field(default_factory=Inner)
-    group: Group = field(default_factory=Group)
-    odd_variant: Literal["paper", "official"] = "paper"
-    size: Group = field(default_factory=Group)
+    checkout: str = ""
 
-    added: ClassVar = {"size": Group()}
-    renamed: ClassVar = {
-        "group": Renamed("group.on"),
-        "how": Renamed("group.variant", {"": "paper", "code": "official"}),
-        "odd:teeth": Renamed("odd_variant"),
-    }
+    places: ClassVar = ("checkout",)
 
 
-@pytest.mark.parametrize(
-    ("values", "new"),
-    [({"group": False}, "group.on"), ({"how": "code"}, "group.variant"), ({"odd": ["teeth"]}, "odd_variant")],
-)
-def test_an_old_name_is_refused_with_the_new_one(values, new):
-    with pytest.raises(InputError, match=rf"a\.{new}"):
-        build(Now, values, "file", "a.")
-
-
-@pytest.mark.parametrize("stored", [{"odd": 5}, {"odd": None}, {"how": [{}]}, {"how": [["code"], 1.5]}])
-def test_stored_settings_of_wrong_types_are_kept_until_used(stored):
-    assert with_new_names(Now, stored).keys() <= {"odd_variant", "group"}
-
-
-@dataclass(frozen=True)
-class Faster:
-    speed: int = 2
-
-    added: ClassVar = {"speed": 1}
-
-
-@pytest.mark.parametrize(("config", "first"), [(Faster(), {"speed": 2}), (Faster(speed=1), {})])
-def test_a_later_setting_is_left_out_where_all_is_as_before(config, first):
-    assert with_first_names(config) == first
-
-
-def test_settings_stored_by_old_names_have_the_same_digest():
-    stored = {"inner": {"rate": 0.5, "steps": 3}, "group": False, "how": "code", "odd": ["teeth"]}
-    now = Now(Inner(0.5), Group(on=False, variant="official"), odd_variant="official")
-    assert build(Now, with_new_names(Now, stored), "file") == now
-    assert with_new_names(Now, asdict(now)) == asdict(now)
-    first = with_first_names(now)
-    assert first == {
-        **stored,
-        "odd": ("teeth",),
-        "group.": {"later": 0},
-    }  # a setting added since has no first name
-    assert with_first_names(Now()) == {
-        "inner": asdict(Inner()),
-        "group": True,
-        "how": "",
-        "odd": (),
-        "group.": {"later": 0},
-    }
-    assert with_first_names(Now(size=Group(on=False)))["size"] == asdict(Group(on=False))
+def test_where_something_lies_does_not_decide_results():
+    decide = {"inner": {"rate": 0.1, "steps": 3}}
+    assert deciding_settings((Placed(checkout="here"), None, 2)) == (decide, None, 2)

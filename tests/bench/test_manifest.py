@@ -2,54 +2,64 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
-from headbench.bench import registry
 from headbench.bench.errors import InputError
-from headbench.bench.manifest import Manifest
+from headbench.bench.manifest import PROTOCOLS, Manifest, protocol_path
 from headbench.bench.runner.store import Cell
-from headbench.bench.specs import RENAMED_METRICS
 from headbench.methods.ga.spec import GA
 from headbench.metrics.psnr import PSNR
 
 GALLERY = Path(__file__).parents[2] / "reports" / "gallery" / "run.json"
 
 
-@pytest.fixture(scope="module")
-def published():
-    return json.loads(GALLERY.read_text())
+@pytest.fixture
+def published(tmp_path):
+    """A copy of the published run, with its protocols in its own folder."""
+    shutil.copytree(GALLERY.parent, tmp_path / "run", ignore=shutil.ignore_patterns("suite", "*.jpg"))
+    return tmp_path / "run" / "run.json"
+
+
+def change_json(path, change):
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
 
 
 def test_the_published_manifest_is_written_as_it_was_read(published, tmp_path):
-    Manifest.read(GALLERY).write(tmp_path / "run.json")
-    assert json.loads((tmp_path / "run.json").read_text()) == published
+    Manifest.read(published).write(tmp_path / "again" / "run.json")
+    files = [path.relative_to(published.parent) for path in published.parent.rglob("*.json")]
+    assert len(files) == 3
+    for file in files:
+        assert (tmp_path / "again" / file).read_bytes() == (published.parent / file).read_bytes()
 
 
-def test_a_manifest_of_an_earlier_version_is_read(published, tmp_path):
-    old = json.loads(json.dumps(published))
-    flags = {"regional": "regions", "temporal": "temporal", "training": "training"}
-    names = {new: old_name for old_name, new in RENAMED_METRICS.items()}
-    for metric in old["metrics"]:
-        kind = metric.pop("kind")
-        metric["per_frame"] = kind not in ("avatar", "training")
-        metric |= {flag: kind == name for name, flag in flags.items()}
-        metric["name"] = names.get(metric["name"], metric["name"])
-    old["configuration"]["metrics"] = [names.get(name, name) for name in old["configuration"]["metrics"]]
-    assert old["configuration"]["metrics"] != published["configuration"]["metrics"]
-    (tmp_path / "run.json").write_text(json.dumps(old))
-    assert Manifest.read(tmp_path / "run.json") == Manifest.read(GALLERY)
+def test_runs_side_by_side_share_their_protocols(published, monkeypatch):
+    own = Manifest.read(published)
+    folder = published.parent
+    shared = folder.parent / PROTOCOLS
+    (folder / PROTOCOLS).rename(shared)
+    assert Manifest.read(published) == own
+    monkeypatch.chdir(folder)
+    assert Manifest.read(Path("run.json")) == own
+    shutil.rmtree(shared)
+    with pytest.raises(InputError, match="the protocol of novel_view.*no such file") as caught:
+        Manifest.read(published)
+    assert caught.value.file == str(protocol_path(folder, own.protocols["novel_view"].hash))
+    own.write(published, folder.parent)
+    assert not (folder / PROTOCOLS).exists()
+    assert Manifest.read(published) == own
 
 
-def test_a_method_whose_settings_cannot_be_imported_is_read(published, tmp_path, monkeypatch):
-    known = registry.discover("methods")
-    broken = {
-        name: dataclasses.replace(plugin, spec=dataclasses.replace(plugin.spec, config="not_there:Config"))
-        for name, plugin in known.items()
-    }
-    monkeypatch.setattr("headbench.bench.runner.config.discover", lambda group: broken)
-    assert Manifest.read(GALLERY).configuration.settings == published["configuration"]["settings"]
+def test_the_protocols_of_another_run_are_refused(published):
+    own = Manifest.read(published).protocols
+    first, second = (protocol_path(published.parent, each.hash) for each in own.values())
+    second.replace(first)
+    with pytest.raises(InputError, match="task, hash: expected novel_view, .*found self_reenactment"):
+        Manifest.read(published)
 
 
 @pytest.mark.parametrize(
@@ -71,23 +81,38 @@ def test_a_method_whose_settings_cannot_be_imported_is_read(published, tmp_path,
         (lambda m: m["metrics"][0].update(tables=["/etc/x"]), "metrics, tables"),
         (lambda m: m["clips"][0].pop("fingerprint"), "clips[0].fingerprint"),
         (lambda m: m["clips"][0].update(subject="a/b"), "clips"),
+        (lambda m: m.pop("protocols"), "protocols"),
         (lambda m: m["protocols"].update(novel_view=None), "protocols.novel_view"),
-        (lambda m: m["protocols"]["novel_view"].pop("hash"), "protocols.novel_view.hash"),
-        (lambda m: m["protocols"]["novel_view"]["keys"][0].pop(), "protocols.novel_view.keys[0][3]"),
-        (lambda m: m["protocols"]["novel_view"]["keys"][0].reverse(), "protocols.novel_view.keys[0][1]"),
-        (
-            lambda m: m["protocols"]["novel_view"]["keys"].append(["..", "E", 0, "c"]),
-            "protocols.novel_view.keys",
-        ),
+        (lambda m: m["protocols"].update(novel_view="../x"), "protocols.novel_view"),
     ],
 )
-def test_a_manifest_that_is_none_is_refused_by_its_key(published, tmp_path, change, key):
-    record = json.loads(json.dumps(published))
-    change(record)
-    (tmp_path / "run.json").write_text(json.dumps(record))
+def test_a_manifest_that_is_none_is_refused_by_its_key(published, change, key):
+    change_json(published, change)
     with pytest.raises(InputError) as caught:
-        Manifest.read(tmp_path / "run.json")
+        Manifest.read(published)
     assert caught.value.key == key
+    assert caught.value.file == str(published)
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        (lambda p: p.pop("hash"), "hash"),
+        (lambda p: p.update(more=1), "more"),
+        (lambda p: p.update(id="\x1b[2J"), "id"),
+        (lambda p: p.update(hash="other"), "task, hash"),
+        (lambda p: p["keys"][0].pop(), "keys[0][3]"),
+        (lambda p: p["keys"][0].reverse(), "keys[0][1]"),
+        (lambda p: p["keys"].append(["..", "E", 0, "c"]), "keys"),
+    ],
+)
+def test_a_protocol_that_is_none_is_refused_by_its_key(published, change, key):
+    file = protocol_path(published.parent, Manifest.read(published).protocols["novel_view"].hash)
+    change_json(file, change)
+    with pytest.raises(InputError) as caught:
+        Manifest.read(published)
+    assert caught.value.key == key
+    assert caught.value.file == str(file)
 
 
 @pytest.mark.parametrize(

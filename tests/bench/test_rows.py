@@ -2,6 +2,7 @@ import itertools
 import os
 import re
 
+import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -71,14 +72,17 @@ def test_rows_are_the_same_when_read_back(rows, tmp_path):
     assert again.select(**NAMED).equals(rows.select(**NAMED))
 
 
-def test_rows_of_earlier_versions_have_no_record_of_the_load(rows, tmp_path):
-    table = rows.select(**NAMED)
-    old = table.drop(columns=["machine", "threads", "other_cores"])
-    old.to_parquet(tmp_path / "rows.parquet", index=False)
-    pd.testing.assert_frame_equal(Rows.read(tmp_path / "rows.parquet").select(**NAMED), table)
-    assert set(table["machine"]) == {""}
-    assert set(table["threads"]) == {0}
-    assert table["other_cores"].isna().all()
+def test_single_precision_keeps_seven_digits(rows, tmp_path):
+    table = pd.concat([rows.select(**NAMED)] * 100, ignore_index=True)
+    table["value"] = np.random.default_rng(0).uniform(20, 40, len(table))
+    exact, short = Rows(table), Rows(table).in_single_precision()
+    sizes = []
+    for number, each in enumerate((Rows(table.assign(value=0.0)), exact, short)):
+        each.write(path := tmp_path / f"{number}.parquet")
+        sizes.append(path.stat().st_size)
+    found = Rows.read(path).select(**NAMED)["value"].to_numpy()
+    np.testing.assert_allclose(found, table["value"], rtol=2**-24, atol=0)
+    assert sizes[2] - sizes[0] < 0.65 * (sizes[1] - sizes[0])
 
 
 def test_rows_are_updated_in_their_places(rows):

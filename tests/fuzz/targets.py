@@ -98,7 +98,7 @@ def colmap(folder: str) -> Callable[[], object]:
     return lambda: model_cameras(read_model(folder), distortion="left to the images")
 
 
-RUN = ("run/run.json", "run/rows.parquet")
+RUN = ("run/run.json", "run/protocols/*.json", "run/rows.parquet")
 CELLS = (*RUN, "run/901/**/*")
 LAYOUTS = ("insta", "imavatar")
 MEAN = "--methods mean-image --preset smoke --set metrics=psnr --set frames_per_task=1"

@@ -7,7 +7,6 @@ import pytest
 from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget
 from headbench.bench.errors import InputError
-from headbench.bench.io.files import digest
 from headbench.bench.registry import resolve
 from headbench.bench.runner.config import (
     DemoConfig,
@@ -66,23 +65,6 @@ def test_insta_is_refused_on_a_gpu_before_any_work(tmp_path):
 def test_a_run_records_the_version_of_the_method_that_it_runs(name):
     spec = SPECS[name]
     assert resolve_method(spec, "demo", {}).record()["version"] == resolve(spec.implementation).version
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    {
-        "ours": "87f12239f1fa",
-        "ga": "dac45c4314fd",
-        "gbs": "daae6f0bc069",
-        "gha": "64b397d5dc48",
-        "insta": "aa3d4245fc40",
-        "mean-image": "872346b1a896",
-        "nearest-camera": "8cb115f71ccc",
-    }.items(),
-)
-def test_runs_stored_under_former_names_keep_their_identity(name, expected):
-    """The identities that run folders of these methods' versions hold: renamed settings and modules keep them."""
-    assert digest(resolve_method(SPECS[name], "paper", {}).identity())[:12] == expected
 
 
 def values(settings, *names):

@@ -1,16 +1,13 @@
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from headbench.bench.contracts import STAGES, HeadPose
-from headbench.bench.errors import InputError
 from headbench.bench.registry import discover, resolve
-from headbench.bench.runner.config import RunConfig, default_names, resolve_metrics
-from headbench.bench.specs import RENAMED_METRICS
+from headbench.bench.runner.config import default_names
 
 SPECS = [
     p.spec for p in discover("metrics").values() if p.spec and p.spec.implementation.startswith("headbench.")
@@ -72,10 +69,3 @@ def test_the_implementation_is_there(spec):
 def test_listing_metrics_imports_neither_torch_nor_opencv():
     code = "import sys; from headbench.bench.registry import discover; discover('metrics'); discover('profiles'); sys.exit(bool({'torch', 'cv2'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-@pytest.mark.parametrize(("former", "name"), RENAMED_METRICS.items())
-def test_a_former_name_is_refused_with_the_new_one(former, name):
-    assert name in BY_NAME
-    with pytest.raises(InputError, match=name):
-        resolve_metrics(RunConfig(data=Path(), out=Path(), methods=("ga",), metrics=(former,)))

@@ -109,6 +109,7 @@ def listing(**changes):
         (lambda files: {n: c for n, c in files.items() if n != "rows.parquet"}, "rows.parquet: .* in the list only"),
         (lambda files: relisted({**files, "../x/seed-0/fit.json": b"{}"}), "expected files of a run"),
         (lambda files: relisted({**files, "a/b/seed-0/avatar.pkl": b""}), "expected files of a run"),
+        (lambda files: {n: c for n, c in files.items() if not n.startswith("protocols/")}, "protocols/.* in the list only"),
         (lambda files: {n: c for n, c in files.items() if n != INDEX}, "bundle.json: expected a list of the files"),
         (lambda files: [*files.items(), ("run.json", b"{}")], "each name once"),
         (listing(link="javascript:alert(1)"), "link: expected an address"),

@@ -118,10 +118,10 @@ def test_rows_that_are_changed_missing_or_twice_are_found(run, found, change, wo
             "fit.json, fingerprint: expected",
         ),
         (
-            "../../../run.json",
-            lambda path: change_json(
-                path, lambda r: r["protocols"]["novel_view"].update(quantisation="floor")
-            ),
+            "../../../protocols",
+            lambda folder: [
+                change_json(path, lambda r: r.update(quantisation="floor")) for path in folder.iterdir()
+            ],
             "protocols.novel_view.quantisation: expected round-to-8-bit, found floor",
         ),
     ],

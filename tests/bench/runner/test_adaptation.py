@@ -159,13 +159,13 @@ def test_a_reduced_comparison_has_another_size_and_another_hash(config, toy):
         chosen = dataclasses.replace(config, divide=divide, out=f"{config.out}{divide}")
         assert runner.run(chosen).failed == []
         manifest = manifest_of(chosen)
-        record[divide] = manifest["protocols"]["novel_view"]
+        record[divide] = RunFolder(Path(chosen.out)).read_manifest().protocols["novel_view"]
         # Whoever opens the captures of a run again, as reports do, sees what was measured.
         (clip,) = open_clips(chosen)
         assert clip.fingerprint == manifest["clips"][0]["fingerprint"]
-    assert record[1]["resolution"] == "8x6"
-    assert record[2]["resolution"] == "4x3"
-    assert record[1]["hash"] != record[2]["hash"]
+    assert record[1].resolution == "8x6"
+    assert record[2].resolution == "4x3"
+    assert record[1].hash != record[2].hash
     with pytest.raises(ValueError, match="divide"):
         RunConfig("a", "b", divide=0)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from headbench.bench.configuration import with_first_names
+from headbench.bench.configuration import deciding_settings
 from headbench.bench.errors import InputError
 from headbench.methods.official import needs
 from headbench.methods.official.checkout import Repository, look
@@ -107,8 +107,8 @@ def test_nothing_that_the_checkout_configures_is_run(repository, tmp_path):
 
 def test_where_the_checkout_lies_does_not_make_another_avatar():
     one, other = (GAOfficialConfig(checkout=place, python=place) for place in ("a", "b"))
-    assert with_first_names(one) == with_first_names(other)
-    assert with_first_names(one) != with_first_names(replace(one, commit="1234567"))
+    assert deciding_settings(one) == deciding_settings(other)
+    assert deciding_settings(one) != deciding_settings(replace(one, commit="1234567"))
 
 
 @pytest.mark.parametrize(

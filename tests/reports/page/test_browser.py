@@ -1,9 +1,12 @@
 """The page in Chromium, opened from the disk."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from headbench.bench.contracts import FrameKey
+from headbench.bench.runner.store import RunFolder
 from headbench.reports.page import split
 from headbench.reports.page.command import PageSettings, report
 
@@ -132,11 +135,11 @@ def test_tables_sort_and_places_lead_to_frames(opened, toy_run, write_run):
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1400, "light"), (390, "dark")])
-def test_hostile_names_are_text_and_nothing_scrolls_sideways(
-    opened, write_run, change_manifest, width, scheme
-):
+def test_hostile_names_are_text_and_nothing_scrolls_sideways(opened, write_run, width, scheme):
     run = write_run("run", {HOSTILE: 30.0, "other": 31.0})
-    change_manifest(run, lambda m: m["protocols"]["novel_view"].update(keys=[["a", "EMO", 0, "a"]]))
+    manifest = RunFolder(run).read_manifest()
+    one = replace(manifest.protocols["novel_view"], keys=(FrameKey("a", "EMO", 0, "a"),))
+    replace(manifest, protocols={**manifest.protocols, "novel_view": one}).write(RunFolder(run).manifest)
     tab = opened(run, width, scheme)
     assert order(tab) == [HOSTILE, "other"]
     assert tab.locator("#panels b").nth(1).text_content() == HOSTILE

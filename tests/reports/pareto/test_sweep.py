@@ -49,7 +49,7 @@ def test_variants_are_scored_like_the_run_itself(finished, toy):
     assert found == {"varying": 128 - 61, "varying+dark": 64 - 61, "varying+light": 191 - 61}
     assert set(rows["metric"]) == {"error", "files"}  # nothing was trained: no metric of training
     record, original = (read_json(RunFolder(path).manifest) for path in (finished / "sweep", finished))
-    assert record["protocols"]["novel_view"]["hash"] == original["protocols"]["novel_view"]["hash"]
+    assert record["protocols"]["novel_view"] == original["protocols"]["novel_view"]
     derived = {entry["name"]: entry.get("derived") for entry in record["methods"]}
     assert derived["varying"] is None
     assert derived["varying+dark"] == {"from": "varying", "variant": "dark", "change": "level 0.25"}

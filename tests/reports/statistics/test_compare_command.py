@@ -11,7 +11,7 @@ from headbench.bench import cli
 from headbench.bench.errors import InputError
 from headbench.bench.rows import Rows
 from headbench.bench.runner.store import RunFolder
-from headbench.bench.specs import RENAMED_METRICS, MetricSpec
+from headbench.bench.specs import MetricSpec
 from headbench.reports.statistics.command import CompareSettings, compare_runs
 
 from ..made_rows import TASKS, avatar_row, row
@@ -126,11 +126,9 @@ def test_other_levels_are_kept(folder):
     [
         ({"against": "nobody"}, "nobody"),
         ({"metrics": ("error", "jod")}, "metrics of the runs: error, size, found jod"),
-        ({"metrics": ("former",)}, "its new name, error"),
     ],
 )
-def test_what_is_not_there_is_refused(folder, monkeypatch, changes, message):
-    monkeypatch.setitem(RENAMED_METRICS, "former", "error")
+def test_what_is_not_there_is_refused(folder, changes, message):
     with pytest.raises(InputError, match=message):
         compare_runs(CompareSettings((str(folder),), **changes))
 
