@@ -1,7 +1,6 @@
 """The restricted unpickler: reads what FLAME's files hold, and refuses whatever could run code."""
 
 import builtins
-import contextlib
 import copyreg
 import io
 import os
@@ -11,8 +10,6 @@ import tracemalloc
 import numpy as np
 import pytest
 import scipy.sparse
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.unpickle import read_pickle
@@ -293,26 +290,3 @@ def test_arrays_have_the_bytes_they_declare(tmp_path):
     assert good.count(shape) == 1
     for other in (b"K\x04\x85", b"J\xff\xff\xff\xff\x85", b"J\xff\xff\xff\x7f\x85"):  # 4, -1, 2^31 - 1
         refusal(tmp_path / "x.pkl", good.replace(shape, other))
-
-
-def test_refuses_truncated_files(tmp_path):
-    with chumpy_stand_in() as ch:
-        stream = legacy_pickle({"x": ch(np.arange(4.0)), "y": MATRICES["csc"], "z": "text"})
-    for length in range(0, len(stream), 7):
-        refusal(tmp_path / "cut.pkl", stream[:length])
-
-
-FUZZ = legacy_pickle({"a": np.arange(4.0), "b": MATRICES["csc"], "c": np.arange(3, dtype=np.int32)})
-
-
-@settings(max_examples=300, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, len(FUZZ) - 1), st.integers(0, 255)), min_size=1, max_size=4))
-def test_damage_is_refused_or_harmless(tmp_path_factory, changes):
-    damaged = bytearray(FUZZ)
-    for position, value in changes:
-        damaged[position] = value
-    path = tmp_path_factory.getbasetemp() / "damaged.pkl"
-    path.write_bytes(damaged)
-    kinds = (np.ndarray, str, bytes, int, float, list, tuple, dict)
-    with contextlib.suppress(InputError):
-        assert all(isinstance(value, kinds) for value in read_pickle(path).values())
