@@ -1,158 +1,276 @@
-"""Read pickles from outside without running anything they ask for, in memory and time bounded by their size.
+"""Read the arrays in a FLAME pickle without running anything the file asks for.
 
-A pickle is a program that may call whatever it can import. Here every name in it is looked up in a closed table of
-stand-ins, which only keep what they are given; the caller makes data of them afterwards, within its own bounds.
+A pickle is a program that may call whatever it can import. FLAME and its masks come as Python-2 pickles full of chumpy
+and scipy objects, so every name in the stream is looked up in a closed table of stand-ins. A stand-in keeps what it is
+given; arrays are made at the end, of raw bytes whose number has to be what their types and shapes say.
 """
 
 from __future__ import annotations
 
+import io
+import math
 import pickle
+import re
 import struct
-from collections.abc import Callable, Mapping
-from typing import Any, BinaryIO
+from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
+from typing import Any, Self
 
-MAX_OPERATIONS = 500_000
-"""Genuine files have a few thousand; a single byte can ask for an object of two hundred."""
+import numpy as np
+
+from ..errors import InputError
+from .files import read_bytes, reading
+
+EXPECTED = "a pickled dictionary of numpy, scipy.sparse and chumpy arrays"
+MAX_BYTES = 2**30
+"""Of a file; the largest of FLAME has 0.1 GB."""
+MAX_DENSE_BYTES = 40_000_000
+"""Of all sparse matrices of a file, made dense: a few bytes can declare any shape. A joint regressor has 200,000."""
+MAX_DIMENSIONS = 8
+
+_DATA = (np.ndarray, str, bytes, int, float, complex, type(None), list, tuple, dict)
 
 
-class Refused(Exception):
-    """The stream named a global that is not in the table."""
+def read_pickle(path: str | PathLike[str]) -> dict[str, Any]:
+    """Read a pickled dictionary of arrays: a FLAME model or ``FLAME_masks.pkl``.
+
+    Python-2 strings are taken as latin1; chumpy and scipy.sparse objects become dense arrays.
+
+    Returns
+    -------
+    The dictionary: arrays (also 0-d, for numpy scalars), strings, numbers, plain containers.
+
+    Raises
+    ------
+    InputError
+        Where the file is missing, is no pickle of such a dictionary, is cut off, or names any global other
+        than those that numpy, scipy.sparse and chumpy need for arrays. Nothing of it is run then.
+    """
+    path = Path(path)
+    stream = read_bytes(path, EXPECTED, MAX_BYTES)
+    with reading(path, EXPECTED):
+        content = _ClosedUnpickler(path, stream).load()
+        if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+            raise ValueError(f"a {type(content).__name__.lstrip('_').lower()}, not a dictionary with names")
+        left = len(stream) + MAX_DENSE_BYTES
+        made: dict[int, Any] = {}  # a stand-in with many names is made an array once
+        for value in content.values():
+            if id(value) not in made:
+                made[id(value)] = value.array() if isinstance(value, _StandIn) else value
+                left -= getattr(made[id(value)], "nbytes", 0)
+            if left < 0 or not isinstance(made[id(value)], _DATA):
+                raise ValueError(
+                    "arrays of more bytes than the file has" if left < 0 else "an entry of no data"
+                )
+        return {key: made[id(value)] for key, value in content.items()}
 
 
-class Malformed(Exception):
-    """The stream used a stand-in in a way no genuine pickle does, or asks for too much."""
+class _StandIn:
+    """An object of the stream: what it was made of, and the state that it was given."""
 
+    arguments: tuple[Any, ...]
+    state: Any
 
-class Function:
-    """A callable the stream may use, which it cannot alter: the state of a function is never restored."""
-
-    __slots__ = ("_call",)
-
-    def __init__(self, call: Callable[..., Any]) -> None:
-        self._call = call
-
-    def __call__(self, *arguments: Any) -> Any:
-        return self._call(*arguments)
+    def __new__(cls, *arguments: Any) -> Self:
+        made = super().__new__(cls)
+        made.arguments, made.state = arguments, None
+        return made
 
     def __setstate__(self, state: Any) -> None:
-        raise Malformed("an attempt to alter a function")
+        self.state = state
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The instance dictionary, which Python may wrap in a pair with the slots' state."""
+        pair = isinstance(self.state, tuple) and len(self.state) == 2
+        return self.state[0] if pair else self.state
+
+    def array(self) -> np.ndarray:
+        """The values."""
+        raise ValueError(f"an array that is a {type(self).__name__.lstrip('_').lower()}")
 
 
-class _Bounded:
-    """The rest of a stream; a length that the stream declares never asks for more memory than is left of it."""
+class _DType(_StandIn):
+    """``numpy.dtype(name, align, copy)`` with its state (version, byte order, sub-array, names, fields, ...)."""
 
-    def __init__(self, stream: BinaryIO, size: int) -> None:
-        self._stream, self._size = stream, size
-
-    def read(self, size: int) -> bytes:
-        return self._stream.read(min(size, self._size - self._stream.tell()))
-
-    def readline(self) -> bytes:
-        return self._stream.readline()
-
-    def readinto(self, buffer: Any) -> int:
-        raise Malformed("a buffer")
+    def resolve(self) -> np.dtype[Any]:
+        """The numpy dtype: truth values, integers and floats only."""
+        name, state = self.arguments[0], self.state or (3, "=", None, None, None)
+        if not re.fullmatch("b1|[iu][1248]|f[248]", name) or any(part is not None for part in state[2:5]):
+            raise ValueError(f"an array of dtype {name[:20]!r}")
+        return np.dtype(name).newbyteorder(state[1])
 
 
-class _Operations:
-    """What each operation of a stream does; counts them."""
+class _Array(_StandIn):
+    """``numpy.core.multiarray._reconstruct`` with its state (version, shape, dtype, fortran, bytes)."""
 
-    def __init__(self, table: Mapping[int, Callable[..., None]]) -> None:
-        self._by_code, self._left = table, MAX_OPERATIONS
-
-    def __getitem__(self, code: int) -> Callable[..., None]:
-        self._left -= 1
-        if self._left < 0:
-            raise Malformed(f"more than {MAX_OPERATIONS} operations")
-        return self._by_code[code]
+    def array(self) -> np.ndarray:
+        _, shape, dtype, fortran, raw = self.state
+        return _from_bytes(raw, dtype, shape, "F" if fortran else "C")
 
 
-# The unpickler written in Python: the one in C allocates whatever memo size the stream names, so that nine
-# bytes can ask for gigabytes. Arrays are single operations, hence nothing is lost in speed.
-_PythonUnpickler: Any = vars(pickle)["_Unpickler"]
+class _Buffer(_StandIn):
+    """``numpy._core.numeric._frombuffer``, which protocol 5 uses for contiguous arrays."""
+
+    def array(self) -> np.ndarray:
+        raw, dtype, shape, order = self.arguments
+        return _from_bytes(raw, dtype, shape, order)
 
 
-class ClosedUnpickler(_PythonUnpickler):
-    """Resolves names in a closed table and nowhere else; sets become lists.
+class _Scalar(_StandIn):
+    """``numpy.core.multiarray.scalar``."""
 
-    Parameters
-    ----------
-    stream : read from where it stands, to the end of one pickle.
-    size : of the whole stream, bytes.
-    table : stand-ins by module and name.
-    external : makes a stand-in of what the pickle only names (its persistent ids).
-    """
+    def array(self) -> np.ndarray:
+        dtype, raw = self.arguments
+        return _from_bytes(raw, dtype, (), "C")
 
-    def __init__(
-        self,
-        stream: BinaryIO,
-        size: int,
-        table: Mapping[tuple[str, str], Any],
-        external: Callable[[Any], Any] | None = None,
-    ) -> None:
-        super().__init__(_Bounded(stream, size), encoding="latin1")
-        self._table_of_names, self._external = table, external
-        self.dispatch = _Operations(_OPERATIONS)
 
-    def find_class(self, module: str, name: str) -> Any:
-        try:
-            return self._table_of_names[module, name]
-        except KeyError:
-            raise Refused(f"{module}.{name}"[:200]) from None
+class _Chumpy(_StandIn):
+    """``chumpy.ch.Ch``: a plain array under the key x."""
 
-    def persistent_load(self, pid: Any) -> Any:
-        if self._external is None:
-            raise Malformed("something that is kept elsewhere")
-        return self._external(pid)
+    def array(self) -> np.ndarray:
+        values: np.ndarray = self.fields["x"].array()
+        return values
+
+
+class _Sparse(_StandIn):
+    """A scipy.sparse matrix."""
+
+    layout = ""
+
+    def array(self) -> np.ndarray:
+        """(rows, columns) array; entries at the same place add up."""
+        import scipy.sparse
+
+        fields, shape = self.fields, self.fields["_shape"]
+        if len(shape) != 2 or math.prod(shape) * 8 > MAX_DENSE_BYTES:
+            raise ValueError(f"a sparse matrix of shape {shape}")
+        if self.layout == "coo":
+            rows, columns = fields.get("coords") or (fields["row"], fields["col"])  # since scipy 1.11, before
+            parts: Any = (fields["data"].array(), (rows.array(), columns.array()))
+        else:
+            parts = tuple(fields[name].array() for name in ("data", "indices", "indptr"))
+        matrix = getattr(scipy.sparse, f"{self.layout}_matrix")(parts, shape)
+        if self.layout != "coo":
+            matrix.check_format(full_check=True)
+        dense: np.ndarray = matrix.toarray()
+        return dense
+
+
+def _from_bytes(raw: Any, dtype: _DType, shape: tuple[int, ...], order: Any) -> np.ndarray:
+    """An array from its bytes, whose number has to be just what dtype and shape say."""
+    content = raw.encode("latin1") if isinstance(raw, str) else raw  # Python 2's bytes are read as latin1
+    values = np.frombuffer(content, dtype.resolve())
+    if len(shape) > MAX_DIMENSIONS or math.prod(shape) != values.size:
+        raise ValueError(f"{len(content)} bytes for an array of shape {shape}")
+    # A copy that may be written to.
+    return np.array(values.reshape(shape, order=order), dtype=values.dtype.newbyteorder("="), order="C")
+
+
+def _encode(text: str, encoding: str = "latin1") -> bytes:
+    """``_codecs.encode``: bytes as Python 3 writes them in old protocols."""
+    return text.encode("latin1")
+
+
+def _no_bytes() -> bytes:
+    """``bytes()``: how Python 3 writes the content of an empty array in old protocols."""
+    return b""
+
+
+def _set(items: list[Any]) -> list[Any]:
+    """``set`` in chumpy's bookkeeping; nothing reads it."""
+    return items
+
+
+def _object_of(kind: type[_StandIn], base: Any, state: Any) -> _StandIn:
+    """``copyreg._reconstructor``: how protocols 0 and 1 make instances of new-style classes."""
+    return kind.__new__(kind)
+
+
+def _table() -> dict[tuple[str, str], Any]:
+    table: dict[tuple[str, str], Any] = {
+        ("numpy", "ndarray"): _Array,
+        ("numpy", "dtype"): _DType,
+        ("_codecs", "encode"): _encode,
+        ("chumpy.ch", "Ch"): _Chumpy,
+    }
+    for core in ("numpy.core", "numpy._core"):
+        table[f"{core}.multiarray", "_reconstruct"] = _Array
+        table[f"{core}.multiarray", "scalar"] = _Scalar
+        table[f"{core}.numeric", "_frombuffer"] = _Buffer
+    for builtins in ("__builtin__", "builtins"):
+        table |= {(builtins, "set"): _set, (builtins, "bytes"): _no_bytes, (builtins, "object"): None}
+    for registry in ("copy_reg", "copyreg"):
+        table[registry, "_reconstructor"] = _object_of
+    for layout in ("csc", "csr", "coo"):
+        kind = type(f"_{layout}_matrix", (_Sparse,), {"layout": layout})
+        for module in (f"scipy.sparse.{layout}", f"scipy.sparse._{layout}"):
+            table[module, f"{layout}_matrix"] = table[module, f"{layout}_array"] = kind
+    return table
+
+
+def _load_state(unpickler: Any) -> None:
+    """Give a state to a stand-in; to a class or a function it would stay for the next file."""
+    if not isinstance(unpickler.stack[-2], _StandIn):
+        raise pickle.UnpicklingError("a state for something that has none")
+    _PythonUnpickler.load_build(unpickler)
 
 
 def _load_bytes(unpickler: Any) -> None:
+    """A bytearray, which Python would make of the length that is declared before it is read."""
     (size,) = struct.unpack("<Q", unpickler.read(8))
     unpickler.append(unpickler.read(size))
 
 
-def _load_list(unpickler: Any) -> None:
-    unpickler.append([])
-
-
-def _load_items(unpickler: Any) -> None:
-    items = unpickler.pop_mark()
-    unpickler.stack[-1].extend(items)
-
-
-def _load_whole_list(unpickler: Any) -> None:
-    unpickler.append(unpickler.pop_mark())
-
-
-def _with_plain_keys(load: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Entries of dictionaries with text and numbers as keys: the hash of nested tuples, or of a long number again
-    and again, can take for ever."""
+def _with_plain_keys(load: Callable[[Any], None], keys: slice) -> Callable[[Any], None]:
+    """Entries of dictionaries with text and numbers as keys: the hash of nested tuples can take for ever."""
 
     def checked(unpickler: Any) -> None:
-        # One entry lies on the stack itself; several lie behind the last mark.
-        keys = unpickler.stack[-2:-1] if load is _SET_ITEM else unpickler.stack[::2]
-        if not all(map(_is_plain_key, keys)):
-            raise Malformed("a key that is neither text nor a number")
+        for key in unpickler.stack[keys]:
+            long = isinstance(key, int) and abs(key) >= 2**63
+            if long or not isinstance(key, (str, bytes, float, int, type(None))):
+                raise pickle.UnpicklingError("a key that is neither text nor a number")
         load(unpickler)
 
     return checked
 
 
-def _is_plain_key(key: Any) -> bool:
-    return key is None or isinstance(key, (str, bytes, float)) or (isinstance(key, int) and abs(key) < 2**63)
-
-
 def _refuse(unpickler: Any) -> None:
-    raise Malformed("an extension, which only a registry of its writer knows")
+    raise pickle.UnpicklingError("an operation that files of FLAME do not need")
 
 
-_OPERATIONS: dict[int, Callable[[Any], None]] = dict(_PythonUnpickler.dispatch)
-_SET_ITEM = _OPERATIONS[pickle.SETITEM[0]]
-for _code in (pickle.SETITEM, pickle.SETITEMS, pickle.DICT):
-    _OPERATIONS[_code[0]] = _with_plain_keys(_OPERATIONS[_code[0]])
-for _code in (pickle.EXT1, pickle.EXT2, pickle.EXT4):
-    _OPERATIONS[_code[0]] = _refuse
-_OPERATIONS[pickle.BYTEARRAY8[0]] = _load_bytes
-_OPERATIONS[pickle.EMPTY_SET[0]] = _load_list
-_OPERATIONS[pickle.ADDITEMS[0]] = _load_items
-_OPERATIONS[pickle.FROZENSET[0]] = _load_whole_list
+# The unpickler written in Python: the one in C allocates whatever memo size the stream names, so that nine
+# bytes can ask for gigabytes. Arrays are single operations, hence nothing is lost in speed.
+_PythonUnpickler: Any = vars(pickle)["_Unpickler"]
+_OPERATIONS: dict[int, Callable[[Any], None]] = {
+    **_PythonUnpickler.dispatch,
+    pickle.BUILD[0]: _load_state,
+    pickle.BYTEARRAY8[0]: _load_bytes,
+    pickle.SETITEM[0]: _with_plain_keys(_PythonUnpickler.load_setitem, slice(-2, -1)),
+    pickle.SETITEMS[0]: _with_plain_keys(_PythonUnpickler.load_setitems, slice(0, None, 2)),
+    pickle.DICT[0]: _with_plain_keys(_PythonUnpickler.load_dict, slice(0, None, 2)),
+    **dict.fromkeys((pickle.EXT1[0], pickle.EXT2[0], pickle.EXT4[0]), _refuse),
+    pickle.EMPTY_SET[
+        0
+    ]: _PythonUnpickler.load_empty_list,  # a set would hash what it holds; nothing reads any
+    pickle.ADDITEMS[0]: _PythonUnpickler.load_appends,
+    pickle.FROZENSET[0]: _PythonUnpickler.load_list,
+}
+
+
+class _ClosedUnpickler(_PythonUnpickler):
+    """Resolves names in a closed table and nowhere else."""
+
+    dispatch = _OPERATIONS
+
+    def __init__(self, path: Path, stream: bytes) -> None:
+        super().__init__(io.BytesIO(stream), encoding="latin1")
+        self._path, self._names = path, _table()
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in self._names:
+            remedy = "The file was not read. Get the model from its official source."
+            key = f"global {module}.{name}"
+            raise InputError(self._path, key, EXPECTED, "a name that could run code", remedy)
+        return self._names[module, name]

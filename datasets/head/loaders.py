@@ -15,9 +15,10 @@ from ...bench.contracts import IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import read_npy, read_npz
 from ...bench.io.documents import read_json
+from ...bench.io.files import open_regular
+from ...bench.io.unpickle import read_pickle
 from .arrays import RING_REGIONS, HeadArrays, read_head, with_derived_regions
 from .ict import ict_head, is_ict
-from .unpickle import read_pickle
 
 FLAME_IDENTITY_SIZE = 300
 """Columns of FLAME's ``shapedirs`` that span identity; those after them span expression."""
@@ -63,11 +64,8 @@ def load_head(
         Where a file is missing, damaged or of no known kind, or holds arrays that make no head.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(len(_ZIP))
-    except OSError as error:
-        raise InputError(path, "", "a head model file", error.strerror or "nothing readable") from error
+    with open_regular(path, "a head model file") as stream:
+        start = stream.read(len(_ZIP))
     if start == _ZIP:
         content = read_npz(path)
         head = ict_head(path, content) if is_ict(content) else read_head(path)

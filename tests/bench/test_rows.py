@@ -1,5 +1,4 @@
 import itertools
-import os
 import re
 
 import numpy as np
@@ -118,10 +117,6 @@ def twice(path, frame):
 @pytest.mark.parametrize(
     ("spoil", "found"),
     [
-        (lambda p, f: p.write_bytes(b""), "a Parquet file of rows"),
-        (lambda p, f: p.write_bytes(p.read_bytes()[:-400]), "a Parquet file of rows"),
-        (lambda p, f: (p.unlink(), p.mkdir()), "a folder"),
-        (lambda p, f: (p.unlink(), os.mkfifo(p)), "a pipe"),
         (lambda p, f: written(p, f.drop(columns="protocol")), "no protocol"),
         (lambda p, f: written(p, f.assign(other_cores=-0.5)), "other_cores: expected a number from 0"),
         (twice, "2 task"),

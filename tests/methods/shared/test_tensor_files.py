@@ -25,10 +25,6 @@ def entry(dtype: str, shape: list, end: int) -> dict:
 
 
 DAMAGED = {
-    "missing": None,
-    "empty": b"",
-    "text": b"no tensors at all",
-    "cut short": save({"x": torch.zeros(100)})[:-1],
     "too long": save({"x": torch.zeros(100)}) + b"\0",
     "a header as long as the world": struct.pack("<Q", 2**62) + b"{}",
     "a header of more than its share": file_of(b" " * (MAX_HEADER + 1)),
@@ -44,8 +40,7 @@ DAMAGED = {
 @pytest.mark.parametrize("name", DAMAGED)
 def test_a_damaged_file_is_refused(tmp_path, name):
     path = tmp_path / "x.safetensors"
-    if DAMAGED[name] is not None:
-        path.write_bytes(DAMAGED[name])
+    path.write_bytes(DAMAGED[name])
     tracemalloc.start()
     with pytest.raises(InputError) as caught:
         read_safetensors(path)
