@@ -110,6 +110,9 @@ class MethodSpec:
     variants : "package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]``: what can be derived
         from a trained avatar without training (``headbench sweep``); "" for nothing.
     devices : kinds of devices that it computes on, such as "cpu"; empty means any. A run on another refuses it.
+    renders : "package.module:function" of ``(folder, clip, listing) -> {FrameKey: Render}``, see `bench.audit.naming`: which
+        image that the method's own program left in a folder shows which frame (``headbench evaluate --names``); ``listing``
+        is the capture's, see `DatasetSpec`. "" where no program numbers its renders.
     needs : "package.module:function" of ``(config, device) -> Iterable[Need]``: what a machine has to have, each looked
         for without long work, network or changes of the disk; "" for nothing but what headbench is installed with.
     """
@@ -128,6 +131,7 @@ class MethodSpec:
     default: bool = False
     demo: bool = False
     variants: str = ""
+    renders: str = ""
     devices: tuple[str, ...] = ()
     needs: str = ""
     resolution: ResolutionRule = ResolutionRule()

@@ -122,10 +122,8 @@ class EvaluateSettings:
     """Where metrics are computed that can use a GPU, and with --avatar where to render."""
 
     names: str = ""
-    """How the images are named, if not by key: official-ga, official-tga (FOLDER is the model's, with test/ours_N/renders and
-    val/ours_N/renders as their render.py writes them), official-gbs (test/split_N, put on the capture's background by
-    their masks), official-insta (FOLDER is experiments/CONFIG/debug, with its overlay), or a file MAP.csv with the columns
-    file, sequence, timestep, camera (and subject with several)."""
+    """How the images are named, if not by key: a method whose own program numbers its renders, such as an adapter to an
+    official repository, or a file MAP.csv with the columns file, sequence, timestep, camera (and subject with several)."""
 
     any_background: bool = False
     """Score images as they are even where their background is not the capture's, which is refused otherwise."""

@@ -1,12 +1,10 @@
-"""Which image of a folder shows which frame, where they are not named by key: official repositories, a list in CSV."""
+"""Which image of a folder shows which frame, where they are not named by key: a method's program, a list in CSV."""
 
 from __future__ import annotations
 
 import csv
 import io
-import re
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -17,7 +15,7 @@ from ..errors import InputError
 from ..io.documents import read_text
 from ..io.files import reading, with_slashes
 from ..io.images import read_pixels, read_png
-from ..registry import get, resolve, unknown
+from ..registry import discover, get, resolve, unknown
 from ..runner.captures import found_captures
 from ..runner.config import RunConfig
 from ..runner.store import Cell
@@ -27,7 +25,7 @@ MAP = "a list of names, MAP.csv"
 COLUMNS = ("file", "sequence", "timestep", "camera")
 MAP_COLUMNS = ("file", *FrameKey._fields)
 MAX_MAP_BYTES = 64 * 2**20
-_MAP_REMEDY = "Name the images one by one with --names MAP.csv (columns file, sequence, timestep, camera)."
+MAP_REMEDY = "Name the images one by one with --names MAP.csv (columns file, sequence, timestep, camera)."
 
 
 class Render(NamedTuple):
@@ -46,9 +44,9 @@ Listing = Mapping[str, Sequence[tuple[int, str]]]
 
 
 def named_renders(names: str, folder: Path, config: RunConfig, clips: Sequence[Clip]) -> Renders:
-    """Image of each frame by ``names``: one of `OFFICIAL`, or the path of a CSV file.
+    """Image of each frame by ``names``: a method whose program numbers its renders, or the path of a CSV file.
 
-    The official rules take the images of a subject from a folder named after it, or with one subject from ``folder``.
+    The images of a subject are in a folder named after it, or with one subject in ``folder``. See `MethodSpec.renders`.
 
     Raises
     ------
@@ -58,8 +56,11 @@ def named_renders(names: str, folder: Path, config: RunConfig, clips: Sequence[C
     """
     if names.endswith(".csv"):
         return _listed(Path(names), folder, clips)
-    if names not in OFFICIAL:
-        raise unknown("command line", "--names", names, OFFICIAL, f"Or {MAP}.")
+    specs = [plugin.spec for plugin in discover("methods").values() if plugin.spec is not None]
+    numbered = {method.name: method.renders for method in specs if method.renders}
+    if names not in numbered:
+        raise unknown("command line", "--names", names, numbered, f"Or {MAP}.")
+    renders = resolve(numbered[names])
     spec: DatasetSpec = get("datasets", config.reader)
     found: Renders = {}
     for clip, (path, _) in zip(clips, found_captures(spec, Path(config.data), config.reader_settings)):
@@ -67,7 +68,7 @@ def named_renders(names: str, folder: Path, config: RunConfig, clips: Sequence[C
         if own == folder and len(clips) > 1:
             raise InputError(folder, clip.subject, "a folder with its images for each subject", "none")
         listing: Listing = resolve(spec.listing)(path) if spec.listing else {}
-        found |= OFFICIAL[names](own, clip, listing)
+        found |= renders(own, clip, listing)
     return found
 
 
@@ -103,7 +104,7 @@ def check_truth(clip: Clip, renders: Renders, keys: Iterable[FrameKey], count: i
             expected = f"the ground truth of {key}"
             found = f"an image that differs by {error:.1f} of 255 (root mean square)"
             remedy = (
-                "These are renders of another capture, another background or another order. " + _MAP_REMEDY
+                "These are renders of another capture, another background or another order. " + MAP_REMEDY
             )
             raise InputError(path, "", expected, found, remedy)
 
@@ -127,105 +128,8 @@ def composited(render: Render, background: Sequence[float]) -> ByteArray:
     return np.rint(image + (1 - coverage) * ground).clip(0, 255).astype(np.uint8)
 
 
-def _numbered(folder: Path, prefix: str, count: Sequence[int], of: str) -> list[Path]:
-    """Images ``<prefix>00000.png`` and on in a folder; their number has to be one of ``count``."""
-    pattern = re.compile(re.escape(prefix) + r"(\d{5,})\.png")
-    numbers = sorted(int(match[1]) for path in folder.iterdir() if (match := pattern.fullmatch(path.name)))
-    if len(numbers) not in count or numbers != [*range(len(numbers))]:
-        wanted = " or ".join(map(str, sorted(set(count))))
-        last = f", {prefix}{numbers[0]:05d}.png to {prefix}{numbers[-1]:05d}.png" if numbers else ""
-        expected = f"{wanted} images, {prefix}00000.png and on, one for each frame of {of}"
-        remedy = f"Render the split again, whole and with all cameras. {_MAP_REMEDY}"
-        raise InputError(folder, "", expected, f"{len(numbers)}{last}", remedy)
-    return [folder / f"{prefix}{number:05d}.png" for number in numbers]
-
-
-def _latest(folder: Path, stem: str) -> Path | None:
-    """The folder ``<stem>_<iterations>`` of most iterations, which the repositories load by default, too."""
-    made = {
-        int(match[1]): path
-        for path in (folder.iterdir() if folder.is_dir() else ())
-        if (match := re.fullmatch(rf"{stem}_(\d{{1,9}})", path.name)) and path.is_dir()
-    }
-    return made[max(made)] if made else None
-
-
-def _gaussian_avatars(folder: Path, clip: Clip, listing: Listing) -> Renders:
-    """``{train,val,test}/ours_<iterations>/renders/<index>.png``, by the order of ``transforms_<split>.json``."""
-    if not listing:
-        expected = "a capture in the GaussianAvatars/VHAP layout, whose files give the order"
-        raise InputError("command line", "--names", expected, f"another for {clip.subject}", _MAP_REMEDY)
-    known = {(key.timestep, key.camera): key for key in _every_frame(clip)}
-    found: Renders = {}
-    for split, frames in listing.items():
-        made = _latest(folder / split, "ours")
-        if made is None or not (made / "renders").is_dir():
-            continue
-        images = _numbered(made / "renders", "", [len(frames)], f"transforms_{split}.json")
-        for frame, image in zip(frames, images):
-            if frame in known:
-                found[known[frame]] = Render(image, truth=made / "gt" / image.name)
-    if not found:
-        expected = "test/ours_N/renders or val/ours_N/renders, as render.py leaves them in the model's folder"
-        raise InputError(folder, "", expected, "neither")
-    return found
-
-
-GBS_TEST_FRAMES = 350
-
-
-def _gaussian_blendshapes(folder: Path, clip: Clip, listing: Listing) -> Renders:
-    """``test/split_<iterations>/pred_<index>.png``: the last 350 frames; ``seq/...``: all of them. On black."""
-    frames = _of_one_camera(clip, _every_frame(clip))
-    found_: Renders = {}
-    for name, numbered in (("seq", frames), ("test", frames[-GBS_TEST_FRAMES:])):
-        made = _latest(folder / name, "split")
-        if made is None:
-            continue
-        of = "the capture" if name == "seq" else f"its last {GBS_TEST_FRAMES}"
-        images = _numbered(made, "pred_", [len(numbered)], of)
-        for key, image in zip(numbered, images):
-            mask, truth = (made / image.name.replace("pred_", other) for other in ("pred_mask_", "gt_"))
-            found_[key] = Render(image, mask, truth)
-    if not found_:
-        raise InputError(folder, "", "test/split_N, as test.py leaves it in the model's folder", "none")
-    return found_
-
-
-def _insta(folder: Path, clip: Clip, listing: Listing) -> Renders:
-    """``overlay/<index>.png`` in the folder of its output: the test split, in the order of meshes' names. On black."""
-    held_out = {key.sequence for key in clip.splits["self_reenactment"]}
-    frames = _of_one_camera(clip, [key for key in _every_frame(clip) if key.sequence in held_out])
-    made = folder / "overlay"
-    if not made.is_dir():
-        expected = "overlay, as the program leaves it in experiments/CONFIG/debug of the video's folder"
-        raise InputError(folder, "", expected, "none")
-    images = _numbered(made, "", [len(frames)], "transforms_test.json")
-    return {key: Render(image, image) for key, image in zip(frames, images)}
-
-
-def _of_one_camera(clip: Clip, keys: Iterable[FrameKey]) -> list[FrameKey]:
-    """Frames in order. Raises `InputError` where the order is not given by their timesteps."""
-    frames = sorted(keys, key=lambda key: (key.timestep, key.camera))
-    repeated = [t for t, n in Counter(key.timestep for key in frames).items() if n > 1]
-    if repeated:
-        expected = "a capture of one camera, whose timesteps give the order"
-        found = f"several frames at timestep {repeated[0]}"
-        raise InputError(f"clip {clip.subject}", "cameras", expected, found, _MAP_REMEDY)
-    return frames
-
-
-OFFICIAL: Mapping[str, Callable[[Path, Clip, Listing], Renders]] = {
-    "official-ga": _gaussian_avatars,
-    "official-tga": _gaussian_avatars,
-    "official-gbs": _gaussian_blendshapes,
-    "official-insta": _insta,
-}
-"""How the official repositories of GaussianAvatars, ours (TensorialGaussianAvatar), GaussianBlendshapes and INSTA number
-renders."""
-
-
-def _every_frame(clip: Clip) -> set[FrameKey]:
+def every_frame(clip: Clip) -> set[FrameKey]:
+    """Frames of all splits, and those left out."""
     return {key for keys in clip.splits.values() for key in keys} | set(clip.excluded)
 
 
@@ -241,7 +145,7 @@ def _listed(path: Path, folder: Path, clips: Sequence[Clip]) -> Renders:
     if len(set(header)) != len(header) or not needed <= set(header) <= allowed:
         raise InputError(path, "line 1", f"the columns {', '.join(sorted(needed))}", ", ".join(header))
     by_subject = {clip.subject: clip for clip in clips}
-    known = {key for clip in clips for key in _every_frame(clip)}
+    known = {key for clip in clips for key in every_frame(clip)}
     found: Renders = {}
     for line, row in rows:
         where = f"line {line}"

@@ -33,6 +33,7 @@ GA_OFFICIAL = MethodSpec(
     implementation="headbench.methods.official.ga.method:GAOfficial",
     config="headbench.methods.official.config:GAOfficialConfig",
     needs="headbench.methods.official.needs:ga",
+    renders="headbench.methods.official.renders:gaussian_avatars",
     presets={
         "smoke": {"budget": {"iterations": 60}, "arguments": _short_run()},
         "demo": {"budget": {"iterations": 2_000}, "arguments": _short_run()},
@@ -49,6 +50,7 @@ TGA_OFFICIAL = MethodSpec(
     implementation="headbench.methods.official.tga.method:TGAOfficial",
     config="headbench.methods.official.config:TGAOfficialConfig",
     needs="headbench.methods.official.needs:tga",
+    renders="headbench.methods.official.renders:gaussian_avatars",
     # Their feature lines begin at an iteration that their code fixes: no shorter run trains the method.
     presets={"paper": {"budget": {"iterations": PAPER_ITERATIONS}}},
     native=False,
@@ -76,6 +78,7 @@ GBS_OFFICIAL = MethodSpec(
     implementation="headbench.methods.official.gbs.method:GBSOfficial",
     config="headbench.methods.official.config:GBSOfficialConfig",
     needs="headbench.methods.official.needs:gbs",
+    renders="headbench.methods.official.renders:gaussian_blendshapes",
     presets={
         name: {
             "budget": GBS.presets[name]["budget"],
@@ -111,6 +114,7 @@ INSTA_OFFICIAL = MethodSpec(
     implementation="headbench.methods.official.insta.method:INSTAOfficial",
     config="headbench.methods.official.config:INSTAOfficialConfig",
     needs="headbench.methods.official.needs:insta",
+    renders="headbench.methods.official.renders:insta",
     # Their settings have no schedule to shorten.
     presets={name: {"budget": INSTA.presets[name]["budget"]} for name in ("smoke", "demo", "fast", "paper")},
     monocular=True,

@@ -30,7 +30,7 @@ CASES = [
     (f"{EVALUATE} --clip c --trust", f"--trust: expected --like, {NO_EFFECT} none"),
     (f"{EVALUATE} --like r --method ga", f"--method: expected --avatar, {NO_EFFECT} none"),
     (f"{EVALUATE} --like r --preset fast", f"--preset: expected --avatar, {NO_EFFECT} none"),
-    (f"{EVALUATE} --like r --avatar --names official-ga", "--names: expected no --avatar"),
+    (f"{EVALUATE} --like r --avatar --names ga-official", "--names: expected no --avatar"),
     (f"{EVALUATE} --like r --avatar --any-background", "--any-background: expected no --avatar"),
     (f"{RUN} --workers 2", f"--workers: expected --executor processes, {NO_EFFECT} --executor inline"),
     (f"{RUN} --set execution.workers=2", "--set execution.workers: expected --executor processes"),

@@ -11,7 +11,7 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.audit.command import EvaluateSettings, evaluate
-from headbench.bench.audit.naming import OFFICIAL, Render, check_truth, composited
+from headbench.bench.audit.naming import Render, check_truth, composited
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_png, write_png
@@ -188,7 +188,7 @@ def model(toy, images, tmp_path):
 
 
 def test_renders_numbered_by_gaussianavatars_get_their_keys(run, images, model, tmp_path):
-    evaluate(options(model, run, tmp_path / "out", names="official-ga"))
+    evaluate(options(model, run, tmp_path / "out", names="ga-official"))
     for path in (tmp_path / "out").glob("subject1/theirs/seed-0/renders/*/*.png"):
         np.testing.assert_array_equal(read_png(path), read_png(images / path.name))
     assert scored(images, run, tmp_path / "named").equals(
@@ -214,16 +214,16 @@ def another_order(model):
     [
         (
             one_too_few,
-            "official-ga",
+            "ga-official",
             "3 images, .*transforms_test.json, found 2.*Render the split again.*MAP",
         ),
-        (a_gap, "official-ga", "found 3, 00000.png to 00003.png"),
-        (another_order, "official-ga", "gt/00000.png: expected the ground truth of .* found .*another order"),
-        (lambda m: shutil.rmtree(m / "test"), "official-ga", "names none for the first.*--tasks"),
-        (lambda m: shutil.rmtree(m), "official-ga", "a folder of images"),
-        (lambda m: [shutil.rmtree(m / s) for s in ("val", "test")], "official-ga", "test/ours_N/renders"),
-        (lambda m: None, "official-gbs", "a capture of one camera.*MAP.csv"),
-        (lambda m: None, "oficial-ga", "Did you mean 'official-ga'"),
+        (a_gap, "ga-official", "found 3, 00000.png to 00003.png"),
+        (another_order, "ga-official", "gt/00000.png: expected the ground truth of .* found .*another order"),
+        (lambda m: shutil.rmtree(m / "test"), "ga-official", "names none for the first.*--tasks"),
+        (lambda m: shutil.rmtree(m), "ga-official", "a folder of images"),
+        (lambda m: [shutil.rmtree(m / s) for s in ("val", "test")], "ga-official", "test/ours_N/renders"),
+        (lambda m: None, "gbs-official", "a capture of one camera.*MAP.csv"),
+        (lambda m: None, "ga-oficial", "Did you mean 'ga-official'"),
         (lambda m: None, "none.csv", "no such file"),
     ],
 )
@@ -269,25 +269,6 @@ def test_lists_in_csv_that_do_not_fit_are_refused(run, images, tmp_path, text, m
     assert not (tmp_path / "out").exists()
 
 
-def test_gaussianblendshapes_numbers_the_last_350_frames(tmp_path):
-    keys = [FrameKey("s", "video", timestep, "0") for timestep in range(400)]
-    clip = SimpleNamespace(subject="s", splits={"train": keys[:50]}, excluded=dict.fromkeys(keys[50:], "why"))
-    for name, count in (("test", 350), ("seq", 400)):
-        made = tmp_path / name / "split_40000"
-        made.mkdir(parents=True)
-        for index in range(count):
-            (made / f"pred_{index:05d}.png").touch()
-        found = OFFICIAL["official-gbs"](tmp_path, clip, {})
-        assert {render.truth.name for render in found.values()} >= {"gt_00000.png"}
-        for key in keys[-count:]:
-            index = key.timestep - (400 - count) if name == "test" else key.timestep
-            assert found[key].image.name == f"pred_{index:05d}.png" or name == "seq"
-        assert len(found) == count
-    (tmp_path / "seq/split_40000/pred_00399.png").unlink()
-    with pytest.raises(InputError, match="400 images.*found 399"):
-        OFFICIAL["official-gbs"](tmp_path, clip, {})
-
-
 @pytest.mark.parametrize("masked", [True, False])
 def test_ground_truth_of_renders_on_black_is_compared_there(tmp_path, masked):
     """rgb * coverage lies beside the renders; the clip has the same on white."""
@@ -309,25 +290,6 @@ def test_ground_truth_of_renders_on_black_is_compared_there(tmp_path, masked):
     swapped = {keys[0]: own[keys[1]], keys[1]: own[keys[0]]}
     with pytest.raises(InputError, match="renders of another capture") if masked else nullcontext():
         check_truth(clip, swapped, keys)
-
-
-def test_insta_numbers_the_frames_that_are_held_out(tmp_path):
-    parts = ("video",) * 4 + ("video-held-out",) * 3
-    keys = [FrameKey("s", sequence, timestep, "0") for timestep, sequence in enumerate(parts)]
-    splits = {"train": keys[:3], "self_reenactment": keys[4:6]}
-    clip = SimpleNamespace(subject="s", splits=splits, excluded={keys[3]: "why", keys[6]: "why"})
-    (tmp_path / "overlay").mkdir()
-    for index in range(3):
-        (tmp_path / "overlay" / f"{index:05d}.png").touch()
-    found = OFFICIAL["official-insta"](tmp_path, clip, {})
-    assert {key: render.image.name for key, render in found.items()} == {
-        key: f"{index:05d}.png" for index, key in enumerate(keys[4:])
-    }
-    (tmp_path / "overlay/00002.png").unlink()
-    with pytest.raises(InputError, match="3 images.*transforms_test.json, found 2"):
-        OFFICIAL["official-insta"](tmp_path, clip, {})
-    with pytest.raises(InputError, match="expected overlay, as the program leaves it"):
-        OFFICIAL["official-insta"](tmp_path / "overlay", clip, {})
 
 
 def test_coverage_may_be_the_fourth_channel(tmp_path):
