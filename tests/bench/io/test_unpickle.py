@@ -12,6 +12,7 @@ import pytest
 import scipy.sparse
 
 from headbench.bench.errors import InputError
+from headbench.bench.io import unpickle
 from headbench.bench.io.unpickle import read_pickle
 
 from ...datasets.head.flame_files import chumpy_stand_in, flame_content, legacy_pickle
@@ -177,6 +178,11 @@ def test_refuses_crafted_streams(tmp_path, name):
     refusal(tmp_path / "crafted.pkl", STREAMS[name])
     (tmp_path / "good.pkl").write_bytes(pickle.dumps(ARRAYS))
     np.testing.assert_array_equal(read_pickle(tmp_path / "good.pkl")["double"], ARRAYS["double"])  # unharmed
+
+
+def test_no_stream_alters_a_function_that_others_use(tmp_path):
+    refusal(tmp_path / "x.pkl", b"c_codecs\nencode\n(N(dS'mark'\nI1\nstb.")
+    assert not hasattr(unpickle._encode, "mark")
 
 
 def amplified(count: int, size: int, what: str) -> bytes:
