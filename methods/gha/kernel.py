@@ -34,7 +34,7 @@ def usable(like: Tensor) -> bool:
     return like.dtype == torch.float32 and like.device.type == "cpu" and available()
 
 
-class Part(NamedTuple):
+class PerceptronPart(NamedTuple):
     """A network at some rows of a table; see `networks.Mlp`.
 
     Attributes
@@ -56,7 +56,9 @@ class Part(NamedTuple):
     squashed: bool
 
 
-def perceptron(points: Tensor, part: Part, outputs: int, slope: float, instruction_set: str = "") -> Tensor:
+def perceptron(
+    points: Tensor, part: PerceptronPart, outputs: int, slope: float, instruction_set: str = ""
+) -> Tensor:
     """(n, outputs) first outputs of a network at rows of the (N, F) points; (B, n, outputs) for a (B, C) condition.
 
     Compiled form of `networks.Mlp.reference`. With several conditions there is no gradient by the points.
@@ -70,7 +72,7 @@ def perceptron(points: Tensor, part: Part, outputs: int, slope: float, instructi
 
 
 def blended(
-    points: Tensor, parts: Sequence[Part], outputs: int, slope: float, instruction_set: str = ""
+    points: Tensor, parts: Sequence[PerceptronPart], outputs: int, slope: float, instruction_set: str = ""
 ) -> Tensor:
     """(N, outputs) sums of networks' values times their influences at (N, F) points: compiled form of
     `networks.blended_reference`."""
@@ -87,7 +89,7 @@ class _Perceptrons(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        parts: tuple[Part, ...],
+        parts: tuple[PerceptronPart, ...],
         outputs: int,
         slope: float,
         instruction_set: str,
@@ -145,13 +147,13 @@ class _Perceptrons(torch.autograd.Function):
         return None, None, None, None, by_points if ctx.needs_input_grad[4] else None, *found
 
 
-def _conditions(part: Part, like: Tensor) -> Tensor:
+def _conditions(part: PerceptronPart, like: Tensor) -> Tensor:
     if part.condition is None:
         return like.new_empty(1, 0)
     return part.condition.detach().view(-1, part.condition.shape[-1]).contiguous()
 
 
-def _arrays(part: Part, points: Tensor, conditions: Tensor, slope: float) -> list[Any]:
+def _arrays(part: PerceptronPart, points: Tensor, conditions: Tensor, slope: float) -> list[Any]:
     """What both passes of the kernel take first."""
     influence = points.new_empty(0) if part.influence is None else part.influence.detach()
     return [

@@ -110,13 +110,13 @@ class Mlp:
         condition: Tensor | None,
         *,
         squashed: bool = False,
-    ) -> kernel.Part:
+    ) -> kernel.PerceptronPart:
         """The network as the kernel takes it."""
         layers = range(len(self.widths) - 1)
         matrices, biases = (
             [weights[f"{self.name}.{kind}_{layer}"] for layer in layers] for kind in ("weight", "bias")
         )
-        return kernel.Part(rows, influence, condition, matrices, biases, self._again, squashed)
+        return kernel.PerceptronPart(rows, influence, condition, matrices, biases, self._again, squashed)
 
     def reference(
         self, weights: Weights, points: Tensor, condition: Tensor | None = None, outputs: int | None = None
