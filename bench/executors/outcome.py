@@ -12,7 +12,7 @@ from ..io.documents import checked, read_json
 from ..io.files import write_json
 
 
-class Outcome(TypedDict, total=False):
+class TaskOutcome(TypedDict, total=False):
     """Attributes.
 
     status : how a task ended; a job that is gone while it says "running" was killed.
@@ -45,16 +45,16 @@ def outcome_path(task: Path) -> Path:
     return task / "outcome.json"
 
 
-def read_outcome(task: Path) -> Outcome | None:
+def read_outcome(task: Path) -> TaskOutcome | None:
     """Read the outcome of the task in a folder; None where there is none. Raises `InputError` for a damaged one."""
     path = outcome_path(task)
     if not path.exists():
         return None
-    outcome: Outcome = checked(read_json(path), Outcome, path)
+    outcome: TaskOutcome = checked(read_json(path), TaskOutcome, path)
     return outcome
 
 
-def write_outcome(task: Path, outcome: Outcome) -> None:
+def write_outcome(task: Path, outcome: TaskOutcome) -> None:
     """Write it, atomically."""
     write_json(outcome_path(task), outcome)
 

@@ -19,7 +19,7 @@ from ..progress import duration
 from ..rows import ALL
 from ..runner.store import RunFolder
 from ..specs import Findings
-from .outcome import Outcome, read_outcome
+from .outcome import TaskOutcome, read_outcome
 from .settings import is_speed
 from .slurm import Queued, queue, read_submitted
 from .task import TASK_LOG
@@ -135,7 +135,7 @@ def cell_states(folder: RunFolder, manifest: Manifest) -> list[CellState]:
 def _of_outcome(
     key: tuple[str, str, int],
     folder: Path,
-    outcome: Outcome,
+    outcome: TaskOutcome,
     speed: bool,
     job: str,
     queued: Mapping[str, Queued] | None,

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from .task import TASK_LOG, Task
 
 if TYPE_CHECKING:
-    from .outcome import Outcome
+    from .outcome import TaskOutcome
 
 log = logging.getLogger(__name__)
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
@@ -43,7 +43,7 @@ def work_on(task: Task) -> None:
 
     folder = task.folder
     start = time.monotonic()
-    outcome: Outcome = {
+    outcome: TaskOutcome = {
         "status": "running",
         "speed": task.speed,
         "doing": "starting",
@@ -65,7 +65,7 @@ def work_on(task: Task) -> None:
             check_device(task.device)
             outcome["machine"] = _machine(task.device)
             resolve(task.function)(task, lambda doing: write_outcome(folder, {**outcome, "doing": doing}))
-            ended: Outcome = {**outcome, "status": "done"}
+            ended: TaskOutcome = {**outcome, "status": "done"}
         except Exception as error:
             if isinstance(error, OSError) and error.errno in FULL_DISK:
                 raise

@@ -34,7 +34,7 @@ class Score(NamedTuple):
     reason: str = ""
 
 
-class Frames(NamedTuple):
+class ScoredFrames(NamedTuple):
     """Where the frames to score come from."""
 
     render: Callable[[FrameKey], ByteArray]
@@ -73,7 +73,7 @@ def check_regions(clip: Clip, wanted: Sequence[str] | None) -> tuple[str, ...]:
 
 def score_frames(
     keys: Sequence[FrameKey],
-    frames: Frames,
+    frames: ScoredFrames,
     specs: Sequence[MetricSpec],
     regions: Sequence[str] = (),
     progress: Progress = no_progress,
@@ -123,7 +123,7 @@ def score_frames(
 
 
 def _score_frame(
-    frames: Frames, metrics: Sequence[tuple[MetricSpec, Any]], regions: Sequence[str], key: FrameKey
+    frames: ScoredFrames, metrics: Sequence[tuple[MetricSpec, Any]], regions: Sequence[str], key: FrameKey
 ) -> list[Score]:
     """All metrics that look at one frame at a time, so that it is decoded once."""
     image, truth = frames.render(key), frames.clip.image(key)
@@ -144,7 +144,7 @@ def _score_frame(
 
 
 def _batched(
-    keys: Sequence[FrameKey], frames: Frames, spec: MetricSpec, metric: Any, pool: ThreadPoolExecutor
+    keys: Sequence[FrameKey], frames: ScoredFrames, spec: MetricSpec, metric: Any, pool: ThreadPoolExecutor
 ) -> Iterator[Score]:
     """Scores of a metric that takes many frames in one pass, in order."""
 
@@ -160,7 +160,7 @@ def _batched(
 
 
 def _temporal(
-    keys: Sequence[FrameKey], frames: Frames, spec: MetricSpec, metric: Any, pool: ThreadPoolExecutor
+    keys: Sequence[FrameKey], frames: ScoredFrames, spec: MetricSpec, metric: Any, pool: ThreadPoolExecutor
 ) -> Iterator[Score]:
     """Scores of a metric that compares the change between a frame and the neighbour in time before it.
 

@@ -38,7 +38,7 @@ from ..source import code_digest, is_outside
 from ..specs import MetricSpec
 from .adaptation import AdaptedClip, TrainingView
 from .config import ResolvedMethod
-from .scoring import FULL, Frames, make_metric, score_frames
+from .scoring import FULL, ScoredFrames, make_metric, score_frames
 from .store import Cell, RunFolder, StepState, avatar_files
 
 log = logging.getLogger(__name__)
@@ -521,7 +521,7 @@ def workload(
 def _score(job: Job, specs: Sequence[MetricSpec], protocol: Protocol) -> dict[str, list[Row]]:
     """Rows of each metric over a protocol's frames of the job's subject."""
     keys = [key for key in protocol.keys if key.subject == job.clip.subject]
-    frames = Frames(lambda key: read_png(job.cell.render(protocol.task, key)), job.clip)
+    frames = ScoredFrames(lambda key: read_png(job.cell.render(protocol.task, key)), job.clip)
     by_name = {spec.name: spec for spec in specs}
     with job.progress(f"measuring {protocol.task}") as report:
         scored = score_frames(keys, frames, specs, job.regions, report, job.device)

@@ -22,7 +22,7 @@ _RADIUS = {"metal": 0.0009, "plastic": 0.0014}
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class GlassesFrame:
     """(n, 3) vertices at rest, (m, 3) triangles, (n, 3) linear reflectance."""
 
     vertices: FloatArray
@@ -30,7 +30,9 @@ class Frame:
     albedo: FloatArray
 
 
-def make_glasses(person: Person, anatomy: Anatomy, points: FloatArray, normals: FloatArray) -> Frame | None:
+def make_glasses(
+    person: Person, anatomy: Anatomy, points: FloatArray, normals: FloatArray
+) -> GlassesFrame | None:
     """A frame that sits on the neutral skin (N, 3), or none."""
     if not person.glasses:
         return None
@@ -87,7 +89,7 @@ def make_glasses(person: Person, anatomy: Anatomy, points: FloatArray, normals: 
     first = np.cumsum([0, *(len(vertices) for vertices, _ in tubes)])
     vertices = np.concatenate([vertices for vertices, _ in tubes])
     faces = np.concatenate([faces + start for (_, faces), start in zip(tubes, first)])
-    return Frame(vertices, faces, np.tile(color, (len(vertices), 1)))
+    return GlassesFrame(vertices, faces, np.tile(color, (len(vertices), 1)))
 
 
 def _tube(path: FloatArray, radius: float, up: FloatArray, closed: bool) -> tuple[FloatArray, IntArray]:

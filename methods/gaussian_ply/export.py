@@ -31,7 +31,7 @@ from ..splats import rasterize
 from ..web.bake import Source
 from ..web.model import FIELD_OF_VIEW, look
 from .command import ExportOptions
-from .formats import FORMATS, Splats
+from .formats import FORMATS, StoredSplats
 from .harmonics import DEGREE, fit_harmonics, sphere, turn_harmonics
 
 VIEWS = ((0.0, 0.0), (0.6, 0.0), (-0.6, 0.2))
@@ -77,7 +77,7 @@ def export_pose(settings: ExportOptions, name: str, progress: Progress) -> Findi
     pose = _pose(settings, read_shared_head(folder), progress)
     splats = avatar.splats(pose)
     colours = harmonics_of(avatar, pose, settings.directions)
-    form.write(out, Splats.of(splats, colours.dc, colours.rest))
+    form.write(out, StoredSplats.of(splats, colours.dc, colours.rest))
     lost = _least_psnr(avatar, pose, form.read(out))
     data = {"out": out, "splats": len(splats.means), "timestep": pose.timestep}
     data |= {"bytes": out.stat().st_size, "psnr": lost}
@@ -110,7 +110,7 @@ def harmonics_of(avatar: SplatMethodAvatar, pose: HeadPose, directions: int) -> 
     return Colours(fit.dc, fit.rest, "harmonics fitted to the planes' colours", fit.residual)
 
 
-def _least_psnr(avatar: SplatMethodAvatar, pose: HeadPose, found: Splats) -> float:
+def _least_psnr(avatar: SplatMethodAvatar, pose: HeadPose, found: StoredSplats) -> float:
     """dB, the least of `VIEWS`: the file's splats drawn by our renderer against the avatar's frames, on white."""
     source = Source(avatar, pose, np.zeros(3), np.zeros((4, 3)))
     extent = np.quantile(source.seen(pose).means, (0.005, 0.995), axis=0)

@@ -31,7 +31,7 @@ STANDARD = COLUMNS[:-1]
 OPACITY_MARGIN = 1e-6  # logits stay finite
 
 
-class Splats(NamedTuple):
+class StoredSplats(NamedTuple):
     """Splats in the world, float32: (N, 3) means, (N, 4) quaternions wxyz, (N, 3) scales, (N,) opacities, and harmonics along
     world directions, (N, 3) and (N, 3, 15)."""
 
@@ -43,7 +43,7 @@ class Splats(NamedTuple):
     rest: Tensor
 
     @classmethod
-    def of(cls, posed: PosedSplats, dc: Tensor, rest: Tensor) -> Splats:
+    def of(cls, posed: PosedSplats, dc: Tensor, rest: Tensor) -> StoredSplats:
         """Of an avatar's splats and their harmonics; degrees that it does not have are zero."""
         every = torch.zeros(len(dc), 3, 15)
         every[:, :, : rest.shape[2]] = rest
@@ -56,14 +56,14 @@ class Format(NamedTuple):
     """How a file is written and read; ``check`` raises `UnavailableError` where that needs what is not installed."""
 
     check: Callable[[], Any]
-    write: Callable[[Path, Splats], None]
-    read: Callable[[Path], Splats]
+    write: Callable[[Path, StoredSplats], None]
+    read: Callable[[Path], StoredSplats]
 
 
 # ------------------------------------------------------------------ PLY
 
 
-def _write_ply(path: Path, splats: Splats) -> None:
+def _write_ply(path: Path, splats: StoredSplats) -> None:
     opacities = splats.opacities.numpy().astype(np.float64).clip(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     columns: list[FloatArray] = [
         splats.means.numpy(),
@@ -77,9 +77,9 @@ def _write_ply(path: Path, splats: Splats) -> None:
     write_ply(path, STANDARD, np.concatenate(columns, axis=1).astype(np.float32), note(RENDER))
 
 
-def _read_ply(path: Path) -> Splats:
+def _read_ply(path: Path) -> StoredSplats:
     table = torch.from_numpy(read_ply(path, STANDARD))
-    return Splats(
+    return StoredSplats(
         table[:, :3].contiguous(),
         table[:, 58:].contiguous(),
         table[:, 55:58].exp(),
@@ -97,7 +97,7 @@ FLOAT, ARRAY_BUFFER, POINTS = 5126, 34962, 0
 HARMONICS = [(degree, number) for degree in range(4) for number in range(2 * degree + 1)]
 
 
-def _write_glb(path: Path, splats: Splats) -> None:
+def _write_glb(path: Path, splats: StoredSplats) -> None:
     harmonics = torch.cat([splats.dc[:, :, None], splats.rest], dim=2)
     plain = (0.5 + C0 * splats.dc).clamp(0, 1)
     # Points for viewers that draw no splats: linear, as glTF's colours are.
@@ -151,7 +151,7 @@ def _write_glb(path: Path, splats: Splats) -> None:
     write_bytes(path, whole + b"".join(blocks))
 
 
-def _read_glb(path: Path) -> Splats:
+def _read_glb(path: Path) -> StoredSplats:
     """Read what `_write_glb` wrote."""
     content = read_bytes(path, "a GLB file", MAX_BYTES)
     (length,) = struct.unpack_from("<I", content, 12)
@@ -165,7 +165,7 @@ def _read_glb(path: Path) -> Splats:
             values.reshape(accessor["count"], -1).copy()
         )
     harmonics = [found[f"SH_DEGREE_{degree}_COEF_{number}"] for degree, number in HARMONICS]
-    return Splats(
+    return StoredSplats(
         *(found["POSITION"], found["ROTATION"][:, [3, 0, 1, 2]].contiguous()),
         *(found["SCALE"], found["OPACITY"][:, 0]),
         *(harmonics[0], torch.stack(harmonics[1:], dim=2)),
@@ -191,7 +191,7 @@ def _converted(content: bytes, source: str, target: str) -> bytes:
     return bytes(result["data"])
 
 
-def _write_sog(path: Path, splats: Splats) -> None:
+def _write_sog(path: Path, splats: StoredSplats) -> None:
     with tempfile.TemporaryDirectory() as folder:
         ply = Path(folder) / "splats.ply"
         _write_ply(ply, splats)
@@ -213,7 +213,7 @@ def _marked(content: bytes) -> bytes:
     return out.getvalue()
 
 
-def _read_sog(path: Path) -> Splats:
+def _read_sog(path: Path) -> StoredSplats:
     with tempfile.TemporaryDirectory() as folder:
         ply = Path(folder) / "splats.ply"
         ply.write_bytes(_converted(read_bytes(path, "a SOG file", MAX_BYTES), "sog", "ply"))

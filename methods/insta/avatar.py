@@ -21,7 +21,7 @@ from ..shared.subject_mesh import SubjectMesh, pose_key
 from ..shared.threads import threads
 from . import kernel
 from .config import InstaConfig
-from .field import Architecture, Field, Parameters, Prior
+from .field import Architecture, Parameters, Prior, RadianceField
 from .marching import PosedSurface, Space, canonical_surface
 from .occupancy import Occupancy, occupied_space
 from .rendering import (
@@ -50,7 +50,7 @@ class InstaAvatar:
         folder: Path,
         mesh: SubjectMesh,
         config: InstaConfig,
-        field: Field,
+        field: RadianceField,
         parameters: Parameters,
         space: Space,
         surface: PosedSurface,
@@ -74,7 +74,7 @@ class InstaAvatar:
         architecture = Architecture.of(config, mesh.model.expression_size)
         size = tuple(int(side) for side in occupancy.size)
         parameters, cells = read_field(folder / FIELD_FILE, architecture, size, device)
-        field = Field(architecture, occupancy.box(device), Prior.of(config))
+        field = RadianceField(architecture, occupancy.box(device), Prior.of(config))
         space = occupied_space(occupancy, cells)
         return cls(folder, mesh, config, field, parameters, space, surface.rest, mouth_triangles(head))
 
@@ -171,7 +171,7 @@ class Inference:
 
     def __init__(
         self,
-        field: Field,
+        field: RadianceField,
         parameters: Parameters,
         space: Space,
         mouth: Tensor,

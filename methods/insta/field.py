@@ -85,7 +85,7 @@ class Architecture(NamedTuple):
         return {"table": table, **{name: initial_weight(s, generator) for name, s in shapes.items()}}
 
 
-class Field:
+class RadianceField:
     """Density and colour at canonical points; ``prior`` is added to the logarithm of the density per metre."""
 
     def __init__(self, architecture: Architecture, box: EncodedCube, prior: Prior):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..shared.schedule import numpy_generator
 from .config import InstaConfig
-from .field import EncodedCube, Field, Parameters
+from .field import EncodedCube, Parameters, RadianceField
 from .marching import CanonicalSurface, Space
 
 CELLS_AT_ONCE = 1 << 16
@@ -57,7 +57,7 @@ class Occupancy:
 
     def refresh(
         self,
-        field: Field,
+        field: RadianceField,
         parameters: Parameters,
         condition: Tensor,
         mouth: Tensor,
@@ -89,7 +89,7 @@ class Occupancy:
     @torch.no_grad()
     def _thickness(
         self,
-        field: Field,
+        field: RadianceField,
         parameters: Parameters,
         points: np.ndarray,
         chosen: np.ndarray,

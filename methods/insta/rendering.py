@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Camera, FloatArray
-from .field import Field, Parameters
+from .field import Parameters, RadianceField
 from .marching import PosedSurface, Rays, Space
 
 
@@ -44,7 +44,7 @@ class Marching:
 
 
 def render_rays(
-    field: Field,
+    field: RadianceField,
     parameters: Parameters,
     scenes: Sequence[PosedRays],
     space: Space,

@@ -16,7 +16,7 @@ from ..shared.optimisation import Optimiser
 from ..shared.schedule import Timeline, log_linear, numpy_generator
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, pose_key
 from .config import InstaConfig
-from .field import Architecture, Field, Prior
+from .field import Architecture, Prior, RadianceField
 from .marching import CanonicalSurface, PosedSurface, Space
 from .occupancy import Occupancy
 from .rendering import Marching, PosedRays, Rendered, box_corners, camera_rays, pixels_of_hull, render_rays
@@ -52,7 +52,7 @@ class InstaTraining:
         self.keys: Sequence[FrameKey] = clip.splits["train"]
         self.occupancy = Occupancy(surface, config)
         architecture = Architecture.of(config, mesh.model.expression_size)
-        self.field = Field(architecture, self.occupancy.box(device), Prior.of(config))
+        self.field = RadianceField(architecture, self.occupancy.box(device), Prior.of(config))
         initial = architecture.initial(seed)
         self._optimiser = Optimiser(
             {name: nn.Parameter(value.to(device)) for name, value in initial.items()},

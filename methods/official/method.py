@@ -38,7 +38,7 @@ from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import threads
 from .checkout import Checkout, Environment, Repository, look, look_at_interpreter
 from .config import OfficialConfig
-from .process import Ended, described, run_program
+from .process import ProgramEnd, described, run_program
 
 TRAINING, RENDERING = "training", "rendering"
 """Folders inside the avatar's: of a training under way, and of frames being rendered. Neither outlives its work."""
@@ -193,7 +193,7 @@ class OfficialMethod(ABC, Generic[Config]):
     def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
         """A render as the camera asked for it. Raises `InputError` for one of another size or of another frame."""
 
-    def excused(self, ended: Ended) -> bool:
+    def excused(self, ended: ProgramEnd) -> bool:
         """Whether a renderer that failed has failed after its work was done."""
         return False
 
@@ -455,7 +455,7 @@ class OfficialAvatar:
 
 
 def _read_back(
-    method: OfficialMethod[Any], folder: Path, frames: Sequence[Listed], work: Workplace, ended: Ended
+    method: OfficialMethod[Any], folder: Path, frames: Sequence[Listed], work: Workplace, ended: ProgramEnd
 ) -> Iterator[tuple[FrameKey, Frame]]:
     """Renders by the names of the index that was written before; all are there and none besides."""
     renders = method.render_folder(folder, work)

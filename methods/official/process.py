@@ -41,7 +41,7 @@ class ProgramError(HeadbenchError):
 
 
 @dataclass(frozen=True)
-class Ended:
+class ProgramEnd:
     """How a program ended: its exit code (negative: the signal), its last lines, and where all of them are."""
 
     code: int
@@ -76,7 +76,7 @@ def run_program(
     *,
     variables: Mapping[str, str] | None = None,
     held: IO[str] | None = None,
-) -> Ended:
+) -> ProgramEnd:
     """Run a command in ``folder`` until it ends; its output, both streams, is appended to ``log``.
 
     The program and all that it starts are one process group, which is ended when this call is interrupted, and what the
@@ -113,7 +113,7 @@ def run_program(
             code = process.wait()
         finally:
             _end_group(process)
-    return Ended(code, tuple(last), log)
+    return ProgramEnd(code, tuple(last), log)
 
 
 def _follow(output: IO[bytes], log: IO[bytes], last: deque[str], on_line: Callable[[str], None]) -> None:

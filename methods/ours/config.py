@@ -156,7 +156,7 @@ class Sampling:
 
 
 @dataclass(frozen=True)
-class Capacity:
+class PlannedCapacity:
     """How large the avatar is.
 
     Attributes
@@ -202,7 +202,7 @@ class OursConfig:
     penalty: Penalty = field(default_factory=Penalty)
     outer_layers: OuterLayers = field(default_factory=OuterLayers)
     sampling: Sampling = field(default_factory=Sampling)
-    capacity: Capacity = field(default_factory=Capacity)
+    capacity: PlannedCapacity = field(default_factory=PlannedCapacity)
     hidden: int = 128
     direction_jitter: float = 0.0
     color: Literal["planes", "sh"] = "planes"

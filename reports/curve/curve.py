@@ -29,8 +29,8 @@ from ..aggregate import subject_means
 from ..writers import csv_text
 from .command import CurveSettings
 from .held_out import CAMERA, TIMESTEPS, HeldOutClip, hold_out, reduced
-from .plot import Panel, write_plot
-from .points import HELD_OUT, MEASURED, Point, column, mean, mean_point, points_text
+from .plot import CurvePanel, write_plot
+from .points import HELD_OUT, MEASURED, CurvePoint, column, mean, mean_point, points_text
 from .tracking import clips_by_level, tracking_error
 
 log = logging.getLogger(__name__)
@@ -121,7 +121,7 @@ def curve(settings: CurveSettings, out: Path) -> Findings:
         )
     )
     points = [_point(training, rows, metrics, tasks) for training in trainings]
-    groups: dict[tuple[str, Fraction, float | None], list[Point]] = {}
+    groups: dict[tuple[str, Fraction, float | None], list[CurvePoint]] = {}
     for point in points:
         groups.setdefault((point.method, point.part, point.tracking_error), []).append(point)
     means = [mean_point(group) for group in groups.values()]
@@ -273,7 +273,9 @@ def _drop_interrupted(job: Job) -> None:
         (job.cell.folder / "fit.json").unlink()
 
 
-def _point(training: _Training, rows: Rows, metrics: Sequence[MetricSpec], tasks: Sequence[str]) -> Point:
+def _point(
+    training: _Training, rows: Rows, metrics: Sequence[MetricSpec], tasks: Sequence[str]
+) -> CurvePoint:
     job = training.jobs[0]
     name, subject = job.method.spec.name, job.clip.subject
     records: list[Mapping[str, Any]] = [job.cell.step("fit") or {} for job in training.jobs]
@@ -290,7 +292,7 @@ def _point(training: _Training, rows: Rows, metrics: Sequence[MetricSpec], tasks
     cameras, timesteps = (len({getattr(key, name) for key in keys}) for name in ("camera", "timestep"))
     method = training.method.spec.name
     level = tracking_error(training.clip)
-    return Point(
+    return CurvePoint(
         method, subject, training.part, job.method.budget, cameras, timesteps, level, cost, values, {}
     )
 
@@ -307,9 +309,9 @@ def _reason(rows: Rows, spec: MetricSpec) -> str:
 
 
 def _panel(
-    points: Sequence[Point], spec: MetricSpec, task: str, axis: str, missing: Mapping[str, str]
-) -> Panel:
-    """Quality over what the horizontal axis has: a field of `Point` or a cost."""
+    points: Sequence[CurvePoint], spec: MetricSpec, task: str, axis: str, missing: Mapping[str, str]
+) -> CurvePanel:
+    """Quality over what the horizontal axis has: a field of `CurvePoint` or a cost."""
     lines: dict[str, list[tuple[float, float, float]]] = {}
     for point in points:
         cost = point.cost[axis] if axis in point.cost else getattr(point, axis)
@@ -320,9 +322,9 @@ def _panel(
             line.append((cost, value, half or 0.0))
     unit = f", {spec.unit}" if spec.unit else ""
     title = f"{spec.label}{unit}, held-out {HELD_OUT[task]}"
-    return Panel(title, lines, missing.get(spec.label, ""))
+    return CurvePanel(title, lines, missing.get(spec.label, ""))
 
 
-def _lines(points: Sequence[Point]) -> list[list[object]]:
+def _lines(points: Sequence[CurvePoint]) -> list[list[object]]:
     flat = [point.flat() for point in points]
     return [[*flat[0]], *([*line.values()] for line in flat)]

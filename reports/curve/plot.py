@@ -14,7 +14,7 @@ from ..plots import SMALL, cost_axis, plot_file, show_missing, start_axes
 
 
 @dataclass(frozen=True)
-class Panel:
+class CurvePanel:
     """One plot: (cost, quality, half the interval's width) of each method's points; ``reason`` why there are none."""
 
     title: str
@@ -22,7 +22,7 @@ class Panel:
     reason: str
 
 
-def write_plot(path: Path, rows: Sequence[Sequence[Panel]], cost: str, note: str) -> None:
+def write_plot(path: Path, rows: Sequence[Sequence[CurvePanel]], cost: str, note: str) -> None:
     """Draw rows of panels of equal number and write a PNG, atomically; costs on a logarithmic axis if all are above 0."""
     names = (name for row in rows for panel in row for name in panel.lines)
     size = (4.2 * len(rows[0]), 3.2 * len(rows) + 0.8)
@@ -32,7 +32,7 @@ def write_plot(path: Path, rows: Sequence[Sequence[Panel]], cost: str, note: str
             _draw(axes, panel, cost, colours)
 
 
-def _draw(axes: Axes, panel: Panel, cost: str, colours: Mapping[str, str]) -> None:
+def _draw(axes: Axes, panel: CurvePanel, cost: str, colours: Mapping[str, str]) -> None:
     start_axes(axes, panel.title)
     axes.set_xlabel(cost, fontsize=SMALL)
     if not any(panel.lines.values()):

@@ -21,7 +21,7 @@ MEASURED = ("processor_seconds", "seconds", "peak_memory_bytes")
 
 
 @dataclass(frozen=True)
-class Point:
+class CurvePoint:
     """A method trained with a part of its budget or of the frames, or with a level of tracking error.
 
     Means over seeds of one subject, or over subjects (""). ``cameras`` and ``timesteps`` count what it was trained on.
@@ -72,7 +72,7 @@ def half_width(values: Sequence[float | None]) -> float | None:
     return float(student_t.ppf(0.975, len(known) - 1)) * stdev(known) / math.sqrt(len(known))
 
 
-def mean_point(points: Sequence[Point]) -> Point:
+def mean_point(points: Sequence[CurvePoint]) -> CurvePoint:
     """The mean over subjects of points that differ in nothing else."""
     first = points[0]
     by_name = {key: [point.values[key] for point in points] for key in first.values}
@@ -91,12 +91,12 @@ def mean_point(points: Sequence[Point]) -> Point:
 
 
 def column(spec: MetricSpec, task: str) -> str:
-    """Name of a metric's value in `Point.values`."""
+    """Name of a metric's value in `CurvePoint.values`."""
     return f"{spec.name}_{HELD_OUT[task]}" if task in HELD_OUT else spec.name
 
 
 def points_text(
-    points: Sequence[Point],
+    points: Sequence[CurvePoint],
     metrics: Sequence[MetricSpec],
     tasks: Sequence[str],
     held: Sequence[HeldOutClip],

@@ -30,7 +30,7 @@ BATCH = 32
 """Frames that are encoded before their bytes are counted."""
 
 
-class Frame(NamedTuple):
+class ShownFrame(NamedTuple):
     """A frame of a task."""
 
     task: str
@@ -49,15 +49,15 @@ class Pictures:
     ``lossless`` are frames whose pictures keep every pixel. ``truth`` says why there is no ground truth; "" where there is.
     """
 
-    shown: dict[Frame, list[str | None]] = field(default_factory=dict)
-    reasons: dict[Frame, list[str]] = field(default_factory=dict)
-    lossless: set[Frame] = field(default_factory=set)
+    shown: dict[ShownFrame, list[str | None]] = field(default_factory=dict)
+    reasons: dict[ShownFrame, list[str]] = field(default_factory=dict)
+    lossless: set[ShownFrame] = field(default_factory=set)
     first_cameras_lossless: bool = True
     truth: str = ""
     bytes: int = 0
 
 
-def frame_values(runs: RunSet, metrics: Sequence[MetricSpec]) -> dict[tuple[str, str, Frame], float]:
+def frame_values(runs: RunSet, metrics: Sequence[MetricSpec]) -> dict[tuple[str, str, ShownFrame], float]:
     """Value by metric, label and frame of the whole images that are shown."""
     found = {}
     for task in runs.tasks:
@@ -66,30 +66,30 @@ def frame_values(runs: RunSet, metrics: Sequence[MetricSpec]) -> dict[tuple[str,
                 for spec in metrics:
                     value = run.value(spec.name, name, task, key)
                     if value is not None:
-                        found[spec.name, label, Frame(task, key)] = value
+                        found[spec.name, label, ShownFrame(task, key)] = value
     return found
 
 
 def worst_frames(
-    values: Mapping[tuple[str, str, Frame], float], runs: RunSet, spec: MetricSpec, count: int = WORST
-) -> list[Frame]:
+    values: Mapping[tuple[str, str, ShownFrame], float], runs: RunSet, spec: MetricSpec, count: int = WORST
+) -> list[ShownFrame]:
     """The worst frames of each method that is no trivial baseline (all, where there is no other) and each task by a metric,
     one for each timestep."""
-    found: dict[Frame, None] = {}
+    found: dict[ShownFrame, None] = {}
     sign = 1 if spec.higher_is_better else -1
     for label in runs.ranked or runs.methods:
         for task in runs.tasks:
             own = [
                 (sign * v, f) for (m, n, f), v in values.items() if (m, n, f.task) == (spec.name, label, task)
             ]
-            moments: dict[tuple[str, str, int], Frame] = {}
+            moments: dict[tuple[str, str, int], ShownFrame] = {}
             for _, frame in sorted(own):
                 moments.setdefault(frame.key[:3], frame)
             found.update(dict.fromkeys([*moments.values()][:count]))
     return [*found]
 
 
-def spread(frames: Sequence[Frame]) -> Iterator[Frame]:
+def spread(frames: Sequence[ShownFrame]) -> Iterator[ShownFrame]:
     """Frames in the order in which they are added: each task, subject, sequence and camera alike, evenly over time and
     finer with every turn."""
     ordered = sorted(frames, key=lambda f: (f.group, f.key.timestep))
@@ -97,7 +97,7 @@ def spread(frames: Sequence[Frame]) -> Iterator[Frame]:
     return (frame for turn in zip_longest(*groups) for frame in turn if frame is not None)
 
 
-def _refined(items: Sequence[Frame]) -> list[Frame]:
+def _refined(items: Sequence[ShownFrame]) -> list[ShownFrame]:
     """First and last, then the middle of the longest gaps, level by level."""
     order = dict.fromkeys([0, len(items) - 1])
     parts = 2
@@ -130,7 +130,7 @@ def encode(image: ByteArray, quality: int) -> str:
 
 
 def choose_pictures(
-    runs: RunSet, worst: Sequence[Frame], budget: int, options: RunOptions, progress: Progress
+    runs: RunSet, worst: Sequence[ShownFrame], budget: int, options: RunOptions, progress: Progress
 ) -> Pictures:
     """Encode the worst frames, then others while they fit in ``budget`` bytes of base64.
 
@@ -139,14 +139,14 @@ def choose_pictures(
     clips, why = open_truth(runs, options)
     pictures = Pictures(truth=why)
     source = _Source(runs, clips, why)
-    every = [Frame(task, key) for task in runs.tasks for key in runs.keys[task]]
+    every = [ShownFrame(task, key) for task in runs.tasks for key in runs.keys[task]]
     first_cameras = {task: min((k.camera for k in runs.keys[task]), default="") for task in runs.tasks}
     rest = [frame for frame in spread(every) if frame not in set(worst)]
     done = 0
 
     with ThreadPoolExecutor() as pool:
 
-        def add(frames: Sequence[Frame], qualities: Sequence[int], limit: int) -> bool:
+        def add(frames: Sequence[ShownFrame], qualities: Sequence[int], limit: int) -> bool:
             nonlocal done
             for start in range(0, len(frames), BATCH):
                 batch, of_batch = frames[start : start + BATCH], qualities[start : start + BATCH]
@@ -191,7 +191,7 @@ class _Source:
     def __post_init__(self) -> None:
         self.reason = cache(self._reason)
 
-    def read(self, frame: Frame, quality: int) -> tuple[list[str | None], list[str]]:
+    def read(self, frame: ShownFrame, quality: int) -> tuple[list[str | None], list[str]]:
         truth, reason = self._truth(frame.key)
         images: list[ByteArray | None] = [truth]
         reasons = [reason]
@@ -213,7 +213,7 @@ class _Source:
         except (HeadbenchError, OSError) as error:
             return None, without_folders(str(error))
 
-    def _render(self, label: str, frame: Frame) -> tuple[ByteArray | None, str]:
+    def _render(self, label: str, frame: ShownFrame) -> tuple[ByteArray | None, str]:
         run, name = self.runs.shown[label]
         try:
             image = run.render(name, frame.task, frame.key)

@@ -30,7 +30,7 @@ from ..table_report import COMPARISON, TITLES, layouts, table_of
 from ..tables import AVATAR_TITLE, Table
 from ..writers import render_page
 from .command import MAX_MB, MAX_SPLIT_MB, PageSettings
-from .frames import Frame, Pictures, choose_pictures, frame_values, worst_frames
+from .frames import Pictures, ShownFrame, choose_pictures, frame_values, worst_frames
 from .record import failed_cells, name_of, record_of
 from .split import (
     ENTRY_BYTES,
@@ -147,7 +147,7 @@ def page_text(
     return page, pictures, files
 
 
-def _places(frame: Frame, pictures: Pictures, images: list[str], reasons: list[str]) -> list[int]:
+def _places(frame: ShownFrame, pictures: Pictures, images: list[str], reasons: list[str]) -> list[int]:
     """Index of each picture of a frame among ``images``, -1 - index of its reason where there is none."""
     places = []
     for image, reason in zip(pictures.shown[frame], pictures.reasons[frame]):
@@ -205,12 +205,12 @@ def _json(value: Any) -> str:
     )
 
 
-def _frames(runs: RunSet) -> list[Frame]:
-    return [Frame(task, key) for task in runs.tasks for key in sorted(runs.keys[task])]
+def _frames(runs: RunSet) -> list[ShownFrame]:
+    return [ShownFrame(task, key) for task in runs.tasks for key in sorted(runs.keys[task])]
 
 
 def _data(
-    runs: RunSet, metrics: Sequence[MetricSpec], values: dict[tuple[str, str, Frame], float]
+    runs: RunSet, metrics: Sequence[MetricSpec], values: dict[tuple[str, str, ShownFrame], float]
 ) -> dict[str, Any]:
     """What the script reads: names once, frames by index into them, values by metric and method."""
     frames = _frames(runs)
@@ -219,7 +219,7 @@ def _data(
     )
     places = [{name: index for index, name in enumerate(names)} for names in (subjects, sequences, cameras)]
 
-    def number(spec: MetricSpec, label: str, frame: Frame) -> float | None:
+    def number(spec: MetricSpec, label: str, frame: ShownFrame) -> float | None:
         value = values.get((spec.name, label, frame))
         return None if value is None else round(value, spec.digits + 2)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadPose, SplatAvatar
 from ...bench.io.images import quantise
-from .scene import Scene, Shown
+from .scene import Scene, ShownAvatar
 from .state import FreeView, State
 
 LABEL_PX = 22
@@ -22,7 +22,7 @@ HEAD_ASPECT = 0.75
 """Width by height of a head: panels are arranged so that it is largest."""
 
 
-class Drawing(NamedTuple):
+class DrawnPanes(NamedTuple):
     """An (H, W, 3) image and the milliseconds that each avatar took."""
 
     image: ByteArray
@@ -47,7 +47,7 @@ def key_of(scene: Scene, state: State) -> FrameKey | None:
     return cameras.get(state.camera) or cameras[min(cameras)]
 
 
-def draw(scene: Scene, state: State, view: FreeView, size: tuple[int, int], scale: float = 1.0) -> Drawing:
+def draw(scene: Scene, state: State, view: FreeView, size: tuple[int, int], scale: float = 1.0) -> DrawnPanes:
     """Draw all avatars in one image of about ``size`` (width, height) times ``scale``.
 
     In a camera of the capture panels show frames as metrics see them, fitted into their place, below a scale of 1 drawn at
@@ -83,7 +83,7 @@ def draw(scene: Scene, state: State, view: FreeView, size: tuple[int, int], scal
         image[top + strip : top + strip + place[1], left : left + place[0]] = panel
         where = (left + round(6 * scale), top + round(16 * scale))
         cv2.putText(image, label, where, cv2.FONT_HERSHEY_SIMPLEX, 0.5 * scale, ink, 1, cv2.LINE_AA)
-    return Drawing(image, milliseconds)
+    return DrawnPanes(image, milliseconds)
 
 
 def arrangement(count: int, width: int, height: int) -> tuple[int, int]:
@@ -96,12 +96,12 @@ def arrangement(count: int, width: int, height: int) -> tuple[int, int]:
     return rows, -(-count // rows)
 
 
-def pose_of(shown: Shown, state: State, key: FrameKey | None) -> HeadPose:
+def pose_of(shown: ShownAvatar, state: State, key: FrameKey | None) -> HeadPose:
     """The pose of an avatar."""
     return state.sliders.added(shown.pose(key))
 
 
-def moved(scene: Scene, shown: Shown, camera: Camera, key: FrameKey | None) -> Camera:
+def moved(scene: Scene, shown: ShownAvatar, camera: Camera, key: FrameKey | None) -> Camera:
     """A camera of the first avatar's world as an avatar's method sees it; of another subject it looks at that one's head."""
     motion = np.eye(4)
     motion[:3, 3] = scene.first.center - shown.center
@@ -109,7 +109,7 @@ def moved(scene: Scene, shown: Shown, camera: Camera, key: FrameKey | None) -> C
     return shown.camera(there, key)
 
 
-def splats_of(scene: Scene, shown: Shown, state: State, view: FreeView) -> SplatArrays | None:
+def splats_of(scene: Scene, shown: ShownAvatar, state: State, view: FreeView) -> SplatArrays | None:
     """Splats of an avatar in the world of the first, coloured as the view sees them; None where it has none to give."""
     if not isinstance(shown.avatar, SplatAvatar):
         return None
@@ -129,7 +129,7 @@ def splats_of(scene: Scene, shown: Shown, state: State, view: FreeView) -> Splat
     )
 
 
-def _frame(shown: Shown, state: State, key: FrameKey, place: tuple[int, int] | None) -> ByteArray:
+def _frame(shown: ShownAvatar, state: State, key: FrameKey, place: tuple[int, int] | None) -> ByteArray:
     """A frame of the capture as metrics see it; with a place, drawn no larger than that."""
     pose, camera = pose_of(shown, state, key), shown.form.clip.cameras[shown.form.key(key).camera]
     if place is None:

@@ -16,7 +16,7 @@ IMAGES, SPLATS = "images", "splats"
 MOST_FPS = 60
 
 
-class Panel:
+class ControlPanel:
     """Controls in the browser of ``client``; ``changed`` is called after each change, ``jumped`` with a camera's name.
 
     Attributes

@@ -34,7 +34,7 @@ Recording = dict[int, dict[str, FrameKey]]
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class ShownAvatar:
     """An avatar, the clip it is compared on, and that clip in the form of its method.
 
     Attributes
@@ -116,12 +116,12 @@ class Scene:
     missing : avatars of the runs that are not there, each with the reason.
     """
 
-    shown: Sequence[Shown]
+    shown: Sequence[ShownAvatar]
     recordings: Mapping[str, Recording]
     missing: Sequence[str]
 
     @property
-    def first(self) -> Shown:
+    def first(self) -> ShownAvatar:
         """The avatar in whose world the viewer's camera is."""
         return self.shown[0]
 
@@ -140,7 +140,7 @@ def open_scene(settings: ViewSettings, kept: Path) -> Scene:
     Raises `InputError` where there is nothing to show, or more than `MOST_SHOWN`.
     """
     missing: list[str] = []
-    shown: list[Shown] = []
+    shown: list[ShownAvatar] = []
     for number, name in enumerate(settings.avatars):
         shown += _opened(Path(name), settings, kept / str(number), missing)
     if not shown:
@@ -158,7 +158,7 @@ def open_scene(settings: ViewSettings, kept: Path) -> Scene:
     return Scene(shown, _recordings(shown), missing)
 
 
-def _opened(path: Path, settings: ViewSettings, kept: Path, missing: list[str]) -> Iterator[Shown]:
+def _opened(path: Path, settings: ViewSettings, kept: Path, missing: list[str]) -> Iterator[ShownAvatar]:
     if not path.is_dir():
         raise InputError(path, "", "the folder of a run or of an avatar", "no such folder")
     run, cell = _run_of(path)
@@ -192,7 +192,9 @@ def _opened(path: Path, settings: ViewSettings, kept: Path, missing: list[str]) 
             + ([job.clip.subject] if len(wanted) > 1 or len(settings.avatars) > 1 else [])
             + ([f"seed {job.seed}"] if len(seeds) > 1 else [])
         )
-        yield Shown(label, avatar, job.clip, job.form, _driving(source, job.clip, job.method, config, kept))
+        yield ShownAvatar(
+            label, avatar, job.clip, job.form, _driving(source, job.clip, job.method, config, kept)
+        )
 
 
 def _run_of(path: Path) -> tuple[Path | None, tuple[str, str, int] | None]:
@@ -220,7 +222,7 @@ def _chosen(
     return [m for m in methods if (m.spec.name in asked if asked else not m.spec.trivial)]
 
 
-def _imported(path: Path, settings: ViewSettings, kept: Path) -> Shown:
+def _imported(path: Path, settings: ViewSettings, kept: Path) -> ShownAvatar:
     method = stored_method(path, settings.method)
     if settings.data is None:
         expected = "the capture that the avatar was made from, with its cameras and poses"
@@ -233,7 +235,9 @@ def _imported(path: Path, settings: ViewSettings, kept: Path) -> Shown:
     form = _form(clips[0], MethodNeeds.of(method.spec), stored_heads(path), kept)
     avatar = method.create().load(avatar_folder(path), device=config.device)
     source = _source(settings, config)
-    return Shown(method.spec.name, avatar, clips[0], form, _driving(source, clips[0], method, config, kept))
+    return ShownAvatar(
+        method.spec.name, avatar, clips[0], form, _driving(source, clips[0], method, config, kept)
+    )
 
 
 def _config(data: str, settings: ViewSettings, kept: Path) -> RunConfig:
@@ -270,7 +274,7 @@ def _driving(
     return {other.subject: _form(other, needs, config.heads, kept / "sources") for other in others}
 
 
-def _recordings(shown: Sequence[Shown]) -> dict[str, Recording]:
+def _recordings(shown: Sequence[ShownAvatar]) -> dict[str, Recording]:
     """Sequences by subject and name, those held out last and marked; of subjects that drive every avatar."""
     found: dict[str, Recording] = {}
     clips = {avatar.clip.subject: avatar.clip for avatar in shown}

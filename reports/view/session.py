@@ -20,7 +20,7 @@ from ...bench.io.provenance import COMPOSITE
 from ...bench.io.video import write_webm
 from ..robustness.viewpoints import turntable
 from .drawing import draw, rotations, splats_of
-from .panel import Panel
+from .panel import ControlPanel
 from .scene import Scene
 from .state import FreeView, State
 
@@ -60,7 +60,7 @@ class Session:
         self._tasks: list[Callable[[], None]] = []
         self.updates = 0
         self._look_at_head()
-        self._panel = Panel(client, scene, expressions, self._changed.set, self._jump)
+        self._panel = ControlPanel(client, scene, expressions, self._changed.set, self._jump)
         client.camera.on_update(lambda _: self._camera_moved())
         self._panel.screenshot.on_click(lambda _: self._do(self._screenshot))
         self._panel.turntable.on_click(lambda _: self._do(self._turntable))

@@ -22,7 +22,7 @@ from headbench.methods.gbs.spec import GBS
 from headbench.methods.gha.config import GHAConfig
 from headbench.methods.gha.spec import GHA
 from headbench.methods.insta.spec import INSTA
-from headbench.methods.ours.config import Capacity, Lines, OursConfig, OuterLayers, Penalty, Planes
+from headbench.methods.ours.config import Lines, OursConfig, OuterLayers, Penalty, Planes, PlannedCapacity
 from headbench.methods.ours.spec import OURS
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, Timeline
@@ -160,8 +160,8 @@ def test_the_paper_preset_of_gbs_is_the_paper():
         (Lines, {"expressions": -1}),
         (Lines, {"dynamic": ()}),
         (Lines, {"dynamic": ("opacity", "opacity")}),
-        (Capacity, {"tolerance": 0.0}),
-        (Capacity, {"detail": 0.0}),
+        (PlannedCapacity, {"tolerance": 0.0}),
+        (PlannedCapacity, {"detail": 0.0}),
         (OuterLayers, {"count": -1}),
         (OuterLayers, {"gap": 0.0}),
         (OuterLayers, {"opacity": 1.0}),

@@ -20,7 +20,7 @@ from ....bench.errors import InputError
 from ....bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_arrays
 from ...head.arrays import HeadArrays
 from ..recording import read_calibration
-from .tracks import MEMBERS, Track, tracking_file
+from .tracks import MEMBERS, BenchmarkTrack, tracking_file
 
 MOST_SCALE = 1000.0
 EULER_TOLERANCE = 1e-3
@@ -37,7 +37,7 @@ class BenchmarkSequence:
 
 
 def read_sequence(
-    data: Path, track: Track, participant: str, sequence: str, head: HeadArrays
+    data: Path, track: BenchmarkTrack, participant: str, sequence: str, head: HeadArrays
 ) -> BenchmarkSequence:
     """Read cameras and tracking of a sequence from the benchmark's folder.
 

@@ -23,7 +23,7 @@ from ....bench.io.files import atomic_path, check_writable, reading
 from ....bench.io.images import probe_image, read_png
 from ....bench.io.video import encode_h264, ffmpeg
 from ..sequence import open_video, probe_video
-from .tracks import CRF, TRACKS, Track, Video
+from .tracks import CRF, TRACKS, BenchmarkTrack, Video
 
 MOST_ENTRIES = 10_000
 MOST_VIDEO_BYTES = 2**32
@@ -38,7 +38,9 @@ _CODECS = {"avc1": "H.264", "h264": "H.264", "H264": "H.264"}
 # Frames
 
 
-def find_frames(folder: Path, track: Track, method: str, data: Path | None) -> dict[Video, list[Path]]:
+def find_frames(
+    folder: Path, track: BenchmarkTrack, method: str, data: Path | None
+) -> dict[Video, list[Path]]:
     """Frames of every video of a submission, in order of time.
 
     They are ``<folder>/<participant>/<sequence>_<timestep>_<serial>.png``, or those of a run's method:
@@ -110,7 +112,7 @@ def _by_camera(folder: Path, participant: str, method: str) -> dict[tuple[str, s
     return found
 
 
-def _check_lengths(where: Path, track: Track, counts: dict[Video, int]) -> None:
+def _check_lengths(where: Path, track: BenchmarkTrack, counts: dict[Video, int]) -> None:
     """Cameras of a sequence have one length; the sequences of a participant have as many frames as is published."""
     by_sequence: dict[tuple[str, str], set[int]] = {}
     for video, count in counts.items():
@@ -142,7 +144,7 @@ class Encoded(NamedTuple):
 
 
 def write_submission(
-    frames: dict[Video, list[Path]], track: Track, out: Path, progress: Progress
+    frames: dict[Video, list[Path]], track: BenchmarkTrack, out: Path, progress: Progress
 ) -> list[Encoded]:
     """Encode all videos and write the zip, whole or not at all; say what the encoding cost."""
     ffmpeg()
@@ -215,7 +217,9 @@ class Issues:
     noted: list[str] = field(default_factory=list)
 
 
-def check_submission(file: Path, data: Path | None, name: str, progress: Progress) -> tuple[Track, Issues]:
+def check_submission(
+    file: Path, data: Path | None, name: str, progress: Progress
+) -> tuple[BenchmarkTrack, Issues]:
     """Look at a zip as the server does (files, frame counts, sizes), and beyond: every frame decoded, codec, rate.
 
     Parameters
@@ -253,7 +257,7 @@ def check_submission(file: Path, data: Path | None, name: str, progress: Progres
     return track, issues
 
 
-def _track_of(names: Sequence[str] | dict[str, zipfile.ZipInfo]) -> Track:
+def _track_of(names: Sequence[str] | dict[str, zipfile.ZipInfo]) -> BenchmarkTrack:
     return max(TRACKS.values(), key=lambda track: sum(video.name in names for video in track.videos()))
 
 
@@ -266,7 +270,7 @@ def _unpack(file: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: 
         shutil.copyfileobj(source, target, 1 << 20)
 
 
-def _check_video(path: Path, video: Video, track: Track, issues: Issues) -> int:
+def _check_video(path: Path, video: Video, track: BenchmarkTrack, issues: Issues) -> int:
     """Decode a video; note what is wrong with it, return how many frames it has."""
     try:
         declared, size = probe_video(path)

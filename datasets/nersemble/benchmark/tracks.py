@@ -35,7 +35,7 @@ class Video(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Track:
+class BenchmarkTrack:
     """A task of the benchmark.
 
     Attributes
@@ -73,7 +73,7 @@ class Track:
 
 
 _TEST_SEQUENCES = ("FREE", "EMO-1-shout+laugh", "SEN-09-frown_events_bad", "SEN-10-port_strong_smokey")
-NVS = Track(
+NVS = BenchmarkTrack(
     "nvs",
     (1100, 1604),
     73.0,
@@ -86,7 +86,7 @@ NVS = Track(
     },
     ("222200046", "222200037", "222200039"),
 )
-MONO = Track(
+MONO = BenchmarkTrack(
     "mono_flame_avatar",
     (512, 512),
     24.3,
@@ -95,7 +95,7 @@ MONO = Track(
     train_serial="222200037",
     totals={"393": 816, "404": 665, "461": 486, "477": 530, "486": 608},
 )
-TRACKS: Mapping[TrackName, Track] = {track.name: track for track in (NVS, MONO)}
+TRACKS: Mapping[TrackName, BenchmarkTrack] = {track.name: track for track in (NVS, MONO)}
 
 
 def tracking_file(data: Path, participant: str, sequence: str) -> Path:

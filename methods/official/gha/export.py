@@ -32,7 +32,7 @@ IMAGES, PARAMETERS, CAMERAS = "images", "params", "cameras"
 
 
 @dataclass(frozen=True, eq=False)
-class Tracking:
+class GHATracking:
     """Tracked parameters of one subject as their code reads them: those of the native method.
 
     A point of the canonical head is ``R (S x) + T`` in the world: R, T of the head's root and neck, S metres a unit.
@@ -46,7 +46,7 @@ class Tracking:
     rows: np.ndarray
 
     @classmethod
-    def of(cls, head: HeadAsset, subject: Subject) -> Tracking:
+    def of(cls, head: HeadAsset, subject: Subject) -> GHATracking:
         """Of a subject. Raises `InputError` for a head model without a face or lips."""
         if not len(head.regions.get("lips", ())):
             known = ", ".join(sorted(head.regions)) or "no regions"
@@ -82,7 +82,7 @@ class Tracking:
 
 
 def write_training(
-    clip: Clip, tracking: Tracking, work: Workplace, progress: Progress
+    clip: Clip, tracking: GHATracking, work: Workplace, progress: Progress
 ) -> dict[str, FrameKey]:
     """Write the training frames alone: timesteps and cameras numbered from 0. Returns the key of every image.
 
@@ -113,7 +113,7 @@ def write_training(
 
 
 def write_list(
-    frames: Sequence[Listed], tracking: Tracking, side: int, work: Workplace
+    frames: Sequence[Listed], tracking: GHATracking, side: int, work: Workplace
 ) -> list[tuple[Path, list[int]]]:
     """Write frames to render, those of each camera in a folder of their own; return the folders and frame numbers.
 

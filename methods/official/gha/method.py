@@ -37,7 +37,7 @@ from ..spec import GHA_OFFICIAL
 from .export import (
     IMAGES,
     PARAMETERS,
-    Tracking,
+    GHATracking,
     read_render,
     training_side,
     whole_timesteps,
@@ -86,7 +86,7 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
             if skew > 1e-3 * float(clip.cameras[name].K[0, 0]):
                 raise InputError(where, f"camera {name}", "no skew; the code knows none", f"{skew:.2f}")
         whole_timesteps(clip)
-        Tracking.of(clip.head, Subject.of(clip))
+        GHATracking.of(clip.head, Subject.of(clip))
 
     def check_length(self, iterations: int, checkout: Checkout) -> None:
         """Refuse a run without an iteration for each of the two stages."""
@@ -101,7 +101,7 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
         target = work.program / TETRAHEDRA
         target.parent.mkdir(parents=True)
         os.symlink(checkout.folder / TETRAHEDRA, target)
-        return write_training(clip, Tracking.of(clip.head, Subject.of(clip)), work, progress)
+        return write_training(clip, GHATracking.of(clip.head, Subject.of(clip)), work, progress)
 
     def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
         """Both of their scripts, one after the other, by the launcher."""
@@ -182,7 +182,7 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
         """The frames of each camera as an application of their own, all run by the launcher."""
         _check_white(background, "render")
         head = read_shared_head(folder)
-        tracking = Tracking.of(head, read_subject(folder / SUBJECT_FILE, head))
+        tracking = GHATracking.of(head, read_subject(folder / SUBJECT_FILE, head))
         side = max(_side(folder), square_side(frame.camera for frame in frames))
         renders = self.render_folder(folder, work)
         renders.mkdir(parents=True)

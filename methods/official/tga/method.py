@@ -36,7 +36,7 @@ from ..ga.method import (
     copy_file,
 )
 from ..method import Listed, Patch, Workplace
-from ..process import Ended
+from ..process import ProgramEnd
 from ..spec import TGA_OFFICIAL
 
 JAW_FILE, CLUSTER_FILE = "sorted_jaw_poses.npz", "train_cluster_16.npz"
@@ -141,7 +141,7 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
         super().write_list(folder, frames, background, checkout, work)
         copy_file(folder / JAW_FILE, work.input / JAW_FILE)
 
-    def excused(self, ended: Ended) -> bool:
+    def excused(self, ended: ProgramEnd) -> bool:
         """Their renderer appends its speed to a file of its author's, once all images of a split are written."""
         return any(re.search(r"FileNotFoundError.*fps\.txt", line) for line in ended.lines)
 

@@ -12,7 +12,7 @@ from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
 from headbench.bench.runner import scoring
 from headbench.bench.runner.config import RunConfig, resolve_metrics
-from headbench.bench.runner.scoring import Frames, check_regions, score_frames
+from headbench.bench.runner.scoring import ScoredFrames, check_regions, score_frames
 from headbench.bench.specs import MetricSpec
 
 KEYS = [FrameKey("s", sequence, t, "a") for sequence, t in [("EMO", 0), ("EMO", 1), ("EMO", 2), ("FREE", 7)]]
@@ -86,7 +86,7 @@ def spec(monkeypatch):
     return make
 
 
-FRAMES = Frames(render, RegionalToyClip())
+FRAMES = ScoredFrames(render, RegionalToyClip())
 
 
 def test_frames_and_regions_are_scored_in_the_order_of_keys(spec):
@@ -128,7 +128,7 @@ def test_batches_read_a_bounded_number_of_frames_ahead(spec, monkeypatch):
     clip = types.SimpleNamespace(image=lambda key: np.zeros((4, 6, 3), np.uint8))
     many = spec("many", "Batched")
     monkeypatch.setattr(scoring, "resolve", lambda reference: Slow)
-    assert len(score_frames(keys, Frames(counted, clip), [many])["many"]) == 200
+    assert len(score_frames(keys, ScoredFrames(counted, clip), [many])["many"]) == 200
     assert worst[0] <= scoring._AHEAD + 2
 
 
@@ -220,6 +220,6 @@ def test_a_metric_that_can_computes_on_the_gpu_of_the_run(monkeypatch, device, t
     cuda = SimpleNamespace(is_available=lambda: there)
     monkeypatch.setattr(scoring, "resolve", lambda name: cuda if name == "torch:cuda" else OnDevice)
     spec = MetricSpec("d", "D", "", False, 1, "there:OnDevice", "a difference")
-    (plain,) = score_frames(KEYS[:1], Frames(render, RegionalToyClip()), [spec])["d"]
-    (found,) = score_frames(KEYS[:1], Frames(render, RegionalToyClip()), [spec], device=device)["d"]
+    (plain,) = score_frames(KEYS[:1], ScoredFrames(render, RegionalToyClip()), [spec])["d"]
+    (found,) = score_frames(KEYS[:1], ScoredFrames(render, RegionalToyClip()), [spec], device=device)["d"]
     assert found.value == plain.value + more

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from headbench.methods.insta.config import InstaConfig
-from headbench.methods.insta.field import Architecture, Field, Prior
+from headbench.methods.insta.field import Architecture, Prior, RadianceField
 from headbench.methods.insta.marching import CanonicalSurface, canonical_surface
 from headbench.methods.insta.occupancy import Occupancy
 from headbench.methods.insta.warp import mouth_triangles
@@ -39,7 +39,7 @@ class Stage(NamedTuple):
     config: InstaConfig
     surface: CanonicalSurface
     occupancy: Occupancy
-    field: Field
+    field: RadianceField
     mouth: torch.Tensor
 
 
@@ -50,7 +50,7 @@ def make_stage(head, prior=None, **more):
     surface = canonical_surface(head, mesh, config)
     occupancy = Occupancy(surface, config)
     architecture = Architecture.of(config, head.expression_basis.shape[2])
-    field = Field(architecture, occupancy.box("cpu"), prior or Prior.of(config))
+    field = RadianceField(architecture, occupancy.box("cpu"), prior or Prior.of(config))
     return Stage(config, surface, occupancy, field, mouth_triangles(head))
 
 

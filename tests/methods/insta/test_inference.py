@@ -8,7 +8,7 @@ import torch
 
 from headbench.methods.insta import kernel
 from headbench.methods.insta.avatar import Inference
-from headbench.methods.insta.field import Field
+from headbench.methods.insta.field import RadianceField
 from headbench.methods.insta.marching import Space
 from headbench.methods.insta.rendering import Marching, PosedRays, camera_rays
 
@@ -44,7 +44,7 @@ SHAPES = {
 
 
 class Scene(NamedTuple):
-    field: Field
+    field: RadianceField
     parameters: dict[str, torch.Tensor]
     space: Space
     mouth: torch.Tensor

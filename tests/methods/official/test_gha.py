@@ -16,7 +16,7 @@ from headbench.bench.runner.adaptation import TrainingView
 from headbench.methods.official.config import GHAOfficialConfig
 from headbench.methods.official.ga.windows import square, square_side
 from headbench.methods.official.gha import method as implementation
-from headbench.methods.official.gha.export import MOUTH_ROWS, Tracking, overshot
+from headbench.methods.official.gha.export import MOUTH_ROWS, GHATracking, overshot
 from headbench.methods.official.method import TRAINING_LOG, Workplace, check_export
 from headbench.methods.official.process import ProgramError
 from headbench.methods.shared.avatar_files import Subject
@@ -79,7 +79,7 @@ def test_both_stages_are_run_and_frames_come_back_by_key(method, official_clip, 
     wanted = views(official_clip, "novel_view", "self_reenactment", "train")
     found = dict(avatar.render_listed(wanted, (1.0, 1.0, 1.0), no_progress))
     assert found.keys() == wanted.keys()
-    tracking = Tracking.of(official_clip.head, Subject.of(official_clip))
+    tracking = GHATracking.of(official_clip.head, Subject.of(official_clip))
     for key, frame in found.items():
         camera, pose = wanted[key]
         assert frame.rgb.shape == (camera.height, camera.width, 3)
@@ -139,7 +139,7 @@ def test_only_training_frames_are_exported_and_to_the_bit(method, official_clip,
     folders = sorted((work.input / "params").iterdir())
     timesteps = sorted({key.timestep for key in official_clip.splits["train"]})
     assert len(folders) == len(timesteps)
-    tracking = Tracking.of(official_clip.head, Subject.of(official_clip))
+    tracking = GHATracking.of(official_clip.head, Subject.of(official_clip))
     for folder, timestep in zip(folders, timesteps, strict=True):
         values = dict(np.load(folder / "params.npz"))
         rotation, _ = cv2.Rodrigues(values["pose"][0, :3].astype(np.float64))

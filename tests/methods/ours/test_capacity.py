@@ -13,7 +13,7 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.runner.adaptation import TrainingView
 from headbench.bench.runner.stored import TRAINING_FILE
 from headbench.methods.ours.capacity import plan_capacity
-from headbench.methods.ours.config import Capacity, Lines, OursConfig, Penalty
+from headbench.methods.ours.config import Lines, OursConfig, Penalty, PlannedCapacity
 from headbench.methods.ours.method import Ours
 from headbench.methods.shared.avatar_files import Subject
 from headbench.methods.shared.config import SplatTraining
@@ -27,7 +27,7 @@ SMALL = OursConfig(
     hidden=16,
     lines=Lines(resolution=8, channels=4),
     penalty=Penalty(face_mm=0.1, other_mm=0.2),
-    capacity=Capacity(mode="auto"),
+    capacity=PlannedCapacity(mode="auto"),
 )
 MEGAPIXEL = 40
 """Enlarges the toy's cameras so that its millimetres are pixels."""

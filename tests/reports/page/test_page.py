@@ -13,7 +13,7 @@ from headbench.bench.rows import ALL, Rows
 from headbench.bench.runner.config import RunOptions
 from headbench.reports.page import frames, split
 from headbench.reports.page.command import PageSettings, report
-from headbench.reports.page.frames import Frame, choose_pictures, spread
+from headbench.reports.page.frames import ShownFrame, choose_pictures, spread
 from headbench.reports.page.report import write_page
 from headbench.reports.runs import RunData, RunSet
 from headbench.reports.table_report import layouts, table_text
@@ -206,7 +206,7 @@ def test_an_error_cannot_end_the_script_it_stands_in(page, toy_run):
 
 def test_the_worst_frames_are_always_there(toy_run, monkeypatch):
     runs = RunSet.read([toy_run])
-    every = [Frame(task, key) for task in runs.tasks for key in sorted(runs.keys[task])]
+    every = [ShownFrame(task, key) for task in runs.tasks for key in sorted(runs.keys[task])]
     spec = next(s for s in runs.metrics if s.name == "error")
     values = {("error", "toy", frame): float(index) for index, frame in enumerate(every)}
     moments = {}
@@ -232,7 +232,9 @@ def test_the_worst_frames_are_always_there(toy_run, monkeypatch):
 
 def test_frames_are_added_evenly_and_from_all_groups():
     every = [
-        Frame("t", FrameKey("s", "q", timestep, camera)) for camera in "ab" for timestep in range(0, 90, 10)
+        ShownFrame("t", FrameKey("s", "q", timestep, camera))
+        for camera in "ab"
+        for timestep in range(0, 90, 10)
     ]
     order = [*spread(every)]
     assert sorted(order) == sorted(every)
