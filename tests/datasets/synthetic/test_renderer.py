@@ -60,7 +60,7 @@ def test_every_camera_holds_the_whole_head_with_a_margin(geometry, rest, size, i
     for camera in plan.cameras:
         _, mask = renderer.render(camera, 1)
         assert mask[: size[1] // 20].max() == 0, camera
-        assert mask[:, [0, -1]].max() < 10, camera
+        assert mask[:, [0, -1]].sum() < 0.5 * 255, camera  # of single curls, less than half a pixel
         # The bust is cut by the frame, not by its own end.
         assert (mask[-1] > 200).sum() > size[0] // 8, camera
 
