@@ -20,9 +20,11 @@ from ...bench.io.arrays import Member
 from ...bench.io.documents import parse_json
 from ...bench.io.files import write_bytes
 from ..shared.avatar_files import SUBJECT_FILE, RefinedTracking, read_shared_head, read_subject
+from ..shared.avatar_kernel import available
 from ..shared.device_frame import to_device
 from ..shared.rendering import Drawn, LastPose, PosedSplats, posed_splats, read_back
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
+from ..shared.threads import torch_on_one_thread
 from .config import GHAConfig
 from .driving import Driver, HeadMotion, code_size
 from .gaussian_head import POINTS, FeatureSplats, GaussianHead
@@ -82,8 +84,9 @@ class GHAAvatar:
         the difference to the one asked for is added.
         """
         trained = self._tensors["background"]
-        drawn = self._head.draw(self._posed(pose), camera, trained)
-        image = self._head.sharpen(self._tensors, drawn, trained, bounded=True)
+        with torch_on_one_thread(available()):
+            drawn = self._head.draw(self._posed(pose), camera, trained)
+            image = self._head.sharpen(self._tensors, drawn, trained, bounded=True)
         image = image[: camera.height, : camera.width]
         alpha = drawn.alpha
         if self._head.config.upscale > 1:

@@ -287,7 +287,6 @@ def _trained(scene: TrainingScene, head: MeshHead, fit: Fit) -> dict[str, Any]:
         fit,
         published_length=max(1, round(config.schedule_length * config.mesh_fraction)),
         checkpoint_every_s=config.checkpoint_every_s,
-        by_torch=True,
         began=began,
     )
     names = [*(name for network in head.networks for name in network.shapes()), "landmarks"]

@@ -71,7 +71,6 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
                 replace(fit, budget=budget, progress=_phase_progress(fit.progress, mesh.iterations, 0)),
                 published_length=round(config.schedule_length * (1 - config.mesh_fraction)),
                 checkpoint_every_s=config.checkpoint_every_s,
-                by_torch=True,
                 began=began,
             )
         finally:

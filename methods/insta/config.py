@@ -8,6 +8,8 @@ from typing import Literal
 
 INSTANT_NGP_STEP = math.sqrt(3) / 1024
 SMALLEST = 1e-12
+THICKEST = 1.0
+"""Metres of a shell on one side of the surface."""
 STEP_MIN = 1e-5
 MOST = {
     "levels": 32,
@@ -148,6 +150,9 @@ class InstaConfig:
             # The kernel computes in float32, where smaller numbers are 0.
             if not getattr(self, name) >= SMALLEST:
                 raise ValueError(f"{name} must be at least {SMALLEST}, found {getattr(self, name)}")
+        for name in ("shell_outside", "shell_inside"):
+            if getattr(self, name) > THICKEST:
+                raise ValueError(f"{name} must be at most {THICKEST} metres, found {getattr(self, name)}")
         for name in (
             "conditions",
             "mouth_weight",

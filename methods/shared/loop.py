@@ -99,7 +99,6 @@ def train(
     published_length: int,
     checkpoint_every_s: float,
     began: float | None = None,
-    by_torch: bool = False,
 ) -> Outcome:
     """Train until the budget is spent; continue from the checkpoint in ``fit.out`` if it is of the same run.
 
@@ -112,7 +111,6 @@ def train(
     published_length : iterations of the published run (`Timeline`).
     began : what the clock said before the preparation of ``trainable``, whose seconds then count like those of
         iterations; by default counting begins here.
-    by_torch : torch's layers do the long work and keep their threads; then rounding depends on the number of threads.
 
     Raises
     ------
@@ -121,7 +119,7 @@ def train(
     """
     budget, clock = fit.budget, fit.clock
     check_budget(budget)
-    path, compiled = fit.out / CHECKPOINT, available() and not by_torch
+    path, compiled = fit.out / CHECKPOINT, available()
     wait = synchroniser(fit.device)
     saved = load_checkpoint(path, fit.run, fit.device)
     started = clock() if began is None else began

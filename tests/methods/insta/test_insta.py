@@ -193,6 +193,7 @@ def test_the_official_variants_train_as_well(clip, tmp_path):
         ("step", 1e-12),
         ("step", float("nan")),
         ("prior_scale", 1e-320),
+        ("shell_outside", 1e38),
     ],
 )
 def test_settings_out_of_range_are_refused(name, wrong):
