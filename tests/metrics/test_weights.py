@@ -105,13 +105,6 @@ def test_a_faulty_entry_is_named(tmp_path, state, spoil, message):
         weights.load_backbone(SQUEEZE, tmp_path / "w.pth")
 
 
-@pytest.mark.parametrize("content", [b"", b"<html>404</html>", b"PK\x03\x04 not really a zip"])
-def test_a_file_that_is_no_weights_file_is_bad_input(tmp_path, content):
-    (tmp_path / "w.pth").write_bytes(content)
-    with pytest.raises(InputError, match="cannot be read"):
-        weights.load_backbone(SQUEEZE, tmp_path / "w.pth")
-
-
 class Payload:
     def __reduce__(self):
         return print, ("code from a weights file ran",)
@@ -119,7 +112,7 @@ class Payload:
 
 def test_code_in_a_weights_file_is_not_run(tmp_path, capsys):
     torch.save({"features.0.weight": Payload()}, tmp_path / "w.pth")
-    with pytest.raises(InputError, match="print: expected a PyTorch file of weights"):
+    with pytest.raises(InputError, match="expected a PyTorch file of weights, found the name print"):
         weights.load_backbone(SQUEEZE, tmp_path / "w.pth")
     assert "ran" not in capsys.readouterr().out
 
