@@ -100,7 +100,7 @@ def test_notes_of_two_tables_have_names_of_their_own(write_run, submit, build, c
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [({}, "bundles (*.zip) of `headbench bundle`"), ({"a.zip": b"text"}, "a damaged ZIP file")],
+    [({}, "bundles (*.zip) of `headbench bundle`"), ({"a.zip": b"text"}, "unreadable content")],
 )
 def test_a_folder_without_sound_bundles_is_refused(folder, tmp_path, content, words, capsys):
     for name, data in content.items():
