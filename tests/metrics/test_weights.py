@@ -105,13 +105,6 @@ def test_a_faulty_entry_is_named(tmp_path, state, spoil, message):
         weights.load_backbone(SQUEEZE, tmp_path / "w.pth")
 
 
-@pytest.mark.parametrize("content", [b"", b"<html>404</html>", b"PK\x03\x04 not really a zip"])
-def test_a_file_that_is_no_weights_file_is_bad_input(tmp_path, content):
-    (tmp_path / "w.pth").write_bytes(content)
-    with pytest.raises(InputError, match="expected a PyTorch file of weights"):
-        weights.load_backbone(SQUEEZE, tmp_path / "w.pth")
-
-
 class Payload:
     def __reduce__(self):
         return print, ("code from a weights file ran",)
