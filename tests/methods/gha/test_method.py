@@ -22,7 +22,6 @@ from headbench.methods.gha.gaussian_training import GaussianTraining
 from headbench.methods.gha.mesh_training import FOLDER, MeshTraining
 from headbench.methods.gha.method import GHA, parted, within
 from headbench.methods.shared.loop import CHECKPOINT
-from headbench.tests.benchmarks.timing import torch_threads
 
 from .small import SMALL, small_config
 
@@ -76,15 +75,6 @@ def test_interrupted_and_continued_is_the_same_bit_for_bit(trained, clip, tmp_pa
     assert content(avatar) == content(trained[0])
     assert not (tmp_path / CHECKPOINT).exists()
     assert not (tmp_path / FOLDER).exists()
-
-
-def test_any_number_of_threads_trains_to_the_same_bits(clip, tmp_path):
-    settings = {"motion_steps": 5, "motion_weight": 0.1, "residual": True, "augment": False}
-    avatars = []
-    for threads in (1, 3):
-        with torch_threads(threads):
-            avatars.append(content(fit(clip, tmp_path / str(threads), **settings)))
-    assert avatars[0] == avatars[1]
 
 
 def test_another_seed_gives_another_avatar(trained, clip, tmp_path):
