@@ -19,7 +19,7 @@ from ...bench.specs import Findings
 from ...datasets.head.procedural.model import procedural_head
 from ...reports.view.command import ViewSettings
 from ...reports.view.drawing import draw, splats_of
-from ...reports.view.scene import Scene, Shown
+from ...reports.view.scene import Scene, ShownAvatar
 from ...reports.view.server import serving
 from ...reports.view.state import FreeView, Sliders, State
 from .avatar.untrained import cameras_around, random_poses, untrained_avatar
@@ -102,7 +102,7 @@ def _scene(count: int) -> Scene:
     poses = dict(enumerate(random_poses(head, 4)))
     keys = tuple(FrameKey("untrained", "EMO-1", t, name) for t in poses for name in cameras)
     clip: Any = _Clip(head, cameras, poses, {"train": keys})
-    return Scene([Shown("ours", untrained_avatar(head, count), clip, AdaptedClip(clip), {})], {}, ())
+    return Scene([ShownAvatar("ours", untrained_avatar(head, count), clip, AdaptedClip(clip), {})], {}, ())
 
 
 def _stages(scene: Scene, splats: bool, repeats: int = 8) -> dict[str, float]:
