@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import pickle
 import tracemalloc
@@ -144,12 +145,17 @@ def damaged(tmp_path, monkeypatch) -> Callable[[Reader], Path]:
     return make
 
 
-@pytest.mark.parametrize("damage", DAMAGE)
-@pytest.mark.parametrize("name", READERS)
+def part_of_a_text(name: str, damage: str) -> bool:
+    """Whether the damage leaves a text, which is shorter and sound."""
+    return READERS[name].text and damage.startswith(("empty", "cut"))
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [pair for pair in itertools.product(READERS, DAMAGE) if not part_of_a_text(*pair)],
+)
 def test_a_damaged_file_is_refused_by_its_name(damaged, name, damage):
     reader = READERS[name]
-    if reader.text and damage in ("empty", "cut in its first tenth", "cut in its middle", "cut near its end"):
-        pytest.skip("a part of a text is a text")
     path = damaged(reader)
     DAMAGE[damage](path)
     tracemalloc.start()
