@@ -23,11 +23,7 @@ from headbench.bench.io.documents import read_json
 from headbench.bench.registry import SPEC_TYPES, discover
 from headbench.bench.runner.config import RunConfig, resolve_metrics
 from headbench.bench.runner.store import RunFolder
-from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.head.arrays import save_head
 from headbench.metrics import speed
-
-from .datasets.nersemble.re_record import re_record
 
 TINY = ("--preset", "smoke", "--set", "frames_per_task=3")
 METHODS = {"mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours"}
@@ -171,7 +167,8 @@ OTHERS = "synth --out others --subjects 2 --cameras 2 --timesteps 4 --size 24x32
 PLAIN = "run --data {capture} --out plain --methods mean-image,nearest-camera --preset smoke --set metrics=psnr,ssim --set frames_per_task=3"
 SUITE = "suite --out suite --methods mean-image --preset smoke --subjects 1 --cameras 2 --timesteps 60 --size 32x32"
 GATE = "gate plain --baseline baseline.json"
-PREPARE = "prepare nersemble --root recording --tracking tracking --head head_model.npz"
+RECORD = "record nersemble {capture} --out recording"
+PREPARE = "prepare nersemble --root recording/recording --tracking recording/tracking --head recording/head_model.npz"
 
 EVERY_METHOD = "(?s)ga .*gbs .*gha .*insta .*ours "
 
@@ -333,6 +330,7 @@ CASES = {
     "steps": [case("steps {capture} --out steps", "jaw bases", "steps/jaw_bases.png", "steps/steps.json")],
     "tongue": [case("tongue {capture} --out tongue", "left out", "tongue/tongue.yaml")],
     "refit": [case("refit {capture} --target 2020 --out refitted", "neutral head", "refitted/heat_map.png")],
+    "record nersemble": [case(RECORD, "Prepare it", "recording/head_model.npz")],
     "prepare nersemble": [
         case(
             f"{PREPARE} --subjects {{subject}} --sequences all --downscale 1 --out prepared",
@@ -346,13 +344,10 @@ CASES = {
 
 
 @pytest.fixture(scope="module")
-def elsewhere(tmp_path_factory, run):
-    """The directory that commands run in: neither that of the run nor one above it. It holds a raw recording."""
+def elsewhere(tmp_path_factory):
+    """The directory that commands run in: neither that of the run nor one above it."""
     folder = tmp_path_factory.mktemp("elsewhere")
     (folder / "board").mkdir()
-    clip = read_capture(run.root / "capture")
-    re_record(clip, folder / "recording", tracking=folder / "tracking")
-    save_head(folder / "head_model.npz", clip.head)
     return folder
 
 

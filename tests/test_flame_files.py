@@ -9,13 +9,11 @@ import pytest
 
 from headbench.bench import cli
 from headbench.datasets.ga.layout import DECLARATION_FILE, HEAD_FILE
-from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.loaders import EYELID_FILES, MASKS_FILE, load_head
 from headbench.datasets.head.teeth import with_teeth
 
 from .datasets.head.flame_files import write_flame
 from .datasets.head.flame_stand_in import stand_in, write_stand_in
-from .datasets.nersemble.re_record import re_record
 from .datasets.tiny_capture import make_plan, rig, write_tiny_capture
 from .fuzz.samples import SETTINGS
 
@@ -38,7 +36,6 @@ def files(tmp_path_factory):
     for path in folder.glob("data/*/flame_param/*.npz"):
         with np.load(path) as arrays:
             np.savez(path, **{**arrays, "eyelids": np.full((1, 2), 0.5, np.float32)})
-    re_record(read_capture(union), folder / "recording", tracking=folder / "tracking")
     # As VHAP leaves a capture: no head model in it, and nothing that names one.
     (union / HEAD_FILE).unlink()
     for path in folder.glob(f"data/*/{DECLARATION_FILE}"):
@@ -63,7 +60,10 @@ def files(tmp_path_factory):
 
 
 GIVEN = "--head flame/flame2023.pkl --cy bottom"
-PREPARE = "prepare nersemble --root recording --tracking tracking --head flame/flame2023.pkl --subjects 901"
+PREPARE = (
+    "prepare nersemble --root recording/recording --tracking recording/tracking --head flame/flame2023.pkl "
+    "--subjects 901"
+)
 COMMANDS = (
     f"inspect capture {GIVEN} --out inspected",
     f"steps capture {GIVEN} --out steps",
@@ -72,6 +72,7 @@ COMMANDS = (
     "refit refitted/UNION3_901 --target flame/flame2023.pkl --out again",
     "refit refitted/UNION3_901 --target 2023 --out procedural",
     f"export colmap capture {GIVEN} --out colmap --names flat --tracking",
+    f"record nersemble capture {GIVEN} --out recording",
     f"{PREPARE} --sequences EMO-1,FREE,SEN-01 --downscale 1 --out prepared",
     "export ply run/901/ga/seed-0/avatar --out ga.ply",
     "render run/901/ours/seed-0/avatar --capture colmap --reader colmap --frames train --out rendered",

@@ -1,4 +1,4 @@
-"""``headbench prepare nersemble``."""
+"""``headbench prepare nersemble`` and ``headbench record nersemble``."""
 
 from __future__ import annotations
 
@@ -6,11 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import tyro
+
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind
 from ...bench.options import DependentOptions
-from ...bench.specs import Findings
+from ...bench.specs import Findings, writes
+from ..ga.layout import HEAD_FILE
+from ..head.arrays import save_head
+from ..options import CaptureOptions
 from .names import SUBJECT_NAMES, chosen_subjects
 
 if TYPE_CHECKING:
@@ -87,6 +92,21 @@ class PrepareSettings:
         ),
         DependentOptions(("rejoin",), "union_root"),
     )
+
+
+@dataclass(frozen=True)
+class RecordSettings(CaptureOptions):
+    """What to write as a raw recording."""
+
+    capture: tyro.conf.Positional[str]
+    """Synthetic capture: a UNION folder, as `headbench synth` writes them."""
+    out: str
+    """Folder to write: recording/ is for --root of `headbench prepare nersemble`, tracking/ for --tracking,
+    head_model.npz for --head."""
+    release: Literal["v2", "v1", "paper2023"] = "v2"
+    """Whose folders: of the second release, of the first, or of the 2023 paper."""
+    frames: Literal["images", "video"] = "images"
+    """"images" with masks, as VHAP's preprocessing leaves them, or "video" without."""
 
 
 def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progress) -> Findings:
@@ -169,3 +189,38 @@ def _done(results: list[SubjectResult], plans: list[SubjectPlan], settings: Prep
         del data[result.subject]["subject"]
     passed = not settings.tracking or all(result.union is not None for result in results)
     return Findings("\n".join(lines), data, passed)
+
+
+@writes("out", "a recording")
+def record_nersemble(settings: RecordSettings, progress: Progress = no_progress) -> Findings:
+    """Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to try prepare on.
+
+    For synthetic captures, as they bring their own head model.
+    """
+    from ...bench.io.video import video_codec
+    from ..clip import check_apart
+    from .re_record import re_record
+
+    clip = settings.open(settings.capture, progress)
+    out = Path(settings.out)
+    check_apart(clip, out)
+    masks = settings.frames == "images"
+    sequences = re_record(
+        clip,
+        out / "recording",
+        tracking=out / "tracking",
+        release=settings.release,
+        masks=masks,
+        source=settings.capture,
+        progress=progress,
+    )
+    save_head(out / HEAD_FILE, clip.head)
+    codec = "" if masks or settings.release == "paper2023" else video_codec()
+    text = (
+        f"Subject {clip.subject}, {len(sequences)} sequences, {len(clip.cameras)} cameras"
+        f"{f', videos in {codec}' if codec else ''}.\n"
+        f"Prepare it: headbench prepare nersemble --root {out / 'recording'} --tracking {out / 'tracking'} "
+        f"--head {out / HEAD_FILE} --subjects {clip.subject} --sequences {','.join(sequences)} --downscale 1"
+    )
+    data = {"subject": clip.subject, "sequences": sequences, "cameras": [*clip.cameras], "codec": codec}
+    return Findings(text, data)

@@ -23,8 +23,8 @@ from ...bench.io.video import video_codec
 from ...bench.machine import processor_count
 from ...bench.specs import Findings
 from ...datasets.nersemble.command import PrepareSettings, prepare_nersemble
+from ...datasets.nersemble.re_record import RecordingWriter
 from ...datasets.synthetic.plan import cameras
-from .raw_recordings import RecordingWriter
 
 SUBJECT = "999"
 SEQUENCE = "EMO-1-shout+laugh"

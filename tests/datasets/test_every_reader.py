@@ -15,6 +15,7 @@ COMMANDS = {
     ),
     "tongue": (["--cameras", "1"], ["tongue.yaml", "tongue_901.png"]),
     "export colmap": (["--tracking"], ["sparse/0/images.bin", "flame_param/00000.npz", "head_model.npz"]),
+    "record nersemble": ([], ["recording/metadata_sequences.csv", "head_model.npz"]),
 }
 
 

@@ -50,6 +50,7 @@ WRITERS = [
     Writer("synth", "settings", f"synth {SYNTH} --out out"),
     Writer("run", "unfinished", "run --config config.json", (PAGE,)),
     Writer("prepare", "recording", f"{PREPARE} --out out"),
+    Writer("record", "synthetic", "record nersemble synthetic/UNION2_900 --out out"),
     Writer("refit", "heads", "refit capture --target head.npz --out out"),
     Writer("evaluate", "images", "evaluate images --like run --out out --label theirs", (PAGE,)),
     Writer(

@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from headbench.tests.benchmarks.raw_recordings import RecordingWriter
+from headbench.datasets.nersemble.re_record import RecordingWriter
 
 from .recordings import SUBJECT, Recording, world_cameras, write_recording
 

@@ -10,10 +10,15 @@ from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.subject import PosedSubject
-from headbench.datasets.nersemble.command import PrepareSettings, prepare_nersemble
+from headbench.datasets.nersemble.command import (
+    PrepareSettings,
+    RecordSettings,
+    prepare_nersemble,
+    record_nersemble,
+)
+from headbench.datasets.nersemble.re_record import re_record
 
 from ..tiny_capture import make_plan, rig, write_tiny_capture
-from .re_record import re_record
 
 SEQUENCES = "EMO-1,SEN-01,FREE"
 
@@ -65,6 +70,15 @@ def test_there_and_back(release, frames, clip, tmp_path):
             assert np.abs(again.image(key)[outside].astype(int) - 255).mean() < 2
 
 
+def test_the_command_says_how_to_prepare(clip, tmp_path):
+    source = clip.files[clip.splits["train"][0]].image.parents[2] / "UNION3_901"
+    findings = record_nersemble(RecordSettings(str(source), str(tmp_path / "raw")))
+    assert "--subjects 901" in findings.text
+    names = {entry.name for entry in (tmp_path / "raw").iterdir()}
+    assert names == {"recording", "tracking", "head_model.npz"}
+    assert (tmp_path / "raw" / "recording" / "901" / "sequences" / "BACKGROUND").is_dir()
+
+
 def test_a_missing_frame_is_named_before_anything_is_written(clip, tmp_path):
     source = clip.files[clip.splits["train"][0]].image.parents[2]
     shutil.copytree(source, tmp_path / "capture")
@@ -74,7 +88,7 @@ def test_a_missing_frame_is_named_before_anything_is_written(clip, tmp_path):
     gone = value["frames"].pop(1)
     path.write_text(json.dumps(value))
     with pytest.raises(InputError, match="no such frame") as caught:
-        re_record(read_capture(union), tmp_path / "raw", source=union)
+        record_nersemble(RecordSettings(str(union), str(tmp_path / "raw")))
     assert caught.value.file == str(union)
     assert caught.value.key.endswith(f"/{gone['timestep_index']:05d}/{gone['camera_id']}")
     assert not (tmp_path / "raw").exists()

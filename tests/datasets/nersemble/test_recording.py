@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
+from headbench.datasets.nersemble.re_record import RecordingWriter
 from headbench.datasets.nersemble.recording import participant, participants, read_calibration
-from headbench.tests.benchmarks.raw_recordings import RecordingWriter
 
 from .recordings import SEQUENCES, SUBJECT, world_cameras, write_recording
 

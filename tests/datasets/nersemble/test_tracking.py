@@ -5,8 +5,8 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.teeth import with_teeth
+from headbench.datasets.nersemble.re_record import write_tracked
 from headbench.datasets.nersemble.tracking import find_tracked, read_tracked
-from headbench.tests.benchmarks.raw_recordings import write_tracked
 
 from ..head.toy import toy_head
 from .recordings import tracked_arrays

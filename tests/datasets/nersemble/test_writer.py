@@ -8,7 +8,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.video import video_codec, write_video
-from headbench.tests.benchmarks.raw_recordings import RecordingWriter, write_tracked
+from headbench.datasets.nersemble.re_record import RecordingWriter, write_tracked
 
 from ..head.toy import toy_head
 from .recordings import HEIGHT, SUBJECT, WIDTH, tracked_arrays, world_cameras
