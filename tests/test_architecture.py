@@ -207,8 +207,6 @@ def test_names_of_tests_have_at_most_60_characters():
 
 
 TWICE = {
-    "DeviceSplats",
-    "PosedMesh",
     "SplatAvatar",
     "SubjectPlan",
     "SynthSettings",

@@ -41,17 +41,15 @@ class FeatureSplats(NamedTuple):
 
 
 class FeatureImage(NamedTuple):
-    """What a camera sees at the splatted size: the (h, w, C) feature image, its (h, w) alpha, and the (h, w, 3) colours
-    that the first features are."""
+    """What a camera sees at the splatted size: the (h, w, C) feature image and its (h, w) alpha."""
 
     features: Tensor
     alpha: Tensor
-    colors: Tensor
 
-    @classmethod
-    def of(cls, features: Tensor, alpha: Tensor) -> FeatureImage:
-        """With the colours of the features."""
-        return cls(features, alpha, features[..., :3])
+    @property
+    def colors(self) -> Tensor:
+        """(h, w, 3): the first features."""
+        return self.features[..., :3]
 
 
 class PointInputs(NamedTuple):
@@ -109,10 +107,9 @@ class GaussianHead:
         if noise is not None:
             seen = seen + noise
         changes = nets.attributes(tensors, features, parts, seen, pose)
-        scales = Scales(c.unit, c.displacement_scale, c.attribute_scale, LARGEST_LOG_SCALE)
         turn = left_products(motion.quaternion[None])[0]
         placed = posed(
-            *(scales, motion.rotation, motion.translation, turn, points, moves),
+            *(c, motion.rotation, motion.translation, turn, points, moves),
             *(tensors["log_scales"], tensors["quats"], tensors["opacities"], changes),
         )
         means, quats, sizes, opacities = placed
@@ -129,7 +126,7 @@ class GaussianHead:
             background=feature_background(background, self.config.channels),
             check_values=False,
         )
-        return FeatureImage.of(rendering.image, rendering.alpha)
+        return FeatureImage(rendering.image, rendering.alpha)
 
     def sharpen(
         self, tensors: Weights, drawn: FeatureImage, background: Tensor, *, bounded: bool = False
@@ -225,7 +222,8 @@ class SuperResolution:
                 values = _resized(values, size, align_corners=True)
             for layer in range(2):
                 values = normalised_convolution(values, weights[f"sr.conv_{block}_{layer}"])
-        return self._image(weights, values, drawn, background)
+        colors = F.linear(values, weights["sr.color"].flatten(1), weights["sr.color_bias"])
+        return self._finished(colors, drawn, background)
 
     @torch.no_grad()
     def bounded(
@@ -262,11 +260,6 @@ class SuperResolution:
             colors[:, :, first : first + rows] = F.conv2d(strip, *color)
         return self._finished(colors[0].permute(1, 2, 0), drawn, background)
 
-    def _image(self, weights: Weights, values: Tensor, drawn: FeatureImage, background: Tensor) -> Tensor:
-        """(u H, u W, 3) image of the last block's (u H, u W, D) output."""
-        layer = weights["sr.color"].flatten(1), weights["sr.color_bias"]
-        return self._finished(F.linear(values, *layer), drawn, background)
-
     def _finished(self, colors: Tensor, drawn: FeatureImage, background: Tensor) -> Tensor:
         """(u H, u W, 3) image of the last layer's (u H, u W, 3) output."""
         near = enlarged(near_drawn(drawn.alpha), self.upscale)
@@ -290,17 +283,8 @@ def residual_image(colors: Tensor, plain: Tensor, alpha: Tensor, near: Tensor, b
     return torch.where(near[..., None] > 0, plain + alpha[..., None] * colors, background)
 
 
-class Scales(NamedTuple):
-    """How numbers become lengths; see `GHAConfig`, and `LARGEST_LOG_SCALE` for the last."""
-
-    unit: float
-    displacement: float
-    attribute: float
-    largest_log_scale: float
-
-
 def posed(
-    scales: Scales,
+    config: GHAConfig,
     rotation: Tensor,
     translation: Tensor,
     turn: Tensor,
@@ -321,13 +305,13 @@ def posed(
     log_scales, quats, opacities : (N, 3), (N, 4) and (N,) logits, canonical.
     changes : (N, 8) what networks add to them, before its factor.
     """
-    unit, displacement, attribute, largest = scales
-    scale, quat, faint = (attribute * changes).split(list(ATTRIBUTES), dim=1)
-    canonical = points + displacement * moves
+    unit = config.unit
+    scale, quat, faint = (config.attribute_scale * changes).split(list(ATTRIBUTES), dim=1)
+    canonical = points + config.displacement_scale * moves
     return (
         unit * canonical @ rotation.t() + translation,
         (quats + quat) @ turn.t(),
-        unit * (log_scales + scale).clamp_max(largest).exp(),
+        unit * (log_scales + scale).clamp_max(LARGEST_LOG_SCALE).exp(),
         torch.sigmoid(opacities + faint[:, 0]),
     )
 

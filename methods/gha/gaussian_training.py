@@ -235,7 +235,7 @@ def zoomed(
     outside = feature_background(background, drawn.features.shape[2])
     features = _zoomed(drawn.features, zoom, 1, outside)
     alpha = _zoomed(drawn.alpha[..., None], zoom, 1, drawn.alpha.new_zeros(1))[..., 0]
-    return FeatureImage.of(features, alpha), _zoomed(target, zoom, upscale, background)
+    return FeatureImage(features, alpha), _zoomed(target, zoom, upscale, background)
 
 
 def _zoomed(values: Tensor, zoom: Zoom, upscale: int, outside: Tensor) -> Tensor:

@@ -62,6 +62,15 @@ def test_the_protocols_of_another_run_are_refused(published):
         Manifest.read(published)
 
 
+def check_refused(manifest, file, change, key):
+    """Reading a manifest refuses a change of it, or of a file beside it, by file and key."""
+    change_json(file, change)
+    with pytest.raises(InputError) as caught:
+        Manifest.read(manifest)
+    assert caught.value.key == key
+    assert caught.value.file == str(file)
+
+
 @pytest.mark.parametrize(
     ("change", "key"),
     [
@@ -87,11 +96,7 @@ def test_the_protocols_of_another_run_are_refused(published):
     ],
 )
 def test_a_manifest_that_is_none_is_refused_by_its_key(published, change, key):
-    change_json(published, change)
-    with pytest.raises(InputError) as caught:
-        Manifest.read(published)
-    assert caught.value.key == key
-    assert caught.value.file == str(published)
+    check_refused(published, published, change, key)
 
 
 @pytest.mark.parametrize(
@@ -108,11 +113,7 @@ def test_a_manifest_that_is_none_is_refused_by_its_key(published, change, key):
 )
 def test_a_protocol_that_is_none_is_refused_by_its_key(published, change, key):
     file = protocol_path(published.parent, Manifest.read(published).protocols["novel_view"].hash)
-    change_json(file, change)
-    with pytest.raises(InputError) as caught:
-        Manifest.read(published)
-    assert caught.value.key == key
-    assert caught.value.file == str(file)
+    check_refused(published, file, change, key)
 
 
 @pytest.mark.parametrize(

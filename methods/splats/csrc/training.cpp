@@ -1,8 +1,6 @@
 // What training computes of splats beside the rasteriser, as functions of the Python module. Work is divided alike for any
 // number of threads, and sums are taken in one order, so that results are equal bit for bit.
-#include <cmath>
 #include <string>
-#include <utility>
 #include <vector>
 
 #include "tasks.h"

@@ -138,7 +138,7 @@ def a_picture():
     features = torch.tensor(np.stack(planes, -1), dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
     target = torch.rand(24, 32, 3, generator=generator, dtype=torch.float64)
-    return FeatureImage.of(features, torch.ones(12, 16)), target
+    return FeatureImage(features, torch.ones(12, 16)), target
 
 
 @pytest.mark.parametrize("draws", [(0.0, 0.0, 0.0), (0.1, 0.7, 0.4), (0.3, 0.99, 0.99)])

@@ -117,7 +117,7 @@ def test_super_resolution_is_torchs_layers(widths):
             values = torch.relu(torch.nn.InstanceNorm2d(values.shape[1])(values))
     expected = torch.sigmoid(F.conv2d(values, weights["sr.color"], weights["sr.color_bias"]))[0]
     alpha = torch.rand(5, 7, generator=generator, dtype=torch.float64)
-    image = network(weights, FeatureImage.of(features, alpha), GROUND)
+    image = network(weights, FeatureImage(features, alpha), GROUND)
     assert image.shape == (5 * network.upscale, 7 * network.upscale, 3)
     assert torch.allclose(image, expected.permute(1, 2, 0), atol=1e-10)
 
@@ -139,7 +139,7 @@ def test_super_resolution_in_strips_is_that_of_the_whole_image(height, width, wi
     }
     features = torch.randn(height, width, 3, generator=generator, dtype=torch.float64)
     alpha = torch.rand(height, width, generator=generator, dtype=torch.float64)
-    drawn = FeatureImage.of(features, alpha)
+    drawn = FeatureImage(features, alpha)
     expected = network(weights, drawn, GROUND)
     found = network.bounded(weights, drawn, GROUND, at_once)
     torch.testing.assert_close(found, expected, atol=1e-9, rtol=1e-9)
@@ -157,7 +157,7 @@ def peak_of_a_4k_image() -> int:
     weights = network.initial(torch.Generator().manual_seed(9), "cpu")
     features = torch.randn(540, 960, config.channels, generator=torch.Generator().manual_seed(10))
     before = status("VmRSS")
-    image = network.bounded(weights, FeatureImage.of(features, torch.ones(540, 960)), GROUND.float())
+    image = network.bounded(weights, FeatureImage(features, torch.ones(540, 960)), GROUND.float())
     assert image.shape == (2160, 3840, 3)
     assert torch.isfinite(image).all()
     assert 0 <= image.min() < image.max() <= 1
@@ -180,11 +180,11 @@ def test_a_residual_starts_as_the_splatted_colours(widths):
     alpha = torch.zeros(4, 5)
     planes = features[None, ..., :3].permute(0, 3, 1, 2)
     plain = torch.nn.Upsample(scale_factor=network.upscale, mode="bilinear")(planes)[0].permute(1, 2, 0)
-    drawn = FeatureImage.of(features, torch.ones(4, 5))
+    drawn = FeatureImage(features, torch.ones(4, 5))
     assert torch.equal(network(weights, drawn, GROUND.float()), plain)
     weights["sr.color_bias"] += 0.3
     alpha[:, 4] = 1
-    image = network(weights, FeatureImage.of(features, alpha), GROUND.float())
+    image = network(weights, FeatureImage(features, alpha), GROUND.float())
     empty, clear = (
         slice(first * network.upscale, last * network.upscale) for first, last in ((0, 2), (2, 3))
     )
