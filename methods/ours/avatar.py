@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ...bench.contracts import HeadPose
-from ..compact.file import COMPACT_FILE, read_compact
+from ..avatars.compact.file import COMPACT_FILE, read_compact
 from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
 from ..shared.avatar_kernel import HarmonicColors, WorldTransform
-from ..shared.binding import NORMAL
 from ..shared.rendering import USUAL, Cutoffs, LastPose, PlacedSplats, StoredSplatAvatar
 from ..shared.subject_mesh import KnownPoses, SubjectMesh
 from .appearance import driving_coefficients
@@ -31,15 +29,6 @@ from .field import (
 )
 from .inference import DrivenPose, LineOffsets, PlaneColors
 from .storage import FIELD_FILE, RESIDUAL, Field, read_field, splat_columns
-
-
-class SeenFrom(NamedTuple):
-    """Colours of one pose's splats as a function of where they are seen from."""
-
-    normals: Tensor
-    """(N, 3) unit vectors out of the surface, in the world."""
-    radiance: Callable[[Tensor], Tensor]
-    """Maps a unit vector (3,) from the splats to the camera, in the world, to colours (N, 3) >= 0."""
 
 
 class OursAvatar(StoredSplatAvatar):
@@ -117,19 +106,6 @@ class OursAvatar(StoredSplatAvatar):
         """
         self._known = KnownPoses(self._posed, int(megabytes * 2**20))
         return self._known.prepare(poses)
-
-    @torch.no_grad()
-    def seen_from(self, pose: HeadPose) -> SeenFrom:
-        """Colours of a pose by world direction."""
-        posed = self._known(pose)
-        splats = self._changed(posed)
-
-        @torch.no_grad()
-        def radiance(direction: Tensor) -> Tensor:
-            turned = torch.nn.functional.normalize(posed.turns @ direction.to(posed.turns), dim=1)
-            return changed_colors(self.colors.along(-turned.index_select(0, self._binding)), splats)
-
-        return SeenFrom(posed.frames.rotation[:, :, NORMAL].index_select(0, self._binding), radiance)
 
     @torch.no_grad()
     def static_logits(self) -> Tensor:
