@@ -29,7 +29,7 @@ from ..runner.config import ResolvedMethod, RunConfig, RunOptions, default_names
 from ..runner.run import describe, make_jobs, write_reports
 from ..runner.steps import DIGESTS, Job, measure, render
 from ..runner.store import Cell, RunFolder
-from ..runner.stored import avatar_digest, open_avatar
+from ..runner.stored import avatar_digest, open_avatar, shown_by
 from ..specs import Findings, MethodSpec
 from .background import check_background
 from .command import EvaluateSettings
@@ -74,7 +74,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
                 str(config.data), "", "the capture of the avatar's subject", f"{len(clips)} captures"
             )
         stored = open_avatar(source, settings.method)
-        shown = stored.shows_another(clips[0].subject, clips[0].head, clips[0].shape)
+        shown = stored.shows_another(*shown_by(clips[0]))
         if shown:
             expected = f"an avatar of {clips[0].subject}, whom the capture shows"
             raise InputError(stored.folder, "subject", expected, f"one of {shown}")

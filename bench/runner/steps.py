@@ -40,7 +40,7 @@ from .adaptation import AdaptedClip, TrainingView
 from .config import ResolvedMethod
 from .scoring import FULL, ScoredFrames, make_metric, score_frames
 from .store import Cell, RunFolder, StepState, avatar_files
-from .stored import VARIANT_MARK, write_avatar_record
+from .stored import VARIANT_MARK, shown_by, write_avatar_record
 
 log = logging.getLogger(__name__)
 RESULT_FORMAT = 1  # raise when a step changes what it leaves behind
@@ -200,9 +200,8 @@ def fit(job: Job) -> Avatar:
                 _train(job, method, report)
         seconds = time.perf_counter() - start
         clip, budget = job.form.clip, asdict(job.method.budget)
-        shown = clip.subject, clip.shape, clip.head.version
         origin = {"seed": job.seed, "budget": budget, "capture": clip.fingerprint}
-        write_avatar_record(job.cell.avatar, job.method, *shown, "training", origin)
+        write_avatar_record(job.cell.avatar, job.method, *shown_by(clip), "training", origin)
         job.cell.finish(
             "fit",
             job.fit_fingerprint,

@@ -12,7 +12,7 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from ..configuration import build
-from ..contracts import Avatar, Budget, FloatArray, HeadAsset
+from ..contracts import Avatar, Budget, Clip, FloatArray
 from ..errors import InputError
 from ..io.documents import checked, read_json
 from ..io.files import digest, digest_file, entries, write_json
@@ -96,6 +96,12 @@ def write_avatar_record(
     write_json(folder / AVATAR_FILE, record)
 
 
+def shown_by(clip: Clip) -> tuple[str, FloatArray, str]:
+    """Subject, its shape and the version of the head model, of the clip that an avatar is trained on."""
+    versions = (pose.head_model for pose in clip.poses.values())
+    return clip.subject, clip.shape, next(versions, "")
+
+
 def registered_name(method: ResolvedMethod) -> str:
     """Name of a method without what its settings or a variant add to it."""
     label = getattr(method.config, "label", "")
@@ -137,13 +143,13 @@ class StoredAvatar:
         """File of the head model beside the avatar, by its version: what `adaptation.plan` refits a capture to."""
         return {self.record["head_model"]: str(self.folder / HEAD_FILE)} if self.record["head_digest"] else {}
 
-    def shows_another(self, subject: str, head: HeadAsset, shape: FloatArray) -> str:
+    def shows_another(self, subject: str, shape: FloatArray, head_model: str) -> str:
         """The name of the subject that the avatar shows, if that is another than the one given; else "".
 
         Another subject has another name and another shape; shapes of two head models do not compare.
         """
         name, own = self.record["subject"], np.asarray(self.record["shape"])
-        if self.record["head_model"] == head.version and own.shape == np.shape(shape):
+        if self.record["head_model"] == head_model and own.shape == np.shape(shape):
             return name if np.abs(own - shape).max(initial=0.0) > SAME_SHAPE else ""
         return name if name != subject else ""
 

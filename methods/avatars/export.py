@@ -18,8 +18,8 @@ from ..splats import rasterize
 from .command import AvatarOptions, ExportOptions
 from .formats import FORMATS, StoredSplats
 from .harmonics import DEGREE, harmonics_of
+from .views import FIELD_OF_VIEW, direction_of, look
 from .web.bake import Source
-from .web.model import FIELD_OF_VIEW, look
 
 VIEWS = ((0.0, 0.0), (0.6, 0.0), (-0.6, 0.2))
 """Azimuth and elevation, radians, from which the loss is measured."""
@@ -79,7 +79,9 @@ def _least_psnr(avatar: SplatAvatar, pose: HeadPose, found: StoredSplats) -> flo
     distance = float((extent[1] - extent[0]).max()) / np.tan(np.radians(FIELD_OF_VIEW))
     worst = np.inf
     for azimuth, elevation in VIEWS:
-        camera = source.camera(look(azimuth, elevation, 1.5 * distance, extent.mean(axis=0), SIZE))
+        camera = source.camera(
+            look(direction_of(azimuth, elevation), 1.5 * distance, extent.mean(axis=0), SIZE)
+        )
         along = torch.nn.functional.normalize(found.means - torch.from_numpy(camera.center).float(), dim=1)
         harmonics = torch.cat([found.dc[:, :, None], found.rest], dim=2)
         colors = torch.relu(0.5 + (harmonics * sh_basis(along, DEGREE)[:, None]).sum(2))

@@ -9,14 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Camera, FloatArray, HarmonicAvatar, HeadPose, SplatAvatar
+from ...bench.contracts import HarmonicAvatar, HeadPose, SplatAvatar
 from ..shared.networks import coefficient_count, sh_basis
+from .views import camera_at, visibility
 
 DEGREE = 3
 FAR_M = 1e3
 """Distance from which all splats are seen along one direction."""
-BEHIND = 0.02
-"""Weight of directions from behind a splat's triangle, from which it is hardly seen and was hardly trained."""
+HIDDEN = 0.005
+"""Least weight of a direction, in parts of that from which a splat shows most: where it is hidden it was hardly trained."""
 BLOCK = 4096  # splats whose normal equations are solved at once
 
 
@@ -36,7 +37,7 @@ def harmonics_of(avatar: SplatAvatar, pose: HeadPose, directions: int) -> Harmon
     if isinstance(avatar, HarmonicAvatar):
         dc, rest = map(torch.from_numpy, avatar.harmonics(pose))
         return Harmonics(dc, rest, None)
-    splats = avatar.splats(pose)
+    splats, along = avatar.splats(pose), sphere(directions)
     middle = splats.means.mean(axis=0)
 
     def radiance(direction: Tensor) -> Tensor:
@@ -44,15 +45,7 @@ def harmonics_of(avatar: SplatAvatar, pose: HeadPose, directions: int) -> Harmon
         assert colors is not None  # the camera is given
         return torch.from_numpy(np.asarray(colors, np.float32))
 
-    normals = torch.nn.functional.normalize(torch.from_numpy(splats.means - middle), dim=1)
-    return fit_harmonics(radiance, normals, sphere(directions))
-
-
-def camera_at(place: FloatArray) -> Camera:
-    """A camera that is only asked where it is: at (3,) metres."""
-    motion = np.eye(4)
-    motion[:3, 3] = -np.asarray(place, np.float64)
-    return Camera("place", 8, 8, np.eye(3), motion)
+    return fit_harmonics(radiance, visibility(splats, along.numpy()), along)
 
 
 def sphere(count: int) -> Tensor:
@@ -88,13 +81,13 @@ def turn_harmonics(dc: Tensor, rest: Tensor, rotation: Tensor) -> tuple[Tensor, 
     return turned[:, :, 0].contiguous(), turned[:, :, 1:].contiguous()
 
 
-def fit_harmonics(radiance: Callable[[Tensor], Tensor], normals: Tensor, directions: Tensor) -> Harmonics:
+def fit_harmonics(radiance: Callable[[Tensor], Tensor], weights: Tensor, directions: Tensor) -> Harmonics:
     """Weighted least squares for each splat over (M, 3) directions from the splat to the camera.
 
     Parameters
     ----------
     radiance : maps one direction (3,) to the colours (N, 3) seen from there.
-    normals : (N, 3) unit vectors out of the surface; directions against them weigh `BEHIND`.
+    weights : (N, M) of the directions, see `visibility`; at least `HIDDEN` is taken.
     """
     # 3DGS looks harmonics up along the way from the camera to the splat.
     basis = sh_basis(-directions, DEGREE)
@@ -105,12 +98,12 @@ def fit_harmonics(radiance: Callable[[Tensor], Tensor], normals: Tensor, directi
     products = (basis[:, :, None] * basis[:, None, :]).flatten(1)
     for start in range(0, len(colors), BLOCK):
         rows = slice(start, start + BLOCK)
-        weights = torch.where(normals[rows] @ directions.t() > 0, 1.0, BEHIND)  # (n, M)
+        part = weights[rows].clamp_min(HIDDEN)  # (n, M)
         # The coefficients are of order 1, and the weights add up to tens: 1e-6 only guards the solver.
-        matrix = (weights @ products).view(-1, count, count) + 1e-6 * torch.eye(count)
-        right = torch.einsum("mk,nm,nmc->nkc", basis, weights, colors[rows])
+        matrix = (part @ products).view(-1, count, count) + 1e-6 * torch.eye(count)
+        right = torch.einsum("mk,nm,nmc->nkc", basis, part, colors[rows])
         coefficients[rows] = torch.linalg.solve(matrix, right)
         error = (torch.einsum("mk,nkc->nmc", basis, coefficients[rows]) - colors[rows]).square().mean(2)
-        residual[rows] = ((weights * error).sum(1) / weights.sum(1)).sqrt()
+        residual[rows] = ((part * error).sum(1) / part.sum(1)).sqrt()
     channels = coefficients.transpose(1, 2)
     return Harmonics(channels[:, :, 0].contiguous(), channels[:, :, 1:].contiguous(), residual)

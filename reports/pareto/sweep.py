@@ -17,7 +17,7 @@ from ...bench.runner.config import default_names, resolve_metrics
 from ...bench.runner.run import describe, load, trained
 from ...bench.runner.steps import Job, measure, render
 from ...bench.runner.store import RunFolder
-from ...bench.runner.stored import write_avatar_record
+from ...bench.runner.stored import shown_by, write_avatar_record
 from ...bench.specs import MetricSpec
 from .command import SweepSettings
 
@@ -92,8 +92,7 @@ def _measured(job: Job, base: Job, variant: Variant | None, metrics: Sequence[Me
     assert source is not None  # `trained` saw to it
     derived_from = digest(source["fingerprint"], source.get("files"))
     if variant is not None:
-        clip = job.form.clip
-        shown = clip.subject, clip.shape, clip.head.version
+        shown = shown_by(job.form.clip)
         change = {"variant": variant.name, "of": derived_from}
         write_avatar_record(job.cell.avatar, job.method, *shown, "variant", change)
     files = job.cell.digests(path for path in job.cell.avatar.rglob("*") if path.is_file())

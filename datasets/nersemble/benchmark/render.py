@@ -44,7 +44,7 @@ def render_participant(settings: SubmissionRenderSettings, progress: Progress) -
         found = f"{method.spec.name}, which works at another"
         raise InputError(folder / AVATAR_FILE, "resolution", expected, found, "Train it with another preset.")
     for name, sequence in sequences.items():
-        shown = stored.shows_another(settings.participant, head, sequence.shape)
+        shown = stored.shows_another(settings.participant, sequence.shape, head.version)
         if shown:
             log.warning(
                 "%s shows %s, with another shape than %s has in %s", folder, shown, settings.participant, name

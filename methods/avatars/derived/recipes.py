@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,10 +14,10 @@ from torch import Tensor
 from ....bench.contracts import Camera, Clip, HeadPose, SplatAvatar
 from ....bench.io.files import write_bytes
 from ...ours.field import PLANES
-from ...shared.rendering import USUAL, Cutoffs, view_of
+from ...shared.rendering import USUAL, Cutoffs
 from ...shared.schedule import evenly
 from ...shared.tensor_files import read_safetensors
-from ...splats import rasterize
+from ..views import contribution
 
 Storage = Literal["exact", "half", "8bit", "compact"]
 STORAGE_SUMMARIES: dict[Storage, str] = {
@@ -112,26 +112,9 @@ def training_views(clip: Clip, count: int = VIEWS) -> list[tuple[Camera, HeadPos
     return [(clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys]
 
 
-def contributions(avatar: SplatAvatar, views: Iterable[tuple[Camera, HeadPose]]) -> Tensor:
-    """(N,) blending weights of each splat, summed over all pixels of all views.
-
-    The weight of a splat in a pixel is its alpha times the transmittance in front of it; the sum over pixels is the
-    derivative of the sum of a one-channel image by the splat's colour. As importance for pruning: Fang and Wang,
-    "Mini-Splatting", ECCV 2024, section 4.
-    """
-    total: Tensor | None = None
-    for camera, pose in views:
-        posed, view = avatar.splats(pose), view_of(camera, "cpu")
-        geometry = posed.means, posed.quats, posed.scales, posed.opacities
-        means, quats, scales, opacities = map(torch.from_numpy, geometry)
-        colors = torch.ones(len(means), 1, requires_grad=True)
-        where = view.world_to_camera, view.K, camera.width, camera.height
-        image = rasterize(means, quats, scales, opacities, colors, *where).image
-        (weights,) = torch.autograd.grad(image.sum(), colors)
-        total = weights[:, 0] if total is None else total + weights[:, 0]
-    if total is None:
-        raise ValueError("views: expected one at least, found none")
-    return total
+def contributions(avatar: SplatAvatar, views: Sequence[tuple[Camera, HeadPose]]) -> Tensor:
+    """(N,) blending weights of each splat, summed over all pixels of all views; see `contribution`."""
+    return torch.stack([contribution(avatar.splats(pose), camera) for camera, pose in views]).sum(0)
 
 
 def most_contributing(weights: Tensor, fraction: float) -> Tensor:

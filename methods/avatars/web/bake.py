@@ -12,7 +12,8 @@ import torch
 from ....bench.contracts import Camera, FloatArray, HeadPose, Progress, SplatAvatar
 from ...shared.networks import sh_basis
 from ...splats.reference import rotation_matrices
-from ..harmonics import FAR_M, camera_at, fit_harmonics, sphere
+from ..harmonics import FAR_M, fit_harmonics, sphere
+from ..views import camera_at, direction_of, visibility
 from .model import JOINTS, Slider, WebAvatar, blended, joint_motions, rotation_of
 
 AWAY_M = 1.0
@@ -67,7 +68,7 @@ class Source:
     def camera(self, view: Camera) -> Camera:
         """A camera of the head's frame in the world of the pose at rest."""
         motion = np.eye(4)
-        rotation = self._rotation
+        rotation = self.rotation
         motion[:3, :3] = rotation.T
         motion[:3, 3] = self.root - rotation.T @ (self.root + np.asarray(self.rest.translation, np.float64))
         return replace(view, world_to_camera=view.world_to_camera @ motion)
@@ -75,7 +76,7 @@ class Source:
     def seen(self, pose: HeadPose, camera: Camera | None = None) -> Seen:
         """The splats of a pose, coloured as a camera of the head's frame sees them."""
         found = self.avatar.splats(pose, None if camera is None else self.camera(camera))
-        rotation = self._rotation
+        rotation = self.rotation
         means = (found.means - self.root - self.rest.translation) @ rotation + self.root
         quats = torch.from_numpy(np.asarray(found.quats, np.float64))
         opacities = np.asarray(found.opacities, np.float64).clip(1e-6, 1 - 1e-6)
@@ -88,7 +89,8 @@ class Source:
         )
 
     @property
-    def _rotation(self) -> FloatArray:
+    def rotation(self) -> FloatArray:
+        """(3, 3) from the head's frame to the world."""
         return rotation_of(np.asarray(self.rest.rotation, np.float64)[None])[0]
 
 
@@ -99,10 +101,10 @@ def bake(
     total = len(sliders) + 1
     rest = source.seen(source.rest)
     middle = rest.means.mean(axis=0)
-    few = [camera_at(middle + AWAY_M * _direction(*angles)) for angles in FEW_DIRECTIONS]
+    few = [camera_at(middle + AWAY_M * direction_of(*angles)) for angles in FEW_DIRECTIONS]
     colors = [_colors(source, source.rest, camera) for camera in few]
     weights = _weights(source, rest)
-    harmonics = _harmonics(source, rest, middle, degree, directions)
+    harmonics = _harmonics(source, middle, degree, directions)
     progress(1, total, "at rest")
     morphs: dict[str, list[FloatArray]] = {
         name: [] for name in ("means", "turns", "log_scales", "logits", "colors")
@@ -123,12 +125,6 @@ def bake(
         joints=source.joints,
         sliders=sliders,
         **arrays,
-    )
-
-
-def _direction(azimuth: float, elevation: float) -> FloatArray:
-    return np.array(
-        [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)]
     )
 
 
@@ -192,16 +188,16 @@ def vector_of(rotations: FloatArray) -> FloatArray:
     return np.asarray(sine * np.where(length > 1e-9, angle / np.maximum(length, 1e-9), 1.0)[:, None])
 
 
-def _harmonics(source: Source, rest: Seen, middle: FloatArray, degree: int, directions: int) -> FloatArray:
-    """(N, 3, K): least squares over directions from which the surface is seen; see `fit_harmonics`."""
-    outward = torch.from_numpy(rest.means - middle).float()
-    normals = torch.nn.functional.normalize(outward, dim=1)
+def _harmonics(source: Source, middle: FloatArray, degree: int, directions: int) -> FloatArray:
+    """(N, 3, K): least squares over directions, weighted by how much each splat shows; see `fit_harmonics`."""
 
     def radiance(direction: torch.Tensor) -> torch.Tensor:
         far = camera_at(middle + FAR_M * direction.numpy())
         return torch.from_numpy(_colors(source, source.rest, far)).float()
 
-    fit = fit_harmonics(radiance, normals, sphere(directions))
+    along = sphere(directions)
+    weights = visibility(source.avatar.splats(source.rest), along.double().numpy() @ source.rotation.T)
+    fit = fit_harmonics(radiance, weights, along)
     every = torch.cat([fit.dc[:, :, None], fit.rest], dim=2).double().numpy()
     return np.asarray(every[:, :, : (degree + 1) ** 2])
 
@@ -222,7 +218,7 @@ def _turned(
     values = [turn.high if slider == turn else 0.0 for slider in sliders]
     pose = source.pose(sliders, values)
     linear, _ = blended(weights, joint_motions(tuple(sliders), np.array(values), source.joints))
-    camera = camera_at(middle + FAR_M * _direction(0.0, 0.0))
+    camera = camera_at(middle + FAR_M * direction_of(0.0, 0.0))
     found = _colors(source, pose, camera)
     ahead = np.tile([0.0, 0.0, -1.0], (len(found), 1))
     errors = []

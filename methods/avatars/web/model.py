@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ....bench.contracts import Camera, FloatArray
+from ....bench.contracts import FloatArray
 from ...shared.networks import sh_basis
 
 JOINTS = ("neck", "jaw", "left eye", "right eye")
@@ -133,22 +133,3 @@ def rotation_of(vectors: FloatArray) -> FloatArray:
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
     sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
     return np.asarray(np.eye(3) + sine * cross + (1 - cosine) * cross @ cross)
-
-
-def look(azimuth: float, elevation: float, distance: float, target: FloatArray, size: int) -> Camera:
-    """A square view of a target from around it; angles in radians, 0 from the front, 30 degrees wide."""
-    ahead = -np.array(
-        [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)]
-    )
-    right = np.cross(ahead, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    motion = np.eye(4)
-    motion[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
-    motion[:3, 3] = -motion[:3, :3] @ (target - distance * ahead)
-    focal = size / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
-    K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
-    return Camera("page", size, size, K, motion)
-
-
-FIELD_OF_VIEW = 30.0
-"""Of the page's camera, degrees."""

@@ -44,15 +44,11 @@ def test_an_avatar_is_loaded_from_its_cell_or_from_anywhere(cell, folder):
 def test_what_it_shows_is_told_from_other_subjects(folder):
     stored = open_avatar(folder)
     shape = np.array(stored.record["shape"])
-
-    class Head:
-        version = stored.record["head_model"]
-
-    assert stored.shows_another("902", Head, shape) == ""  # the same shape by another name
-    assert stored.shows_another("901", Head, shape + 0.1) == "901"
-    Head.version = "another model"
-    assert stored.shows_another("901", Head, shape + 0.1) == ""
-    assert stored.shows_another("902", Head, shape) == "901"
+    model = stored.record["head_model"]
+    assert stored.shows_another("902", shape, model) == ""  # the same shape by another name
+    assert stored.shows_another("901", shape + 0.1, model) == "901"
+    assert stored.shows_another("901", shape + 0.1, "another model") == ""
+    assert stored.shows_another("902", shape, "another model") == "901"
 
 
 @pytest.mark.parametrize(

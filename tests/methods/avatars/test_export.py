@@ -16,7 +16,8 @@ from headbench.datasets.ga import reader
 from headbench.datasets.ga.reader import read_capture
 from headbench.methods.avatars.command import ExportPlySettings, export_ply
 from headbench.methods.avatars.export import neutral_pose
-from headbench.methods.avatars.harmonics import BEHIND, fit_harmonics, sphere
+from headbench.methods.avatars.harmonics import HIDDEN, fit_harmonics, sphere
+from headbench.methods.avatars.views import visibility
 from headbench.methods.avatars.web.command import ExportHtmlSettings, export_html
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
@@ -24,7 +25,7 @@ from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.method import GBS
 from headbench.methods.ours.avatar import OursAvatar
 from headbench.methods.shared.networks import sh_basis
-from headbench.methods.shared.rendering import view_of
+from headbench.methods.shared.rendering import PosedSplats, view_of
 from headbench.methods.splats import rasterize
 from headbench.methods.trivial.method import NearestCamera
 
@@ -171,8 +172,7 @@ def test_colours_that_are_harmonics_are_found_exactly():
         parts = np.stack([np.real(values), np.imag(values)], axis=1)
         return torch.from_numpy(0.5 + (weights * parts).sum((2, 3))).float()
 
-    normals = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(5, 3))).float(), dim=1)
-    fit = fit_harmonics(radiance, normals, directions)
+    fit = fit_harmonics(radiance, torch.from_numpy(rng.uniform(size=(5, 128))).float(), directions)
     assert fit.residual.max() < 1e-4
     unseen = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(20, 3))).float(), dim=1)
     basis = sh_basis(-unseen, 3)
@@ -181,19 +181,34 @@ def test_colours_that_are_harmonics_are_found_exactly():
     np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
-def test_directions_from_behind_hardly_count():
+def test_a_splat_behind_a_wall_shows_from_behind_alone():
+    """A wall of opaque splats at z = 0, and one splat behind it."""
+    wall = np.array([[x, y, 0.0] for x in np.linspace(-1, 1, 21) for y in np.linspace(-1, 1, 21)])
+    means = np.concatenate([wall, [[0.0, 0.0, -0.2]]]).astype(np.float32)
+    count = len(means)
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
+    splats = PosedSplats(
+        means, quats, np.full((count, 3), 0.06, np.float32), np.full(count, 0.99, np.float32), None
+    )
     directions = sphere(200)
-    normals = torch.tensor([[0.0, 0.0, 1.0]])
+    shown = visibility(splats, directions.numpy())[-1]
+    assert shown[directions[:, 2] > 0.8].max() < 0.05
+    assert shown[directions[:, 2] < -0.8].min() > 0.5
+
+
+def test_directions_of_no_weight_hardly_count():
+    directions = sphere(200)
 
     def radiance(direction):
         return torch.full((1, 3), 0.7 if direction[2] > 0 else 0.1)
 
-    fit = fit_harmonics(radiance, normals, directions)
-    front = 0.5 + sh_basis(-normals, 3) @ torch.cat([fit.dc[:, :, None], fit.rest], dim=2)[0].t()
+    fit = fit_harmonics(radiance, (directions[:, 2] > 0).float()[None], directions)
+    seen = sh_basis(torch.tensor([[0.0, 0.0, -1.0]]), 3)
+    front = 0.5 + seen @ torch.cat([fit.dc[:, :, None], fit.rest], dim=2)[0].t()
     assert abs(float(front[0, 0]) - 0.7) < 0.03
-    even = fit_harmonics(radiance, torch.zeros(1, 3), directions)  # none is in front: all weigh the same
+    even = fit_harmonics(radiance, torch.ones(1, 200), directions)
     assert fit.residual[0] < 0.6 * even.residual[0]
-    assert BEHIND < 0.1
+    assert HIDDEN < 0.1
 
 
 def test_too_few_directions_are_refused():
