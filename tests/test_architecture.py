@@ -206,18 +206,10 @@ def test_names_of_tests_have_at_most_60_characters():
     assert [key for key, count in seen.items() if count > 1] == []
 
 
-TWICE = {
-    "SplatAvatar",
-    "SubjectPlan",
-    "SynthSettings",
-}
-"""Names of two classes that are still to be told apart."""
-
-
 def test_public_classes_have_names_of_their_own():
     homes: dict[str, list[str]] = {}
     for path in SOURCES:
         for name in re.findall(r"^class ([A-Z]\w*)", path.read_text(), re.MULTILINE):
             homes.setdefault(name, []).append(str(path))
     assert len(homes) > 500
-    assert {name: paths for name, paths in homes.items() if len(paths) > 1 and name not in TWICE} == {}
+    assert {name: paths for name, paths in homes.items() if len(paths) > 1} == {}

@@ -19,7 +19,7 @@ from ..options import CaptureOptions
 from .names import SUBJECT_NAMES, chosen_subjects
 
 if TYPE_CHECKING:
-    from .plan import SubjectPlan
+    from .plan import PreparationPlan
     from .prepare import SubjectResult
 
 
@@ -150,7 +150,7 @@ def _check_named(settings: PrepareSettings, subjects: list[str]) -> None:
     raise InputError(settings.root, "--subjects", expected, ", ".join(known), remedy)
 
 
-def _table(plans: list[SubjectPlan]) -> list[str]:
+def _table(plans: list[PreparationPlan]) -> list[str]:
     lines = [f"{'subject':8} {'sequence':34} {'timesteps':>9} {'cameras':>7}  masks  colour  tracking"]
     for plan in plans:
         for job in plan.jobs:
@@ -163,13 +163,13 @@ def _table(plans: list[SubjectPlan]) -> list[str]:
     return lines
 
 
-def _checked(plans: list[SubjectPlan]) -> Findings:
+def _checked(plans: list[PreparationPlan]) -> Findings:
     images = sum(job.count * len(job.cameras) for plan in plans for job in plan.jobs)
     text = "\n".join([*_table(plans), "", f"All there: {images} images to make."])
     return Findings(text, {"images": images, "subjects": [plan.subject for plan in plans]})
 
 
-def _done(results: list[SubjectResult], plans: list[SubjectPlan], settings: PrepareSettings) -> Findings:
+def _done(results: list[SubjectResult], plans: list[PreparationPlan], settings: PrepareSettings) -> Findings:
     """Passed unless parameters were asked for and are missing."""
     lines = _table(plans)
     for plan, result in zip(plans, results, strict=True):

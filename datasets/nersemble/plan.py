@@ -94,7 +94,7 @@ class SequenceJob:
 
 
 @dataclass(frozen=True, eq=False)
-class SubjectPlan:
+class PreparationPlan:
     """One subject to prepare: its sequences, those held out among them, and its head model if there is one."""
 
     subject: str
@@ -115,7 +115,7 @@ class SubjectPlan:
         )
 
 
-def plan_subject(settings: PrepareSettings, subject: str) -> SubjectPlan:
+def plan_subject(settings: PrepareSettings, subject: str) -> PreparationPlan:
     """Read everything about one subject but its pixels. Raises `InputError` for the first fault."""
     one = participant(Path(settings.root), subject)
     out = Path(os.path.abspath(settings.out))
@@ -163,7 +163,7 @@ def plan_subject(settings: PrepareSettings, subject: str) -> SubjectPlan:
         )
     label = f"v{len(jobs[0].cameras)}_DS{settings.downscale}"
     union = out / f"UNION{len(jobs)}_{subject}_{label}_{settings.split}-test"
-    return SubjectPlan(subject, jobs, test, head, version, union)
+    return PreparationPlan(subject, jobs, test, head, version, union)
 
 
 def _head_version(settings: PrepareSettings, head: HeadArrays | None) -> str:

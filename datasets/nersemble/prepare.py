@@ -26,7 +26,7 @@ from ..ga.writer import camera_record, file_record, save_npz, transforms_documen
 from ..head.arrays import save_head
 from .frames import file_names, write_images, writing
 from .names import NOVEL_VIEW_CAMERA
-from .plan import CY, SequenceJob, SubjectPlan
+from .plan import CY, PreparationPlan, SequenceJob
 from .tracking import TrackedSequence
 
 RECORD_FILE = "headbench-prepare.json"
@@ -69,7 +69,7 @@ class SubjectResult:
 
 
 def prepare(
-    plans: Sequence[SubjectPlan], *, workers: int = 0, progress: Progress = no_progress
+    plans: Sequence[PreparationPlan], *, workers: int = 0, progress: Progress = no_progress
 ) -> list[SubjectResult]:
     """Prepare subjects. Raises `InputError` before the first image where a folder holds something else, and in
     mid-run for videos that end early and for a full disk; another call then continues."""
@@ -81,7 +81,7 @@ def prepare(
         return _prepare(plans, workers, progress)
 
 
-def _prepare(plans: Sequence[SubjectPlan], workers: int, progress: Progress) -> list[SubjectResult]:
+def _prepare(plans: Sequence[PreparationPlan], workers: int, progress: Progress) -> list[SubjectResult]:
     states = {job.folder: _checked_state(job) for plan in plans for job in plan.jobs}
     jobs = [job for plan in plans for job in plan.jobs]
     open_jobs = [job for job in jobs if not _has_all_images(job, states[job.folder])]
@@ -168,7 +168,7 @@ def _count_images(job: SequenceJob) -> int:
     return len(wanted & file_names(job.folder / "images"))
 
 
-def _write_metadata(plan: SubjectPlan, job: SequenceJob, state: SequenceState) -> None:
+def _write_metadata(plan: PreparationPlan, job: SequenceJob, state: SequenceState) -> None:
     """Write a sequence's JSONs and parameters, unless they are there already.
 
     A call without tracking leaves the parameters that an earlier call wrote.
@@ -234,7 +234,7 @@ def _is_readable(job: SequenceJob) -> bool:
     return all((job.folder / name).exists() for name in _READABLE)
 
 
-def _write_union(plan: SubjectPlan) -> dict[str, int]:
+def _write_union(plan: PreparationPlan) -> dict[str, int]:
     """Write the union where every sequence is tracked, unless it is there; frames per split."""
     if not all(_is_readable(job) for job in plan.jobs):
         return {}
@@ -259,7 +259,7 @@ def _write_union(plan: SubjectPlan) -> dict[str, int]:
     return frames
 
 
-def _missing(plan: SubjectPlan) -> tuple[str, ...]:
+def _missing(plan: PreparationPlan) -> tuple[str, ...]:
     """What the capture lacks, one sentence each."""
     untracked = [job.recorded.name for job in plan.jobs if not _is_readable(job)]
     unmasked = [job.recorded.name for job in plan.jobs if not job.recorded.has_masks]

@@ -34,7 +34,7 @@ from ...bench.start import end_with_parent, starting_workers
 from ..images import is_whole
 from .panels import KERNEL, default_samples, sample_count
 from .performance import KINDS, Kind, share_out
-from .plan import SERIALS, SubjectPlan, SynthSettings, load_geometry, plan_subject
+from .plan import SERIALS, SubjectPlan, SyntheticSettings, load_geometry, plan_subject
 from .renderer import CaptureRenderer
 
 MANIFEST, MARK = "synthesis.json", "provenance.xmp"
@@ -102,7 +102,7 @@ def synthesize(
     """
     samples = default_samples(*size) if samples_per_pixel is None else sample_count(samples_per_pixel)
     pixels = (size[0], size[1])
-    settings = SynthSettings(
+    settings = SyntheticSettings(
         subjects,
         cameras,
         timesteps,
@@ -180,7 +180,7 @@ _renderer: list[CaptureRenderer] = []
 """This process's own, in a worker: spawned processes cannot be handed one."""
 
 
-def _begin(out: Path, index: int, settings: SynthSettings) -> None:
+def _begin(out: Path, index: int, settings: SyntheticSettings) -> None:
     end_with_parent()
     torch.set_num_threads(1)  # the processes share the cores already
     threadpool_limits(1)
@@ -219,7 +219,7 @@ def _work_off(out: Path, plans: Sequence[SubjectPlan], execution: Execution) -> 
 def render_subject(task: Task, report: Callable[[str], None]) -> None:
     """Render what is missing of a subject, as an executor's task, with the threads that it was given."""
     given = task.arguments
-    settings = SynthSettings(**{**given["settings"], "size": tuple(given["settings"]["size"])})
+    settings = SyntheticSettings(**{**given["settings"], "size": tuple(given["settings"]["size"])})
     out = Path(given["out"])
     plan = plan_subject(out, given["index"], load_geometry(settings.head), settings)
     work = _left(plan)
@@ -250,7 +250,7 @@ def _missing(plan: SubjectPlan, sequence: str, timestep: int) -> tuple[str, ...]
     return tuple(camera for camera in plan.cameras if not whole(camera))
 
 
-def _check(settings: SynthSettings) -> None:
+def _check(settings: SyntheticSettings) -> None:
     size, noise, most = settings.size, settings.tracking_noise, len(SERIALS)
     error = settings.tracking_error
     count, kinds = settings.cameras, ", ".join(KINDS)
@@ -269,7 +269,7 @@ def _check(settings: SynthSettings) -> None:
     share_out(settings.timesteps, settings.performance)
 
 
-def _manifest(settings: SynthSettings, head: str) -> dict[str, Any]:
+def _manifest(settings: SyntheticSettings, head: str) -> dict[str, Any]:
     """What a folder holds that is of these settings and of a head of this fingerprint."""
     return {
         "version": _VERSION,

@@ -50,7 +50,7 @@ EDITION = 2
 
 
 @dataclass(frozen=True)
-class SynthSettings:
+class SyntheticSettings:
     """What decides a synthetic capture's content. ``size`` is (width, height)."""
 
     subjects: int
@@ -87,7 +87,7 @@ class SubjectPlan:
     performed: Mapping[str, Performed]
     poses: Mapping[str, tuple[HeadPose, ...]]
     writer: CaptureWriter
-    settings: SynthSettings
+    settings: SyntheticSettings
 
     def moments(self) -> Iterator[tuple[str, int]]:
         """(sequence, timestep) of everything to render."""
@@ -100,7 +100,7 @@ class SubjectPlan:
         return int(digest(self.settings.seed, self.person.name, sequence, timestep, camera)[:7], 16)
 
 
-def plan_subject(out: Path, index: int, geometry: Geometry, settings: SynthSettings) -> SubjectPlan:
+def plan_subject(out: Path, index: int, geometry: Geometry, settings: SyntheticSettings) -> SubjectPlan:
     """Plan subject number ``index``: nothing is rendered or written."""
     name = f"{FIRST_SUBJECT + index}"
     who = draw_person(name, index, settings.seed, settings.dynamics)

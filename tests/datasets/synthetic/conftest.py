@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull
 from headbench.datasets.synthetic.history import over_time
 from headbench.datasets.synthetic.panels import default_samples
 from headbench.datasets.synthetic.performance import CONTROLS
-from headbench.datasets.synthetic.plan import SynthSettings, load_geometry, plan_subject
+from headbench.datasets.synthetic.plan import SyntheticSettings, load_geometry, plan_subject
 from headbench.datasets.synthetic.subject import RenderedSubject
 
 
@@ -20,7 +20,7 @@ def geometry():
 
 @pytest.fixture(scope="session")
 def plan(geometry, tmp_path_factory):
-    settings = SynthSettings(1, 3, 8, (48, 70), "procedural", 0, 0.0, default_samples(48, 70))
+    settings = SyntheticSettings(1, 3, 8, (48, 70), "procedural", 0, 0.0, default_samples(48, 70))
     return plan_subject(Path(tmp_path_factory.mktemp("plan")), 0, geometry, settings)
 
 

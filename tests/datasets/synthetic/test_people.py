@@ -13,7 +13,7 @@ from headbench.datasets.synthetic.anatomy import linear
 from headbench.datasets.synthetic.hair import STYLES
 from headbench.datasets.synthetic.history import coupled_strengths, over_time
 from headbench.datasets.synthetic.people import draw_person
-from headbench.datasets.synthetic.plan import SynthSettings, plan_subject
+from headbench.datasets.synthetic.plan import SyntheticSettings, plan_subject
 from headbench.datasets.synthetic.skin import FLUSHES, FOLDS
 from headbench.datasets.synthetic.subject import RenderedSubject
 
@@ -39,7 +39,7 @@ def test_ten_subjects_are_of_all_kinds(seed):
 @pytest.fixture(scope="module")
 def bearded(geometry):
     """A subject with everything that there is."""
-    settings = SynthSettings(1, 2, 8, (48, 70), "procedural", 0, 0.0, 16)
+    settings = SyntheticSettings(1, 2, 8, (48, 70), "procedural", 0, 0.0, 16)
     plan = plan_subject(Path("unused"), 0, geometry, settings)
     return replace(plan, person=replace(plan.person, beard=0.015, glasses="plastic", sag=1.0))
 

@@ -9,7 +9,7 @@ from skimage.data import lbp_frontal_face_cascade_filename
 from skimage.draw import polygon2mask
 from skimage.feature import Cascade
 
-from headbench.datasets.synthetic.plan import FRONTAL, SynthSettings, plan_subject
+from headbench.datasets.synthetic.plan import FRONTAL, SyntheticSettings, plan_subject
 from headbench.datasets.synthetic.renderer import CaptureRenderer
 
 from .conftest import settled
@@ -52,7 +52,7 @@ def test_mask_is_clean(renderer, plan):
     [((72, 104), 0, "curly"), ((69, 100), 7, "long")],
 )
 def test_every_camera_holds_the_whole_head_with_a_margin(geometry, rest, size, index, style):
-    settings = SynthSettings(8, 16, 8, size, "procedural", 0, 0.0, 9)
+    settings = SyntheticSettings(8, 16, 8, size, "procedural", 0, 0.0, 9)
     plan = plan_subject(Path("unused"), index, geometry, settings)
     assert plan.person.style == style
     renderer = CaptureRenderer(plan)
@@ -116,7 +116,7 @@ def test_a_detector_finds_the_face(geometry):
     detector = Cascade(lbp_frontal_face_cascade_filename())
     found = []
     for index in range(10):
-        settings = SynthSettings(10, 2, 8, (275, 401), "procedural", 4700, 0.0, 9)
+        settings = SyntheticSettings(10, 2, 8, (275, 401), "procedural", 4700, 0.0, 9)
         plan = plan_subject(Path("unused"), index, geometry, settings)
         renderer = CaptureRenderer(plan)
         every = list(plan.moments())
