@@ -15,7 +15,6 @@ from headbench.bench import cli
 from headbench.bench.contracts import Budget
 from headbench.bench.errors import ExitCode, HeadbenchError, InputError
 from headbench.bench.runner import run as runner
-from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.reports.curve import curve as module
@@ -24,6 +23,7 @@ from headbench.reports.curve.held_out import hold_out
 from headbench.reports.curve.points import MEASURED, half_width
 
 from ...datasets.tiny_capture import write_tiny_capture
+from ...small_run import run_on
 
 TESTS = Path(__file__).parents[1]
 HELD_TIMESTEP, HELD_CAMERA = 2, "1"  # of timesteps 0 to 3, and of cameras at -60, -30, 30 and 60 degrees
@@ -49,18 +49,8 @@ def make_run(plugin, tmp_path):
     """A finished run of methods on one ball or more."""
 
     def make(*methods, subjects=("ball-a",)):
-        for subject in subjects:
-            (tmp_path / "data" / subject).mkdir(parents=True)
-        runner.run(
-            RunConfig(
-                data=str(tmp_path / "data"),
-                out=str(tmp_path / "run"),
-                methods=methods,
-                metrics=("psnr",),
-                reader="ball_plugin:READER",
-                preset="smoke",
-            )
-        )
+        how = {"subjects": subjects, "reader": "ball_plugin:READER"}
+        run_on(tmp_path / "data", tmp_path / "run", *methods, **how)
         plugin.FITS.clear()
         plugin.RENDERED.clear()
         return tmp_path / "run"
@@ -134,14 +124,7 @@ def test_tracking_error_changes_poses_alone(plugin, tmp_path):
     capture = tmp_path / "capture"
     synthesize(capture, cameras=4, timesteps=24, size=(16, 16), samples_per_pixel=4, workers=1)
     (union,) = capture.glob("UNION*")
-    config = RunConfig(
-        data=str(union),
-        out=str(tmp_path / "run"),
-        methods=("curve_plugin:METHOD",),
-        preset="smoke",
-        metrics=("psnr",),
-    )
-    runner.run(config)
+    run_on(union, tmp_path / "run", "curve_plugin:METHOD")
     plugin.FITS.clear()
     plugin.POSES.clear()
     findings = curve_run(settings(tmp_path / "run", over="tracking_error", levels=(0.0, 2.0), frames=2))
@@ -320,16 +303,8 @@ def tiny_run(plugin, tmp_path):
     capture = write_tiny_capture(tmp_path / "data")
 
     def make(*methods):
-        config = RunConfig(
-            data=str(capture.union),
-            out=str(tmp_path / "run"),
-            methods=methods,
-            preset="smoke",
-            metrics=("psnr",),
-            frames_per_task=1,
-        )
-        runner.run(config)
-        return tmp_path / "run"
+        how = {"frames_per_task": 1, "settings": {}}
+        return run_on(capture.union, tmp_path / "run", *methods, **how).root
 
     return make
 
