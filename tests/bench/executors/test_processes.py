@@ -40,14 +40,13 @@ def cell_of(config, subject, method):
     return RunFolder(Path(config.out)).cell(subject, method, 0).folder
 
 
-@pytest.mark.parametrize("workers", [None, 2])
-def test_a_device_that_is_not_there_fails_each_task(tmp_path, workers):
+def test_a_device_that_is_not_there_fails_each_task(tmp_path):
     tasks = [
         replace(Task.of(tmp_path, place, "math:sqrt"), device="xpu", restarts=0) for place in ("one", "two")
     ]
     for task in tasks:
         task.folder.mkdir()
-    schedule = Schedule("tasks", lambda task: True, Execution("processes", workers=workers))
+    schedule = Schedule("tasks", lambda task: True, Execution("processes"))
     failures = schedule.work_off(tasks)
     assert set(failures) == {"one", "two"}
     for task in tasks:
