@@ -1,7 +1,9 @@
-"""A run on a tiny capture in which methods are trained for a few iterations, for tests of what is done with avatars."""
+"""Runs small enough for tests: on toy plug-ins, and of methods trained for a few iterations on a tiny capture."""
 
 from pathlib import Path
+from typing import Any
 
+import pandas as pd
 import pytest
 
 from headbench.bench.runner import run as runner
@@ -13,19 +15,27 @@ from .datasets.tiny_capture import make_plan, write_tiny_capture
 from .fuzz.samples import SETTINGS
 
 
-def small_run(folder: Path, *methods: str) -> RunFolder:
-    """The run, beside its capture ``data``; it writes no reports."""
-    capture = write_tiny_capture(folder / "data", make_plan(head=toy_head(16, version="procedural2020")))
+def run_on(data: Path, out: Path, *methods: str, subjects: tuple[str, ...] = (), **changes: Any) -> RunFolder:
+    """A finished run of ``methods`` at the preset smoke, measured by PSNR unless ``changes`` says otherwise.
+
+    It writes no reports. ``subjects`` are folders to be made in ``data``, which readers of toy plug-ins take for captures.
+    """
+    for subject in subjects:
+        (data / subject).mkdir(parents=True, exist_ok=True)
+    settings = {name: SETTINGS[name] for name in methods if name in SETTINGS}
+    chosen = {"preset": "smoke", "metrics": ("psnr",), "settings": settings, **changes}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "write_reports", lambda out: [])
-        runner.run(
-            RunConfig(
-                data=str(capture.union),
-                out=str(folder / "out"),
-                methods=methods,
-                preset="smoke",
-                metrics=("psnr",),
-                settings={name: SETTINGS[name] for name in methods if name in SETTINGS},
-            )
-        )
-    return RunFolder(folder / "out")
+        runner.run(RunConfig(data=str(data), out=str(out), methods=methods, **chosen))
+    return RunFolder(out)
+
+
+def rows_of(run: RunFolder) -> pd.DataFrame:
+    """All rows of a run."""
+    return pd.read_parquet(run.rows)
+
+
+def small_run(folder: Path, *methods: str) -> RunFolder:
+    """A run of methods, each trained for two iterations, beside its capture ``data``."""
+    capture = write_tiny_capture(folder / "data", make_plan(head=toy_head(16, version="procedural2020")))
+    return run_on(capture.union, folder / "out", *methods)

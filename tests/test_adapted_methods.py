@@ -4,17 +4,14 @@ import dataclasses
 import sys
 from types import ModuleType
 
-import pandas as pd
 import pytest
 
 from headbench.bench.io.images import read_png
-from headbench.bench.runner import run as runner
-from headbench.bench.runner.config import RunConfig
-from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import ResolutionRule
 from headbench.methods.trivial.spec import MEAN_IMAGE
 
 from .datasets.tiny_capture import write_tiny_capture
+from .small_run import rows_of, run_on
 
 SQUARE = ResolutionRule(square="pad", size=(128, 128))
 FORMS = {
@@ -34,18 +31,9 @@ def run(tmp_path_factory):
         setattr(module, name, dataclasses.replace(MEAN_IMAGE, **form))
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, module.__name__, module)
-        patch.setattr(runner, "write_reports", lambda out: [])
-        runner.run(
-            RunConfig(
-                data=str(capture.union),
-                out=str(folder / "out"),
-                methods=("mean-image", *(f"{module.__name__}:{name}" for name in FORMS)),
-                preset="smoke",
-                metrics=("psnr",),
-            )
-        )
-    run = RunFolder(folder / "out")
-    return run, pd.read_parquet(run.rows)
+        forms = (f"{module.__name__}:{name}" for name in FORMS)
+        run = run_on(capture.union, folder / "out", "mean-image", *forms)
+    return run, rows_of(run)
 
 
 def values(rows, method):

@@ -161,25 +161,6 @@ IMPORTED_IN_FUNCTIONS = {"nlopt", "pycolmap", "pymeshlab"}
 """Packages that only few commands use, each slow to import; not by any module, but by the functions that use them."""
 
 
-def test_specs_and_commands_are_light_to_import():
-    import subprocess
-    import sys
-
-    code = (
-        "import sys\n"
-        "from headbench.bench.registry import discover\n"
-        "for group in ('methods', 'datasets', 'metrics', 'reports', 'benchmarks', 'commands'):\n"
-        "    broken = {n: p.error for n, p in discover(group).items() if p.error}\n"
-        "    assert not broken, broken\n"
-        "from headbench.bench.cli import main\n"
-        "assert main(['--help']) == 0\n"
-        "slow = {'cv2', 'matplotlib', 'pandas', 'pyarrow', 'scipy', 'sklearn', 'torch'}\n"
-        f"heavy = (slow | {IMPORTED_IN_FUNCTIONS}) & set(sys.modules)\n"
-        "assert not heavy, heavy\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
-
-
 def test_packages_of_few_uses_are_imported_in_functions():
     found = []
     for path in SOURCES:

@@ -3,6 +3,7 @@
 Then every command that the command line lists, over the folder of that run and from another directory.
 """
 
+import io
 import json
 import random
 import re
@@ -10,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from functools import partial
 from pathlib import Path
 
@@ -24,6 +25,8 @@ from headbench.bench.registry import SPEC_TYPES, discover
 from headbench.bench.runner.config import RunConfig, resolve_metrics
 from headbench.bench.runner.store import RunFolder
 from headbench.metrics import speed
+
+from .datasets.flat_renderer import flat_pictures
 
 TINY = ("--preset", "smoke", "--set", "frames_per_task=3")
 METHODS = {"mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours"}
@@ -47,14 +50,19 @@ def few_timed_frames():
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """The folder of one small comparison from nothing, its paths given from a directory that is left afterwards."""
+def demo(tmp_path_factory):
+    """One small comparison from nothing, its paths given from a directory that is left afterwards: its folder, what it prints."""
     home = tmp_path_factory.mktemp("home")
-    (home / "board").mkdir()  # for bundles
-    with pytest.MonkeyPatch.context() as patch:
+    printed = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(printed):
         patch.chdir(home)
-        assert cli.main(["demo", "--out", "demo", *TINY]) == 0
-    return RunFolder(home / "demo")
+        assert cli.main(["demo", "--out", "demo", *TINY, "--json"]) == 0
+    return RunFolder(home / "demo"), printed.getvalue()
+
+
+@pytest.fixture(scope="module")
+def run(demo):
+    return demo[0]
 
 
 def quality(folder: RunFolder):
@@ -118,10 +126,8 @@ def test_the_manifest_lets_one_repeat_it(run):
         assert not set(protocol.keys) & {key for key, _ in protocol.excluded}
 
 
-def test_the_result_is_there_for_machines(run, capsys, monkeypatch):
-    monkeypatch.chdir(run.root.parent)
-    assert cli.main(["demo", "--out", run.root.name, *TINY, "--json"]) == 0
-    means = json.loads(capsys.readouterr().out)["means"]
+def test_the_result_is_there_for_machines(demo):
+    means = json.loads(demo[1])["means"]
     assert {entry["method"] for entry in means} == METHODS
 
 
@@ -174,7 +180,7 @@ EVERY_METHOD = "(?s)ga .*gbs .*gha .*insta .*ours "
 
 # In the order in which they run: some need what an earlier one left.
 CASES = {
-    "demo": [],  # the run of this module, and `test_the_result_is_there_for_machines`
+    "demo": [],  # the run of this module
     "synth": [case(OTHERS, "others", "others/synthesis.json")],
     "run": [case(PLAIN, r"\| nearest-camera", "plain/rows.parquet", "plain/tables/comparison.md")],
     "speed": [case("speed {demo} --methods mean-image", "speed measured again, avatars: 1")],
@@ -366,7 +372,8 @@ def test_the_command_works_from_another_directory(command, run, elsewhere, monke
     (union,) = (run.root / "capture").glob("UNION*")
     places = {"demo": run.root, "capture": union, "subject": union.name.rpartition("_")[2]}
     for words, prints, leaves in CASES[command]:
-        code = cli.main(words.format(**places).split())
+        with flat_pictures() if command in ("suite", "synth") else nullcontext():
+            code = cli.main(words.format(**places).split())
         printed = capsys.readouterr()
         assert code == 0, printed.err
         assert re.search(prints, printed.out), printed.out

@@ -60,6 +60,7 @@ def files(tmp_path_factory):
 
 
 GIVEN = "--head flame/flame2023.pkl --cy bottom"
+INSPECT = ["inspect", "capture", "--timesteps", "1", "--cameras", "1"]
 PREPARE = (
     "prepare nersemble --root recording/recording --tracking recording/tracking --head flame/flame2023.pkl "
     "--subjects 901"
@@ -108,7 +109,7 @@ def test_what_is_missing_beside_the_pickle_is_said(
     shutil.copytree(files / "flame", tmp_path / "flame")
     for name in left_out:
         (tmp_path / "flame" / name).unlink()
-    words = ["inspect", "capture", "--head", str(tmp_path / "flame" / "flame2023.pkl"), "--cy", "bottom"]
+    words = [*INSPECT, "--head", str(tmp_path / "flame" / "flame2023.pkl"), "--cy", "bottom"]
     assert cli.main([*words, "--out", str(tmp_path / "out")]) == code
     err = capsys.readouterr().err
     assert said in err if said else "eyelids" not in err
@@ -117,7 +118,7 @@ def test_what_is_missing_beside_the_pickle_is_said(
 def test_teeth_are_as_asked_for(files, tmp_path, monkeypatch):
     monkeypatch.chdir(files)
     for teeth, code in (("add", 0), ("auto", 0), ("keep", 0)):
-        words = f"inspect capture {GIVEN} --set teeth={teeth} --out {tmp_path / teeth}".split()
-        assert cli.main(words) == code
+        words = f"{GIVEN} --set teeth={teeth} --out {tmp_path / teeth}".split()
+        assert cli.main([*INSPECT, *words]) == code
         seen = json.loads((tmp_path / teeth / "inspection.json").read_text())
         assert seen["vertices"] == len(stand_in().template) + (0 if teeth == "keep" else 120)

@@ -3,20 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 
-from headbench.bench.runner import run as runner
 from headbench.bench.runner.captures import reader_of
-from headbench.bench.runner.config import RunConfig
-from headbench.bench.runner.store import RunFolder
 from headbench.datasets.ga.reader import read_capture
 from headbench.reports.table_report import table_text
 
 from .datasets.head.toy import toy_head
 from .datasets.monocular.videos import Recording, write_imavatar, write_insta
 from .datasets.tiny_capture import FRONTAL, make_plan, rig, write_tiny_capture
-from .fuzz.samples import SETTINGS
+from .small_run import rows_of, run_on
 
 
 @pytest.fixture(scope="module")
@@ -35,19 +31,7 @@ def videos(tmp_path_factory):
 
 
 def compare(folder, out, *methods):
-    data = str(folder)
-    runner.run(
-        RunConfig(
-            data=data,
-            out=str(out),
-            reader=reader_of(data),
-            methods=methods,
-            preset="smoke",
-            metrics=("psnr",),
-            settings={name: SETTINGS[name] for name in methods if name in SETTINGS},
-        )
-    )
-    return pd.read_parquet(RunFolder(out).rows)
+    return rows_of(run_on(folder, out, *methods, reader=reader_of(str(folder))))
 
 
 @pytest.mark.parametrize("layout", ["insta", "imavatar"])

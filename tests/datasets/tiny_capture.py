@@ -16,6 +16,7 @@ from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePla
 from headbench.datasets.head.arrays import HeadArrays
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.head.teeth import with_teeth
+from headbench.reports.robustness import viewpoints
 
 from .head.toy import toy_head
 
@@ -25,14 +26,10 @@ FRONTAL = "222200037"
 
 def look_at(name: str, position: np.ndarray, width: int, height: int, cx: float, cy: float) -> Camera:
     """Camera at ``position`` looking at the origin, +y up."""
-    forward = -position / np.linalg.norm(position)
-    right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ position
     focal = 3.2 * width
-    return Camera(name, width, height, np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]]), matrix)
+    K = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]])
+    motion = viewpoints.look_at(position, np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    return Camera(name, width, height, K, motion)
 
 
 def rig(width: int = 48, height: int = 64, cx: float = 24.7, cy: float = 29.3) -> list[Camera]:

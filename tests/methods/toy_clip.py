@@ -14,6 +14,7 @@ from headbench.datasets.head.arrays import HeadArrays
 from headbench.methods.shared.binding import to_world
 from headbench.methods.shared.subject_mesh import SubjectMesh
 from headbench.methods.splats import rasterize
+from headbench.reports.robustness import viewpoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,15 +48,9 @@ class ToyClip:
 
 def look_at(position: np.ndarray, target: np.ndarray, name: str, width: int, height: int) -> Camera:
     """Camera at a position looking at a target, y up in the world, with a 40 degree field of view."""
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    world_to_camera = np.eye(4)
-    world_to_camera[:3, :3], world_to_camera[:3, 3] = rotation, -rotation @ position
     focal = 0.5 * height / np.tan(np.radians(20))
     K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
-    return Camera(name, width, height, K, world_to_camera)
+    return Camera(name, width, height, K, viewpoints.look_at(position, target, np.array([0.0, 1.0, 0.0])))
 
 
 def toy_cameras(count: int, width: int, height: int) -> dict[str, Camera]:

@@ -12,7 +12,7 @@ import pytest
 from headbench.bench import cli
 from headbench.bench.errors import InputError
 from headbench.bench.executors.cell import _Run
-from headbench.bench.executors.outcome import read_outcome
+from headbench.bench.executors.outcome import read_outcome, write_outcome
 from headbench.bench.executors.processes import Processes
 from headbench.bench.executors.run import machine_of
 from headbench.bench.executors.schedule import Schedule
@@ -40,23 +40,13 @@ def cell_of(config, subject, method):
     return RunFolder(Path(config.out)).cell(subject, method, 0).folder
 
 
-def test_rows_equal_those_of_one_process(config, rows_of, inline):
-    assert rows_of(config, TWO).equals(inline)
-    assert set(inline["status"]) == {"ok", "failed"}
-    outcome = read_outcome(cell_of(config, "subject2", "failing"))
-    assert (outcome["status"], outcome["reason"]) == ("failed", "RuntimeError: the training diverged")
-    assert "Traceback" in (cell_of(config, "subject2", "failing") / "job.log").read_text()
-    assert outcome["process"] != os.getpid()
-
-
-@pytest.mark.parametrize("workers", [None, 2])
-def test_a_device_that_is_not_there_fails_each_task(tmp_path, workers):
+def test_a_device_that_is_not_there_fails_each_task(tmp_path):
     tasks = [
         replace(Task.of(tmp_path, place, "math:sqrt"), device="xpu", restarts=0) for place in ("one", "two")
     ]
     for task in tasks:
         task.folder.mkdir()
-    schedule = Schedule("tasks", lambda task: True, Execution("processes", workers=workers))
+    schedule = Schedule("tasks", lambda task: True, Execution("processes"))
     failures = schedule.work_off(tasks)
     assert set(failures) == {"one", "two"}
     for task in tasks:
@@ -66,21 +56,13 @@ def test_a_device_that_is_not_there_fails_each_task(tmp_path, workers):
     assert len(processes) == 2, "a failure on a device may be that of its process"
 
 
-def test_machines_of_several_kinds_are_all_named(config, rows_of, inline, caplog):
-    rows_of(config, TWO)
-    cells = [cell_of(config, "subject1", name) for name in ("toy", "failing")]
-    for cell, card in zip(cells, "AB"):
-        path = cell / "outcome.json"
-        outcome = read_json(path)
-        outcome["machine"]["device"] = {"name": f"Card {card}", "memory_bytes": 9}
-        write_json(path, outcome)
-    jobs = [SimpleNamespace(cell=SimpleNamespace(folder=cell)) for cell in cells]
-    assert machine_of(jobs, {})["device"] == {"name": "Card A and Card B", "memory_bytes": 9}
-    assert "Card A, Card B: their times and speeds do not compare" in caplog.text
-
-
-def test_done_cells_are_kept_and_failed_ones_tried_again(config, rows_of, inline):
-    rows_of(config, TWO)
+def test_rows_are_those_of_one_process_and_done_cells_are_kept(config, rows_of, inline):
+    assert rows_of(config, TWO).equals(inline)
+    assert set(inline["status"]) == {"ok", "failed"}
+    outcome = read_outcome(cell_of(config, "subject2", "failing"))
+    assert (outcome["status"], outcome["reason"]) == ("failed", "RuntimeError: the training diverged")
+    assert "Traceback" in (cell_of(config, "subject2", "failing") / "job.log").read_text()
+    assert outcome["process"] != os.getpid()
     paths = [cell_of(config, "subject1", name) / "outcome.json" for name in ("toy", "failing")]
     before = [path.stat().st_mtime_ns for path in paths]
     assert rows_of(config, TWO).equals(inline)
@@ -130,19 +112,20 @@ def test_speed_is_measured_after_the_trainings_alone(config, rows_of):
     assert len(set(spans)) == 1  # one process, one after another
 
 
-def test_speed_alone_is_measured(config, rows_of):
-    rows = rows_of(replace(config, methods=("toy_plugin:METHOD",), metrics=("fps",)), TWO)
-    assert set(rows["status"]) == {"ok"}
-
-
-def test_kept_cells_are_named_and_changed_code_fails_others(config, caplog):
+def test_kept_cells_are_named_and_changed_code_fails_others(config, rows_of, caplog):
     caplog.set_level("INFO", logger="headbench")
-    config = replace(config, methods=("toy_plugin:METHOD",))
-    runner.run(config, TWO)
+    config = replace(config, methods=("toy_plugin:METHOD",), metrics=("fps",))
+    assert set(rows_of(config, TWO)["status"]) == {"ok"}  # speed alone
     assert ": kept" not in caplog.text
+    folder = RunFolder(Path(config.out))
+    own = folder.read_manifest().machine
+    for subject, processor in (("subject1", "A"), ("subject2", "B"), ("subject3", "A")):
+        path = cell_of(config, subject, "toy") / "outcome.json"
+        write_json(path, {**read_json(path), "machine": {**own, "processor": processor}})
     runner.run(config, TWO)
     assert caplog.text.count("toy seed 0: kept: trained ") == 3
-    folder = RunFolder(Path(config.out))
+    assert folder.read_manifest().machine == {**own, "processor": "A and B"}
+    assert "do not compare" in caplog.text
     assert _Run.read(folder.root).methods.keys() == {"toy"}
     record = read_json(folder.manifest)
     record["methods"][0]["code"] = "of another"
@@ -209,6 +192,17 @@ def test_status_shows_failed_cells_with_their_logs(config, capsys):
     assert "3 done, 3 failed" in capsys.readouterr().out
 
 
+def test_machines_of_several_kinds_are_all_named(tmp_path, caplog):
+    jobs = []
+    for card in "AB":
+        folder = tmp_path / card
+        machine = {"processor": "X", "device": {"name": f"Card {card}", "memory_bytes": 9}}
+        write_outcome(folder, {"status": "done", "speed": False, "machine": machine})
+        jobs.append(SimpleNamespace(cell=SimpleNamespace(folder=folder)))
+    assert machine_of(jobs, {})["device"] == {"name": "Card A and Card B", "memory_bytes": 9}
+    assert "Card A, Card B: their times and speeds do not compare" in caplog.text
+
+
 def test_time_left_is_by_method_and_shared_out():
     def cell(method, state, seconds=None):
         return CellState("s", method, 0, state, "", seconds)
@@ -220,15 +214,3 @@ def test_time_left_is_by_method_and_shared_out():
     assert time_left([*done, *two]) == (10.0, True)
     assert time_left([cell("b", "waiting")]) == (None, False)
     assert time_left([cell("a", "waiting", 8.0), cell("a", "waiting")]) == (8.0, True)  # one for its speed
-
-
-def test_the_machine_is_that_of_the_cells(config, caplog):
-    runner.run(replace(config, methods=("toy_plugin:METHOD",)), TWO)
-    folder = RunFolder(Path(config.out))
-    own = folder.read_manifest().machine
-    for subject, processor in (("subject1", "A"), ("subject2", "B"), ("subject3", "A")):
-        path = cell_of(config, subject, "toy") / "outcome.json"
-        write_json(path, {**read_json(path), "machine": {**own, "processor": processor}})
-    runner.run(replace(config, methods=("toy_plugin:METHOD",)), TWO)
-    assert folder.read_manifest().machine == {**own, "processor": "A and B"}
-    assert "do not compare" in caplog.text

@@ -526,30 +526,29 @@ def test_a_report_that_fails_stops_no_other(monkeypatch, toy, tmp_path, caplog):
 
 
 CELL = ("avatar", "avatar/level.txt", "fit.json", "renders", "renders/novel_view", "rows.parquet")
-LINKED = (
-    *("run.json", "protocols", "rows.parquet", "contact_sheet.png", "report.html", "tables"),
-    *("subject1", "subject1/toy"),
-    *("subject1/toy/seed-0", *(f"subject1/toy/seed-0/{name}" for name in CELL)),
-)
+REPLACED = ("run.json", "rows.parquet", "contact_sheet.png", "report.html", "tables")
+REFUSED = ("protocols", "subject1", "subject1/toy", *(f"subject1/toy/seed-0/{name}" for name in ("", *CELL)))
 
 
-@pytest.mark.parametrize("place", LINKED)
-def test_a_received_run_is_not_written_through_its_links(config, monkeypatch, tmp_path, place, capsys):
+@pytest.mark.parametrize(("places", "expected"), [(REPLACED, 0), *(((place,), 2) for place in REFUSED)])
+def test_a_received_run_is_not_written_through_its_links(
+    config, monkeypatch, tmp_path, places, expected, capsys
+):
+    """A file is replaced, a report left out; a folder that results go into is refused."""
     monkeypatch.undo()
     monkeypatch.syspath_prepend(Path(__file__).parents[1])
     words = ["run", "--data", config.data, "--out", config.out, "--methods", "toy_plugin:METHOD"]
     words += ["--set", "reader=toy_plugin:READER", "--set", "metrics=psnr"]
     outside = tmp_path / "outside"
-    link = Path(config.out) / place
-    link.parent.mkdir(parents=True)
-    if link.suffix:
-        outside.write_text("victim")
-    else:
-        outside.mkdir()
-    link.symlink_to(outside)
+    outside.mkdir()
+    for place in places:
+        link, target = Path(config.out) / place, outside / Path(place).name
+        link.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text("victim") if link.suffix else target.mkdir()
+        link.symlink_to(target)
     code = cli.main(words)
     error = capsys.readouterr().err
     assert "Traceback" not in error
-    assert outside.read_text() == "victim" if link.suffix else not list(outside.iterdir())
-    refused = place.startswith(("subject1", "protocols"))  # else a file is replaced, a report left out
-    assert code == (2 if refused else 0), error
+    for target in outside.iterdir():
+        assert target.read_text() == "victim" if target.is_file() else not list(target.iterdir())
+    assert code == expected, error

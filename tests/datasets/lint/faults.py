@@ -274,20 +274,18 @@ FAULTS = (
         _edit(TRAIN, lambda v: v["frames"][4].update(camera_id="elsewhere")),
         ("HB502",),
     ),
-    Fault("JSON cut off", "HB101", _cut_json, REFUSED),
+    Fault("JSON cut off", "HB101", _cut_json),
     Fault(
         "frame without its image's name",
         "HB102",
         _edit(TRAIN, lambda v: v["frames"][3].pop("file_path")),
-        REFUSED,
     ),
-    Fault("image deleted", "HB103", lambda good: _test_images(good, 2)[1].unlink(), REFUSED),
-    Fault("image cut off", "HB103", _cut_image, REFUSED),
+    Fault("image deleted", "HB103", lambda good: _test_images(good, 2)[1].unlink()),
+    Fault("image cut off", "HB103", _cut_image),
     Fault(
         "parameters damaged",
         "HB103",
         lambda good: good.files("flame_param")[4].write_bytes(b"PK\x03\x04 no archive"),
-        REFUSED,
     ),
     Fault(
         "mask of another size",
@@ -295,7 +293,6 @@ FAULTS = (
         lambda good: write_image(
             good.files("fg_masks")[7], np.full((HEIGHT // 2, WIDTH // 2), 255, np.uint8)
         ),
-        REFUSED,
     ),
     Fault("frame left out", "HB105", _edit(TRAIN, lambda v: v["frames"].pop(5)), ("HB113",)),
     Fault(
@@ -359,7 +356,7 @@ FAULTS = (
     Fault("principal point dropped", "HB509", _declare(cy="centre")),
     Fault("camera moves", "HB512", _nudge_one_frame, REFUSED),
     Fault("other version declared", "HB601", _declare(head_model="flame2020"), ("HB100", "HB613")),
-    Fault("no head", "HB602", lambda good: (good.union / "head_model.npz").unlink(), REFUSED),
+    Fault("no head", "HB602", lambda good: (good.union / "head_model.npz").unlink()),
     Fault("too many coefficients", "HB603", _one(5, lambda a: a.update(expr=np.zeros((1, 99)))), REFUSED),
     Fault("NaN", "HB604", _one(5, lambda a: a["expr"].fill(np.nan)), REFUSED),
     Fault("few coefficients", "HB605", _parameters(change=lambda a, i: a.update(expr=a["expr"][:, :5]))),

@@ -97,14 +97,6 @@ def test_halved_intrinsics_are_not_taken_for_the_other_edge(tmp_path):
     assert not {"HB100", "HB511"} & set(found)
 
 
-@pytest.mark.parametrize(
-    "fault", [f for f in FAULTS if f.code in ("HB101", "HB102", "HB103", "HB104", "HB602")]
-)
-def test_a_fault_of_a_file_is_reported_once(fault, good):
-    fault.plant(good)
-    assert codes(good) == [fault.code]
-
-
 def test_a_width_beyond_the_limit_of_gaussian_avatars(pristine):
     evidence, _ = lint_capture(LintSettings(str(pristine.union), views=1, duplicates=0))
     path = next(iter(evidence.headers))

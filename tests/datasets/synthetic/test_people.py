@@ -44,6 +44,11 @@ def bearded(geometry):
     return replace(plan, person=replace(plan.person, beard=0.015, glasses="plastic", sag=1.0))
 
 
+@pytest.fixture(scope="module")
+def subject(bearded):
+    return RenderedSubject(bearded.person, bearded.geometry, bearded.shape)
+
+
 def folds(states):
     return np.array([state.folds for state in states])
 
@@ -111,8 +116,7 @@ def test_the_tracked_mesh_has_hair_volume_and_not_locks(bearded):
     assert np.linalg.norm(offset[edges[:, 0]] - offset[edges[:, 1]], axis=1).max() < 0.5 * style.cap + 0.002
 
 
-def test_beard_and_glasses_lie_on_the_face_and_move_with_it(bearded, rest):
-    subject = RenderedSubject(bearded.person, bearded.geometry, bearded.shape)
+def test_beard_and_glasses_lie_on_the_face_and_move_with_it(bearded, subject, rest):
     assert {"beard", "glasses"} <= subject.rest_meshes().keys()
     pose = bearded.geometry.translation.pose(rest, "900", 0)
     calm = subject.posed_meshes(pose, rest, settled(rest, bearded.person))
@@ -130,8 +134,7 @@ def test_beard_and_glasses_lie_on_the_face_and_move_with_it(bearded, rest):
     np.testing.assert_array_equal(moved["glasses"].vertices, calm["glasses"].vertices)
 
 
-def test_stretched_skin_shines_more(bearded, rest):
-    subject = RenderedSubject(bearded.person, bearded.geometry, bearded.shape)
+def test_stretched_skin_shines_more(bearded, subject, rest):
     puffed = {**rest, "cheek_puff": 1.0}
     gloss = [
         subject.posed_meshes(bearded.geometry.translation.pose(a, "900", 0), a, settled(a, bearded.person))[

@@ -17,15 +17,10 @@ from headbench.methods.insta.avatar import FIELD_FILE, SETTINGS_FILE, InstaAvata
 from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.method import Insta
 from headbench.methods.insta.spec import INSTA
-from headbench.methods.shared.loop import CHECKPOINT
 
 from .small import SMALL
 
 BUDGET = Budget(iterations=24)
-
-
-class Killed(Exception):
-    pass
 
 
 def fit(clip, folder, progress=no_progress, seed=3, **more):
@@ -41,30 +36,6 @@ def content(avatar):
 def trained(clip, tmp_path_factory):
     folder = tmp_path_factory.mktemp("insta")
     return folder, fit(clip, folder)
-
-
-def test_a_run_repeats_itself_and_another_seed_does_not(trained, clip, tmp_path):
-    assert content(fit(clip, tmp_path / "same")) == content(trained[1])
-    assert content(fit(clip, tmp_path / "other", seed=4)) != content(trained[1])
-
-
-# Between refreshes of the grid, right after one, and twice in one run.
-@pytest.mark.parametrize("kills", [(6,), (8,), (3, 17)])
-def test_interrupted_and_continued_is_the_same_bit_for_bit(trained, clip, tmp_path, kills):
-    for kill in kills:
-
-        def killer(done, total, note="", kill=kill):
-            if done == kill:
-                raise Killed
-
-        with pytest.raises(Killed):
-            fit(clip, tmp_path, killer)
-        assert (tmp_path / CHECKPOINT).exists()
-    seen = []
-    avatar = fit(clip, tmp_path, lambda done, total, note="": seen.append(done))
-    assert seen[0] == kills[-1] + 1
-    assert content(avatar) == content(trained[1])
-    assert not (tmp_path / CHECKPOINT).exists()
 
 
 def test_training_lowers_the_error_on_a_held_out_view(clip, tmp_path):
@@ -121,7 +92,7 @@ def test_a_single_pixel_and_a_background(trained, clip):
 
 def test_without_the_kernel_an_avatar_looks_the_same(trained, clip, monkeypatch):
     key = clip.splits["train"][0]
-    camera, pose = clip.cameras[key.camera].resized(7, 9), clip.poses[key.timestep]
+    camera, pose = clip.cameras[key.camera].resized(4, 5), clip.poses[key.timestep]
     expected = trained[1].render(camera, pose)
     monkeypatch.setattr(kernel, "load", lambda: None)
     frame = InstaAvatar.read(trained[0], "cpu").render(camera, pose)

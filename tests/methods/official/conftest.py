@@ -36,7 +36,8 @@ def behave(repository):
     def set_behaviour(what):
         (repository[0] / "behaviour.txt").write_text(what)
 
-    return set_behaviour
+    yield set_behaviour
+    set_behaviour("")
 
 
 def brightness(pose, refined):

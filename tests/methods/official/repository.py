@@ -7,7 +7,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from headbench.bench.contracts import Budget
+from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.runner.adaptation import TrainingView
 from headbench.datasets.head.teeth import lip_rings
 from headbench.methods.official.config import GAOfficialConfig
 from headbench.methods.official.ga.method import GAOfficial
@@ -15,6 +16,18 @@ from headbench.methods.official.gha.method import GHAOfficial
 from headbench.methods.official.tga.method import TGAOfficial
 
 BUDGET = Budget(iterations=20)
+
+
+def fit(method, clip, out, progress=no_progress, *, budget=BUDGET, seed=0):
+    """Train on the clip's training frames."""
+    return method.fit(TrainingView(clip), out, budget, device="cpu", seed=seed, progress=progress)
+
+
+def views(clip, *splits):
+    """Camera and pose by key, of the frames of some splits."""
+    return {k: (clip.cameras[k.camera], clip.poses[k.timestep]) for s in splits for k in clip.splits[s]}
+
+
 LINES_BEGIN = 12
 """Iteration at which the stand-in of TGA's training begins to train feature lines."""
 

@@ -27,7 +27,8 @@ from headbench.methods.official.spec import GBS_OFFICIAL
 from headbench.methods.shared.schedule import ShuffledEpochs
 
 from .blendshapes_repository import CYLINDER, HELD_OUT, BlendshapesStandIn, make_blendshapes_repository
-from .repository import settings
+from .repository import fit as train
+from .repository import settings, views
 
 BUDGET = Budget(iterations=2_000)
 
@@ -58,12 +59,7 @@ def exported(method, moving_clip, tmp_path):
 
 
 def fit(method, clip, out):
-    return method.fit(TrainingView(clip), out, BUDGET, device="cpu", seed=0, progress=no_progress)
-
-
-def views(clip, *splits):
-    keys = [key for split in splits for key in clip.splits[split]]
-    return {key: (clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys}
+    return train(method, clip, out, budget=BUDGET)
 
 
 def read_frame(work, number):

@@ -21,9 +21,7 @@ from headbench.methods.official.method import TRAINING_LOG, Workplace, check_exp
 from headbench.methods.official.process import ProgramError
 from headbench.methods.shared.avatar_files import Subject
 
-from .repository import HeadAvatarStandIn, make_head_avatar_repository
-
-BUDGET = Budget(iterations=20)
+from .repository import BUDGET, HeadAvatarStandIn, fit, make_head_avatar_repository, views
 
 
 @pytest.fixture
@@ -43,19 +41,6 @@ def method(repository):
     return HeadAvatarStandIn(
         GHAOfficialConfig(str(repository[0]), sys.executable, repository[1], mesh_fraction=0.25)
     )
-
-
-@pytest.fixture
-def avatar(method, official_clip, tmp_path):
-    return fit(method, official_clip, tmp_path / "avatar")
-
-
-def fit(method, clip, out, progress=no_progress):
-    return method.fit(TrainingView(clip), out, BUDGET, device="cpu", seed=0, progress=progress)
-
-
-def views(clip, *splits):
-    return {k: (clip.cameras[k.camera], clip.poses[k.timestep]) for s in splits for k in clip.splits[s]}
 
 
 def test_both_stages_are_run_and_frames_come_back_by_key(method, official_clip, tmp_path):
@@ -92,28 +77,24 @@ def test_both_stages_are_run_and_frames_come_back_by_key(method, official_clip, 
     ("behaviour", "expected"),
     {"crash": "exit code 1.*CUDA out of memory", "stop": "ended before its 5 iterations"}.items(),
 )
-def test_a_stage_that_fails_says_so(method, repository, official_clip, tmp_path, behaviour, expected):
-    (repository[0] / "behaviour.txt").write_text(behaviour)
+def test_a_stage_that_fails_says_so(method, behave, official_clip, tmp_path, behaviour, expected):
+    behave(behaviour)
     with pytest.raises(ProgramError, match=expected):
         fit(method, official_clip, tmp_path / "avatar")
-    (repository[0] / "behaviour.txt").write_text("")
+    behave("")
     assert fit(method, official_clip, tmp_path / "avatar").files()
 
 
-@pytest.mark.parametrize(
-    ("behaviour", "expected"),
-    {
+def test_renders_that_are_not_what_was_listed_are_found(method, behave, official_clip, tmp_path):
+    avatar = fit(method, official_clip, tmp_path / "avatar")
+    for behaviour, expected in {
         "reversed": "the mark of frame",
         "other size": "expected 128x64 pixels, found 124x62",
         "one too few": r"lacks 1 of 3 renders, first 000001.png",
-    }.items(),
-)
-def test_renders_that_are_not_what_was_listed_are_found(
-    avatar, repository, official_clip, behaviour, expected
-):
-    (repository[0] / "behaviour.txt").write_text(behaviour)
-    with pytest.raises(ProgramError, match=expected):
-        list(avatar.render_listed(views(official_clip, "novel_view"), (1.0, 1.0, 1.0), no_progress))
+    }.items():
+        behave(behaviour)
+        with pytest.raises(ProgramError, match=expected):
+            list(avatar.render_listed(views(official_clip, "novel_view"), (1.0, 1.0, 1.0), no_progress))
 
 
 def test_only_training_frames_are_exported_and_to_the_bit(method, official_clip, tmp_path):

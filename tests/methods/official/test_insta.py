@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.runner.adaptation import TrainingView
@@ -24,8 +24,8 @@ from headbench.methods.official.process import ProgramError
 from headbench.methods.shared.avatar_files import Subject
 
 from .insta_repository import make_insta_repository
+from .repository import BUDGET, fit, views
 
-BUDGET = Budget(iterations=20)
 GROUND = (1.0, 1.0, 1.0)
 
 
@@ -61,14 +61,6 @@ def exported(method, official_clip, tmp_path):
     work = Workplace.at(tmp_path / "work")
     work.make()
     return work, method.export(TrainingView(official_clip), method.look(), work, no_progress)
-
-
-def fit(method, clip, out, progress=no_progress):
-    return method.fit(TrainingView(clip), out, BUDGET, device="cpu", seed=0, progress=progress)
-
-
-def views(clip, *splits):
-    return {k: (clip.cameras[k.camera], clip.poses[k.timestep]) for s in splits for k in clip.splits[s]}
 
 
 def test_frames_are_rendered_under_their_keys_on_any_ground(avatar, official_clip, monkeypatch):

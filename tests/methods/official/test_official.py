@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import time
 from pathlib import Path
 
@@ -27,17 +28,14 @@ from headbench.methods.official.method import (
 from headbench.methods.official.process import ProgramError
 
 from .conftest import brightness
-from .repository import BUDGET, StandIn, settings
+from .repository import StandIn, fit, lip_numbers, make_repository, settings, views
 
 
-def fit(method, clip, out, *, budget=BUDGET, seed=0, progress=no_progress):
-    return method.fit(TrainingView(clip), out, budget, device="cpu", seed=seed, progress=progress)
-
-
-def views(clip, *splits):
-    return {
-        key: (clip.cameras[key.camera], clip.poses[key.timestep]) for s in splits for key in clip.splits[s]
-    }
+@pytest.fixture(scope="module")
+def repository(head, tmp_path_factory):
+    """The stand-in, made once."""
+    folder = tmp_path_factory.mktemp("official") / "repository"
+    return folder, make_repository(folder, *lip_numbers(head))
 
 
 @pytest.fixture
@@ -45,9 +43,18 @@ def method(repository):
     return StandIn(settings(*repository))
 
 
+@pytest.fixture(scope="module")
+def trained(repository, official_clip, tmp_path_factory):
+    """Folder of an avatar that tests only copy."""
+    out = tmp_path_factory.mktemp("trained") / "avatar"
+    fit(StandIn(settings(*repository)), official_clip, out)
+    return out
+
+
 @pytest.fixture
-def avatar(method, official_clip, tmp_path):
-    return fit(method, official_clip, tmp_path / "avatar")
+def avatar(method, trained, tmp_path):
+    shutil.copytree(trained, tmp_path / "avatar")
+    return method.load(tmp_path / "avatar", device="cpu")
 
 
 class Killed(KeyboardInterrupt):
@@ -80,9 +87,9 @@ def test_an_avatar_is_trained_kept_and_read_again(method, avatar, official_clip,
 
 
 def test_folders_may_be_relative(repository, official_clip, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.chdir(repository[0].parent)
     method = StandIn(settings(Path(repository[0].name), repository[1]))
-    avatar = fit(method, official_clip, Path("out") / "avatar")
+    avatar = fit(method, official_clip, Path(os.path.relpath(tmp_path / "avatar")))
     asked = views(official_clip, "novel_view")
     assert dict(avatar.render_listed(asked, (1.0, 1.0, 1.0), no_progress)).keys() == asked.keys()
 

@@ -9,13 +9,12 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.io.arrays import read_npz
 from headbench.bench.io.documents import read_json
-from headbench.bench.runner.adaptation import TrainingView
 from headbench.datasets.steps.clusters import cluster_expressions
 from headbench.datasets.steps.jaw_bases import jaw_quaternions
 from headbench.methods.official.config import TGAOfficialConfig
 from headbench.methods.official.method import Workplace
 
-from .repository import BUDGET, LINES_BEGIN, TensorialStandIn, settings
+from .repository import BUDGET, LINES_BEGIN, TensorialStandIn, fit, settings, views
 
 
 @pytest.fixture
@@ -25,13 +24,11 @@ def method(repository):
 
 
 def test_it_trains_and_renders_though_their_log_has_no_place(method, official_clip, tmp_path):
-    arguments = {"device": "cpu", "seed": 0, "progress": no_progress}
-    avatar = method.fit(TrainingView(official_clip), tmp_path / "a", BUDGET, **arguments)
+    avatar = fit(method, official_clip, tmp_path / "a")
     names = {path.name for path in avatar.files()}
     assert names >= {"point_cloud.ply", "triplane.pth", "feat_line.pth", "sorted_jaw_poses.npz"}
-    keys = official_clip.splits["novel_view"]
-    wanted = {k: (official_clip.cameras[k.camera], official_clip.poses[k.timestep]) for k in keys}
-    assert dict(avatar.render_listed(wanted, (1.0, 1.0, 1.0), no_progress)).keys() == set(keys)
+    wanted = views(official_clip, "novel_view")
+    assert dict(avatar.render_listed(wanted, (1.0, 1.0, 1.0), no_progress)).keys() == wanted.keys()
     record = read_json(tmp_path / "a" / "training.json")
     assert record["leaks"] == []
     assert any("jaw bases from training poses" in line for line in record["differences"])

@@ -2,9 +2,8 @@
 
 from dataclasses import replace
 
-import numpy as np
+from toy_plugin import ToyAvatar
 
-from headbench.bench.contracts import Frame
 from headbench.bench.specs import MethodSpec
 
 FITS = []
@@ -15,18 +14,10 @@ RENDERED = []
 """(timestep, camera) of every frame."""
 
 
-class Avatar:
-    def __init__(self, path):
-        self.path = path
-        self.level = float((path / "level.txt").read_text())
-
+class Avatar(ToyAvatar):
     def render(self, camera, pose, background=(1.0, 1.0, 1.0)):
         RENDERED.append((pose.timestep, camera.id))
-        rgb = np.full((camera.height, camera.width, 3), self.level, np.float32)
-        return Frame(rgb, np.ones(rgb.shape[:2], np.float32))
-
-    def files(self):
-        return [self.path / "level.txt"]
+        return super().render(camera, pose, background)
 
 
 class Method:

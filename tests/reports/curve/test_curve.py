@@ -15,7 +15,6 @@ from headbench.bench import cli
 from headbench.bench.contracts import Budget
 from headbench.bench.errors import ExitCode, HeadbenchError, InputError
 from headbench.bench.runner import run as runner
-from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.reports.curve import curve as module
@@ -23,16 +22,18 @@ from headbench.reports.curve.command import CurveSettings, curve_run
 from headbench.reports.curve.held_out import hold_out
 from headbench.reports.curve.points import MEASURED, half_width
 
+from ...datasets.flat_renderer import flat_pictures
 from ...datasets.tiny_capture import write_tiny_capture
+from ...small_run import run_on
 
-TESTS = Path(__file__).parents[1]
+TESTS = Path(__file__).parents[2]
 HELD_TIMESTEP, HELD_CAMERA = 2, "1"  # of timesteps 0 to 3, and of cameras at -60, -30, 30 and 60 degrees
 
 
 @pytest.fixture
 def plugin(monkeypatch):
     """The methods that take note, importable by name, and the reader of ball captures."""
-    for folder in ("curve", "robustness"):
+    for folder in ("reports/curve", "reports/robustness", "bench"):
         monkeypatch.syspath_prepend(TESTS / folder)
     monkeypatch.setattr(runner, "write_reports", lambda folder: [])
     monkeypatch.setattr(module, "METRICS", ("psnr", "storage"))
@@ -49,18 +50,8 @@ def make_run(plugin, tmp_path):
     """A finished run of methods on one ball or more."""
 
     def make(*methods, subjects=("ball-a",)):
-        for subject in subjects:
-            (tmp_path / "data" / subject).mkdir(parents=True)
-        runner.run(
-            RunConfig(
-                data=str(tmp_path / "data"),
-                out=str(tmp_path / "run"),
-                methods=methods,
-                metrics=("psnr",),
-                reader="ball_plugin:READER",
-                preset="smoke",
-            )
-        )
+        how = {"subjects": subjects, "reader": "ball_plugin:READER"}
+        run_on(tmp_path / "data", tmp_path / "run", *methods, **how)
         plugin.FITS.clear()
         plugin.RENDERED.clear()
         return tmp_path / "run"
@@ -132,19 +123,14 @@ def test_less_to_train_on_is_measured_on_the_same_frames(make_run, plugin, over,
 
 def test_tracking_error_changes_poses_alone(plugin, tmp_path):
     capture = tmp_path / "capture"
-    synthesize(capture, cameras=4, timesteps=24, size=(16, 16), samples_per_pixel=4, workers=1)
+    with flat_pictures():
+        synthesize(capture, cameras=3, timesteps=8, size=(16, 16), workers=1)
     (union,) = capture.glob("UNION*")
-    config = RunConfig(
-        data=str(union),
-        out=str(tmp_path / "run"),
-        methods=("curve_plugin:METHOD",),
-        preset="smoke",
-        metrics=("psnr",),
-    )
-    runner.run(config)
+    run_on(union, tmp_path / "run", "curve_plugin:METHOD")
     plugin.FITS.clear()
     plugin.POSES.clear()
-    findings = curve_run(settings(tmp_path / "run", over="tracking_error", levels=(0.0, 2.0), frames=2))
+    of_errors = {"over": "tracking_error", "frames": 1}
+    findings = curve_run(settings(tmp_path / "run", levels=(0.0, 2.0), **of_errors))
     assert [point["tracking_error"] for point in findings.data["points"]] == [0.0, 2.0]
     exact, wrong = plugin.POSES
     assert exact.keys() == wrong.keys()
@@ -153,7 +139,7 @@ def test_tracking_error_changes_poses_alone(plugin, tmp_path):
     for picture in capture.rglob("*.png"):
         assert (made / picture.relative_to(capture)).samefile(picture)
     with pytest.raises(InputError, match=r"1 without noting\+tracking-0, noting\+tracking-2\."):
-        curve_run(settings(tmp_path / "run", over="tracking_error", levels=(1.0,), frames=2))
+        curve_run(settings(tmp_path / "run", levels=(1.0,), **of_errors))
     assert not made.with_name("capture-tracking-1").exists()
 
 
@@ -320,16 +306,8 @@ def tiny_run(plugin, tmp_path):
     capture = write_tiny_capture(tmp_path / "data")
 
     def make(*methods):
-        config = RunConfig(
-            data=str(capture.union),
-            out=str(tmp_path / "run"),
-            methods=methods,
-            preset="smoke",
-            metrics=("psnr",),
-            frames_per_task=1,
-        )
-        runner.run(config)
-        return tmp_path / "run"
+        how = {"frames_per_task": 1, "settings": {}}
+        return run_on(capture.union, tmp_path / "run", *methods, **how).root
 
     return make
 
@@ -343,8 +321,6 @@ def test_a_method_that_keeps_images_keeps_none_that_is_held_out(tiny_run):
 
 
 def test_a_metric_that_is_missing_says_why(make_run, monkeypatch):
-    toy = TESTS.parent / "bench"
-    monkeypatch.syspath_prepend(toy)
     monkeypatch.setattr(module, "METRICS", ("psnr", "toy_plugin:NOT_HERE"))
     findings = curve_run(settings(make_run("curve_plugin:METHOD"), fractions=("1",)))
     assert findings.passed

@@ -7,11 +7,12 @@ from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.runner import run as runner
-from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
 from headbench.reports.pareto import sweep as module
 from headbench.reports.pareto.command import SweepSettings
 from headbench.reports.pareto.sweep import sweep
+
+from ...small_run import run_on
 
 
 @pytest.fixture
@@ -20,19 +21,10 @@ def finished(toy, tmp_path, monkeypatch):
     monkeypatch.setattr(runner, "write_reports", lambda folder: [])
     monkeypatch.setattr(module, "default_names", lambda group: ())
     toy.MADE.clear()
-    for subject in ("subject1", "subject2"):
-        (tmp_path / "data" / subject).mkdir(parents=True)
-    runner.run(
-        RunConfig(
-            data=str(tmp_path / "data"),
-            out=str(tmp_path / "run"),
-            methods=("toy_plugin:METHOD", "toy_plugin:VARYING"),
-            metrics=("toy_plugin:ERROR", "toy_plugin:FILES", "toy_plugin:STEPS"),
-            reader="toy_plugin:READER",
-            preset="smoke",
-        )
-    )
-    return tmp_path / "run"
+    methods = ("toy_plugin:METHOD", "toy_plugin:VARYING")
+    metrics = ("toy_plugin:ERROR", "toy_plugin:FILES", "toy_plugin:STEPS")
+    how = {"subjects": ("subject1", "subject2"), "metrics": metrics, "reader": "toy_plugin:READER"}
+    return run_on(tmp_path / "data", tmp_path / "run", *methods, **how).root
 
 
 def swept(run, **settings):

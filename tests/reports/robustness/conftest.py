@@ -3,7 +3,8 @@ from pathlib import Path
 import pytest
 
 from headbench.bench.runner import run as runner
-from headbench.bench.runner.config import RunConfig
+
+from ...small_run import run_on
 
 
 @pytest.fixture
@@ -21,17 +22,8 @@ def ball_run(balls, tmp_path):
     """Makes a finished run of some of the ball methods on two subjects."""
 
     def make(*methods):
-        for subject in ("ball-a", "ball-bee"):
-            (tmp_path / "data" / subject).mkdir(parents=True, exist_ok=True)
-        config = RunConfig(
-            data=str(tmp_path / "data"),
-            out=str(tmp_path / "run"),
-            methods=tuple(f"ball_plugin:{name}" for name in methods),
-            metrics=("psnr",),
-            reader="ball_plugin:READER",
-            preset="smoke",
-        )
-        runner.run(config)
-        return tmp_path / "run"
+        named = (f"ball_plugin:{name}" for name in methods)
+        how = {"subjects": ("ball-a", "ball-bee"), "reader": "ball_plugin:READER"}
+        return run_on(tmp_path / "data", tmp_path / "run", *named, **how).root
 
     return make
