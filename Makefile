@@ -112,9 +112,7 @@ baseline: setup
 	$(gated_demo)
 	$(BIN)/headbench gate $(GATED) --baseline tests/demo_baseline.json --update --captures remade
 
-# The anchor is optional: without numba the table says so.
 bench: setup
-	-$(BIN)/python -m pip install --quiet --disable-pip-version-check 'numba>=0.59'
 	$(BIN)/headbench bench splats
 
 # The README's table and picture are those of the last demo.

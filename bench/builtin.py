@@ -292,8 +292,8 @@ class StressSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class BenchSettings(StressSettings):
-    """Times are the least of many runs, beside an anchor timed in the same run, and each table says whether they are
-    processor times or by the clock, and of how many threads; compare ratios, not milliseconds, between machines.
+    """What is compared is timed in turns, and each table says whether times are processor times or by the clock, and of
+    how many threads; compare ratios, not milliseconds, between machines.
     """
 
     tradeoffs: bool = False
@@ -306,7 +306,7 @@ def bench(settings: BenchSettings, progress: Progress) -> Findings:
 
 
 def stress(settings: StressSettings, progress: Progress) -> Findings:
-    """Try a part of headbench at numerical extremes and print each case, what is expected and what came out."""
+    """Try a part of headbench at numerical extremes and print each case and what came out."""
     return _measure(settings, "stress", progress)
 
 

@@ -1,6 +1,6 @@
-"""Captures that headbench reads or makes. Light to import: implementations are named, not loaded."""
+"""Captures that headbench reads or makes, and benchmarks. Light to import: implementations are named, not loaded."""
 
-from ..bench.specs import DatasetSpec
+from ..bench.specs import BenchmarkSpec, DatasetSpec
 
 ERRORS = "headbench.datasets.lint.before_run:errors"
 
@@ -37,4 +37,17 @@ SYNTHETIC = DatasetSpec(
     implementation="headbench.datasets.synthetic.capture:synthesize",
     reads=False,
     needs="headbench.datasets.synthetic.needs:needs",
+)
+
+HEAD = BenchmarkSpec(
+    name="head",
+    summary="the head model: time of a forward pass, fast beside readable path; numerical extremes",
+    speed="headbench.datasets.benchmarks.head:speed",
+    stress="headbench.datasets.benchmarks.head:stress",
+)
+
+REFIT = BenchmarkSpec(
+    name="refit",
+    summary="the refit to another head model: residuals, timesteps a second",
+    speed="headbench.datasets.benchmarks.refit:speed",
 )

@@ -1,8 +1,8 @@
-"""The reports offered; light to import."""
+"""The reports offered, and benchmarks; light to import."""
 
 from __future__ import annotations
 
-from ..bench.specs import ReportSpec
+from ..bench.specs import BenchmarkSpec, ReportSpec
 
 TABLE = ReportSpec(
     name="table",
@@ -27,4 +27,16 @@ PAGE = ReportSpec(
     name="page",
     summary="One HTML file with tables, frames of all methods side by side, curves and the record of the run.",
     implementation="headbench.reports.page.report:write_page",
+)
+
+STATISTICS = BenchmarkSpec(
+    name="statistics",
+    summary="tests and intervals on simulated comparisons: do they reject and cover as often as stated?",
+    stress="headbench.reports.statistics.calibration:stress",
+)
+
+VIEWER = BenchmarkSpec(
+    name="viewer",
+    summary="the viewer in a browser: updates a second while a slider moves, milliseconds by step",
+    speed="headbench.reports.view.benchmark:speed",
 )

@@ -68,7 +68,6 @@ def no_flushes():
 
 ALLOWED_SKIPS = {
     r"needs a GPU and gsplat": "no GPU in CI",
-    r"^the anchor needs numba": "an optional reference of a benchmark; numba follows numpy late",
     r"is not beside the repository|beside the repository$|which is not there$": "files of others, which are not committed",
     r"^Slurm is not installed": "run on a cluster with `pytest -m slurm`",
 }

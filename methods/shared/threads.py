@@ -34,3 +34,14 @@ def torch_on_one_thread(compiled: bool) -> Iterator[None]:
     finally:
         torch.set_num_threads(before)
         _kernels.reset(token)
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Torch on ``count`` threads; with one, all that it does counts to the thread that is timed."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

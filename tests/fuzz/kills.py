@@ -14,26 +14,24 @@ import json
 import multiprocessing
 import os
 import re
-import shutil
 import signal
 import sys
 import time
-import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from .cases import Place, changed, load_everything
+from headbench.bench import cli
+
 from .samples import AVATAR, PREPARE, SYNTH, prepare_samples
+from .watch import Place, forked, load_everything, on_change
 
 
-@dataclass(frozen=True)
-class Writer:
+class Writer(NamedTuple):
     """A command that writes. ``measured`` are patterns of files whose content a machine's speed decides."""
 
     name: str
@@ -46,6 +44,10 @@ PAGE = "report.html"  # speeds stand on it
 MEASURED_FILES = ("measure.json", "points.csv", "pareto.png", "cost.*", PAGE)
 MEASURED_TABLES = ("measure.json", "tables/*", "contact_sheet.png", PAGE)
 MEASURED_CURVE = ("fit.json", "measure.json", "curve.csv", "curve.png", PAGE)
+GA, OURS = AVATAR.format("ga"), AVATAR.format("ours")
+PARITY = "parity ga --checkout repository --python ./python --commit= --device cpu-shim --data capture"
+SUBMISSION = "submission render avatar --method ga --data benchmark --participant 393 --out out"
+PROCESSES = "run --config config.json --executor processes --workers 1"
 WRITERS = [
     Writer("synth", "settings", f"synth {SYNTH} --out out"),
     Writer("run", "unfinished", "run --config config.json", (PAGE,)),
@@ -53,13 +55,8 @@ WRITERS = [
     Writer("record", "synthetic", "record nersemble synthetic/UNION2_900 --out out"),
     Writer("refit", "heads", "refit capture --target head.npz --out out"),
     Writer("evaluate", "images", "evaluate images --like run --out out --label theirs", (PAGE,)),
-    Writer(
-        "evaluate avatar",
-        "run",
-        f"evaluate {AVATAR.format('ga')} --avatar --like run --out out",
-        MEASURED_FILES,
-    ),
-    Writer("render", "run", f"render {AVATAR.format('ga')} --capture capture --out out --video", ("*.webm",)),
+    Writer("evaluate avatar", "run", f"evaluate {GA} --avatar --like run --out out", MEASURED_FILES),
+    Writer("render", "run", f"render {GA} --capture capture --out out --video", ("*.webm",)),
     Writer("sweep", "run", "sweep run --methods ga --variants half", MEASURED_FILES),
     Writer("curve", "run", "curve run --methods ga --fractions 1/2 1 --frames 1", MEASURED_CURVE),
     Writer("report", "run", "report run --out report.html"),
@@ -75,107 +72,55 @@ WRITERS = [
     Writer(
         "parity",
         "official",
-        "parity ga --checkout repository --python ./python --commit= --device cpu-shim --data capture "
-        "--iterations 3 --orders 1 --frames 1 --tolerance 100 --out out",
+        f"{PARITY} --iterations 3 --orders 1 --frames 1 --tolerance 100 --out out",
         ("*.log", PAGE),
     ),
-    Writer("compact", "run", f"compact {AVATAR.format('ours')} --out out --compare capture"),
-    Writer("export html", "run", f"export html {AVATAR.format('ga')} --out out.html"),
-    *(
-        Writer(f"export {form}", "run", f"export {form} {AVATAR.format('ga')} --out out.{form}")
-        for form in ("glb", "sog")
-    ),
-    Writer("export ply", "run", f"export ply {AVATAR.format('ga')} --out out.ply"),
+    Writer("compact", "run", f"compact {OURS} --out out --compare capture"),
+    *(Writer(f"export {x}", "run", f"export {x} {GA} --out out.{x}") for x in ("html", "glb", "sog", "ply")),
     Writer("export colmap", "capture", "export colmap capture --out out"),
     Writer("import ga", "ply", "import ga point_cloud.ply --capture capture --out out"),
-    Writer(
-        "submission render",
-        "benchmark",
-        "submission render avatar --method ga --data benchmark --participant 393 --out out",
-    ),
+    Writer("submission render", "benchmark", SUBMISSION),
     Writer("tongue", "exclusions", "tongue capture --out reviewed"),
-    Writer("inspect", "capture", "inspect capture --out out"),
-    Writer("steps", "capture", "steps capture --out out"),
+    *(Writer(name, "capture", f"{name} capture --out out") for name in ("inspect", "steps")),
     Writer("lint", "capture", "lint capture"),
     Writer("verify", "run", "verify run"),
-    Writer(
-        "processes",
-        "unfinished",
-        "run --config config.json --executor processes --workers 1",
-        (PAGE, "outcome.json"),
-    ),
+    Writer("processes", "unfinished", PROCESSES, (PAGE, "outcome.json")),
 ]
 
 
-# One command, in the process that runs it.
-
-
-def start(writer: Writer, place: Place, kill_at: int | None) -> tuple[int | None, int, str]:
-    """Run the command in a forked process; its exit code (None: killed), how many changes it made, what it printed.
-
-    ``kill_at`` is the change before which the process kills itself and what it started.
-    """
-    read, write = os.pipe()
-    place.output.seek(0)
-    place.output.truncate()
-    process = os.fork()
-    if process == 0:
-        code = 70
-        try:
-            os.setsid()
-            os.chdir(place.work)
-            place.isolate(audit=False)
-            count = _count(place.work, write, kill_at)
-            code = _call(writer.line)
-            next(count)  # no change that comes after this is one of the command's
-        except BaseException:  # noqa: BLE001 - this process must end here
-            traceback.print_exc()
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    os.close(write)
-    with os.fdopen(read, "rb") as pipe:
-        changes = len(pipe.read())
-    status = os.waitpid(process, 0)[1]
-    place.output.seek(0)
-    text = place.output.read().decode(errors="replace")
-    return None if os.WIFSIGNALED(status) else os.WEXITSTATUS(status), changes, text
-
-
-def _call(line: str) -> int:
-    from headbench.bench import cli
-
+def call(line: str) -> int:
+    """Run a command line; its exit code."""
     try:
         return int(cli.main(line.split()))
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 1
 
 
-def _count(work: Path, pipe: int, kill_at: int | None) -> Iterator[None]:
-    """Write a byte for each change under ``work`` from now on until the iterator goes on; kill before ``kill_at``."""
-    state = {"count": 0, "watched": True}
+def start(writer: Writer, place: Place, kill_at: int | None = None) -> tuple[int, int]:
+    """Run the command in a forked process; how it ended (minus a signal), and how many changes it made.
 
-    def audit(event: str, arguments: tuple) -> None:
-        if not state["watched"]:
-            return
-        state["watched"] = False
-        if any(path.is_relative_to(work) for path in changed(event, arguments)):
-            state["count"] += 1
-            if state["count"] == kill_at:
-                os.killpg(0, signal.SIGKILL)
-            os.write(pipe, b".")
-        state["watched"] = True
+    ``kill_at`` is the change before which the process kills itself and what it started.
+    """
+    place.output.seek(0)
+    place.output.truncate()
 
-    sys.addaudithook(audit)
+    def work(tell: Callable[[Any], None]) -> None:
+        place.isolate()
+        changes = 0
 
-    def stop() -> Iterator[None]:
-        state["watched"] = False
-        yield
+        def change(path: Path) -> None:
+            nonlocal changes
+            if path.is_relative_to(place.work):
+                changes += 1
+                if changes == kill_at:
+                    os.killpg(0, signal.SIGKILL)
 
-    return stop()
+        on_change(change)
+        code = call(writer.line)
+        tell((code, changes))
 
-
-# What a command leaves.
+    ended, values = forked(work)
+    return values[0] if values else (ended, 0)
 
 
 TIMES = re.compile(
@@ -191,18 +136,16 @@ def tree(place: Place, writer: Writer) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for path in sorted(place.work.rglob("*")):
         name = str(path.relative_to(place.work))
-        if path.is_symlink():
-            found[name] = f"link to {os.readlink(path)}"
-        elif path.is_dir():
-            found[name] = "folder"
+        if path.is_symlink() or path.is_dir():
+            found[name] = os.readlink(path) if path.is_symlink() else "folder"
         elif path.suffix == ".log" or any(path.match(pattern) for pattern in writer.measured):
             found[name] = "file"
         else:
-            found[name] = content(path, str(place.work))
+            found[name] = _content(path, str(place.work))
     return found
 
 
-def content(path: Path, work: str) -> Any:
+def _content(path: Path, work: str) -> Any:
     """What a file holds, without times."""
     data = path.read_bytes()
     try:
@@ -226,109 +169,83 @@ def differences(expected: dict[str, Any], found: dict[str, Any]) -> list[str]:
     """Files left behind, missing or of other content."""
     lines = [f"left behind: {name}" for name in found if name not in expected]
     lines += [f"missing: {name}" for name in expected if name not in found]
-    return lines + [
-        f"differs: {name}" for name in expected if found.get(name, expected[name]) != expected[name]
-    ]
-
-
-# All commands.
+    common = [name for name in expected if name in found]
+    return lines + [f"differs: {name}" for name in common if found[name] != expected[name]]
 
 
 class Kills:
     """The kills of one command: what an unbroken run leaves, and the changes still to be tried."""
 
-    def __init__(self, writer: Writer, samples: Path, seed: int, skip: int = 0):
-        self.writer, self.place = writer, Place(samples / writer.sample)
+    def __init__(self, writer: Writer, samples: Path, seed: int):
+        self.writer, self.place, self.done = writer, Place(samples / writer.sample), 0
         self.findings: list[tuple[int, str]] = []
-        self.done = 0
+        self.waiting: list[int] = []
+        self.expected: dict[str, Any] | None = None
         self.place.restore()
-        self.code, self.changes, self.text = start(writer, self.place, None)
+        self.code, self.changes = start(writer, self.place)
+        self.traced = "Traceback" in self.place.text()
         self.expected = tree(self.place, writer)
+        if self.code not in (0, 1):
+            self.findings.append((0, f"an unbroken run: exit code {self.code}: {_last(self.place.text())}"))
         self.place.restore()
-        code, _, text = start(writer, self.place, None)
-        faults = differences(self.expected, tree(self.place, writer))
-        if code not in (0, 1) or code != self.code or faults:
-            why = "; ".join([*faults[:3], _last(text)])
-            self.findings.append((0, f"two unbroken runs: {self.code} and {code}; {why}"))
-            self.waiting: list[int] = []  # kills have nothing to be compared with
-            return
+        if self.findings or not self._ends_alike(0):
+            return  # kills have nothing to be compared with
         every = [*range(1, self.changes + 1)]
-        edges = every[:10] + every[-10:]
+        edges = [*dict.fromkeys(every[:10] + every[-10:])]
         rest = [n for n in every if n not in edges]
-        order = [*dict.fromkeys(edges), *np.random.default_rng(seed).permutation(rest).tolist()]
-        self.waiting = order[skip:]
+        self.waiting = [*edges, *np.random.default_rng(seed).permutation(rest).tolist()]
 
     def kill(self, number: int) -> None:
         """Kill the command before a change, start it again, and compare."""
         self.place.restore()
-        killed, _, text = start(self.writer, self.place, number)
         self.done += 1
-        if killed is not None:
-            if killed != self.code:
-                self.findings.append((number, f"not killed, exit code {killed}: {_last(text)}"))
-            return
-        code, _, text = start(self.writer, self.place, None)
-        faults = differences(self.expected, tree(self.place, self.writer))
+        code, _ = start(self.writer, self.place, number)
+        if code == -signal.SIGKILL:
+            self._ends_alike(number)
+        elif code != self.code:
+            self.findings.append((number, f"not killed, exit code {code}: {_last(self.place.text())}"))
+
+    def _ends_alike(self, number: int) -> bool:
+        """Whether the command, started now, ends as the unbroken run did."""
+        code, _ = start(self.writer, self.place)
+        text = self.place.text()
+        faults = differences(self.expected or {}, tree(self.place, self.writer))[:3]
         if code != self.code:
-            self.findings.append((number, f"exit code {code} instead of {self.code}: {_last(text)}"))
-        elif "Traceback (most recent call last)" in text and "Traceback" not in self.text:
-            self.findings.append((number, f"a traceback: {_last(text)}"))
-        elif faults:
-            self.findings.append((number, "; ".join(faults[:3])))
+            faults = [f"exit code {code} instead of {self.code}: {_last(text)}"]
+        elif "Traceback (most recent call last)" in text and not self.traced:
+            faults = [f"a traceback: {_last(text)}"]
+        if faults:
+            self.findings.append((number, ("" if number else "a second unbroken run: ") + "; ".join(faults)))
+        return not faults
 
 
 def _last(text: str) -> str:
     return text.strip().splitlines()[-1][:300] if text.strip() else ""
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a command's kills: a finding is the change and what went wrong after it."""
-
-    name: str
-    changes: int
-    done: int
-    findings: list[tuple[int, str]]
-
-
 def kill_all(
-    writers: Sequence[Writer], samples: Path, seed: int, end: float, at: int | None = None, skip: int = 0
-) -> list[Outcome]:
-    """Kill commands in rounds, one change of each, until all are done or ``end``; those that were not begun are left out."""
+    names: Sequence[str], samples: Path, seed: int, end: float, at: int | None = None
+) -> list[tuple]:
+    """Kill commands in rounds, one change of each, until all are done or ``end``; those that were not begun are left out.
+
+    Returns
+    -------
+    list
+        For each command its name, the number of its changes, how many were tried, and the findings by change.
+    """
     kills: list[Kills] = []
     began = time.monotonic()
-    for writer in writers:
+    for writer in (writer for writer in WRITERS if writer.name in names):
         if not kills or time.monotonic() - began < (end - began) / 2:
-            kills.append(Kills(writer, samples, seed, skip))
-    if at and kills[0].waiting:
-        kills[0].kill(at)
-    while at is None and any(k.waiting for k in kills) and time.monotonic() < end:
+            kills.append(Kills(writer, samples, seed))
+            kills[-1].waiting = kills[-1].waiting if at is None else [at]
+    while any(k.waiting for k in kills) and time.monotonic() < end:
         for k in kills:
             if k.waiting and time.monotonic() < end:
                 k.kill(k.waiting.pop(0))
     for k in kills:
-        shutil.rmtree(k.place.root)
-    return [Outcome(k.writer.name, k.changes, k.done, k.findings) for k in kills]
-
-
-def describe(outcomes: Sequence[Outcome], left_out: Sequence[str]) -> str:
-    """How many changes of how many were tried, then each kind of finding."""
-    lines = [f"{'command':<16}{'changes':>9}{'killed':>8}{'findings':>10}"]
-    counts = [(o.name, o.changes, o.done, len(o.findings)) for o in outcomes]
-    counts.append(("all", *(sum(column) for column in zip(*(count[1:] for count in counts)))))
-    lines += [f"{name:<16}{changes:>9}{done:>8}{findings:>10}" for name, changes, done, findings in counts]
-    if left_out:
-        lines.append(f"no time for: {', '.join(left_out)}")
-    for outcome in outcomes:
-        kinds: dict[str, list[int]] = {}
-        for number, text in outcome.findings:
-            kinds.setdefault(re.sub(r"-\w{8}\b", "-*", text), []).append(number)
-        for text, numbers in kinds.items():
-            shown = ", ".join(map(str, numbers[:10])) + (", ..." if len(numbers) > 10 else "")
-            command = f"python -m headbench.tests.fuzz.kills --command '{outcome.name}' --at {numbers[0]}"
-            killed = f", killed before {shown}" if numbers[0] else ""
-            lines.append(f"\n{outcome.name}{killed}: {text}\n  {command}")
-    return "\n".join(lines)
+        k.place.remove()
+    return [(k.writer.name, k.changes, k.done, k.findings) for k in kills]
 
 
 def main() -> int:
@@ -338,26 +255,26 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--command", action="append", default=[], help="the start of names; default: all")
     parser.add_argument("--at", type=int, help="kill the command before this change only")
-    parser.add_argument(
-        "--skip", type=int, default=0, help="so many of each command were tried with this seed before"
-    )
-    parser.add_argument("--samples", type=Path, default=Path("build/fuzz"))
     options = parser.parse_args()
-    samples = prepare_samples(options.samples)
+    samples = prepare_samples()
     load_everything()
-    chosen = [w for w in WRITERS if not options.command or any(w.name.startswith(n) for n in options.command)]
+    chosen = [w.name for w in WRITERS if not options.command or w.name.startswith(tuple(options.command))]
     end = time.monotonic() + options.seconds
-    shares = [chosen[index :: options.workers] for index in range(options.workers)]
-    shares = [share for share in shares if share]
+    shares = [
+        share for share in (chosen[index :: options.workers] for index in range(options.workers)) if share
+    ]
     with ProcessPoolExecutor(len(shares), multiprocessing.get_context("fork")) as pool:
-        jobs = [
-            pool.submit(kill_all, share, samples, options.seed, end, options.at, options.skip)
-            for share in shares
-        ]
-        found = {outcome.name: outcome for job in jobs for outcome in job.result()}
-    outcomes = [found[writer.name] for writer in chosen if writer.name in found]
-    print(describe(outcomes, [writer.name for writer in chosen if writer.name not in found]))
-    return 1 if any(outcome.findings for outcome in outcomes) else 0
+        jobs = [pool.submit(kill_all, share, samples, options.seed, end, options.at) for share in shares]
+        found = {outcome[0]: outcome for job in jobs for outcome in job.result()}
+    print(f"{'command':<20}{'changes':>9}{'killed':>8}{'findings':>10}")
+    for name, changes, done, findings in found.values():
+        print(f"{name:<20}{changes:>9}{done:>8}{len(findings):>10}")
+        for number, text in {text: (number, text) for number, text in reversed(findings)}.values():
+            again = f"python -m headbench.tests.fuzz.kills --command '{name}' --at {number}"
+            print(f"  killed before {number}: {text}\n    {again}")
+    if left := [name for name in chosen if name not in found]:
+        print(f"no time for: {', '.join(left)}")
+    return 1 if any(outcome[3] for outcome in found.values()) else 0
 
 
 if __name__ == "__main__":

@@ -16,20 +16,25 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+import safetensors.torch
+import scipy.sparse
 import torch
 import yaml
 
 from headbench.bench import cli
 from headbench.bench.io.files import digest
+from headbench.bench.rows import Row, Rows
 from headbench.datasets.colmap.writer import export_model
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.methods.shared.avatar_files import read_shared_head
 from headbench.methods.shared.checkpoint import save_checkpoint
+from headbench.methods.shared.ply import write_ply
 from headbench.metrics.lpips_network import SQUEEZE
 
-from ..datasets.head.flame_files import write_flame
+from ..datasets.head.flame_files import legacy_pickle, write_flame
 from ..datasets.head.toy import toy_head
 from ..datasets.monocular.videos import Recording, write_imavatar, write_insta
 from ..datasets.nersemble.benchmark_folder import write_benchmark
@@ -39,7 +44,6 @@ from ..methods.gha.small import SMALL as SMALL_GHA
 from ..methods.insta.small import SMALL as SMALL_INSTA
 from ..methods.official.repository import lip_numbers, make_interpreter, make_repository
 
-STAMP = "stamp"
 AVATAR = "run/901/{}/seed-0/avatar"
 CHECKPOINT, BACKBONE = "checkpoint.safetensors", "squeezenet1_1-b8a52dc0.pth"
 SYNTH = "--cameras 2 --timesteps 7 --size 16x16"
@@ -49,6 +53,7 @@ PREPARE = (
 )
 METHODS = ("mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours")
 ITERATIONS = {"budget": {"iterations": 2}}
+NUMBERS = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
 SETTINGS = {
     "ga": ITERATIONS,
     "gbs": {**ITERATIONS, "samples": 200, "teeth_samples": 20},
@@ -82,6 +87,38 @@ def with_capture(folder: Path, samples: Path) -> Path:
     """Copy the capture into a sample; return the folder of the finished run's avatars of it."""
     shutil.copytree(samples / "capture" / "capture", folder / "capture")
     return samples / "run" / "run" / "901"
+
+
+def files(folder: Path, samples: Path) -> None:
+    """A small file of every format."""
+    import pycolmap
+
+    np.savez(folder / "plain.npz", x=NUMBERS)
+    np.savez_compressed(folder / "compressed.npz", x=NUMBERS)
+    np.save(folder / "a.npy", NUMBERS)
+    tensors = {"x": torch.from_numpy(NUMBERS)}
+    torch.save(tensors, folder / "a.pth")
+    torch.save(tensors, folder / "old.pth", _use_new_zipfile_serialization=False)
+    (folder / "a.safetensors").write_bytes(safetensors.torch.save(tensors))
+    (folder / "a.pkl").write_bytes(pickle.dumps({"x": NUMBERS}))
+    objects = {"x": NUMBERS, "matrix": scipy.sparse.csc_matrix(np.eye(4)), "text": "lbs"}
+    (folder / "python2.pkl").write_bytes(legacy_pickle(objects))
+    write_ply(folder / "a.ply", ("x", "y", "z"), NUMBERS)
+    rows = (Row("m", "1", 0, "t", "s", "q", i, "c", "full", "psnr", 1.0, "h") for i in range(30))
+    Rows.of(rows).write(folder / "rows.parquet")
+    picture = np.random.default_rng(0).integers(0, 255, (20, 30, 3), dtype=np.uint8)
+    for name in ("a.png", "a.jpg"):
+        cv2.imwrite(str(folder / name), picture)
+    (folder / "a.json").write_text('{"x": [1, 2.5, "text"]}')
+    (folder / "a.yaml").write_text("x: [1, 2.5, text]\ny: {z: true}\n")
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(camera_id=7, model="PINHOLE", width=40, height=30, params=[50.0, 51, 20, 15])
+    model.add_camera_with_trivial_rig(camera)
+    image = pycolmap.Image("a.png", np.zeros((2, 2)), 7, 3)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    for kind, write in (("bin", model.write_binary), ("txt", model.write_text)):
+        (folder / kind).mkdir()
+        write(folder / kind)
 
 
 def capture(folder: Path, samples: Path, subject: str = "901") -> None:
@@ -245,51 +282,55 @@ def synthetic(folder: Path, samples: Path) -> None:
 SAMPLES: dict[str, Callable[[Path, Path], None]] = {
     sample.__name__: sample
     for sample in (
-        *(capture, heads, recording, videos, monocular, run, unfinished, two_subjects, timed, checkpoint),
+        *(
+            files,
+            capture,
+            heads,
+            recording,
+            videos,
+            monocular,
+            run,
+            unfinished,
+            two_subjects,
+            timed,
+            checkpoint,
+        ),
         *(compact, ply, colmap, benchmark, exclusions, baseline, settings, weights, images, bundles),
         *(official, synthetic),
     )
 }
 
 
-def make(root: Path) -> Path:
-    """Make every sample that ``root`` lacks, each whole or not at all; all, where the code has changed since."""
-    if not _is_current(root):
-        shutil.rmtree(root, ignore_errors=True)
-        root.mkdir(parents=True)
-        (root / STAMP).write_text(_sources())
+def make(root: Path) -> None:
+    """Make every sample."""
     for name, build in SAMPLES.items():
-        if not (root / name).exists():
-            partial = root / f".{name}"
-            shutil.rmtree(partial, ignore_errors=True)
-            partial.mkdir()
-            build(partial, root)
-            partial.rename(root / name)
-    return root
+        (root / name).mkdir(parents=True)
+        build(root / name, root)
 
 
-def prepare_samples(root: Path) -> Path:
-    """Make the samples that ``root`` lacks, in another process, since that starts threads, which no fork survives."""
+def prepare_samples(root: Path = Path("build/fuzz")) -> Path:
+    """The folder with the samples of the code as it is.
+
+    They are made in another process where they are missing, since that starts threads, which no fork survives.
+    """
     os.environ.update(OMP_NUM_THREADS="1", OMP_WAIT_POLICY="PASSIVE")
-    if _is_current(root) and all((root / name).exists() for name in SAMPLES):
-        return root.resolve()
-    words = [sys.executable, "-m", "headbench.tests.fuzz.samples", str(root)]
-    made = subprocess.run(words, check=False, capture_output=True, text=True)
-    if made.returncode:
-        raise RuntimeError(f"samples: {made.stdout[-5000:]}{made.stderr[-5000:]}")
-    return root.resolve()
-
-
-def _is_current(root: Path) -> bool:
-    """Whether the samples of a folder were made by the code as it is."""
-    return (root / STAMP).exists() and (root / STAMP).read_text() == _sources()
-
-
-def _sources() -> str:
-    """Digest of the code that samples depend on."""
     top = Path(__file__).parents[2]
-    folders = ("bench", "datasets", "methods", "metrics", "reports", "tests/fuzz")
-    return digest(*(path.read_text() for name in folders for path in sorted((top / name).rglob("*.py"))))
+    packages = ("bench", "datasets", "methods", "metrics", "reports")
+    sources = [Path(__file__), *(path for name in packages for path in sorted((top / name).rglob("*.py")))]
+    current = root / digest(*(path.read_text() for path in sources))[:12]
+    if not current.exists():
+        shutil.rmtree(root, ignore_errors=True)
+        partial = root / "partial"
+        made = subprocess.run(
+            [sys.executable, "-m", "headbench.tests.fuzz.samples", str(partial)],
+            check=False,
+            capture_output=True,
+            text=True,
+        )
+        if made.returncode:
+            raise RuntimeError(f"samples: {made.stdout[-5000:]}{made.stderr[-5000:]}")
+        partial.rename(current)
+    return current.resolve()
 
 
 def _run(

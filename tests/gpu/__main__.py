@@ -17,11 +17,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from headbench.bench.benchmarks import table
 from headbench.bench.errors import HeadbenchError
 from headbench.bench.io.documents import checked, read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.machine import check_device, machine_record
-from headbench.tests.benchmarks.timing import table
 
 from .steps import ROOT, STEPS, Bar
 
@@ -73,8 +73,7 @@ def kept(step: int, device: str, out: Path) -> list[Bar]:
 
 def shown(found: dict[int, list[Bar]]) -> str:
     """The table of bars."""
-    rows = [(str(step), *bar.cells()) for step, bars in found.items() for bar in bars]
-    return table(("step", "what", "bound", "found", "verdict"), rows)
+    return table([{"step": step, **bar.cells()} for step, bars in found.items() for bar in bars])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

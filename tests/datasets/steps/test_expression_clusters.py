@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sklearn.cluster import SpectralClustering
 from sklearn.metrics import adjusted_rand_score
 
+from headbench.datasets.benchmarks.refit import performance
 from headbench.datasets.steps import clusters as module
 from headbench.datasets.steps.clusters import (
     cluster_by_distance,
@@ -15,7 +18,8 @@ from headbench.datasets.steps.clusters import (
     mean_vertex_distances,
     similarities,
 )
-from headbench.tests.benchmarks.clusters import performed_clip
+from headbench.datasets.synthetic.performance import HELD_OUT, perform, share_out
+from headbench.datasets.synthetic.plan import load_geometry
 
 from .clips import make_clip, with_poses
 
@@ -29,6 +33,27 @@ def grouped_clip(train: int, groups: int, noise: float = 0.02):
     wobble = noise * rng.normal(size=(train + 1, 8))
     still = {"jaw": lambda t: np.zeros(3), "eyes": lambda t: np.zeros(6)}
     return with_poses(base, expression=lambda t: centres[truth[t]] + wobble[t], **still), truth[:train]
+
+
+def performed_clip(timesteps: int, seed: int):
+    """Training timesteps as subjects of the synthetic capture perform them, with the noise of a tracking; without images."""
+    geometry = load_geometry("procedural")
+    rng = np.random.default_rng(seed)
+    lengths = share_out(round(1.2 * timesteps) + 1)  # a sixth of a performance is held out
+    poses = [
+        geometry.translation.pose(moment, "s", 0)
+        for name, count in lengths.items()
+        if name != HELD_OUT
+        for moment in perform(name, count, 100 * seed).activations
+    ]
+    clip = performance(geometry.head, timesteps)
+    noisy = {
+        t: replace(
+            pose, timestep=t, expression=pose.expression + 0.02 * rng.standard_normal(len(pose.expression))
+        )
+        for t, pose in enumerate(poses[:timesteps])
+    }
+    return replace(clip, poses=noisy)
 
 
 def test_separate_groups_become_the_classes():

@@ -9,8 +9,7 @@ from headbench.bench.errors import InputError
 from headbench.methods.shared import loop
 from headbench.methods.shared.loop import CHECKPOINT, Fit, train
 from headbench.methods.shared.optimisation import Optimiser
-from headbench.methods.shared.threads import threads
-from headbench.tests.benchmarks.timing import torch_threads
+from headbench.methods.shared.threads import threads, torch_threads
 
 
 class Drift:

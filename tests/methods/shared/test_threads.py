@@ -2,8 +2,7 @@
 
 import torch
 
-from headbench.methods.shared.threads import threads, torch_on_one_thread
-from headbench.tests.benchmarks.timing import torch_threads
+from headbench.methods.shared.threads import threads, torch_on_one_thread, torch_threads
 
 
 def test_torch_on_one_thread_leaves_kernels_theirs():

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from headbench.methods.shared import binding, losses, training_kernel
 from headbench.methods.shared.networks import sh_to_rgb
+from headbench.methods.shared.threads import torch_threads
 from headbench.methods.splats.cpu import instruction_sets
-from headbench.tests.benchmarks.timing import torch_threads
 
 VERTICES, FACES, SPLATS = 211, 310, 2_077  # no multiples of a vector, more than one task
 

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from headbench.tests.benchmarks.splats.scenes import Scene
+from headbench.methods.benchmarks.scenes import SplatScene
 
 
 class Dense(NamedTuple):
@@ -24,7 +24,7 @@ class Dense(NamedTuple):
 
 
 def render_dense(
-    scene: Scene,
+    scene: SplatScene,
     *,
     near: float = 0.01,
     eps2d: float = 0.3,
@@ -33,7 +33,7 @@ def render_dense(
     transmittance_min: float = 1e-4,
 ) -> Dense:
     """Render without gradients. Memory is (N, H W); keep both small."""
-    s = Scene(*(v.detach().double() if isinstance(v, Tensor) else v for v in scene))
+    s = SplatScene(*(v.detach().double() if isinstance(v, Tensor) else v for v in scene))
     camera = s.means @ s.viewmat[:3, :3].T + s.viewmat[:3, 3]
     order = torch.argsort(camera[:, 2], stable=True)
     order = order[camera[order, 2] > near]

@@ -1,6 +1,6 @@
 """The kernel, in every instruction set this machine runs, against the float64 reference.
 
-Numerical extremes and numbers of threads are in tests/benchmarks/test_extremes.py.
+Numerical extremes and numbers of threads are in tests/methods/benchmarks/test_extremes.py.
 """
 
 from __future__ import annotations
@@ -18,24 +18,22 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from headbench.methods.splats import rasterize
-from headbench.tests.benchmarks.splats.scenes import (
-    Outcome,
-    Scene,
+from headbench.methods.benchmarks.scenes import (
+    DrawnScene,
+    SplatScene,
     cloud,
-    compare_with,
-    float64_truth,
     head_shell,
     relative_error,
     render_with_gradients,
 )
+from headbench.methods.splats import rasterize
 
-from .cases import check_kernel, kernels, needs_kernel
+from .cases import check_kernel, compare_with, float64_truth, kernels, needs_kernel
 
 pytestmark = needs_kernel
 
 
-def replaced(scene: Scene, **parts) -> Scene:
+def replaced(scene: SplatScene, **parts) -> SplatScene:
     """A scene whose first splats take other values: ``parts`` are rows by field name."""
     fields = {}
     for name, rows in parts.items():
@@ -215,7 +213,7 @@ def one_torch_thread() -> Iterator[None]:
 @pytest.fixture(
     scope="module", params=[(20_000, 275, 401), pytest.param((60_000, 550, 802), marks=pytest.mark.slow)]
 )
-def frame(request) -> tuple[Scene, Outcome]:
+def frame(request) -> tuple[SplatScene, DrawnScene]:
     scene = head_shell(*request.param)
     return scene, float64_truth(scene)
 
@@ -248,7 +246,7 @@ def test_depths_that_float32_cannot_tell_apart_keep_their_order(kernel):
 
 
 @pytest.fixture(scope="module")
-def wide() -> tuple[Scene, Outcome]:
+def wide() -> tuple[SplatScene, DrawnScene]:
     """Splats a pixel wide at the right end of a wide image."""
     width, height, count = 2048, 16, 300
     rng = torch.Generator().manual_seed(6)

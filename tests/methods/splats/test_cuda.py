@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from headbench.bench.errors import UnavailableError
+from headbench.methods.benchmarks.scenes import cloud, head_shell, relative_error
 from headbench.methods.splats import available_backends, cpu, cuda, rasterize
-from headbench.tests.benchmarks.splats.scenes import cloud, head_shell, relative_error
 
 from .cases import request_of
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from headbench.methods.benchmarks.scenes import SplatScene, cloud
 from headbench.methods.splats import cuda, rasterize
-from headbench.tests.benchmarks.splats.scenes import Scene, cloud
 
 from .cases import backends, check_kernel, kernels, request_of
 from .dense import render_dense
@@ -18,7 +18,7 @@ CUT_OFFS = [
 cut_offs = pytest.mark.parametrize("options", CUT_OFFS, ids=["alpha", "transmittance", "both"])
 
 
-def thick() -> Scene:
+def thick() -> SplatScene:
     """Opaque enough that every cut-off shows."""
     return cloud(250, 45, 38, seed=40, size=0.1, opacity=1.0)
 

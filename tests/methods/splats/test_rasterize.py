@@ -9,14 +9,14 @@ import torch
 
 from headbench.bench.errors import UnavailableError
 from headbench.bench.native.loader import Kernel
-from headbench.methods.splats import available_backends, cpu, rasterize
-from headbench.tests.benchmarks.splats.scenes import (
+from headbench.methods.benchmarks.scenes import (
     DIFFERENTIABLE,
-    Scene,
+    SplatScene,
     cloud,
     relative_error,
     render_with_gradients,
 )
+from headbench.methods.splats import available_backends, cpu, rasterize
 
 from .cases import backends
 
@@ -61,7 +61,7 @@ def with_value(field, index, value):
 
 
 @backends
-@pytest.mark.parametrize("name", [*Scene._fields[:7], "background"])
+@pytest.mark.parametrize("name", [*SplatScene._fields[:7], "background"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_values_that_are_not_finite_are_refused(backend, name, value):
     scene = with_value(name, -1, value)

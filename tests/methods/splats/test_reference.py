@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from headbench.methods.splats import rasterize
-from headbench.methods.splats.reference import rotation_matrices
-from headbench.tests.benchmarks.splats.scenes import (
+from headbench.methods.benchmarks.scenes import (
     DIFFERENTIABLE,
-    Scene,
+    SplatScene,
     cloud,
     relative_error,
     render_with_gradients,
 )
+from headbench.methods.splats import rasterize
+from headbench.methods.splats.reference import rotation_matrices
 
 from .dense import render_dense
 
@@ -198,7 +198,7 @@ def test_rotation_matrices_agree_with_scipy_at_any_length():
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10_000), angle=st.floats(-3, 3), shift=st.floats(-5, 5))
 def test_moving_splats_and_camera_together_changes_nothing(seed, angle, shift):
-    scene = Scene(*(v.double() if torch.is_tensor(v) else v for v in cloud(12, 18, 17, seed=seed)))
+    scene = SplatScene(*(v.double() if torch.is_tensor(v) else v for v in cloud(12, 18, 17, seed=seed)))
     turn = Rotation.from_rotvec([0.3 * angle, angle, -0.7 * angle])
     motion = torch.eye(4, dtype=F64)
     motion[:3, :3] = torch.from_numpy(turn.as_matrix())

@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from headbench.methods.benchmarks.scenes import SplatScene, cloud
 from headbench.methods.splats import available_backends, cuda, rasterize
-from headbench.tests.benchmarks.splats.scenes import Scene, cloud
 
 from .cases import backends, request_of
 from .test_cuda import FakeGsplat
@@ -18,7 +18,7 @@ from .test_cuda import FakeGsplat
 WIDTH, HEIGHT = 44, 29  # neither is a multiple of a tile's 16 pixels
 
 
-def published(scene: Scene, near: float = 0.2) -> list[int]:
+def published(scene: SplatScene, near: float = 0.2) -> list[int]:
     """`preprocessCUDA` of diff-gaussian-rasterization 59f5f77, splat by splat, in float64 and its own order of steps."""
     fx, fy = float(scene.K[0, 0]), float(scene.K[1, 1])
     world = scene.viewmat.double().numpy()
@@ -52,7 +52,7 @@ def published(scene: Scene, near: float = 0.2) -> list[int]:
     return radii
 
 
-def crowd() -> Scene:
+def crowd() -> SplatScene:
     """Splats in and about the image, near and behind the camera, most too faint to be drawn."""
     scene = cloud(600, WIDTH, HEIGHT, seed=3)
     rng = torch.Generator().manual_seed(4)

@@ -10,7 +10,7 @@ from scipy import stats
 from headbench.bench.errors import InputError
 from headbench.reports.aggregate import subject_means
 from headbench.reports.statistics.bootstrap import SequencePairs, SubjectPairs, block_length, interval, pair
-from headbench.tests.benchmarks.statistics import Population
+from headbench.reports.statistics.calibration import Population
 
 
 @pytest.fixture

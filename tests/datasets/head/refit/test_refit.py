@@ -7,13 +7,13 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from headbench.bench.errors import InputError
+from headbench.datasets.benchmarks.refit import EXACT_MEAN_MM, EXACT_P95_MM, performance
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.head.refit import refit as block
 from headbench.datasets.head.refit.command import RefitSettings
 from headbench.datasets.head.refit.refit import BLOCK, refit
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.head.teeth import with_teeth
-from headbench.tests.benchmarks.refit import EXACT_MEAN_MM, EXACT_P95_MM, performance
 
 from .heads import subdivided, toy_pair
 

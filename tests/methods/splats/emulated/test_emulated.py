@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
+from headbench.methods.benchmarks.scenes import SplatScene, cloud, head_shell, relative_error
 from headbench.methods.splats.rasterize import rasterize
-from headbench.tests.benchmarks.splats.scenes import Scene, cloud, head_shell, relative_error
 
 COMPILER, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
 ROOT = Path(__file__).parents[4]
@@ -61,7 +61,7 @@ def driver(tmp_path_factory) -> Path:
     ],
     ids=["cloud", "five channels", "head", "many opaque"],
 )
-def test_arm_kernels_agree_with_the_reference(driver, tmp_path, scene: Scene):
+def test_arm_kernels_agree_with_the_reference(driver, tmp_path, scene: SplatScene):
     rng = np.random.default_rng(0)
     channels = scene.colors.shape[1]
     on_image = rng.standard_normal((scene.height, scene.width, channels), dtype=np.float32)

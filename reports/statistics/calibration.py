@@ -1,18 +1,19 @@
-"""Paired differences as a benchmark of head avatars has them, drawn from a known population."""
+"""``headbench stress statistics``: tests and intervals on paired differences that are drawn from a known population."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 from scipy.signal import lfilter
 
-from ...bench.contracts import FloatArray, Progress, no_progress
+from ...bench.benchmarks import Row, findings
+from ...bench.contracts import FloatArray, Progress
 from ...bench.specs import Findings
-from ...reports.statistics.bootstrap import SequencePairs, SubjectPairs, interval
-from ...reports.statistics.comparisons import LEVEL, best_set, least_p, sign_flip_p
+from .bootstrap import SequencePairs, SubjectPairs, interval
+from .comparisons import LEVEL, best_set, least_p, sign_flip_p
 
 
 @dataclass(frozen=True)
@@ -84,41 +85,41 @@ CASES: Mapping[str, Population] = {
 }
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """Shares over the trials.
+def stress(quick: bool, progress: Progress) -> Findings:
+    """Calibrate every case of `CASES` and the sets of the best; passed where the level is kept as promised."""
+    trials = QUICK_TRIALS if quick else TRIALS
+    cases: list[Row] = []
+    for index, (case, population) in enumerate(CASES.items()):
+        progress(index, len(CASES) + 1, case)
+        cases.append({"simulated": case, **calibrate(population, trials)})
+    sets: list[Row] = []
+    for advantage in (0.0, 0.25, 0.5):
+        left_out, kept = best_set_errors(5, 9, trials, advantage)
+        sets.append({"best by dB": advantage, "left out %": 100 * left_out, "others marked %": 100 * kept})
+    error = standard_error(trials)
+    faults = [f"{row['simulated']}: not as promised" for row in cases if row["verdict"] == BROKEN]
+    limit = 100 * (LEVEL + 2 * error)
+    faults += [f"best by {row['best by dB']:g} dB: left out" for row in sets if row["left out %"] > limit]
+    note = (
+        f"{trials} trials each; nominal {LEVEL:.0%} tests, {1 - LEVEL:.0%} intervals; standard error {error:.1%}. The best "
+        "are of 5\nmethods, 9 subjects (standard deviation 0.25 dB)."
+    )
+    return findings({"Tests and intervals": cases, "Sets of the best": sets}, note, faults)
 
-    Attributes
-    ----------
-    promised : the population is one that the test's exactness assumes: its differences are symmetric about their mean.
-    rejected : of the sign-flip test at the level; None where so few subjects cannot be tested.
-    covered : of the intervals.
-    frame_test : how often a paired t-test over frames rejects.
-    error : standard error of ``rejected`` and of 1 - ``covered`` where they are 5 %.
+
+BROKEN = "not as promised"
+
+
+def calibrate(population: Population, trials: int, seed: int = 0) -> Row:
+    """Draw the population ``trials`` times; test and give an interval each time.
+
+    Returns
+    -------
+    Row
+        In %: how often the sign-flip test rejects (None where so few subjects cannot be tested), how often the interval
+        covers, and how often a paired t-test over frames rejects; and a verdict on what was promised. The test's exactness
+        assumes differences that are symmetric about their mean.
     """
-
-    case: str
-    promised: bool
-    null: bool
-    trials: int
-    rejected: float | None
-    covered: float
-    frame_test: float
-    error: float
-
-    @property
-    def as_promised(self) -> bool:
-        """Whether the test, on the null, and the interval are within `RANGE`, where that was promised."""
-        if not self.promised:
-            return True
-        shares = [1 - self.covered]
-        if self.null and self.rejected is not None:
-            shares.append(self.rejected)
-        return all(RANGE[0] - 2 * self.error <= share <= RANGE[1] + 2 * self.error for share in shares)
-
-
-def calibrate(case: str, population: Population, trials: int, seed: int = 0) -> Calibration:
-    """Draw the population ``trials`` times; test and give an interval each time."""
     generator = np.random.default_rng(seed)
     rejected = covered = frame_test = 0
     for trial in range(trials):
@@ -127,16 +128,24 @@ def calibrate(case: str, population: Population, trials: int, seed: int = 0) -> 
         bounds = interval(subjects, LEVEL, REPLICATES, seed=trial)
         covered += bounds is not None and bounds[0] <= population.mean <= bounds[1]
         frame_test += frame_t_test_p(subjects) <= LEVEL
-    return Calibration(
-        case,
-        not population.skewed,
-        population.mean == 0,
-        trials,
-        rejected / trials if least_p(population.subjects) <= LEVEL else None,
-        covered / trials,
-        frame_test / trials,
-        float(np.sqrt(LEVEL * (1 - LEVEL) / trials)),
-    )
+    testable, error = least_p(population.subjects) <= LEVEL, standard_error(trials)
+    shares = [1 - covered / trials] + [rejected / trials] * (testable and population.mean == 0)
+    verdict = "ok"
+    if population.skewed:
+        verdict = "beyond the test's assumption"
+    elif not all(RANGE[0] - 2 * error <= share <= RANGE[1] + 2 * error for share in shares):
+        verdict = BROKEN
+    return {
+        "test rejects %": 100 * rejected / trials if testable else None,
+        "interval covers %": 100 * covered / trials,
+        "frame t-test rejects %": 100 * frame_test / trials,
+        "verdict": verdict,
+    }
+
+
+def standard_error(trials: int) -> float:
+    """Of a share that is 5 %."""
+    return float(np.sqrt(LEVEL * (1 - LEVEL) / trials))
 
 
 def frame_t_test_p(subjects: tuple[SubjectPairs, ...]) -> float:
@@ -164,42 +173,3 @@ def best_set_errors(
         left_out += "0" not in found
         kept += len(found - {"0"})
     return left_out / trials, kept / trials / (methods - 1)
-
-
-def run(quick: bool = False, progress: Progress = no_progress) -> Findings:
-    """Calibrate every case of `CASES` and the sets of the best."""
-    trials = QUICK_TRIALS if quick else TRIALS
-    results = []
-    for index, (case, population) in enumerate(CASES.items()):
-        progress(index, len(CASES) + 1, case)
-        results.append(calibrate(case, population, trials))
-    advantages = (0.0, 0.25, 0.5)
-    sets = [(advantage, *best_set_errors(5, 9, trials, advantage)) for advantage in advantages]
-    progress(len(CASES) + 1, len(CASES) + 1, "sets of the best")
-    nominal = f"nominal {LEVEL:.0%} tests, {1 - LEVEL:.0%} intervals"
-    lines = [
-        f"{trials} trials each; {nominal}; standard error {results[0].error:.1%}",
-        "",
-        f"{'simulated':<32}{'sign-flip test':>16}{'interval':>12}{'frame t-test':>16}",
-        f"{'':<32}{'rejects':>16}{'covers':>12}{'rejects':>16}",
-    ]
-    for result in results:
-        rejected = "not testable" if result.rejected is None else f"{result.rejected:.1%}"
-        mark = "" if result.as_promised else "  not as promised"
-        mark = mark if result.promised else "  beyond the test's assumption"
-        lines.append(
-            f"{result.case:<32}{rejected:>16}{result.covered:>12.1%}{result.frame_test:>16.1%}{mark}"
-        )
-    lines += ["", "Best of 5 methods, 9 subjects (standard deviation 0.25 dB):"]
-    for advantage, left_out, kept in sets:
-        lines.append(
-            f"  best by {advantage:.2f} dB: left out in {left_out:.1%}, each other one marked in {kept:.1%}"
-        )
-    limit = LEVEL + 2 * results[0].error
-    passed = all(result.as_promised for result in results) and all(out <= limit for _, out, _ in sets)
-    data = {
-        "level": LEVEL,
-        "cases": [{**asdict(result), "as_promised": result.as_promised} for result in results],
-        "best_sets": [{"advantage": a, "left_out": out, "others_marked": kept} for a, out, kept in sets],
-    }
-    return Findings("\n".join(lines), data, passed)

@@ -8,22 +8,25 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 import numpy as np
 
-from ...bench.contracts import Camera, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
+from ...bench.benchmarks import Row, findings
+from ...bench.contracts import Progress
+from ...bench.io.images import encode_image
+from ...bench.registry import resolve
 from ...bench.runner.adaptation import AdaptedClip
 from ...bench.specs import Findings
-from ...datasets.head.procedural.model import procedural_head
-from ...reports.view.command import ViewSettings
-from ...reports.view.drawing import draw, splats_of
-from ...reports.view.scene import Scene, ShownAvatar
-from ...reports.view.server import serving
-from ...reports.view.state import FreeView, Sliders, State
-from .avatar.untrained import cameras_around, random_poses, untrained_avatar
-from .timing import table
+from .command import ViewSettings
+from .drawing import draw, splats_of
+from .scene import Scene, ShownAvatar
+from .server import serving
+from .state import FreeView, Sliders, State
+
+UNTRAINED = "headbench.methods.benchmarks.untrained:untrained"
+"""Makes a capture and an avatar of any size; named, as this package imports no method."""
 
 SPLATS, QUICK_SPLATS = (20_000, 60_000), (2_000,)
 WINDOW = 1280, 720
@@ -44,71 +47,36 @@ MOVE_SLIDER = """([x, y, every]) => { let step = 0; window.moving = setInterval(
     {clientX: x + 40 * Math.sin(step / 10), clientY: y, bubbles: true, buttons: 1})); }, every); }"""
 
 
-@dataclass(frozen=True, eq=False)
-class _Clip:
-    """A capture without images, as much as a viewer asks of one."""
-
-    head: HeadAsset
-    cameras: dict[str, Camera]
-    poses: dict[int, HeadPose]
-    splits: dict[str, tuple[FrameKey, ...]]
-    subject: str = "untrained"
-    shape: FloatArray = field(default_factory=lambda: np.zeros(1))
-    background: FloatArray = field(default_factory=lambda: np.ones(3))
-
-
-def measure(quick: bool, progress: Progress) -> Findings:
+def speed(quick: bool, progress: Progress) -> Findings:
     """Serve untrained avatars of ours, move a slider in Chromium; passed where images of the first keep `LEAST_RATE`.
 
     Without Playwright and Chromium the rates of a browser are missing, and nothing is judged.
     """
     counts, seconds = (QUICK_SPLATS, QUICK_SECONDS) if quick else (SPLATS, SECONDS)
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    rows = []
-    for done, (count, mode) in enumerate((count, mode) for count in counts for mode in ("images", "splats")):
+    rows: list[Row] = []
+    for done, (count, mode) in enumerate(product(counts, ("images", "splats"))):
         progress(done, 2 * len(counts), f"{count} splats, {mode}")
-        scene = _scene(count)
-        row: dict[str, Any] = {"splats": count, "mode": mode, **_stages(scene, mode == "splats")}
-        if chromium:
-            row |= _in_browser(scene, mode, chromium, seconds)
-        rows.append(row)
-    progress(2 * len(counts), 2 * len(counts), "")
-    names = ("pose and draw ms", "pack ms", "sent a second", "uploads a second")
-    lines = [
-        table(
-            ["splats", "drawn as", *names],
-            [[f"{row['splats']:,}", row["mode"], *(_cell(row.get(name)) for name in names)] for row in rows],
-        ),
-        f"A window of {WINDOW[0]}x{WINDOW[1]}, WebGL in software. pack: JPEG of a draft. sent: by the server while a slider moves.",
-        "uploads: textures that the browser gave to WebGL; one image takes two.",
-    ]
+        clip, avatar = resolve(UNTRAINED)(count, 550, 802, version="2023", timesteps=4)
+        scene = Scene([ShownAvatar("ours", avatar, clip, AdaptedClip(clip), {})], {}, ())
+        row = {"splats": count, "drawn as": mode, **_stages(scene, mode == "splats")}
+        rows.append(row | (_in_browser(scene, mode, chromium, seconds) if chromium else {}))
+    note = (
+        f"A window of {WINDOW[0]}x{WINDOW[1]}, WebGL in software. pack: JPEG of a draft. sent: by the server while a slider "
+        "moves.\nuploads: textures that the browser gave to WebGL; one image takes two."
+    )
     faults = []
     if not chromium:
-        lines.append(
-            "The browser's rates are missing: there is no Chromium. Install it: apt-get install chromium."
+        note += (
+            "\nThe browser's rates are missing: there is no Chromium. Install it: apt-get install chromium."
         )
     elif not quick and rows[0]["sent a second"] < LEAST_RATE:
         faults = [f"{rows[0]['sent a second']:.1f} updates a second, fewer than {LEAST_RATE:g}"]
-    return Findings("\n".join([*lines, *faults]), {"rows": rows}, passed=not faults)
-
-
-def _cell(value: float | None) -> str:
-    return "?" if value is None else f"{value:.1f}"
-
-
-def _scene(count: int) -> Scene:
-    head = procedural_head("2023")
-    cameras = {camera.id: camera for camera in cameras_around(head, 4, 550, 802)}
-    poses = dict(enumerate(random_poses(head, 4)))
-    keys = tuple(FrameKey("untrained", "EMO-1", t, name) for t in poses for name in cameras)
-    clip: Any = _Clip(head, cameras, poses, {"train": keys})
-    return Scene([ShownAvatar("ours", untrained_avatar(head, count), clip, AdaptedClip(clip), {})], {}, ())
+    return findings({"The viewer": rows}, note, faults)
 
 
 def _stages(scene: Scene, splats: bool, repeats: int = 8) -> dict[str, float]:
     """Medians of milliseconds, with another expression each time."""
-    import cv2
-
     view = FreeView.of(next(iter(scene.first.clip.cameras.values())))
     drawn, packed = [], []
     for number in range(repeats):
@@ -120,7 +88,7 @@ def _stages(scene: Scene, splats: bool, repeats: int = 8) -> dict[str, float]:
             continue
         image = draw(scene, state, view, WINDOW, 0.99).image
         between = time.perf_counter()
-        cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])
+        encode_image(image, ".jpg", place="the viewer")
         drawn.append(between - start)
         packed.append(time.perf_counter() - between)
     stages = {"pose and draw ms": drawn} | ({"pack ms": packed} if packed else {})
