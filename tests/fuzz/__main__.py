@@ -27,7 +27,7 @@ from typing import Any
 import hypothesis
 from hypothesis import HealthCheck, Phase, given
 from hypothesis import strategies as st
-from hypothesis.errors import HypothesisException
+from hypothesis.errors import HypothesisException, StopTest
 
 from headbench.bench.errors import HeadbenchError, InputError
 
@@ -179,7 +179,7 @@ def fuzz(reader: Reader, sample: Path, seed: int, end: float = float("inf")) -> 
                 raise Over
             try:
                 tell({"outcome": check(reader, place, data.draw)})
-            except HypothesisException:
+            except (HypothesisException, StopTest):  # by which hypothesis ends a case
                 raise
             except BaseException as error:
                 tell({"finding": finding_of(error)})

@@ -269,7 +269,8 @@ def main() -> int:
     print(f"{'command':<20}{'changes':>9}{'killed':>8}{'findings':>10}")
     for name, changes, done, findings in found.values():
         print(f"{name:<20}{changes:>9}{done:>8}{len(findings):>10}")
-        for number, text in {text: (number, text) for number, text in reversed(findings)}.values():
+        kinds = {re.sub(r"-\w{8}\b", "-*", text): number for number, text in reversed(findings)}
+        for text, number in kinds.items():
             again = f"python -m headbench.tests.fuzz.kills --command '{name}' --at {number}"
             print(f"  killed before {number}: {text}\n    {again}")
     if left := [name for name in chosen if name not in found]:

@@ -47,7 +47,7 @@ class Reader:
     sample: str
     read: Callable[[], object]
     files: tuple[str, ...] = ("**/*",)
-    cases: int = 8
+    cases: int = 15
     text: bool = False
     """Whether a part of the file may be a whole file."""
 
@@ -136,7 +136,7 @@ GATE = "gate run --baseline baseline.json"
 OURS = AVATAR.format("ours")
 EXCLUSIONS = "reviewed/tongue.yaml"
 FUNCTIONS = (
-    Reader("capture", "capture", look_at(read_capture, "capture"), cases=12),
+    Reader("capture", "capture", look_at(read_capture, "capture"), cases=25),
     Reader("head npz", "heads", on(load_head, "head.npz"), ("head.npz",)),
     Reader("head eyelids", "heads", on(load_head, "eyelids.npz"), ("eyelids.npz",)),
     Reader("head flame2023", "heads", on(load_head, "flame2023.pkl"), ("flame2023.pkl",)),
