@@ -100,20 +100,13 @@ def test_trained_methods_beat_the_mean_image_even_after_seconds(run):
     assert means["ours"] > means["mean-image"] + 1
 
 
-def test_tables_and_pictures_are_left_to_look_at(run, capsys):
+def test_tables_and_pictures_are_left_to_look_at(run):
     assert {path.suffix for path in run.tables.iterdir()} == {".md", ".csv", ".tex", ".html", ".json"}
+    assert {path.stem for path in run.tables.iterdir()} == {"comparison", "speed", "cost"}
     assert '<script type="application/json" id="images">["' in run.page.read_text()
     sheet = cv2.imread(str(run.contact_sheet))
     assert sheet.shape[0] > 300
     assert sheet.std() > 10
-    capsys.readouterr()
-    assert {path.stem for path in run.tables.iterdir()} == {"comparison", "speed", "cost"}
-    for layout, mark in (("speed", "Raster"), ("cost", "Per primitive")):
-        assert cli.main(["table", str(run.root), "--layout", layout]) == 0
-        assert mark in capsys.readouterr().out
-    for form, mark in (("md", "| ours"), ("csv", "ours,"), ("latex", r"\toprule")):
-        assert cli.main(["table", str(run.root), "--format", form]) == 0
-        assert mark in capsys.readouterr().out
 
 
 def test_the_manifest_lets_one_repeat_it(run):
@@ -150,13 +143,17 @@ def test_killed_at_random_moments_it_ends_with_the_same_numbers(run, tmp_path):
     assert Path(tmp_path / "demo" / "contact_sheet.png").read_bytes() == run.contact_sheet.read_bytes()
 
 
-LAYOUTS = ("speed", "cost", "paper-1", "paper-3", "paper-4")
 FORMATS = {
     "md": r"(?i)\| ours +\|",
     "csv": "(?im)^ours",
     "latex": r"\\toprule",
     "html": "<table",
     "json": '(?i)"ours"',
+}
+LAYOUTS = {
+    "speed": "(?s)Raster.*ours",
+    "cost": "(?s)Per primitive.*ours",
+    **dict.fromkeys(("paper-1", "paper-3", "paper-4"), FORMATS["md"]),
 }
 
 
@@ -189,8 +186,7 @@ CASES = {
     "list": [case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets")],
     "table": [
         *(case(f"table {{demo}} --format {name}", mark) for name, mark in FORMATS.items()),
-        *(case(f"table {{demo}} --layout {layout}", FORMATS["md"]) for layout in LAYOUTS),
-        *(case(f"table {{demo}} --layout {layout} --format csv", FORMATS["csv"]) for layout in LAYOUTS),
+        *(case(f"table {{demo}} --layout {layout}", mark) for layout, mark in LAYOUTS.items()),
         case("table {demo} --layout paper-4 --published", "Published"),
         case("table {demo} plain", "one seed"),
         case("table {demo} --columns psnr novel_view --digits 1 --out t.tex", "t.tex", "t.tex"),
