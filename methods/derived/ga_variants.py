@@ -16,6 +16,7 @@ from ..compact.file import COMPACT_FILE, decode_subject, encode_subject
 from ..compact.precision import Precision
 from ..ga.method import GAAvatar
 from ..ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
+from ..ops.harmonics import coefficient_count
 from ..ours.storage import SPLAT_WIDTHS, splat_columns
 from ..shared.avatar_files import (
     SUBJECT_FILE,
@@ -25,7 +26,6 @@ from ..shared.avatar_files import (
     save_shared_head,
     write_subject,
 )
-from ..shared.networks import coefficient_count
 from ..shared.subject_mesh import SubjectMesh
 from .recipes import GA, Recipe, contributions, most_contributing, read_reduced, training_views, write_reduced
 

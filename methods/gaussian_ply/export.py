@@ -21,10 +21,10 @@ from ..ga.storage import COLUMNS, PLY_FILE
 from ..gbs.avatar import GBSAvatar
 from ..gha.avatar import GHAAvatar
 from ..insta.avatar import FIELD_FILE as RADIANCE_FILE
+from ..ops.harmonics import C0, sh_basis
 from ..ours.avatar import OursAvatar
 from ..ours.storage import FIELD_FILE
 from ..shared.avatar_files import read_shared_head
-from ..shared.networks import C0, sh_basis
 from ..shared.ply import read_names
 from ..shared.tensor_files import read_safetensors
 from ..splats import rasterize

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..shared.networks import coefficient_count, sh_basis
+from ..ops.harmonics import coefficient_count, sh_basis
 
 DEGREE = 3
 BEHIND = 0.02

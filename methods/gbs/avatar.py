@@ -15,12 +15,11 @@ from ...bench.contracts import HeadPose, IntArray, no_stage
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.files import write_bytes
+from ..ops.harmonics import coefficient_count, sh_degree
 from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
-from ..shared.networks import coefficient_count, sh_degree
 from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .blendshapes import Entries, PointMotions, PosedAttributes, Rig, apply_pose, difference_widths
-from .device_frame import DeviceSplats
 from .points import SurfacePoints, full_barycentric
 
 
@@ -39,10 +38,6 @@ class GBSAvatar(StoredSplatAvatar):
         super().__init__([folder / AVATAR_FILE, folder / SUBJECT_FILE], self._placed, device)
         self._rig, self.stored = rig, stored
         self._last = LastPose(self._posed)
-        self._on_device: LastPose[PlacedSplats] | None = None
-        if torch.device(device).type != "cpu":
-            parts = stored.neutral, stored.entries, stored.differences
-            self._on_device = LastPose(DeviceSplats(rig, *parts))
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GBSAvatar:
@@ -67,8 +62,6 @@ class GBSAvatar(StoredSplatAvatar):
         return apply_pose(stored.neutral, differences, motions)
 
     def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
-        if self._on_device is not None:
-            return self._on_device(pose, end_stage)
         posed = self._last(pose, end_stage)
         degree = sh_degree(self.stored.neutral["sh_rest"])
         return PlacedSplats(posed.world, posed.opacities, lambda center: posed.colors(center, degree))

@@ -11,7 +11,7 @@ import torch
 
 from ...bench.contracts import Camera, FloatArray, HeadPose, Progress, SplatAvatar
 from ..gaussian_ply.harmonics import fit_harmonics, sphere
-from ..shared.networks import sh_basis
+from ..ops.harmonics import sh_basis
 from ..splats.reference import rotation_matrices
 from .model import JOINTS, Slider, WebAvatar, blended, joint_motions, rotation_of
 

@@ -39,14 +39,14 @@ from ...methods.ga.spec import GA
 from ...methods.gbs import training as gbs
 from ...methods.gbs.config import GBSConfig
 from ...methods.gbs.spec import GBS
+from ...methods.ops.planes import ColorNetwork, encode, line_position, sum_rows, triplane_features
 from ...methods.ours import appearance as ours
+from ...methods.ours import field
 from ...methods.ours.config import OursConfig
-from ...methods.ours.field import NamedTensors, line_position, line_table, normalised_weight, plane_features
 from ...methods.ours.spec import OURS
 from ...methods.shared import splat_training
 from ...methods.shared.avatar_files import Subject
 from ...methods.shared.loop import TrainingImages
-from ...methods.shared.networks import PAIRS, encode, sum_rows
 from ...methods.shared.optimisation import Densifier, Optimiser
 from ...methods.shared.schedule import ShuffledEpochs, Timeline
 from ...methods.shared.splat_training import BoundTraining, SplatTrainer, Start
@@ -210,9 +210,9 @@ def _timed_stages(stages: _Stages) -> Iterator[None]:
         (ga, "to_world", "to world space"),
         (ours, "to_world", "to world space"),
         (ga, "harmonic_colors", "colours"),
-        (ours, "table_offsets", "lines"),
+        (ours, "line_offsets", "lines"),
         (ours, "directions_to", "directions"),
-        (ours, "canonical_positions", "canonical positions"),
+        (field, "points_on", "canonical positions"),
         (gbs, "apply_pose", "to world space"),
     ]
     plain = [(Optimiser, "step"), (Densifier, "observe"), (TrainingImages, "get")]
@@ -225,16 +225,14 @@ def _timed_stages(stages: _Stages) -> Iterator[None]:
         yield
 
 
-PLANE_TENSORS = (*(f"plane_{name}" for name, _, _ in PAIRS), "color_weight_0", "color_weight_1")
-
-
-def _with_planes(function: Callable[..., Tensor], parameters: NamedTensors, *arguments: Any) -> Tensor:
-    return function(*arguments, *(parameters[name] for name in PLANE_TENSORS))
+def _with_planes(function: Callable[..., Tensor], *arguments: Any) -> Tensor:
+    *places, network = arguments
+    return function(*places, *network)
 
 
 def _colors_of_planes(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    def run(box: Any, positions: Tensor, directions: Tensor, *tensors: Tensor) -> Tensor:
-        return function(dict(zip(PLANE_TENSORS, tensors)), box, positions, directions)
+    def run(*arguments: Any) -> Tensor:
+        return function(*arguments[:3], ColorNetwork(*arguments[3:]))
 
     return run
 
@@ -314,26 +312,25 @@ def _network_operations(training: SplatTrainer) -> dict[str, float]:
         return run
 
     with ExitStack() as entered:
-        for name in ("plane_colors", "table_offsets"):
+        for name in ("plane_colors", "line_offsets"):
             entered.enter_context(patch.object(ours, name, noting(name)))
         training.loss(FIRST_ITERATION, 0)
-    parameters, box, positions, directions = seen["plane_colors"]
-    inputs = torch.cat([*plane_features(parameters, box, positions), encode(directions)], dim=1)
-    on = float((inputs @ parameters["color_weight_0"].t() > 0).sum())
-    hidden, width = parameters["color_weight_0"].shape
+    positions, directions, box, network = seen["plane_colors"]
+    inputs = torch.cat([*triplane_features(network[:3], box, positions), encode(directions)], dim=1)
+    on = float((inputs @ network.first.t() > 0).sum())
+    hidden, width = network.first.shape
     # Where planes do not move splats, nobody asks for gradients by the directions.
     back = width if positions.requires_grad else width - encode(directions).shape[1]
     counts = {
         "colours": len(positions) * hidden * (width + 3),
         "colours, backward": on * (width + back + 6),
     }
-    parameters, box, blended, positions = seen["table_offsets"]
-    place = line_position(box.unit(positions[box.contains(positions)]), parameters["lines"].shape[2])
-    table = line_table(blended, normalised_weight(parameters, 0))
-    first = torch.relu(sum_rows(table, *place) + parameters["line_bias_0"])
-    second = first @ normalised_weight(parameters, 1).t() + parameters["line_bias_1"] > 0
+    positions, box, table, layers = seen["line_offsets"]
+    place = line_position(box.unit(positions[box.contains(positions)]), len(table) // 3)
+    first = torch.relu(sum_rows(table, *place) + layers.bias_0)
+    second = first @ layers.weight_1.t() + layers.bias_1 > 0
     places, of_first, of_second = first.numel(), float((first > 0).sum()), float(second.sum())
-    outputs, hidden = parameters["line_direction_2"].shape
+    outputs, hidden = layers.weight_2.shape
     counts["lines"] = 6 * places + of_first * hidden + places * outputs
     counts["lines, backward"] = 6 * (places + of_first) + of_second * 2 * (hidden + outputs)
     return {stage: 2.0 * count for stage, count in counts.items()}

@@ -16,26 +16,33 @@ from ....bench.contracts import Camera, HeadAsset, HeadPose, Progress, no_progre
 from ....bench.specs import Findings
 from ....datasets.head.procedural.model import procedural_head
 from ....methods.ga.method import GAAvatar
+from ....methods.ops.planes import (
+    ENCODING_SIZE,
+    Bounds,
+    LinePosition,
+    line_offsets,
+    line_position,
+    offset_writer,
+    plane_colors,
+    shader,
+    sum_rows,
+)
+from ....methods.ops.splats import activate, directions_to, to_world
 from ....methods.ours.appearance import driving_coefficients
 from ....methods.ours.avatar import OursAvatar
 from ....methods.ours.field import (
-    Bounds,
+    FIRST_LAYER,
+    LAST_LAYER,
     CanonicalFrames,
-    LinePosition,
     apply_offsets,
     blend_lines,
-    canonical_directions,
-    line_offsets,
-    line_position,
+    color_network,
+    line_table,
     normalised_weight,
+    offset_layers,
     plane_features,
     position_part,
-    shade,
-    shade_directions,
 )
-from ....methods.shared.avatar_kernel import WorldTransform
-from ....methods.shared.binding import to_world
-from ....methods.shared.networks import offset_network, sum_rows
 from ....methods.shared.rendering import draw_splats, read_back, view_of
 from ..timing import seconds_of, table, take_turns, torch_threads
 from .untrained import cameras_around, random_poses, untrained_avatar
@@ -188,8 +195,7 @@ class _Parts:
             self._place = line_position(unit, self._tensors["lines"].shape[2])
             features = plane_features(self._tensors, Bounds(*self._tensors["plane_box"]), self._positions)
             self._from_position = position_part(self._tensors, features)
-            splats = avatar.neutral
-            self._carrier = WorldTransform(self._binding, *splats[:3])
+            self._activated = activate(avatar.neutral.log_scales, avatar.neutral.quats)
             self._coefficients = self._driving()
             self._offsets = self.offsets()
             self._splats = self._changed(self._offsets)
@@ -209,9 +215,10 @@ class _Parts:
     def offsets_by_torch(self) -> Tensor:
         """With the first layer on the blended lines, all units of all layers."""
         assert self._avatar.line_offsets is not None
-        return self._avatar.line_offsets.by_torch(
-            self._avatar.line_offsets.table(torch.cat(self._coefficients))
-        )
+        table = self._avatar.line_offsets.table(torch.cat(self._coefficients))
+        offsets = table.new_zeros(len(self._binding), len(self._tensors["line_bias_2"]))
+        offset_writer.definition(offset_layers(self._tensors), self._place)(offsets, self._inside, table)
+        return offsets
 
     def units_on(self) -> float:
         """Part of the first layer's units that are on, over all splats inside."""
@@ -237,34 +244,32 @@ class _Parts:
 
     def _offsets_of(self, features: Tensor) -> Tensor:
         summed = features @ normalised_weight(self._tensors, 0).t()
-        layers = [normalised_weight(self._tensors, layer) for layer in (1, 2)]
-        biases = [self._tensors[f"line_bias_{layer}"] for layer in range(3)]
-        inside = offset_network(summed, biases[0], layers[0], biases[1], layers[1], biases[2])
+        inside = offset_layers(self._tensors)(summed)
         return inside.new_zeros(len(self._binding), inside.shape[1]).index_copy(0, self._inside, inside)
 
     def world(self) -> Any:
         splats = self._splats
-        return self._carrier(self._frames, splats.means, splats.log_scales, splats.quats)
+        shape = splats.log_scales, splats.quats
+        return to_world(self._frames, self._binding, splats.means, *shape, self._activated)
 
     def world_by_torch(self) -> Any:
         splats = self._splats
-        return to_world(self._frames, self._binding, splats.means, splats.log_scales, splats.quats)
+        return to_world.definition(self._frames, self._binding, splats.means, splats.log_scales, splats.quats)
 
     def colors(self) -> Tensor:
-        # A copy of the means: for the same tensor the last colours would be given again.
-        means = self._world.means.view_as(self._world.means)
-        return self._avatar.colors(means, self._view.center, self._turns, self._binding)
+        return self._avatar.colors(self._world.means, self._view.center, self._turns, self._binding)
 
     def colors_direct(self) -> Tensor:
         """By torch, with the part of the position known."""
-        directions = canonical_directions(self._turns, self._binding, self._world.means, self._view.center)
-        return shade_directions(self._tensors, self._from_position, directions)
+        of_direction = self._tensors[FIRST_LAYER][:, -ENCODING_SIZE:].t()
+        shade = shader.definition(self._from_position, of_direction, self._tensors[LAST_LAYER])
+        return shade(self._world.means, self._view.center, self._turns, self._binding)
 
     def colors_by_planes(self) -> Tensor:
         """Planes sampled and all layers at each splat."""
-        features = plane_features(self._tensors, Bounds(*self._tensors["plane_box"]), self._positions)
-        directions = canonical_directions(self._turns, self._binding, self._world.means, self._view.center)
-        return shade(self._tensors, features, directions)
+        directions = directions_to(self._world.means, self._view.center, self._turns, self._binding)
+        box = Bounds(*self._tensors["plane_box"])
+        return plane_colors(self._positions, directions, box, color_network(self._tensors))
 
     def raster(self) -> Any:
         opacities = torch.sigmoid(self._splats.logits)
@@ -277,8 +282,8 @@ class _Parts:
         self._turns = self._canonical.turns(self._frames)
         self._coefficients = self._driving()
         blended = blend_lines(self._tensors["lines"], *self._coefficients)
-        inside = line_offsets(self._tensors, blended, self._place)
-        offsets = inside.new_zeros(len(self._binding), inside.shape[1]).index_copy(0, self._inside, inside)
+        table = line_table(blended, normalised_weight(self._tensors, 0))
+        offsets = line_offsets(self._positions, self._box, table, offset_layers(self._tensors))
         self._splats = self._changed(offsets)
         self._world = self.world()
         self._shown = self.colors_by_planes()

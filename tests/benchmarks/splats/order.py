@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from ....bench.contracts import HeadAsset
-from ....methods.shared.binding import to_world, triangle_frames
+from ....methods.ops.mesh import triangle_frames
+from ....methods.ops.splats import to_world
 from ..timing import milliseconds, table, take_turns
 from .scenes import Scene, passes
 

@@ -21,8 +21,8 @@ from headbench.methods.gaussian_ply.export import neutral_pose
 from headbench.methods.gaussian_ply.harmonics import BEHIND, fit_harmonics, sphere
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.method import GBS
+from headbench.methods.ops.harmonics import sh_basis
 from headbench.methods.ours.avatar import OursAvatar
-from headbench.methods.shared.networks import sh_basis
 from headbench.methods.shared.ply import write_ply
 from headbench.methods.shared.rendering import view_of
 from headbench.methods.splats import rasterize
