@@ -23,6 +23,7 @@ if _TYPE_CHECKING:
         Clip,
         Frame,
         FrameKey,
+        HarmonicAvatar,
         HeadAsset,
         HeadPose,
         ListedFrames,
@@ -47,6 +48,7 @@ if _TYPE_CHECKING:
     from .bench.rows import ALL
     from .bench.runner.adaptation import AdaptedClip, MethodNeeds
     from .bench.runner.config import resolve_method
+    from .bench.runner.stored import load_avatar
     from .bench.specs import (
         BenchmarkSpec,
         DatasetSpec,
@@ -79,6 +81,7 @@ __all__ = [
     "Findings",
     "Frame",
     "FrameKey",
+    "HarmonicAvatar",
     "HeadAsset",
     "HeadPose",
     "HeadbenchError",
@@ -113,6 +116,7 @@ __all__ = [
     "check_metric",
     "check_reader",
     "exclude_given",
+    "load_avatar",
     "load_head",
     "resolve_method",
     "writes",
@@ -126,6 +130,7 @@ _HOMES = {
     "bench.options": ("DependentOptions",),
     "bench.errors": ("HeadbenchError", "InputError", "UnavailableError"),
     "bench.runner.config": ("resolve_method",),
+    "bench.runner.stored": ("load_avatar",),
     "bench.rows": ("ALL",),
     "bench.specs": tuple(name for name in __all__ if name.endswith("Spec"))
     + ("Findings", "Need", "ResolutionRule", "writes"),

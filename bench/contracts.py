@@ -312,6 +312,20 @@ class SplatAvatar(Avatar, Protocol):
 
 
 @runtime_checkable
+class HarmonicAvatar(SplatAvatar, Protocol):
+    """An avatar whose splats' colours are spherical harmonics in every pose. Optional.
+
+    Exporters take these coefficients; those of other avatars of splats are fitted to the colours that `splats` gives.
+    """
+
+    def harmonics(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:
+        """(N, 3) of degree 0 and (N, 3, K) float32 above it, K up to 15, along world directions from the camera to the splat.
+
+        Order, signs and offset are those of 3D Gaussian Splatting (Kerbl et al., SIGGRAPH 2023).
+        """
+
+
+@runtime_checkable
 class ListedFrames(Avatar, Protocol):
     """An avatar that another program draws, for many frames in one call. Optional.
 

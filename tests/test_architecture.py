@@ -131,7 +131,7 @@ READ_IN_ONE_PLACE = {
         "bench/audit/bundle.py",
         "bench/io/archives.py",
         "datasets/nersemble/benchmark/submission.py",
-        "methods/gaussian_ply/formats.py",  # an archive just made in memory
+        "methods/avatars/formats.py",  # an archive just made in memory
     },
     r"\bcv2\.im(read|readmulti|decode|decodemulti|write|writemulti|encode)\b": {
         "bench/io/images.py",

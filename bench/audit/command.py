@@ -113,10 +113,7 @@ class EvaluateSettings:
     """FOLDER holds an avatar: it is rendered, and its storage and speed are measured, too."""
 
     method: str = ""
-    """With --avatar: the method that reads it; default: that of the run whose folder it lies in."""
-
-    preset: str = ""
-    """With --avatar: preset of the method, where the image size depends on it; default: that of the run, else fast."""
+    """With --avatar: its method as package.module:SPEC, where that is not registered."""
 
     device: str = "cpu"
     """Where metrics are computed that can use a GPU, and with --avatar where to render."""
@@ -153,7 +150,7 @@ class EvaluateSettings:
     dependent = (
         DependentOptions(("tasks", "metrics", "reader", "frames_per_task"), "like", False),
         DependentOptions(("trust",), "like"),
-        DependentOptions(("method", "preset"), "avatar"),
+        DependentOptions(("method",), "avatar"),
         DependentOptions(("names", "any_background"), "avatar", False),
     )
 

@@ -29,7 +29,7 @@ from ..runner.config import ResolvedMethod, RunConfig, RunOptions, default_names
 from ..runner.run import describe, make_jobs, write_reports
 from ..runner.steps import DIGESTS, Job, measure, render
 from ..runner.store import Cell, RunFolder
-from ..runner.stored import avatar_digest, avatar_folder, shows_another, stored_heads, stored_method
+from ..runner.stored import avatar_digest, open_avatar, shown_by
 from ..specs import Findings, MethodSpec
 from .background import check_background
 from .command import EvaluateSettings
@@ -73,12 +73,12 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
             raise InputError(
                 str(config.data), "", "the capture of the avatar's subject", f"{len(clips)} captures"
             )
-        shown = shows_another(source, clips[0].subject, clips[0].head, clips[0].shape)
+        stored = open_avatar(source, settings.method)
+        shown = stored.shows_another(*shown_by(clips[0]))
         if shown:
             expected = f"an avatar of {clips[0].subject}, whom the capture shows"
-            raise InputError(avatar_folder(source), "subject", expected, f"one of {shown}")
-        of = stored_method(source, settings.method, settings.preset)
-        avatar = of.create().load(avatar_folder(source), device=config.device)
+            raise InputError(stored.folder, "subject", expected, f"one of {shown}")
+        avatar, of = stored.load(config.device), stored.method
         method = images_method(config.methods[0], avatar_digest(source)[:12])
         method = replace(method, spec=replace(method.spec, resolution=of.spec.resolution))
         adapted_for = [replace(of, spec=replace(of.spec, name=method.spec.name))]
@@ -161,7 +161,9 @@ def _open(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
             frames_per_task=settings.frames_per_task,
         )
         clips = open_clips(config)
-    heads = {**stored_heads(Path(settings.folder)), **config.heads} if settings.avatar else {}
+    heads = {}
+    if settings.avatar:
+        heads = {**open_avatar(Path(settings.folder), settings.method).heads, **config.heads}
     config = replace(
         config,
         out=settings.out,

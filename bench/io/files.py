@@ -360,10 +360,10 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     ),
     "a run": ("run.json",),
     "a cell of a run": ("fit.json",),
-    "an avatar": ("subject.npz",),
+    "an avatar": ("avatar.json", "subject.npz"),
 }
 """What marks a folder as one of a kind: patterns of files and folders in it."""
-RESULTS = {"rows.parquet", "headbench.json", "measure.json", "head_model.npz"}
+RESULTS = {"rows.parquet", "headbench.json", "measure.json", "head_model.npz", "avatar.json"}
 """Files that hold results or captures and that no option names to be written."""
 
 

@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -40,13 +40,12 @@ from .adaptation import AdaptedClip, TrainingView
 from .config import ResolvedMethod
 from .scoring import FULL, ScoredFrames, make_metric, score_frames
 from .store import Cell, RunFolder, StepState, avatar_files
+from .stored import VARIANT_MARK, shown_by, write_avatar_record
 
 log = logging.getLogger(__name__)
 RESULT_FORMAT = 1  # raise when a step changes what it leaves behind
 TRAINING, RENDERING, MEASURING_AVATAR = "training", "rendering", "measuring the avatar"
 DIGESTS = "digests"
-VARIANT_MARK = "+"
-"""Between the name of a method and what makes a variant of it."""
 RECORD_EVERY_S = 10.0
 """Seconds between records of the frames rendered; those after the last one are rendered again after a kill."""
 
@@ -200,6 +199,9 @@ def fit(job: Job) -> Avatar:
                 job.cell.set_aside(job.cell.avatar)
                 _train(job, method, report)
         seconds = time.perf_counter() - start
+        clip, budget = job.form.clip, asdict(job.method.budget)
+        origin = {"seed": job.seed, "budget": budget, "capture": clip.fingerprint}
+        write_avatar_record(job.cell.avatar, job.method, *shown_by(clip), "training", origin)
         job.cell.finish(
             "fit",
             job.fit_fingerprint,

@@ -1,21 +1,112 @@
-"""Avatars that lie in a folder, of a run or of `headbench import`: which method reads one, and with which settings."""
+"""Stored avatars: what ``avatar.json`` says of the one in its folder, and `load_avatar`, which reads any of them."""
 
 from __future__ import annotations
 
-import re
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any, Literal, cast
 
 import numpy as np
+from typing_extensions import TypedDict
 
-from ..contracts import FloatArray, HeadAsset
+from ..configuration import build
+from ..contracts import Avatar, Budget, Clip, FloatArray
 from ..errors import InputError
-from ..io.arrays import TEXT, Member, read_arrays
 from ..io.documents import checked, read_json
-from ..io.files import digest, digest_file, entries
-from ..registry import get
-from ..specs import MethodSpec
-from .config import AVATAR_FOLDER, ResolvedMethod, default_names, resolve_method
-from .store import RunFolder, avatar_files
+from ..io.files import digest, digest_file, entries, write_json
+from ..io.provenance import tool
+from ..registry import discover, get, resolve
+from ..specs import MethodSpec, ResolutionRule
+from .config import AVATAR_FOLDER, ResolvedMethod
+from .store import avatar_files
+
+log = logging.getLogger(__name__)
+
+AVATAR_FILE = "avatar.json"
+"""Stands in the folder of every avatar, see `AvatarRecord`."""
+HEAD_FILE = "head_model.npz"
+"""The head model beside an avatar, which all native methods store."""
+SUBJECT_FILE = "subject.npz"
+"""Shape and static offset of the subject, which most methods store."""
+TRAINING_FILE = "training.json"
+"""Where methods record how a training went. Its "losses", if any, are pairs of an iteration and the loss up to there."""
+SAME_SHAPE = 1e-4
+"""Largest difference of two shape coefficients of one subject; files hold float32."""
+VARIANT_MARK = "+"
+"""Between the name of a method and what makes a variant of it."""
+
+Maker = Literal["training", "import", "compact", "variant"]
+
+
+class AvatarRecord(TypedDict):
+    """Content of ``avatar.json``.
+
+    Attributes
+    ----------
+    format : of this file.
+    method : registered name of the method that reads the avatar. ``version`` is that of the method that wrote it.
+    settings : the method's whole configuration; None for a method without any.
+    resolution : the image size that the method works at with these settings.
+    subject, shape : name and (S,) identity coefficients of whom the avatar shows.
+    head_model : version of the head model whose poses drive it.
+    head_digest : SHA-256 of `HEAD_FILE` beside it; "" where there is none.
+    made_by : "training", "import" of another program's file, "compact" storage, or derived as a "variant".
+    origin : what that started from: seed, budget and fingerprint of the capture, digest of the file or avatar.
+    """
+
+    format: Literal[1]
+    method: str
+    version: str
+    settings: dict[str, Any] | None
+    resolution: ResolutionRule
+    subject: str
+    shape: list[float]
+    head_model: str
+    head_digest: str
+    made_by: Maker
+    origin: dict[str, Any]
+
+
+def write_avatar_record(
+    folder: Path,
+    method: ResolvedMethod,
+    subject: str,
+    shape: FloatArray | Sequence[float],
+    head_model: str,
+    made_by: Maker,
+    origin: Mapping[str, Any],
+) -> None:
+    """Write ``avatar.json`` into the folder of an avatar whose other files are complete; see `AvatarRecord`."""
+    head = folder / HEAD_FILE
+    record: AvatarRecord = {
+        "format": 1,
+        "method": registered_name(method),
+        "version": method.spec.version,
+        "settings": None if method.config is None else asdict(method.config),
+        "resolution": method.spec.resolution,
+        "subject": subject,
+        "shape": np.asarray(shape, np.float32).tolist(),
+        "head_model": head_model,
+        "head_digest": digest_file(head) if head.is_file() else "",
+        "made_by": made_by,
+        "origin": {"tool": tool(), **origin},
+    }
+    write_json(folder / AVATAR_FILE, record)
+
+
+def shown_by(clip: Clip) -> tuple[str, FloatArray, str]:
+    """Subject, its shape and the version of the head model, of the clip that an avatar is trained on."""
+    versions = (pose.head_model for pose in clip.poses.values())
+    return clip.subject, clip.shape, next(versions, "")
+
+
+def registered_name(method: ResolvedMethod) -> str:
+    """Name of a method without what its settings or a variant add to it."""
+    label = getattr(method.config, "label", "")
+    name = method.spec.name.partition(VARIANT_MARK)[0]
+    return name.removesuffix(f" ({label})") if label else name
 
 
 def avatar_folder(folder: Path) -> Path:
@@ -28,68 +119,107 @@ def avatar_folder(folder: Path) -> Path:
     return found
 
 
-def stored_method(folder: Path, method: str = "", preset: str = "") -> ResolvedMethod:
-    """The method that made the avatar in a folder, as the run that the folder lies in resolved it.
+@dataclass(frozen=True)
+class StoredAvatar:
+    """An avatar in a folder before it is loaded: the folder, its record, the method that reads it with its settings."""
+
+    folder: Path
+    record: AvatarRecord
+    method: ResolvedMethod
+
+    def load(self, device: str = "cpu") -> Avatar:
+        """Read the avatar. Raises `InputError` for damaged files, and for another head model than it was stored with."""
+        head, known = self.folder / HEAD_FILE, self.record["head_digest"]
+        if known and not head.is_file():
+            raise InputError(head, "", "the head model that the avatar was stored with", "no such file")
+        if known and (found := digest_file(head)) != known:
+            expected = f"the head model that the avatar was stored with, SHA-256 {known[:12]}"
+            raise InputError(head, "", expected, f"another, SHA-256 {found[:12]}")
+        avatar: Avatar = self.method.create().load(self.folder, device=device)
+        return avatar
+
+    @property
+    def heads(self) -> dict[str, str]:
+        """File of the head model beside the avatar, by its version: what `adaptation.plan` refits a capture to."""
+        return {self.record["head_model"]: str(self.folder / HEAD_FILE)} if self.record["head_digest"] else {}
+
+    def shows_another(self, subject: str, shape: FloatArray, head_model: str) -> str:
+        """The name of the subject that the avatar shows, if that is another than the one given; else "".
+
+        Another subject has another name and another shape; shapes of two head models do not compare.
+        """
+        name, own = self.record["subject"], np.asarray(self.record["shape"])
+        if self.record["head_model"] == head_model and own.shape == np.shape(shape):
+            return name if np.abs(own - shape).max(initial=0.0) > SAME_SHAPE else ""
+        return name if name != subject else ""
+
+
+def open_avatar(folder: Path, method: str = "") -> StoredAvatar:
+    """Read ``avatar.json`` of a folder as `avatar_folder` takes it, and find the method that reads the avatar.
 
     Parameters
     ----------
-    method : its name, or "module:SPEC"; "" for that of the run.
-    preset : decides the image size that some methods work at; "" for that of the run, else "fast".
+    method : "module:SPEC" of a method that is not registered; "" for the one of the name that ``avatar.json`` states.
 
     Raises
     ------
     InputError
-        Where ``method`` is left out and no run tells it, and for names that are not known.
+        Where there is no ``avatar.json``, or one that does not fit, for a method that is not known, settings that it does
+        not have, and an avatar that was derived as a variant.
     """
-    home = avatar_folder(folder).resolve()
-    seed, of = home.parent.name, home.parent.parent.name
-    run = RunFolder(home.parents[3]) if len(home.parents) > 3 else None
-    inside = run is not None and home.name == "avatar" and re.fullmatch(r"seed-\d+", seed) is not None
-    config = run.read_manifest().configuration if run and inside and run.manifest.is_file() else None
-    if not method and config is None:
-        expected = f"the method of the avatar: {', '.join(default_names('methods'))}, or another"
-        raise InputError("command line", "--method", expected, "none, and the folder is not that of a run")
-    spec: MethodSpec = get("methods", method or of)
-    settings = {}
-    if config is not None and spec.name == of:
-        preset, settings = preset or config.preset, dict(config.settings.get(of, {}))
-    preset = preset or ("fast" if "fast" in spec.presets or not spec.presets else next(iter(spec.presets)))
-    return resolve_method(spec, preset, settings)
-
-
-HEAD_FILE = "head_model.npz"
-"""The head model beside an avatar, which all native methods store."""
-
-
-def stored_heads(folder: Path) -> dict[str, str]:
-    """File of the head model beside an avatar, by its version: what `adaptation.plan` refits a capture to; {} without one."""
-    path = avatar_folder(folder) / HEAD_FILE
-    return {str(read_arrays(path, {"version": TEXT})["version"]): str(path)} if path.is_file() else {}
-
-
-SUBJECT_FILE = "subject.npz"
-"""Where native avatars, imported ones and most official ones say whom they show."""
-SAME_SHAPE = 1e-4
-"""Largest difference of two shape coefficients of one subject; files hold float32."""
-
-
-def shows_another(folder: Path, subject: str, head: HeadAsset, shape: FloatArray) -> str:
-    """The name of the subject that a stored avatar shows, if that is another than the one given; "" where nobody knows.
-
-    Another is who has another name and another shape; shapes of two head models do not compare.
-    """
-    path = avatar_folder(folder) / SUBJECT_FILE
+    home = avatar_folder(folder)
+    path = home / AVATAR_FILE
     if not path.is_file():
-        return ""
-    found = read_arrays(path, {"name": TEXT, "head_model": TEXT, "shape": Member("f", (None,))})
-    name, own = str(found["name"]), found["shape"]
-    if str(found["head_model"]) == head.version and own.shape == np.shape(shape):
-        return name if np.abs(own - shape).max(initial=0.0) > SAME_SHAPE else ""
-    return name if name != subject else ""
+        remedy = "It is written when a training, an import or `headbench compact` ends."
+        if (folder / "run.json").is_file():
+            remedy = "The avatars of a run lie in SUBJECT/METHOD/seed-N/avatar inside its folder."
+        raise InputError(
+            folder, AVATAR_FILE, f"the {AVATAR_FOLDER}", f"a folder without {AVATAR_FILE}", remedy
+        )
+    record = cast(AvatarRecord, checked(read_json(path), AvatarRecord, path))
+    if record["made_by"] == "variant":
+        remedy = f"Load the trained avatar of {record['method']}, which it was derived from."
+        raise InputError(path, "made_by", "an avatar that its method reads", "a variant of a sweep", remedy)
+    name = method or record["method"]
+    if not method and name not in discover("methods"):
+        remedy = "Install the package that registers it, or name it with --method package.module:SPEC."
+        raise InputError(path, "method", "a method that is registered here", repr(name), remedy)
+    spec: MethodSpec = get("methods", name)
+    if method and spec.name != record["method"]:
+        raise InputError("command line", "--method", f"{record['method']}, which {path} states", spec.name)
+    if spec.version != record["version"]:
+        log.warning(
+            "%s: made by version %s of %s, read by version %s",
+            *(home, record["version"], spec.name, spec.version),
+        )
+    return StoredAvatar(home, record, _resolved(spec, record, path))
 
 
-TRAINING_FILE = "training.json"
-"""Where methods record how a training went. Its "losses", if any, are pairs of an iteration and the loss up to there."""
+def _resolved(spec: MethodSpec, record: AvatarRecord, path: Path) -> ResolvedMethod:
+    """The method with the settings of the record."""
+    settings = record["settings"]
+    if bool(spec.config) != (settings is not None):
+        expected = "settings" if spec.config else "none: this method has no settings"
+        raise InputError(path, "settings", expected, "none" if settings is None else "some")
+    config = None if settings is None else build(resolve(spec.config), settings, str(path), "settings.")
+    return ResolvedMethod(replace(spec, resolution=record["resolution"]), config, Budget())
+
+
+def load_avatar(folder: Path | str, *, device: str = "cpu", method: str = "") -> Avatar:
+    """Load an avatar that a run, an import or `headbench compact` stored, whatever its method.
+
+    Parameters
+    ----------
+    folder : with ``avatar.json``, or the cell of a run (``RUN/SUBJECT/METHOD/seed-N``).
+    device : where it renders.
+    method : "module:SPEC" of a method that is not registered; "" for the one that ``avatar.json`` states.
+
+    Raises
+    ------
+    InputError
+        As `open_avatar` and `StoredAvatar.load` do.
+    """
+    return open_avatar(Path(folder), method).load(device)
 
 
 def training_losses(folder: Path) -> list[tuple[int, float]]:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Clip, HeadPose
+from ...bench.contracts import Clip, FloatArray, HeadPose
 from ..ops.harmonics import (
     coefficient_count,
     harmonic_colors,
@@ -159,9 +159,9 @@ class GAAvatar(StoredSplatAvatar):
         stored = [folder / PLY_FILE, folder / SUBJECT_FILE]
         return cls(stored, mesh, subject, splats, binding, refined, device)
 
-    def harmonics(self) -> tuple[Tensor, Tensor]:
-        """(N, 3) and (N, 3, 15) spherical harmonics along world directions; the pose does not change them."""
-        return self.splat_tensors["sh_dc"], self.splat_tensors["sh_rest"]
+    def harmonics(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:
+        """Colours; see `HarmonicAvatar`. The pose does not change them."""
+        return self.splat_tensors["sh_dc"].cpu().numpy(), self.splat_tensors["sh_rest"].cpu().numpy()
 
     def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
         if self.refined is not None:

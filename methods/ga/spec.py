@@ -19,7 +19,7 @@ GA = MethodSpec(
     implementation="headbench.methods.ga.method:GA",
     config="headbench.methods.ga.config:GAConfig",
     needs="headbench.methods.shared.needs:splats",
-    variants="headbench.methods.derived.ga_variants:variants",
+    variants="headbench.methods.avatars.derived.ga_variants:variants",
     presets=splat_presets(SHORT, {}),
     source="GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians, CVPR 2024, arXiv 2312.02069",
 )

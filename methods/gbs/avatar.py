@@ -11,10 +11,11 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from ...bench.contracts import HeadPose, IntArray, no_stage
+from ...bench.contracts import FloatArray, HeadPose, IntArray, no_stage
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.files import write_bytes
+from ..avatars.harmonics import turn_harmonics
 from ..ops.harmonics import coefficient_count, sh_degree
 from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
 from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
@@ -49,10 +50,11 @@ class GBSAvatar(StoredSplatAvatar):
         return cls(folder, rig, stored, device)
 
     @torch.no_grad()
-    def harmonics(self, pose: HeadPose) -> tuple[Tensor, Tensor, Tensor]:
-        """(N, 3) and (N, 3, K - 1) harmonics in a pose, along the splats' axes, and the (N, 3, 3) turn of these."""
+    def harmonics(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:
+        """Colours of a pose; see `HarmonicAvatar`. They are stored along the splats' axes, which turn with the surface."""
         posed = self._last(pose, no_stage)
-        return posed.sh_dc.cpu(), posed.sh_rest.cpu(), posed.rotation.cpu()
+        dc, rest = turn_harmonics(posed.sh_dc.cpu(), posed.sh_rest.cpu(), posed.rotation.cpu())
+        return dc.numpy(), rest.numpy()
 
     def _posed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PosedAttributes:
         arguments, stored = self._rig.arguments([pose]), self.stored

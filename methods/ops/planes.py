@@ -247,15 +247,10 @@ def shader(from_position: Tensor, of_direction: Tensor, last: Tensor) -> Shader:
 
     def shade(means: Tensor, center: Tensor, turns: Tensor, binding: Tensor) -> Tensor:
         directions = directions_to(means, center, turns, binding)
-        return colors_along(directions, from_position, of_direction, last)
+        hidden = torch.relu(torch.addmm(from_position, encode(directions), of_direction))
+        return torch.relu(0.5 + C0 * (hidden @ last.t()))
 
     return shade
-
-
-def colors_along(directions: Tensor, from_position: Tensor, of_direction: Tensor, last: Tensor) -> Tensor:
-    """Colours (N, 3) >= 0 along (N, 3) unit vectors to the camera; the rest as in `shader`."""
-    hidden = torch.relu(torch.addmm(from_position, encode(directions), of_direction))
-    return torch.relu(0.5 + C0 * (hidden @ last.t()))
 
 
 SAMPLES = 512

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,10 +11,9 @@ from torch import Tensor
 
 from ...bench.contracts import HeadPose
 from ...bench.native.dispatch import to_device
-from ..compact.file import COMPACT_FILE, read_compact
-from ..ops.harmonics import harmonic_colors, harmonic_shader, sh_degree
-from ..ops.mesh import NORMAL
-from ..ops.planes import ENCODING_SIZE, Bounds, Shader, colors_along, shader
+from ..avatars.compact.file import COMPACT_FILE, read_compact
+from ..ops.harmonics import harmonic_shader
+from ..ops.planes import ENCODING_SIZE, Bounds, Shader, shader
 from ..ops.splats import activate, to_world
 from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
 from ..shared.rendering import USUAL, Cutoffs, LastPose, PlacedSplats, StoredSplatAvatar
@@ -33,15 +31,6 @@ from .field import (
 )
 from .inference import DrivenPose, LineOffsets
 from .storage import FIELD_FILE, RESIDUAL, Field, read_field, splat_columns
-
-
-class SeenFrom(NamedTuple):
-    """Colours of one pose's splats as a function of where they are seen from."""
-
-    normals: Tensor
-    """(N, 3) unit vectors out of the surface, in the world."""
-    radiance: Callable[[Tensor], Tensor]
-    """Maps a unit vector (3,) from the splats to the camera, in the world, to colours (N, 3) >= 0."""
 
 
 class OursAvatar(StoredSplatAvatar):
@@ -80,18 +69,13 @@ class OursAvatar(StoredSplatAvatar):
         positions = self._canonical.positions(self._binding, self.neutral.means)
         self._activated = activate(self.neutral.log_scales, self.neutral.quats)
         self.colors: Shader
-        self._along: Callable[[Tensor], Tensor]  # by (N, 3) canonical unit vectors to the camera
         self.line_offsets: LineOffsets | None = None
         if "sh_dc" not in tensors:
             features = plane_features(tensors, Bounds(*tensors["plane_box"]), positions)
             of_direction = tensors[FIRST_LAYER][:, -ENCODING_SIZE:].t().contiguous()
-            network = position_part(tensors, features), of_direction, tensors[LAST_LAYER]
-            self.colors = shader(*network)
-            self._along = lambda directions: colors_along(directions, *network)
+            self.colors = shader(position_part(tensors, features), of_direction, tensors[LAST_LAYER])
         else:
-            dc, rest = tensors["sh_dc"], tensors["sh_rest"]
-            self.colors = harmonic_shader(dc, rest)
-            self._along = lambda directions: harmonic_colors(dc, rest, -directions, sh_degree(rest))
+            self.colors = harmonic_shader(tensors["sh_dc"], tensors["sh_rest"])
         self._jaw_bases = tensors["jaw_bases"].cpu().numpy().astype(np.float64)
         if "lines" in tensors:
             self.line_offsets = LineOffsets(tensors, positions)
@@ -124,19 +108,6 @@ class OursAvatar(StoredSplatAvatar):
         """
         self._known = KnownPoses(self._posed, int(megabytes * 2**20))
         return self._known.prepare(poses)
-
-    @torch.no_grad()
-    def seen_from(self, pose: HeadPose) -> SeenFrom:
-        """Colours of a pose by world direction."""
-        posed = self._known(pose)
-        splats = self._changed(posed)
-
-        @torch.no_grad()
-        def radiance(direction: Tensor) -> Tensor:
-            turned = torch.nn.functional.normalize(posed.turns @ direction.to(posed.turns), dim=1)
-            return changed_colors(self._along(turned.index_select(0, self._binding)), splats)
-
-        return SeenFrom(posed.frames.rotation[:, :, NORMAL].index_select(0, self._binding), radiance)
 
     @torch.no_grad()
     def static_logits(self) -> Tensor:

@@ -19,7 +19,7 @@ from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...datasets.head.arrays import JOINT_NAMES, faces_in_region
 from ...datasets.head.geometry import triangle_areas
 from ...datasets.steps.jaw_bases import IDENTITY, farthest_quaternions, jaw_quaternions
-from ..compact.simplify import training_poses
+from ..avatars.compact.simplify import training_poses
 from ..ops.planes import Bounds
 from ..shared.subject_mesh import SubjectMesh, centroid_displacements
 from .config import OursConfig, Planned

@@ -15,9 +15,9 @@ from ...bench.contracts import Clip
 from ...datasets.head.arrays import faces_in_region
 from ...datasets.steps.clusters import cluster_expressions
 from ...datasets.steps.jaw_bases import leaks
-from ..compact.file import COMPACT_FILE, write_compact
-from ..compact.precision import Precision
-from ..compact.simplify import simplify, training_poses
+from ..avatars.compact.file import COMPACT_FILE, write_compact
+from ..avatars.compact.precision import Precision
+from ..avatars.compact.simplify import simplify, training_poses
 from ..shared.avatar_files import SUBJECT_FILE, Subject, finish_fit, save_shared_head, write_subject
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod

@@ -33,7 +33,7 @@ OURS = MethodSpec(
     implementation="headbench.methods.ours.method:Ours",
     config="headbench.methods.ours.config:OursConfig",
     needs="headbench.methods.shared.needs:splats",
-    variants="headbench.methods.derived.ours_variants:variants",
+    variants="headbench.methods.avatars.derived.ours_variants:variants",
     presets=splat_presets(SHORT, {"planes": {"bounds_variant": "paper"}}),
     source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
     "CVPR 2025, arXiv 2504.14967",

@@ -22,8 +22,9 @@ from ...bench.runner.captures import open_run_clips, run_configuration
 from ...bench.runner.config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
 from ...bench.runner.run import describe, make_jobs, run_jobs, warn_of_missing_metrics
 from ...bench.runner.scoring import FULL
-from ...bench.runner.steps import VARIANT_MARK, Job
+from ...bench.runner.steps import Job
 from ...bench.runner.store import RunFolder
+from ...bench.runner.stored import VARIANT_MARK
 from ...bench.specs import Findings, MetricSpec
 from ..aggregate import subject_means
 from ..writers import csv_text

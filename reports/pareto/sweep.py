@@ -17,6 +17,7 @@ from ...bench.runner.config import default_names, resolve_metrics
 from ...bench.runner.run import describe, load, trained
 from ...bench.runner.steps import Job, measure, render
 from ...bench.runner.store import RunFolder
+from ...bench.runner.stored import shown_by, write_avatar_record
 from ...bench.specs import MetricSpec
 from .command import SweepSettings
 
@@ -90,6 +91,10 @@ def _measured(job: Job, base: Job, variant: Variant | None, metrics: Sequence[Me
     source = base.cell.step("fit")
     assert source is not None  # `trained` saw to it
     derived_from = digest(source["fingerprint"], source.get("files"))
+    if variant is not None:
+        shown = shown_by(job.form.clip)
+        change = {"variant": variant.name, "of": derived_from}
+        write_avatar_record(job.cell.avatar, job.method, *shown, "variant", change)
     files = job.cell.digests(path for path in job.cell.avatar.rglob("*") if path.is_file())
     job.cell.finish("fit", job.fit_fingerprint, derived_from=derived_from, files=files)
     render(job, avatar)

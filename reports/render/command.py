@@ -48,10 +48,7 @@ class RenderSettings:
     """With --video: frames per second."""
 
     method: str = ""
-    """Method that reads the avatar; default: that of the run whose folder it lies in."""
-
-    preset: str = ""
-    """Preset of the method, where the image size depends on it; default: that of the run, else fast."""
+    """Method of the avatar as package.module:SPEC, where it is not registered."""
 
     reader: str = ""
     """Reader of the capture; default: the one that finds it."""

@@ -19,7 +19,7 @@ from ...bench.runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
 from ...bench.runner.captures import open_clips, reader_of
 from ...bench.runner.config import RunConfig
 from ...bench.runner.store import Cell
-from ...bench.runner.stored import avatar_folder, stored_heads, stored_method
+from ...bench.runner.stored import open_avatar
 from ...bench.specs import Findings
 from ..robustness.extremes import head_center
 from ..robustness.viewpoints import turntable
@@ -47,11 +47,11 @@ def render_avatar(settings: RenderSettings, progress: Progress) -> Findings:
     """
     if settings.video:
         webm_writer()
-    method = stored_method(Path(settings.avatar), settings.method, settings.preset)
+    stored = open_avatar(Path(settings.avatar), settings.method)
     clip = _clip(settings)
-    needs = MethodNeeds.of(method.spec)
-    adaptation = plan(clip, needs, stored_heads(Path(settings.avatar)))
-    avatar = method.create().load(avatar_folder(Path(settings.avatar)), device=settings.device)
+    needs = MethodNeeds.of(stored.method.spec)
+    adaptation = plan(clip, needs, stored.heads)
+    avatar = stored.load(settings.device)
     out = Path(settings.out)
     form = AdaptedClip(clip)
     if adaptation is not None:

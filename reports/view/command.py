@@ -34,7 +34,7 @@ class ViewSettings(RunOptions):
     """Sliders for so many leading expressions of each head model."""
 
     method: str = ""
-    """Method that reads an imported avatar."""
+    """Method of an avatar outside of runs as package.module:SPEC, where it is not registered."""
 
     device: str = ""
     """Where to draw; by default where the run was trained."""

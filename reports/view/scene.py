@@ -17,7 +17,7 @@ from ...bench.runner.captures import open_clips, open_run_clips, reader_of, run_
 from ...bench.runner.config import ResolvedMethod, RunConfig, resolve_methods
 from ...bench.runner.run import load, make_jobs
 from ...bench.runner.store import RunFolder
-from ...bench.runner.stored import avatar_folder, stored_heads, stored_method
+from ...bench.runner.stored import avatar_folder, open_avatar
 from ..robustness.extremes import head_center, training_poses
 from ..robustness.reenactment import RigidMean, check_heads, retarget
 from .command import ViewSettings
@@ -223,7 +223,8 @@ def _chosen(
 
 
 def _imported(path: Path, settings: ViewSettings, kept: Path) -> ShownAvatar:
-    method = stored_method(path, settings.method)
+    stored = open_avatar(path, settings.method)
+    method = stored.method
     if settings.data is None:
         expected = "the capture that the avatar was made from, with its cameras and poses"
         raise InputError("command line", "--data", expected, "none, and the avatar lies in no run")
@@ -232,8 +233,8 @@ def _imported(path: Path, settings: ViewSettings, kept: Path) -> ShownAvatar:
     if len(clips) > 1:
         names = ", ".join(clip.subject for clip in clips)
         raise InputError(settings.data, "", "one capture", names, "Name one capture.")
-    form = _form(clips[0], MethodNeeds.of(method.spec), stored_heads(path), kept)
-    avatar = method.create().load(avatar_folder(path), device=config.device)
+    form = _form(clips[0], MethodNeeds.of(method.spec), stored.heads, kept)
+    avatar = stored.load(config.device)
     source = _source(settings, config)
     return ShownAvatar(
         method.spec.name, avatar, clips[0], form, _driving(source, clips[0], method, config, kept)

@@ -29,7 +29,6 @@ CASES = [
     (f"{EVALUATE} --like r --frames_per_task 3", "--frames-per-task: expected no --like"),
     (f"{EVALUATE} --clip c --trust", f"--trust: expected --like, {NO_EFFECT} none"),
     (f"{EVALUATE} --like r --method ga", f"--method: expected --avatar, {NO_EFFECT} none"),
-    (f"{EVALUATE} --like r --preset fast", f"--preset: expected --avatar, {NO_EFFECT} none"),
     (f"{EVALUATE} --like r --avatar --names ga-official", "--names: expected no --avatar"),
     (f"{EVALUATE} --like r --avatar --any-background", "--any-background: expected no --avatar"),
     (f"{RUN} --workers 2", f"--workers: expected --executor processes, {NO_EFFECT} --executor inline"),

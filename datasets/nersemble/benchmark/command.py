@@ -36,10 +36,7 @@ class SubmissionRenderSettings:
     """FLAME 2023 (flame2023.pkl); default: the head model that lies beside the avatar."""
 
     method: str = ""
-    """Method that reads the avatar; default: that of the run whose folder it lies in."""
-
-    preset: str = ""
-    """Preset of the method; default: that of the run, else fast."""
+    """Method of the avatar as package.module:SPEC, where it is not registered."""
 
     device: str = "cpu"
     """Where to render."""

@@ -9,7 +9,7 @@ from ....bench.contracts import Progress
 from ....bench.errors import InputError
 from ....bench.io.files import grouped_writes
 from ....bench.io.images import quantise, write_png
-from ....bench.runner.stored import HEAD_FILE, avatar_folder, shows_another, stored_method
+from ....bench.runner.stored import AVATAR_FILE, HEAD_FILE, open_avatar
 from ....bench.specs import Findings
 from ...head.arrays import HeadArrays, read_head
 from ...head.loaders import load_head
@@ -32,8 +32,8 @@ def render_participant(settings: SubmissionRenderSettings, progress: Progress) -
     if settings.participant not in MONO.sequences:
         expected = f"one of {', '.join(MONO.sequences)}"
         raise InputError("command line", "--participant", expected, repr(settings.participant))
-    folder = avatar_folder(Path(settings.avatar))
-    method = stored_method(folder, settings.method, settings.preset)
+    stored = open_avatar(Path(settings.avatar), settings.method)
+    folder, method = stored.folder, stored.method
     head = _head(folder, settings.head)
     sequences = {
         name: read_sequence(Path(settings.data), MONO, settings.participant, name, head)
@@ -42,16 +42,14 @@ def render_participant(settings: SubmissionRenderSettings, progress: Progress) -
     if not method.spec.resolution.native:
         expected = "one that works at the size of the benchmark's images, 512x512"
         found = f"{method.spec.name}, which works at another"
-        raise InputError(
-            "command line", "--method, --preset", expected, found, "Train it with another preset."
-        )
+        raise InputError(folder / AVATAR_FILE, "resolution", expected, found, "Train it with another preset.")
     for name, sequence in sequences.items():
-        shown = shows_another(folder, settings.participant, head, sequence.shape)
+        shown = stored.shows_another(settings.participant, sequence.shape, head.version)
         if shown:
             log.warning(
                 "%s shows %s, with another shape than %s has in %s", folder, shown, settings.participant, name
             )
-    avatar = method.create().load(folder, device=settings.device)
+    avatar = stored.load(settings.device)
     home = Path(settings.out) / settings.participant
     total = sum(len(sequence.poses) * len(sequence.cameras) for sequence in sequences.values())
     done = 0

@@ -1,5 +1,6 @@
 """Folders of images by key: scored as a run scores its own, in every layout; what is wrong is said before work."""
 
+import json
 import shutil
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -327,7 +328,9 @@ def test_a_stored_avatar_scores_as_in_its_run(run, cell, images, tmp_path):
 def test_an_avatar_of_another_subject_is_refused(run, cell, toy, tmp_path, monkeypatch):
     stored = tmp_path / "stored"
     shutil.copytree(cell.avatar, stored)
-    np.savez(stored / "subject.npz", name="subject7", head_model="toy", shape=np.full(2, 0.5, np.float32))
+    record = json.loads((stored / "avatar.json").read_text())
+    record |= {"subject": "subject7", "head_model": "toy", "shape": [0.5, 0.5]}
+    (stored / "avatar.json").write_text(json.dumps(record))
     monkeypatch.setattr(toy.ToyClip, "head", SimpleNamespace(version="toy"))
     with pytest.raises(InputError, match="found one of subject7"):
         evaluate(options(stored, run, tmp_path / "out", **AVATAR))
@@ -338,7 +341,7 @@ def test_an_avatar_of_another_subject_is_refused(run, cell, toy, tmp_path, monke
     ("folder", "others", "match"),
     [
         ("seed-0", {"avatar": True}, "toy"),  # a method of the run that is not registered
-        ("elsewhere", {"avatar": True}, "--method: expected the method of the avatar: .*ga"),
+        ("elsewhere", {"avatar": True}, "method: expected a method that is registered here, found 'toy'"),
         ("seed-0", {"avatar": True, "method": "gaa"}, "Did you mean"),
         ("nowhere", AVATAR, "no such folder"),
         ("empty", AVATAR, "one without files"),

@@ -12,7 +12,7 @@ from PIL import Image
 from headbench.bench.io.images import read_png, write_png
 from headbench.bench.io.provenance import COMPOSITE, RENDER, SYNTHETIC, mark_png, note
 from headbench.bench.io.video import write_webm
-from headbench.methods.gaussian_ply.formats import STANDARD
+from headbench.methods.avatars.formats import STANDARD
 from headbench.methods.shared.ply import read_ply, write_ply
 from headbench.reports.drawing import SheetSection, Tile, TileRow, write_sheet
 

@@ -16,6 +16,7 @@ from headbench.bench.contracts import Frame, no_progress
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.images import write_png
 from headbench.bench.io.video import write_video
+from headbench.bench.runner.stored import StoredAvatar, avatar_folder
 from headbench.bench.specs import MethodSpec, ResolutionRule
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.subject import PosedSubject
@@ -346,7 +347,10 @@ def test_an_avatar_renders_all_test_frames(benchmark, head, tmp_path, monkeypatc
     avatar = SimpleNamespace(render=shown)
     spec = MethodSpec("shown", "shown", "")
     method = SimpleNamespace(spec=spec, create=lambda: SimpleNamespace(load=lambda path, device: avatar))
-    monkeypatch.setattr(module, "stored_method", lambda *_: method)
+    record = {"subject": "393", "shape": [0.0], "head_model": "another", "head_digest": ""}
+    monkeypatch.setattr(
+        module, "open_avatar", lambda folder, _: StoredAvatar(avatar_folder(folder), record, method)
+    )
     (tmp_path / "avatar").mkdir()
     words = [
         "submission",
@@ -366,7 +370,7 @@ def test_an_avatar_renders_all_test_frames(benchmark, head, tmp_path, monkeypatc
     assert files[0].name == "EMO-1-shout+laugh_00000_220700191.png"
     assert len({path.read_bytes() for path in files}) > 4
     assert "another shape" not in capsys.readouterr().err
-    np.savez(tmp_path / "avatar/subject.npz", name="074", head_model=head.version, shape=np.full(3, 9.0))
+    record |= {"subject": "074", "head_model": head.version, "shape": [9.0, 9.0, 9.0]}
     assert cli.main(words) == 0
     assert "shows 074, with another shape than 393" in capsys.readouterr().err
     assert cli.main([*words[:5], "--participant", "074", "--out", str(tmp_path / "o")]) == 2

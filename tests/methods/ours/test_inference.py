@@ -134,20 +134,3 @@ def test_known_values_are_bounded_and_computed_once():
     known(poses[4])
     known(poses[4])
     assert len(computed) == 6
-
-
-@pytest.mark.parametrize("case", ["opacity", "harmonics", "repaired"])
-def test_colours_by_direction_are_those_of_a_camera_far_away(case, clip, tmp_path):
-    avatar = OursAvatar.read(store(clip, tmp_path, CASES[case]), "cpu")
-    pose = replace(clip.poses[0], rotation=np.array([0.3, -0.8, 0.5], np.float32))
-    seen = avatar.seen_from(pose)
-    for direction in directions(4).double():
-        camera = next(iter(clip.cameras.values()))
-        matrix = np.eye(4)
-        matrix[:3, 3] = -1e4 * direction.numpy()
-        found = avatar.splats(pose, replace(camera, world_to_camera=matrix)).colors
-        np.testing.assert_allclose(seen.radiance(direction.float()), found, atol=1e-3)
-    vertices = avatar.mesh.posed(avatar.mesh.arguments([pose])).double()
-    corners = vertices[avatar.mesh.faces[avatar.field.tensors["splats"][:, -1].long()]]
-    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    np.testing.assert_allclose(seen.normals, torch.nn.functional.normalize(normals, dim=1), atol=1e-4)

@@ -14,6 +14,8 @@ from headbench.methods.shared.rendering import view_of
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.subject_mesh import SubjectMesh
 
+from ..recorded import recorded
+
 SMALL = OursConfig(
     hidden=8, planes=Planes(resolution=8, channels=(4, 2, 2)), lines=Lines(resolution=6, channels=3)
 )
@@ -61,7 +63,7 @@ def write(folder, clip, config, appearance, values, binding):
     )
     write_subject(folder / SUBJECT_FILE, Subject.of(clip))
     save_shared_head(folder, clip.head)
-    return folder
+    return recorded(folder, "ours", clip, config)
 
 
 def place(clip, appearance, optimiser, binding, iteration):

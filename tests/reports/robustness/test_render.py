@@ -1,5 +1,6 @@
 """Frames of stored avatars: those of a run to the bit, named so that they can be scored; orbits; videos."""
 
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError, UnavailableError
+from headbench.bench.io.files import digest_file
 from headbench.bench.io.images import read_png
 from headbench.bench.runner.store import RunFolder
 from headbench.reports.render import render as module
@@ -75,7 +77,11 @@ def test_a_capture_is_refitted_to_the_head_model_of_the_avatar(settings, cell, m
     asked = []
     monkeypatch.setattr(module, "plan", lambda clip, needs, heads: asked.append(heads))
     render(settings)
-    np.savez(cell.avatar / "head_model.npz", version="flame2020")
+    head = cell.avatar / "head_model.npz"
+    head.touch()
+    record = json.loads((cell.avatar / "avatar.json").read_text())
+    record |= {"head_model": "flame2020", "head_digest": digest_file(head)}
+    (cell.avatar / "avatar.json").write_text(json.dumps(record))
     render(settings)
     assert asked == [{}, {"flame2020": str(cell.avatar / "head_model.npz")}]
 

@@ -1,5 +1,6 @@
 """The viewer in Chromium: what is moved is seen to move, for each browser alone."""
 
+import re
 import time
 
 import pytest
@@ -33,6 +34,7 @@ def opened(browser):
         )
         tab.goto(f"http://{address}")
         tab.get_by_text("Drawn by trained models").wait_for()
+        tab.get_by_text(re.compile(r"\d+x\d+: .*sent in")).wait_for()  # a whole frame, not a draft
         return tab
 
     yield start

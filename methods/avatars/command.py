@@ -1,0 +1,132 @@
+"""``headbench export ply|glb|sog`` and ``headbench import ga``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import tyro
+
+from ...bench.contracts import Progress, no_progress
+from ...bench.options import DependentOptions
+from ...bench.runner.config import AvatarFolder
+from ...bench.specs import Findings, writes
+from ...datasets.options import CaptureOptions
+
+
+@dataclass(frozen=True)
+class AvatarOptions(CaptureOptions):
+    """Which avatar is written, and where to."""
+
+    avatar: AvatarFolder
+
+    out: str
+    """File to write."""
+
+    method: str = ""
+    """Method of the avatar as package.module:SPEC, where it is not registered."""
+
+
+@dataclass(frozen=True)
+class ExportOptions(AvatarOptions):
+    """Which pose of which avatar is written."""
+
+    capture: str | None = None
+    """Capture with the pose to write; without one the pose is neutral."""
+
+    timestep: int | None = None
+    """Timestep of the capture; default: the first of its training frames."""
+
+    directions: int = 96
+    """Viewing directions, even over the sphere, at which colours that are not spherical harmonics are sampled."""
+
+    dependent = (DependentOptions(("timestep", "reader", "head", "cy", "set"), "capture"),)
+
+    def __post_init__(self) -> None:
+        if self.directions < 32:
+            raise ValueError(
+                f"directions must be at least 32, twice the coefficients, found {self.directions}"
+            )
+
+
+@dataclass(frozen=True)
+class ExportPlySettings(ExportOptions):
+    """Write an avatar in one pose as a 3D Gaussian splatting PLY, in full precision, that common viewers open."""
+
+
+@dataclass(frozen=True)
+class ExportGlbSettings(ExportOptions):
+    """Write an avatar in one pose as binary glTF with KHR_gaussian_splatting, in full precision."""
+
+
+@dataclass(frozen=True)
+class ExportSogSettings(ExportOptions):
+    """Write an avatar in one pose as SOG, which web viewers open: about a sixth of a PLY's bytes. Needs gaussforge (extra `formats`)."""
+
+
+@dataclass(frozen=True)
+class ImportGASettings(CaptureOptions):
+    """Make an avatar of a GaussianAvatars PLY, and of the flame_param.npz beside it or the capture it was trained on."""
+
+    ply: tyro.conf.Positional[str]
+    """The PLY, with a column binding_0 (`point_cloud/iteration_<N>/point_cloud.ply`)."""
+
+    out: str
+    """Folder to write; `headbench export ply`, `headbench render` and the method ga load it."""
+
+    capture: str | None = None
+    """Capture it was trained on, in a layout that a reader knows; not needed with a flame_param.npz and --head."""
+
+    flame_param: str | None = None
+    """The parameters that the official repository stored with the splats, of one timestep or of all; default: the file
+    flame_param.npz beside the PLY, if there is one. "none" leaves it out."""
+
+    subject: str = ""
+    """Name of the subject, without --capture, which names it."""
+
+    dependent = (
+        DependentOptions(("reader", "cy"), "capture"),
+        DependentOptions(("subject",), "capture", False),
+    )
+
+
+def export_ply(settings: ExportPlySettings, progress: Progress = no_progress) -> Findings:
+    """Write an avatar in one pose as a 3D Gaussian splatting PLY that common viewers open.
+
+    The findings state bytes, how well harmonics represent its colours, and the PSNR of what is read back.
+    """
+    return _export(settings, "ply", progress)
+
+
+def export_glb(settings: ExportGlbSettings, progress: Progress = no_progress) -> Findings:
+    """Write an avatar in one pose as binary glTF with splats.
+
+    The findings are those of `export ply`.
+    """
+    return _export(settings, "glb", progress)
+
+
+def export_sog(settings: ExportSogSettings, progress: Progress = no_progress) -> Findings:
+    """Write an avatar in one pose as SOG, a compact format of web viewers.
+
+    The findings are those of `export ply`.
+    """
+    return _export(settings, "sog", progress)
+
+
+def _export(settings: ExportOptions, name: str, progress: Progress) -> Findings:
+    from .export import export_pose
+
+    return export_pose(settings, name, progress)
+
+
+@writes("out", "an avatar")
+def import_ga(settings: ImportGASettings, progress: Progress = no_progress) -> Findings:
+    """Make an avatar of a GaussianAvatars PLY, and of flame_param.npz or its capture.
+
+    Harmonics of a lower degree are filled up with zeros, and whatever other columns there are is left out. Shape and
+    static offset come from flame_param.npz, else from the capture. With both, training timesteps are shown in the pose that
+    the official training refined, as official renders of them are; held-out timesteps follow the capture.
+    """
+    from .import_ga import import_avatar
+
+    return import_avatar(settings, progress)

@@ -1,0 +1,65 @@
+"""Leave out of an avatar what no picture of it shows, before it is stored compactly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from ....bench.contracts import Clip, HeadPose
+from ...ours.avatar import OursAvatar
+from ...ours.storage import PER_SPLAT, SPLAT_WIDTHS, Field
+from ...splats.constants import ALPHA_MIN
+from .encoding import negligible_lines
+from .precision import Precision
+
+
+def simplify(avatar: OursAvatar, poses: Iterable[HeadPose], precision: Precision) -> Field:
+    """The avatar's field with its splats sorted by triangle, without splats and lines that no pose shows.
+
+    Parameters
+    ----------
+    poses : of training. A splat whose opacity stays below 1/255 in all of them is left out; the renderer culls such
+        splats, so these poses look the same with and without. Without any pose no splat is left out.
+
+    precision : lines that it rounds to zero are set to zero. If that leaves none, and the lines change opacity alone,
+        every pose changes an opacity by the same number; it is added once and for all, and lines and network are left
+        out.
+    """
+    field = avatar.field
+    tensors = dict(field.tensors)
+    kept = _visible(avatar, poses)
+    # Splats of one depth are drawn in order; sorting is stable, so those of one triangle keep theirs.
+    order = kept[torch.argsort(tensors["splats"][kept, -1], stable=True)]
+    for name in PER_SPLAT:
+        if name in tensors:
+            tensors[name] = tensors[name].index_select(0, order)
+    if "lines" not in tensors:
+        return Field(tensors, field.dynamic)
+    silent = torch.from_numpy(negligible_lines(tensors, precision.lines))
+    mask = silent.to(tensors["lines"].device)[:, None, None, None]
+    tensors["lines"] = tensors["lines"].masked_fill(mask, 0)
+    if silent.all() and field.dynamic == ("opacity",):
+        column = SPLAT_WIDTHS["means"]
+        tensors["splats"][:, column] = avatar.static_logits().index_select(0, order)
+        lines = {name for name in tensors if name.startswith(("lines", "line_"))} - {"line_box"}
+        tensors = {name: value for name, value in tensors.items() if name not in lines}
+        tensors["jaw_bases"] = tensors["jaw_bases"][:0]
+    return Field(tensors, field.dynamic)
+
+
+def training_poses(clip: Clip) -> list[HeadPose]:
+    """The poses of a clip's training frames, in order of time."""
+    return [clip.poses[timestep] for timestep in sorted({key.timestep for key in clip.splits["train"]})]
+
+
+def _visible(avatar: OursAvatar, poses: Iterable[HeadPose]) -> Tensor:
+    """Numbers of the splats that some pose shows."""
+    splats = avatar.field.tensors["splats"]
+    keep = None
+    for pose in poses:
+        shown = torch.from_numpy(avatar.splats(pose).opacities) >= ALPHA_MIN
+        keep = shown if keep is None else keep | shown
+    keep = torch.ones(len(splats), dtype=torch.bool) if keep is None else keep
+    return keep.nonzero().squeeze(1).to(splats.device)

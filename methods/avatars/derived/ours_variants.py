@@ -1,0 +1,98 @@
+"""What can be derived from a trained avatar of ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ....bench.contracts import Clip, HeadAsset, Variant
+from ...ours.avatar import OursAvatar
+from ...ours.storage import FIELD_FILE, PER_SPLAT, Field, checked_field, read_field, save_field
+from ...shared.avatar_files import SUBJECT_FILE, read_shared_head, save_shared_head, write_subject
+from ...shared.subject_mesh import SubjectMesh
+from ..compact.file import COMPACT_FILE, read_compact, write_compact
+from ..compact.precision import Precision
+from ..compact.simplify import simplify
+from .recipes import (
+    OURS,
+    Recipe,
+    coarser_lines,
+    coarser_planes,
+    contributions,
+    most_contributing,
+    read_reduced,
+    training_views,
+    write_reduced,
+)
+
+EXACT_PARTS = ("plane_box", "line_box", "jaw_bases")
+TRIANGLES = "triangles"
+_ANY = 1 << 30  # more samples than anything has
+
+
+def variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
+    """The variants of `recipes.OURS` that change this avatar."""
+    whole = OursAvatar.read(folder, device, exact=(folder / FIELD_FILE).exists())
+    head = read_shared_head(folder)
+    weights = contributions(whole, training_views(clip))
+    for recipe in OURS:
+        if _idle(recipe, whole.field):
+            continue
+        rows = most_contributing(weights, recipe.splats).to(device)
+        yield Variant(recipe.name, recipe.summary, partial(_make, whole, head, rows, recipe, device))
+
+
+def _idle(recipe: Recipe, field: Field) -> bool:
+    """Whether a recipe asks for fewer samples of planes or lines, and nothing else, in vain."""
+    if replace(recipe, planes=None, lines=None) != Recipe():
+        return False
+    changed = _resampled(field.tensors, recipe)
+    return all(changed[name] is value for name, value in field.tensors.items())
+
+
+def _resampled(tensors: dict[str, Tensor], recipe: Recipe) -> dict[str, Tensor]:
+    return coarser_lines(coarser_planes(tensors, recipe.planes or _ANY), recipe.lines or _ANY)
+
+
+def _make(
+    whole: OursAvatar, head: HeadAsset, rows: Tensor, recipe: Recipe, device: str, out: Path
+) -> OursAvatar:
+    """Write what a recipe leaves of an avatar; return what is read back."""
+    tensors = dict(whole.field.tensors)
+    for name in PER_SPLAT:
+        if name in tensors:
+            tensors[name] = tensors[name].index_select(0, rows)
+    tensors = _resampled(tensors, recipe)
+    field = Field(tensors, whole.field.dynamic)
+    save_shared_head(out, head)
+    subject = whole.subject
+    if recipe.storage == "compact":
+        path, precision = out / COMPACT_FILE, Precision()
+        # Sorts the splats by triangle and leaves out lines that would be rounded to nothing.
+        field = simplify(OursAvatar([], whole.mesh, subject, field, device), [], precision)
+        write_compact(path, field, subject, head, precision)
+        subject, field = read_compact(path, head, device)
+        stored = [path]
+    else:
+        write_subject(out / SUBJECT_FILE, subject)
+        path = out / FIELD_FILE
+        if recipe.storage == "exact":
+            save_field(path, field)
+            field = read_field(path, head, device)
+        else:
+            table, triangles = tensors["splats"][:, :-1], tensors["splats"][:, -1]
+            narrow = {**tensors, "splats": table, TRIANGLES: triangles.to(torch.int32)}
+            write_reduced(path, narrow, recipe.storage, EXACT_PARTS)
+            read = read_reduced(path)
+            triangles = read.pop(TRIANGLES)[:, None].to(torch.float32)
+            read["splats"] = torch.cat([read["splats"], triangles], dim=1)
+            checked_field(path, read, ",".join(field.dynamic), head)
+            field = field._replace(tensors={name: value.to(device) for name, value in read.items()})
+        stored = [path, out / SUBJECT_FILE]
+    mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
+    return OursAvatar(stored, mesh, subject, field, device, recipe.cutoffs)

@@ -1,0 +1,124 @@
+"""Avatars in one pose as files of splats that viewers open, and what each file loses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ...bench.contracts import HeadAsset, HeadPose, Progress, SplatAvatar
+from ...bench.errors import InputError
+from ...bench.io.files import check_writable
+from ...bench.runner.stored import StoredAvatar, open_avatar
+from ...bench.specs import Findings
+from ..ops.harmonics import sh_basis
+from ..shared.avatar_files import read_shared_head
+from ..splats import rasterize
+from .command import AvatarOptions, ExportOptions
+from .formats import FORMATS, StoredSplats
+from .harmonics import DEGREE, harmonics_of
+from .views import FIELD_OF_VIEW, direction_of, look
+from .web.bake import Source
+
+VIEWS = ((0.0, 0.0), (0.6, 0.0), (-0.6, 0.2))
+"""Azimuth and elevation, radians, from which the loss is measured."""
+SIZE = 400
+
+
+def open_splats(settings: AvatarOptions) -> tuple[StoredAvatar, SplatAvatar]:
+    """The stored avatar that a command names, and the avatar, loaded.
+
+    Raises `InputError` as `open_avatar` does, for an avatar that is not one of splats, and where no head model lies beside it.
+    """
+    stored = open_avatar(Path(settings.avatar), settings.method)
+    avatar = stored.load()
+    if not isinstance(avatar, SplatAvatar):
+        found, remedy = (
+            f"one of {stored.record['method']}",
+            "`headbench view` and `headbench render` show it.",
+        )
+        raise InputError(stored.folder, "", "an avatar of splats", found, remedy)
+    return stored, avatar
+
+
+def export_pose(settings: ExportOptions, name: str, progress: Progress) -> Findings:
+    """Write an avatar in one pose in a format of `FORMATS`, read it back, and compare.
+
+    Raises `InputError` for a folder that holds no avatar of splats, and for a timestep that the capture lacks;
+    `UnavailableError` where the format's library is not installed.
+    """
+    out, form = Path(settings.out), FORMATS[name]
+    check_writable(out, "--out")
+    form.check()
+    stored, avatar = open_splats(settings)
+    pose = _pose(settings, read_shared_head(stored.folder), progress)
+    splats = avatar.splats(pose)
+    colours = harmonics_of(avatar, pose, settings.directions)
+    form.write(out, StoredSplats.of(splats, colours.dc, colours.rest))
+    lost = _least_psnr(avatar, pose, form.read(out))
+    data = {"out": out, "splats": len(splats.means), "timestep": pose.timestep}
+    data |= {"bytes": out.stat().st_size, "psnr": lost}
+    words = "its own spherical harmonics"
+    if colours.residual is not None:
+        # Splats that hardly show would hide how far off those are that do.
+        weight = splats.opacities / max(float(splats.opacities.sum()), 1e-12)
+        residual = colours.residual
+        data["residual_rms"] = float(np.sqrt((weight * residual.numpy() ** 2).sum()))
+        data["residual_p95"] = float(torch.quantile(residual, 0.95)) if len(residual) else 0.0
+        words = f"spherical harmonics fitted to its colours, off by {data['residual_rms']:.4f} (rms)"
+        words += f", {data['residual_p95']:.4f} (95 % of splats)"
+    text = f"{out}: {len(splats.means)} splats, {out.stat().st_size / 1e6:.2f} MB; {words};"
+    return Findings(f"{text} PSNR against the avatar's own frames {lost:.1f} dB or more", data)
+
+
+def _least_psnr(avatar: SplatAvatar, pose: HeadPose, found: StoredSplats) -> float:
+    """dB, the least of `VIEWS`: the file's splats drawn by our renderer against the avatar's frames, on white."""
+    source = Source(avatar, pose, np.zeros(3), np.zeros((4, 3)))
+    extent = np.quantile(source.seen(pose).means, (0.005, 0.995), axis=0)
+    distance = float((extent[1] - extent[0]).max()) / np.tan(np.radians(FIELD_OF_VIEW))
+    worst = np.inf
+    for azimuth, elevation in VIEWS:
+        camera = source.camera(
+            look(direction_of(azimuth, elevation), 1.5 * distance, extent.mean(axis=0), SIZE)
+        )
+        along = torch.nn.functional.normalize(found.means - torch.from_numpy(camera.center).float(), dim=1)
+        harmonics = torch.cat([found.dc[:, :, None], found.rest], dim=2)
+        colors = torch.relu(0.5 + (harmonics * sh_basis(along, DEGREE)[:, None]).sum(2))
+        motion, K = (torch.from_numpy(np.asarray(m, np.float32)) for m in (camera.world_to_camera, camera.K))
+        drawn = rasterize(
+            *(found.means, found.quats, found.scales, found.opacities, colors),
+            *(motion, K, camera.width, camera.height),
+            background=torch.ones(3),
+        )
+        error = float(np.square(drawn.image.clamp(0, 1).numpy() - avatar.render(camera, pose).rgb).mean())
+        worst = min(worst, -10 * float(np.log10(max(error, 1e-12))))
+    return worst
+
+
+def _pose(settings: ExportOptions, head: HeadAsset, progress: Progress) -> HeadPose:
+    if settings.capture is None:
+        return neutral_pose(head)
+    clip = settings.open(settings.capture, progress)
+    timestep = settings.timestep
+    if timestep is None:
+        timestep = min(key.timestep for key in clip.splits["train"])
+    if timestep not in clip.poses:
+        expected = f"a timestep of the capture, {min(clip.poses)} to {max(clip.poses)}"
+        raise InputError("--timestep", "", expected, str(timestep))
+    return clip.poses[timestep]
+
+
+def neutral_pose(head: HeadAsset) -> HeadPose:
+    """Nothing moved: zero expression, rotations and translation."""
+    zero = np.zeros(3, np.float32)
+    return HeadPose(
+        head.version,
+        expression=np.zeros(head.expression_basis.shape[2], np.float32),
+        rotation=zero,
+        neck=zero,
+        jaw=zero,
+        eyes=np.zeros(6, np.float32),
+        translation=zero,
+        eyelids=None if head.eyelid_basis is None else np.zeros(2, np.float32),
+    )

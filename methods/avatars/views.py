@@ -1,0 +1,70 @@
+"""Views of splats from around them, and how much each splat contributes to a view."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...bench.contracts import Camera, FloatArray, Splats
+from ..shared.rendering import view_of
+from ..splats import rasterize
+
+FIELD_OF_VIEW = 30.0
+"""Of the cameras of `look`, degrees."""
+SIZE = 128
+"""Pixels along a side of a picture by which `visibility` looks at splats."""
+
+
+def contribution(splats: Splats, camera: Camera) -> Tensor:
+    """(N,) blending weights of each splat, summed over all pixels of one view.
+
+    The weight of a splat in a pixel is its alpha times the transmittance in front of it; the sum over pixels is the
+    derivative of the sum of a one-channel image by the splat's colour. As importance for pruning: Fang and Wang,
+    "Mini-Splatting", ECCV 2024, section 4.
+    """
+    view = view_of(camera, "cpu")
+    geometry = splats.means, splats.quats, splats.scales, splats.opacities
+    means, quats, scales, opacities = (
+        torch.from_numpy(np.asarray(values, np.float32)) for values in geometry
+    )
+    colors = torch.ones(len(means), 1, requires_grad=True)
+    where = view.world_to_camera, view.K, camera.width, camera.height
+    image = rasterize(means, quats, scales, opacities, colors, *where).image
+    (weights,) = torch.autograd.grad(image.sum(), colors)
+    return weights[:, 0]
+
+
+def visibility(splats: Splats, directions: FloatArray) -> Tensor:
+    """(N, M) how much each splat shows from (M, 3) unit vectors to the camera, in parts of where it shows most."""
+    middle = splats.means.mean(axis=0)
+    radius = float(np.quantile(np.linalg.norm(splats.means - middle, axis=1), 0.99))
+    distance = max(radius, 1e-3) / np.tan(np.radians(FIELD_OF_VIEW / 2))
+    weights = torch.stack([contribution(splats, look(d, distance, middle, SIZE)) for d in directions], dim=1)
+    return weights / weights.amax(dim=1, keepdim=True).clamp_min(1e-6)
+
+
+def direction_of(azimuth: float, elevation: float) -> FloatArray:
+    """(3,) unit vector to a camera at angles in radians, 0 from the front."""
+    around = np.cos(elevation)
+    return np.array([np.sin(azimuth) * around, np.sin(elevation), np.cos(azimuth) * around])
+
+
+def camera_at(place: FloatArray) -> Camera:
+    """A camera that is only asked where it is: at (3,) metres."""
+    motion = np.eye(4)
+    motion[:3, 3] = -np.asarray(place, np.float64)
+    return Camera("place", 8, 8, np.eye(3), motion)
+
+
+def look(direction: FloatArray, distance: float, target: FloatArray, size: int) -> Camera:
+    """A square view of a target, upright, from (3,) a unit vector to the camera that does not point straight up."""
+    ahead = -np.asarray(direction, np.float64)
+    right = np.cross(ahead, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    motion = np.eye(4)
+    motion[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
+    motion[:3, 3] = -motion[:3, :3] @ (target - distance * ahead)
+    focal = size / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
+    K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
+    return Camera("view", size, size, K, motion)

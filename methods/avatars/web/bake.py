@@ -1,0 +1,230 @@
+"""Bakes avatars of splats for a web page, whatever method they are of: by looking at their splats in chosen poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from ....bench.contracts import Camera, FloatArray, HeadPose, Progress, SplatAvatar
+from ...ops.harmonics import sh_basis
+from ...splats.reference import rotation_matrices
+from ..harmonics import FAR_M, fit_harmonics, sphere
+from ..views import camera_at, direction_of, visibility
+from .model import JOINTS, Slider, WebAvatar, blended, joint_motions, rotation_of
+
+AWAY_M = 1.0
+"""Distance at which colours are looked at."""
+FEW_DIRECTIONS = ((0.0, 0.0), (0.7, 0.0), (-0.7, 0.0))
+"""Azimuth and elevation from which the change of colours by a slider is looked at."""
+TRIAL_TURN = 0.25
+LOGIT_MAX = 8.0
+
+
+class Seen(NamedTuple):
+    """Splats in the head's frame: (N, 3), (N, 3, 3), (N, 3), (N,) and (N, 3), the last None without a camera."""
+
+    means: FloatArray
+    rotations: FloatArray
+    log_scales: FloatArray
+    logits: FloatArray
+    colors: FloatArray | None
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """An avatar to bake.
+
+    Attributes
+    ----------
+    rest : the pose at rest: expression, neck, jaw and eyes are 0, rotation and translation those of the head.
+    root : (3,) the root joint without translation, about which ``rest.rotation`` turns, metres.
+    joints : (4, 3) neck, jaw, left and right eye in the head's frame.
+    """
+
+    avatar: SplatAvatar
+    rest: HeadPose
+    root: FloatArray
+    joints: FloatArray
+
+    def pose(self, sliders: Sequence[Slider], values: Sequence[float] | FloatArray) -> HeadPose:
+        """The pose that sliders ask for."""
+        parts = {
+            name: np.array(getattr(self.rest, name), np.float64)
+            for name in ("expression", "neck", "jaw", "eyes")
+        }
+        for slider, value in zip(sliders, values):
+            if not slider.joints:
+                parts["expression"][slider.number] += value
+            for joint in slider.joints:
+                name, first = (("neck", 0), ("jaw", 0), ("eyes", 0), ("eyes", 3))[joint]
+                parts[name][first + slider.axis] += value
+        changed: Any = {name: part.astype(getattr(self.rest, name).dtype) for name, part in parts.items()}
+        return replace(self.rest, **changed)
+
+    def camera(self, view: Camera) -> Camera:
+        """A camera of the head's frame in the world of the pose at rest."""
+        motion = np.eye(4)
+        rotation = self.rotation
+        motion[:3, :3] = rotation.T
+        motion[:3, 3] = self.root - rotation.T @ (self.root + np.asarray(self.rest.translation, np.float64))
+        return replace(view, world_to_camera=view.world_to_camera @ motion)
+
+    def seen(self, pose: HeadPose, camera: Camera | None = None) -> Seen:
+        """The splats of a pose, coloured as a camera of the head's frame sees them."""
+        found = self.avatar.splats(pose, None if camera is None else self.camera(camera))
+        rotation = self.rotation
+        means = (found.means - self.root - self.rest.translation) @ rotation + self.root
+        quats = torch.from_numpy(np.asarray(found.quats, np.float64))
+        opacities = np.asarray(found.opacities, np.float64).clip(1e-6, 1 - 1e-6)
+        return Seen(
+            np.asarray(means, np.float64),
+            rotation.T @ rotation_matrices(quats).numpy(),
+            np.log(np.maximum(np.asarray(found.scales, np.float64), 1e-8)),
+            np.log(opacities / (1 - opacities)).clip(-LOGIT_MAX, LOGIT_MAX),
+            None if found.colors is None else np.asarray(found.colors, np.float64),
+        )
+
+    @property
+    def rotation(self) -> FloatArray:
+        """(3, 3) from the head's frame to the world."""
+        return rotation_of(np.asarray(self.rest.rotation, np.float64)[None])[0]
+
+
+def bake(
+    source: Source, sliders: tuple[Slider, ...], degree: int, directions: int, progress: Progress
+) -> WebAvatar:
+    """Look at the avatar with each slider at its step, and from all around; see `WebAvatar`."""
+    total = len(sliders) + 1
+    rest = source.seen(source.rest)
+    middle = rest.means.mean(axis=0)
+    few = [camera_at(middle + AWAY_M * direction_of(*angles)) for angles in FEW_DIRECTIONS]
+    colors = [_colors(source, source.rest, camera) for camera in few]
+    weights = _weights(source, rest)
+    harmonics = _harmonics(source, middle, degree, directions)
+    progress(1, total, "at rest")
+    morphs: dict[str, list[FloatArray]] = {
+        name: [] for name in ("means", "turns", "log_scales", "logits", "colors")
+    }
+    for number, slider in enumerate(sliders):
+        # Both ways, where the slider goes both ways: what is linear is kept, what bends to one side is not.
+        steps = [slider.step] if slider.low >= 0 else [slider.step, -slider.step]
+        changes = [_change(source, rest, slider, step, weights, few, colors) for step in steps]
+        for name, change in morphs.items():
+            signed = [found[name] * np.sign(step) for found, step in zip(changes, steps)]
+            change.append(np.mean(signed, axis=0))
+        progress(number + 2, total, slider.name)
+    arrays: Mapping[str, FloatArray] = {f"d_{name}": np.stack(found) for name, found in morphs.items()}
+    return WebAvatar(
+        *(rest.means, rest.rotations, rest.log_scales, rest.logits, harmonics),
+        turned=_turned(source, sliders, rest, weights, harmonics, degree, middle),
+        weights=weights,
+        joints=source.joints,
+        sliders=sliders,
+        **arrays,
+    )
+
+
+def _colors(source: Source, pose: HeadPose, camera: Camera) -> FloatArray:
+    found = source.seen(pose, camera).colors
+    assert found is not None  # the camera is given
+    return found
+
+
+def _weights(source: Source, rest: Seen) -> FloatArray:
+    """(N, 4) skinning weights: least squares over a turn of each joint about x and y."""
+    moves = np.zeros((len(rest.means), len(JOINTS)))
+    for joint in range(len(JOINTS)):
+        products, squares = np.zeros(len(rest.means)), np.zeros(len(rest.means))
+        for axis in (0, 1):
+            slider = Slider("", (joint,), axis, 0, 0.0, 1.0, 1.0)
+            moved = source.seen(source.pose([slider], [TRIAL_TURN])).means
+            vector = np.zeros((1, 3))
+            vector[0, axis] = TRIAL_TURN
+            rigid = (rest.means - source.joints[joint]) @ (rotation_of(vector)[0] - np.eye(3)).T
+            products += ((moved - rest.means) * rigid).sum(axis=1)
+            squares += (rigid**2).sum(axis=1)
+        moves[:, joint] = (products / np.maximum(squares, 1e-12)).clip(0.0, 1.0)
+    # What the neck alone moves: it takes the jaw and the eyes along.
+    moves[:, 0] = (moves[:, 0] - moves[:, 1:].sum(axis=1)).clip(0.0, 1.0)
+    return np.asarray(moves / np.maximum(moves.sum(axis=1, keepdims=True), 1.0))
+
+
+def _change(
+    source: Source,
+    rest: Seen,
+    slider: Slider,
+    step: float,
+    weights: FloatArray,
+    few: Sequence[Camera],
+    colors: Sequence[FloatArray],
+) -> dict[str, FloatArray]:
+    """What a slider at a step changes before skinning."""
+    pose = source.pose([slider], [step])
+    seen = source.seen(pose)
+    linear, shift = blended(weights, joint_motions((slider,), np.array([step]), source.joints))
+    means = np.linalg.solve(linear, (seen.means - shift)[..., None])[..., 0] - rest.means
+    left, _, right = np.linalg.svd(linear)
+    relative = (left @ right).transpose(0, 2, 1) @ seen.rotations @ rest.rotations.transpose(0, 2, 1)
+    difference = np.mean([_colors(source, pose, camera) - base for camera, base in zip(few, colors)], axis=0)
+    return {
+        "means": means,
+        "turns": vector_of(relative),
+        "log_scales": seen.log_scales - rest.log_scales,
+        "logits": seen.logits - rest.logits,
+        "colors": difference,
+    }
+
+
+def vector_of(rotations: FloatArray) -> FloatArray:
+    """(N, 3) rotation vectors of (N, 3, 3) rotations by less than half a turn; splats alike from both sides may flip."""
+    skew = rotations - rotations.transpose(0, 2, 1)
+    sine = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1) / 2
+    length = np.linalg.norm(sine, axis=1)
+    angle = np.arctan2(length, (np.trace(rotations, axis1=1, axis2=2) - 1) / 2)
+    return np.asarray(sine * np.where(length > 1e-9, angle / np.maximum(length, 1e-9), 1.0)[:, None])
+
+
+def _harmonics(source: Source, middle: FloatArray, degree: int, directions: int) -> FloatArray:
+    """(N, 3, K): least squares over directions, weighted by how much each splat shows; see `fit_harmonics`."""
+
+    def radiance(direction: torch.Tensor) -> torch.Tensor:
+        far = camera_at(middle + FAR_M * direction.numpy())
+        return torch.from_numpy(_colors(source, source.rest, far)).float()
+
+    along = sphere(directions)
+    weights = visibility(source.avatar.splats(source.rest), along.double().numpy() @ source.rotation.T)
+    fit = fit_harmonics(radiance, weights, along)
+    every = torch.cat([fit.dc[:, :, None], fit.rest], dim=2).double().numpy()
+    return np.asarray(every[:, :, : (degree + 1) ** 2])
+
+
+def _turned(
+    source: Source,
+    sliders: Sequence[Slider],
+    rest: Seen,
+    weights: FloatArray,
+    harmonics: FloatArray,
+    degree: int,
+    middle: FloatArray,
+) -> bool:
+    """Whether colours turn with the head: which of both explains better what a turned neck shows."""
+    turn = next((slider for slider in sliders if slider.joints == (0,) and slider.axis == 1), None)
+    if turn is None or degree == 0:
+        return False
+    values = [turn.high if slider == turn else 0.0 for slider in sliders]
+    pose = source.pose(sliders, values)
+    linear, _ = blended(weights, joint_motions(tuple(sliders), np.array(values), source.joints))
+    camera = camera_at(middle + FAR_M * direction_of(0.0, 0.0))
+    found = _colors(source, pose, camera)
+    ahead = np.tile([0.0, 0.0, -1.0], (len(found), 1))
+    errors = []
+    for along in (ahead, np.einsum("nji,nj->ni", linear, ahead)):
+        basis = sh_basis(
+            torch.from_numpy(along / np.linalg.norm(along, axis=1, keepdims=True)), degree
+        ).numpy()
+        errors.append(np.square(0.5 + np.einsum("nck,nk->nc", harmonics, basis) - found).mean())
+    return bool(errors[1] < errors[0])

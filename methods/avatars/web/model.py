@@ -1,0 +1,135 @@
+"""An avatar as a web page has it: splats, linear morphs, skinning by a few joints, harmonics.
+
+All in the frame of the head: the root joint does not turn, x to the head's left, y up, z to the front; metres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ....bench.contracts import FloatArray
+from ...ops.harmonics import sh_basis
+
+JOINTS = ("neck", "jaw", "left eye", "right eye")
+
+
+class Slider(NamedTuple):
+    """Something that can be moved: an expression, or a turn of joints about an axis. It brings a morph of its own.
+
+    Attributes
+    ----------
+    joints : indices into `JOINTS` of those that it turns; none for an expression.
+    axis : 0, 1 or 2 for x, y, z. number : of the expression.
+    low, high : where the slider ends: coefficients or radians.
+    step : value at which its morph counts fully.
+    """
+
+    name: str
+    joints: tuple[int, ...]
+    axis: int
+    number: int
+    low: float
+    high: float
+    step: float
+
+
+class Moved(NamedTuple):
+    """Splats in the head's frame: (N, 3) means, (N, 3, 3) axes times scales, (N,) opacities, (N, 3) colours."""
+
+    means: FloatArray
+    axes: FloatArray
+    opacities: FloatArray
+    colors: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class WebAvatar:
+    """What a page holds, as float arrays. N splats, M sliders.
+
+    Attributes
+    ----------
+    means, rotations, log_scales, logits : (N, 3), (N, 3, 3), (N, 3), (N,) of the face at rest.
+    harmonics : (N, 3, K), in 3DGS' order and signs, along the way from the camera to the splat.
+    turned : whether harmonics turn with the head, or stay with the world.
+    weights : (N, 4) of `JOINTS`; what is missing to 1 stays with the shoulders.
+    joints : (4, 3) where they are.
+    sliders : M of them.
+    d_means, d_turns, d_log_scales, d_logits, d_colors : (M, N, 3), (M, N, 3), (M, N, 3), (M, N), (M, N, 3): what is added
+        at ``step`` before skinning; turns are rotation vectors.
+    """
+
+    means: FloatArray
+    rotations: FloatArray
+    log_scales: FloatArray
+    logits: FloatArray
+    harmonics: FloatArray
+    turned: bool
+    weights: FloatArray
+    joints: FloatArray
+    sliders: tuple[Slider, ...]
+    d_means: FloatArray
+    d_turns: FloatArray
+    d_log_scales: FloatArray
+    d_logits: FloatArray
+    d_colors: FloatArray
+
+    def moved(self, values: FloatArray, center: FloatArray) -> Moved:
+        """The splats with the sliders at (M,) values, coloured as seen from a (3,) point."""
+        steps = np.asarray(values, np.float64) / [slider.step for slider in self.sliders]
+
+        def added(morphs: FloatArray) -> FloatArray:
+            return np.asarray(np.tensordot(steps, np.asarray(morphs, np.float64), axes=1))
+
+        linear, shift = blended(self.weights, joint_motions(self.sliders, values, self.joints))
+        means = self.means + added(self.d_means)
+        turn = rotation_of(added(self.d_turns)) @ self.rotations
+        axes = linear @ turn * np.exp(self.log_scales + added(self.d_log_scales))[:, None, :]
+        means = np.einsum("nij,nj->ni", linear, means) + shift
+        along = means - center
+        if self.turned:
+            along = np.einsum("nji,nj->ni", linear, along)
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        degree = int(np.sqrt(self.harmonics.shape[2])) - 1
+        basis = sh_basis(torch.from_numpy(along), degree).numpy()
+        colors = 0.5 + np.einsum("nck,nk->nc", self.harmonics, basis) + added(self.d_colors)
+        return Moved(means, axes, 1 / (1 + np.exp(-self.logits - added(self.d_logits))), colors.clip(min=0.0))
+
+
+def joint_motions(
+    sliders: tuple[Slider, ...], values: FloatArray, joints: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """(4, 3, 3) and (4, 3): where each joint takes a point; the neck takes the others along."""
+    turns = np.zeros((len(JOINTS), 3))
+    for slider, value in zip(sliders, values):
+        for joint in slider.joints:
+            turns[joint, slider.axis] += value
+    linear = rotation_of(turns)
+    shift = joints - np.einsum("jik,jk->ji", linear, joints)
+    for joint in range(1, len(JOINTS)):
+        shift[joint] = linear[0] @ shift[joint] + shift[0]
+        linear[joint] = linear[0] @ linear[joint]
+    return linear, shift
+
+
+def blended(weights: FloatArray, motions: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """(N, 3, 3) and (N, 3): linear blend skinning (FLAME, section 3) of motions by (N, J) weights."""
+    linear, shift = motions
+    rest = 1.0 - weights.sum(axis=1)
+    return (
+        np.einsum("nj,jik->nik", weights, linear) + rest[:, None, None] * np.eye(3),
+        weights @ shift,
+    )
+
+
+def rotation_of(vectors: FloatArray) -> FloatArray:
+    """(N, 3, 3) rotations of (N, 3) rotation vectors, by Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=1)
+    x, y, z = (np.asarray(vectors, np.float64) / np.maximum(angle, 1e-12)[:, None]).T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    return np.asarray(np.eye(3) + sine * cross + (1 - cosine) * cross @ cross)

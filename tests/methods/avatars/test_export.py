@@ -1,0 +1,216 @@
+"""Avatars as standard splat files, read back by a parser that knows nothing of ours, and drawn."""
+
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from scipy.special import sph_harm_y
+
+from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.errors import InputError
+from headbench.datasets.ga import reader
+from headbench.datasets.ga.reader import read_capture
+from headbench.methods.avatars.command import ExportPlySettings, export_ply
+from headbench.methods.avatars.export import neutral_pose
+from headbench.methods.avatars.harmonics import HIDDEN, fit_harmonics, sphere
+from headbench.methods.avatars.views import visibility
+from headbench.methods.avatars.web.command import ExportHtmlSettings, export_html
+from headbench.methods.ga.config import GAConfig
+from headbench.methods.ga.method import GA
+from headbench.methods.gbs.config import GBSConfig
+from headbench.methods.gbs.method import GBS
+from headbench.methods.ops.harmonics import sh_basis
+from headbench.methods.ours.avatar import OursAvatar
+from headbench.methods.shared.rendering import PosedSplats, view_of
+from headbench.methods.splats import rasterize
+from headbench.methods.trivial.method import NearestCamera
+
+from ...datasets.tiny_capture import write_tiny_capture
+from ..ours.toy import SMALL, store
+from ..recorded import recorded
+
+NAMES = [
+    *("x", "y", "z", "nx", "ny", "nz"),
+    *(f"f_dc_{i}" for i in range(3)),
+    *(f"f_rest_{i}" for i in range(45)),
+    *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+]
+
+
+def parse(path):
+    """(N, 62) of a standard file, byte by byte; nothing but the exact layout passes."""
+    content = path.read_bytes()
+    header, body = content.split(b"end_header\n", 1)
+    lines = header.decode("ascii").split("\n")
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    count = int(lines[2].removeprefix("element vertex "))
+    assert lines[3:-2] == [f"property float {name}" for name in NAMES]
+    assert lines[-2].endswith("trainedAlgorithmicMedia")
+    assert len(body) == count * 248
+    return np.array([struct.unpack("<62f", body[248 * i : 248 * (i + 1)]) for i in range(count)])
+
+
+def exported(folder, out, **options):
+    """The table written, and the findings."""
+    findings = export_ply(ExportPlySettings(str(folder), out=str(out), **options))
+    return parse(out), findings
+
+
+def viewed(table, camera):
+    """What a viewer of 3DGS does with such a table."""
+    values = torch.from_numpy(table.astype(np.float32))
+    view = view_of(camera, "cpu")
+    means, logits, scales, quats = values[:, :3], values[:, 54], values[:, 55:58].exp(), values[:, 58:]
+    harmonics = torch.cat([values[:, 6:9, None], values[:, 9:54].view(-1, 3, 15)], dim=2)
+    directions = torch.nn.functional.normalize(means - view.center, dim=1)
+    colors = torch.relu(0.5 + (harmonics * sh_basis(directions, 3)[:, None]).sum(2))
+    return rasterize(
+        *(means, quats, scales, torch.sigmoid(logits), colors),
+        *(view.world_to_camera, view.K, camera.width, camera.height),
+        background=torch.ones(3),
+    ).image.numpy()
+
+
+def soft(values):
+    """Colours that vary little enough with direction for harmonics, and are not cut at 0."""
+    values["color_weight_0"][:, -27:] *= 0.3
+    values["color_weight_1"] *= 0.5
+
+
+@pytest.mark.parametrize("color", ["planes", "sh"])
+def test_a_viewer_shows_what_the_avatar_shows(color, clip, tmp_path):
+    config = replace(SMALL, color=color, sh_degree=2)
+    folder = store(clip, tmp_path / "avatar", config, (lambda _: None) if color == "sh" else soft)
+    table, findings = exported(folder, tmp_path / "x.ply", directions=128)
+    avatar, pose = OursAvatar.read(folder, "cpu"), neutral_pose(clip.head)
+    splats = avatar.splats(pose)
+    assert findings.data["splats"] == len(table) == len(splats.means)
+    np.testing.assert_array_equal(table[:, :3], splats.means)
+    np.testing.assert_array_equal(table[:, 58:], splats.quats)
+    np.testing.assert_allclose(np.exp(table[:, 55:58]), splats.scales, rtol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-table[:, 54])), splats.opacities, atol=1e-6)
+    assert not table[:, 3:6].any()
+    assert findings.data["residual_rms"] < 0.05
+    for camera in clip.cameras.values():
+        error = np.mean((viewed(table, camera).clip(0, 1) - avatar.render(camera, pose).rgb) ** 2)
+        assert -10 * np.log10(error) > 32
+
+
+def test_the_pose_of_a_capture_is_written(tmp_path):
+    capture = write_tiny_capture(tmp_path / "capture").union
+    clip = read_capture(capture)
+    folder, options = tmp_path / "ga", {"device": "cpu", "seed": 0, "progress": no_progress}
+    avatar = GA(GAConfig(refine_tracking=False)).fit(clip, folder, Budget(iterations=3), **options)
+    recorded(folder, "ga", clip)
+    timestep = clip.timesteps("self_reenactment")[0]
+    table, _ = exported(folder, tmp_path / "x.ply", capture=str(capture), timestep=timestep)
+    np.testing.assert_array_equal(table[:, :3], avatar.splats(clip.poses[timestep]).means)
+    camera = next(iter(clip.cameras.values()))
+    difference = viewed(table, camera).clip(0, 1) - avatar.render(camera, clip.poses[timestep]).rgb
+    assert np.abs(difference).max() < 1e-4
+    with pytest.raises(InputError, match="timestep"):
+        export_ply(ExportPlySettings(str(tmp_path / "ga"), out="x", capture=str(capture), timestep=10**6))
+    with pytest.raises(InputError, match=r"avatar\.json"):
+        export_ply(ExportPlySettings(str(capture), out="x"))
+
+
+def test_a_viewer_shows_a_blendshape_avatar_in_a_turned_pose(tmp_path):
+    capture = write_tiny_capture(tmp_path / "capture").union
+    clip = read_capture(capture)
+    method = GBS(GBSConfig(samples=200, teeth_samples=10, expressions=4))
+    method.fit(clip, tmp_path / "gbs", Budget(iterations=1), device="cpu", seed=0, progress=no_progress)
+    recorded(tmp_path / "gbs", "gbs", clip, method.config)
+    file = tmp_path / "gbs" / "avatar.safetensors"
+    with safe_open(file, "pt") as stream:
+        metadata = stream.metadata()
+    tensors = load_file(file)
+    tensors["splats"][:, 11:] = 0.3 * torch.randn(tensors["splats"][:, 11:].shape)
+    save_file(tensors, file, metadata)
+    avatar = GBS(method.config).load(tmp_path / "gbs", device="cpu")
+    timestep = clip.timesteps("self_reenactment")[0]
+    pose = replace(clip.poses[timestep], rotation=np.array([0.3, -0.8, 0.2]))
+    fixed = {"poses": {**clip.poses, timestep: pose}}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reader, "read_capture", lambda *_, **__: replace(clip, **fixed))
+        table, _ = exported(tmp_path / "gbs", tmp_path / "x.ply", capture=str(capture), timestep=timestep)
+    assert np.abs(table[:, 9:54]).max() > 0.1
+    for camera in clip.cameras.values():
+        shown = viewed(table, camera).clip(0, 1)
+        assert np.ptp(shown) > 0.1
+        np.testing.assert_allclose(shown, avatar.render(camera, pose).rgb, atol=1e-3)
+
+
+def test_an_avatar_without_splats_is_refused(clip, tmp_path):
+    options = {"device": "cpu", "seed": 0, "progress": no_progress}
+    NearestCamera().fit(clip, tmp_path, Budget(iterations=1), **options)
+    recorded(tmp_path, "nearest-camera", clip)
+    for command, settings in ((export_ply, ExportPlySettings), (export_html, ExportHtmlSettings)):
+        with pytest.raises(
+            InputError, match="an avatar of splats, found one of nearest-camera.*headbench view"
+        ):
+            command(settings(str(tmp_path), out=str(tmp_path / "x")))
+        assert not (tmp_path / "x").exists()
+
+
+def test_colours_that_are_harmonics_are_found_exactly():
+    """Against scipy's complex harmonics, of degree 3: any real combination of them must be fitted without residual."""
+    directions = sphere(128)
+    rng = np.random.default_rng(0)
+    weights = rng.normal(size=(5, 3, 16, 2)) * 0.1
+
+    def radiance(direction):
+        x, y, z = direction.double().numpy()
+        values = [
+            sph_harm_y(degree, order, np.arccos(z), np.arctan2(y, x))
+            for degree in range(4)
+            for order in range(-degree, degree + 1)
+        ]
+        parts = np.stack([np.real(values), np.imag(values)], axis=1)
+        return torch.from_numpy(0.5 + (weights * parts).sum((2, 3))).float()
+
+    fit = fit_harmonics(radiance, torch.from_numpy(rng.uniform(size=(5, 128))).float(), directions)
+    assert fit.residual.max() < 1e-4
+    unseen = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(20, 3))).float(), dim=1)
+    basis = sh_basis(-unseen, 3)
+    found = 0.5 + torch.einsum("mk,nck->nmc", basis, torch.cat([fit.dc[:, :, None], fit.rest], dim=2))
+    expected = torch.stack([radiance(direction) for direction in unseen], dim=1)
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+
+
+def test_a_splat_behind_a_wall_shows_from_behind_alone():
+    """A wall of opaque splats at z = 0, and one splat behind it."""
+    wall = np.array([[x, y, 0.0] for x in np.linspace(-1, 1, 21) for y in np.linspace(-1, 1, 21)])
+    means = np.concatenate([wall, [[0.0, 0.0, -0.2]]]).astype(np.float32)
+    count = len(means)
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
+    splats = PosedSplats(
+        means, quats, np.full((count, 3), 0.06, np.float32), np.full(count, 0.99, np.float32), None
+    )
+    directions = sphere(200)
+    shown = visibility(splats, directions.numpy())[-1]
+    assert shown[directions[:, 2] > 0.8].max() < 0.05
+    assert shown[directions[:, 2] < -0.8].min() > 0.5
+
+
+def test_directions_of_no_weight_hardly_count():
+    directions = sphere(200)
+
+    def radiance(direction):
+        return torch.full((1, 3), 0.7 if direction[2] > 0 else 0.1)
+
+    fit = fit_harmonics(radiance, (directions[:, 2] > 0).float()[None], directions)
+    seen = sh_basis(torch.tensor([[0.0, 0.0, -1.0]]), 3)
+    front = 0.5 + seen @ torch.cat([fit.dc[:, :, None], fit.rest], dim=2)[0].t()
+    assert abs(float(front[0, 0]) - 0.7) < 0.03
+    even = fit_harmonics(radiance, torch.ones(1, 200), directions)
+    assert fit.residual[0] < 0.6 * even.residual[0]
+    assert HIDDEN < 0.1
+
+
+def test_too_few_directions_are_refused():
+    with pytest.raises(ValueError, match="32"):
+        ExportPlySettings("a", out="b", directions=16)

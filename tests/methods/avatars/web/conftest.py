@@ -1,0 +1,55 @@
+from typing import NamedTuple
+
+import pytest
+
+from headbench.bench.contracts import no_progress
+from headbench.methods.avatars.web import export
+from headbench.methods.avatars.web.bake import Source
+from headbench.methods.avatars.web.command import ExportHtmlSettings
+from headbench.methods.avatars.web.model import WebAvatar
+
+from ....small_run import small_run
+
+
+class Exported(NamedTuple):
+    """An avatar, what was baked of it and the page that holds it."""
+
+    source: Source
+    baked: WebAvatar
+    view: dict
+    page: object
+    findings: object
+
+
+@pytest.fixture(scope="package")
+def run(tmp_path_factory):
+    return small_run(tmp_path_factory.mktemp("web"), "ga", "gbs", "ours")
+
+
+@pytest.fixture(
+    scope="package", params=[*(pytest.param(name, marks=pytest.mark.slow) for name in ("ga", "gbs")), "ours"]
+)
+def exported(run, request, tmp_path_factory):
+    """A page of each method, as the command writes it."""
+    kept = {}
+    bake, encode = export.bake, export.encode
+
+    def baked(source, *arguments):
+        kept["source"], kept["baked"] = source, bake(source, *arguments)
+        return kept["baked"]
+
+    def encoded(avatar, view):
+        kept["view"] = view
+        return encode(avatar, view)
+
+    page = tmp_path_factory.mktemp("page") / "avatar.html"
+    capture = str(run.read_manifest().configuration.data)
+    folder = str(run.cell("901", request.param, 0).folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(export, "bake", baked)
+        patch.setattr(export, "encode", encoded)
+        settings = ExportHtmlSettings(
+            folder, str(page), capture=capture, expressions=2, title="<script>x</script>"
+        )
+        findings = export.export_page(settings, no_progress)
+    return Exported(**kept, page=page, findings=findings)

@@ -1,0 +1,94 @@
+"""Avatars baked for a page: against the avatars' own splats, and what the bytes keep of them."""
+
+import base64
+import hashlib
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.spatial.transform
+
+from headbench.methods.avatars.web.bake import vector_of
+from headbench.methods.avatars.web.command import ExportHtmlSettings
+from headbench.methods.avatars.web.model import rotation_of
+from headbench.methods.avatars.web.payload import decode, encode
+
+CENTER = np.array([0.0, 0.0, 1.0])
+
+
+def values_of(baked, **wanted):
+    return np.array([wanted.get(slider.name.replace(" ", "_"), 0.0) for slider in baked.sliders])
+
+
+def test_splats_at_the_step_of_a_slider_are_the_avatars(exported):
+    source, baked = exported.source, exported.baked
+    for number, slider in enumerate(baked.sliders):
+        values = np.zeros(len(baked.sliders))
+        values[number] = slider.step
+        theirs = source.seen(source.pose(baked.sliders, values))
+        moved = baked.moved(values, CENTER)
+        # Both ways are averaged, so that what bends shows a little.
+        assert np.abs(moved.means - theirs.means).max() < (1e-6 if slider.low >= 0 else 2e-3), slider.name
+        covariances = moved.axes @ moved.axes.transpose(0, 2, 1)
+        axes = theirs.rotations * np.exp(theirs.log_scales)[:, None, :]
+        assert np.abs(covariances - axes @ axes.transpose(0, 2, 1)).max() < 0.1 * covariances.max(), (
+            slider.name
+        )
+
+
+def test_sliders_moved_together_stay_near_the_avatar(exported):
+    source, baked = exported.source, exported.baked
+    values = values_of(baked, jaw_open=0.2, neck_turn=0.3, neck_nod=-0.1, eyes_sideways=0.2, expression_1=0.1)
+    moved = baked.moved(values, CENTER).means
+    theirs = source.seen(source.pose(baked.sliders, values)).means
+    travelled = np.linalg.norm(theirs - baked.means, axis=1)
+    assert travelled.max() > 0.02
+    assert np.abs(moved - theirs).max() < 0.15 * travelled.max()
+
+
+def test_the_bytes_keep_what_can_be_seen(exported):
+    baked = exported.baked
+    kept = decode(encode(baked, exported.view))
+    assert kept.sliders == baked.sliders
+    assert kept.turned == baked.turned
+    assert np.abs(kept.means - baked.means).max() < 1e-5
+    assert np.abs(kept.rotations - baked.rotations).max() < 0.05
+    assert np.abs(kept.weights - baked.weights).max() < 0.5 / 255 + 1e-9
+    assert np.abs(kept.d_means - baked.d_means).max() < 1e-4
+    still = np.abs(baked.d_means).max(axis=2) == 0
+    assert (kept.d_means[still] == 0).all()
+
+
+def test_what_the_page_loses_is_told(exported):
+    findings = exported.findings
+    assert findings.data["bytes"] == exported.page.stat().st_size
+    assert findings.data["psnr"].keys() == {"rest", "expressions", "jaw", "neck", "eyes", "together"}
+    assert min(findings.data["psnr"].values()) > 38
+    assert "dB" in findings.text
+
+
+def test_the_page_allows_its_own_script_alone(exported):
+    text = exported.page.read_text()
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1].replace("&#39;", "'")
+    script = text.rpartition("<script>")[2].rpartition("</script>")[0]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert policy == f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'"
+    assert "<title>&lt;script&gt;x&lt;/script&gt;</title>" in text
+    assert "digitalsourcetype/trainedAlgorithmicMedia" in text
+    assert not re.search(r"https?://(?!cv\.iptc\.org)", text)
+
+
+def test_rotations_agree_with_scipy():
+    vectors = np.random.default_rng(0).normal(size=(50, 3))
+    vectors[0] = 0
+    theirs = scipy.spatial.transform.Rotation.from_rotvec(vectors).as_matrix()
+    assert rotation_of(vectors) == pytest.approx(theirs, abs=1e-12)
+    near = np.linalg.norm(vectors, axis=1) < np.pi
+    assert vector_of(theirs)[near] == pytest.approx(vectors[near], abs=1e-9)
+
+
+@pytest.mark.parametrize("bad", [{"degree": 4}, {"expressions": -1}])
+def test_bad_settings_are_refused(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        replace(ExportHtmlSettings("a", "b"), **bad)
