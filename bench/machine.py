@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from .errors import HeadbenchError, InputError, shortened
+from .native.dispatch import is_cuda
 from .registry import resolve
 from .specs import MAX_LABEL
 
@@ -55,7 +56,7 @@ def machine_record(device: str = "cpu") -> dict[str, Any]:
 
 def _device_record(device: str) -> dict[str, Any]:
     """The entry ``device``; none for the CPU, and where a run is described on another machine than it is worked on."""
-    if not _is_cuda(device) or not resolve("torch:cuda").is_available():
+    if not is_cuda(device) or not resolve("torch:cuda").is_available():
         return {}
     use_device(device)
     properties = resolve("torch:cuda").get_device_properties(device)
@@ -68,16 +69,12 @@ def _device_record(device: str) -> dict[str, Any]:
     return {"device": found}
 
 
-def _is_cuda(device: str) -> bool:
-    return device.partition(":")[0] == "cuda"
-
-
 def use_device(device: str) -> None:
     """Make a CUDA device the current one, whose work is waited for, and turn TF32 off; nothing for other devices.
 
     TF32 rounds the factors of matrix products and convolutions to 10 bits of mantissa; torch lets convolutions do so.
     """
-    if _is_cuda(device):
+    if is_cuda(device):
         if ":" in device:  # without a number it means the current one
             resolve("torch:cuda").set_device(device)
         backends: Any = resolve("torch:backends")
@@ -87,7 +84,7 @@ def use_device(device: str) -> None:
 
 def check_device_answers(device: str) -> None:
     """Raise `HeadbenchError` where a CUDA device answers this process no more, as after an illegal access to its memory."""
-    if not _is_cuda(device):
+    if not is_cuda(device):
         return
     try:
         resolve("torch:cuda").synchronize(device)
@@ -132,7 +129,7 @@ class PeakMemory:
 
         self.device_record: dict[str, Any] = {}
         self._device = device
-        self._cuda: Any = resolve("torch:cuda") if _is_cuda(device) else None
+        self._cuda: Any = resolve("torch:cuda") if is_cuda(device) else None
 
         self.before = self.peak = 0
         self._ended = threading.Event()

@@ -5,7 +5,7 @@
 
 namespace headbench::HEADBENCH_ISA {
 
-// Real spherical harmonics above degree 0 of unit vectors, in the order and with the constants of methods/shared/networks.py.
+// Real spherical harmonics above degree 0 of unit vectors, in the order and with the constants of methods/ops/harmonics.py.
 template <int degree>
 HEADBENCH_INLINE void harmonics_basis(Real x, Real y, Real z, Real* basis) {
   if constexpr (degree >= 1) {

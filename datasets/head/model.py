@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose
 from ...bench.errors import InputError
+from ...bench.native.dispatch import on_host, to_device
 from .rotations import axis_angle_to_matrix
 
 
@@ -123,7 +124,7 @@ class HeadModel(torch.nn.Module):
         angles = self._angles(rotation, neck, jaw, eyes)
         inputs = (neutral, expression, angles, _rows(translation, 3, "translation"))
         differentiated = torch.is_grad_enabled() and any(value.requires_grad for value in inputs)
-        fast = neutral.device.type == "cpu" and not differentiated
+        fast = on_host(neutral) and not differentiated
         vertices = self._fast(*inputs) if fast else self._pose(*inputs)
         if eyelids is not None:
             if self.eyelid_matrix is None:
@@ -197,8 +198,11 @@ class HeadModel(torch.nn.Module):
         ``eyelids`` is among them only where the model has eyelid bases (zeros for poses that lack them). Raises as
         `pose_columns`.
         """
-        doubles = {name: torch.from_numpy(values) for name, values in self.pose_columns(poses).items()}
-        return {name: values.to(self.template) for name, values in doubles.items()}
+        columns = self.pose_columns(poses)
+        # One array, so that one copy takes it to a device.
+        joined = torch.from_numpy(np.concatenate([*columns.values()], axis=1)).to(self.template.dtype)
+        parts = to_device(joined, self.template.device).split([part.shape[1] for part in columns.values()], 1)
+        return {name: part.clone() for name, part in zip(columns, parts)}
 
     def pose_columns(self, poses: Sequence[HeadPose]) -> dict[str, FloatArray]:
         """What `pose_arguments` gives, as float64 arrays on the host: (T, n) each.

@@ -12,8 +12,8 @@ from ...bench.errors import InputError
 from ...bench.io.files import check_writable
 from ...bench.runner.stored import StoredAvatar, open_avatar
 from ...bench.specs import Findings
+from ..ops.harmonics import sh_basis
 from ..shared.avatar_files import read_shared_head
-from ..shared.networks import sh_basis
 from ..splats import rasterize
 from .command import AvatarOptions, ExportOptions
 from .formats import FORMATS, StoredSplats

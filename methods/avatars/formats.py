@@ -21,7 +21,7 @@ from ...bench.errors import HeadbenchError, UnavailableError, install_extra
 from ...bench.io.files import read_bytes, write_bytes
 from ...bench.io.provenance import RENDER, note, tool
 from ..ga.storage import COLUMNS
-from ..shared.networks import C0
+from ..ops.harmonics import C0
 from ..shared.ply import MAX_BYTES, read_ply, write_ply
 
 STANDARD = COLUMNS[:-1]

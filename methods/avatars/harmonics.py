@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import HarmonicAvatar, HeadPose, SplatAvatar
-from ..shared.networks import coefficient_count, sh_basis
+from ..ops.harmonics import coefficient_count, sh_basis
 from .views import camera_at, visibility
 
 DEGREE = 3

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..shared.binding import left_products
+from ..ops.splats import left_products
 from ..splats.rasterize import rasterize
 from ..splats.request import Rendering
 

@@ -14,6 +14,15 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip, FloatArray, HeadPose
+from ..ops.harmonics import (
+    coefficient_count,
+    harmonic_colors,
+    harmonic_shader,
+    initial_coefficients,
+    occupied_degree,
+)
+from ..ops.mesh import Frames
+from ..ops.splats import activate, to_world
 from ..shared.avatar_files import (
     SUBJECT_FILE,
     TRACKED,
@@ -23,18 +32,14 @@ from ..shared.avatar_files import (
     read_shared_head,
     read_subject,
 )
-from ..shared.avatar_kernel import HarmonicColors, WorldTransform
-from ..shared.binding import Frames
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
-from ..shared.networks import coefficient_count, initial_coefficients, occupied_degree
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import USUAL, Cutoffs, PlacedSplats, StoredSplatAvatar, View
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
 from ..shared.sizes import Size, halves
 from ..shared.splat_training import BoundTraining, ShadedSplats
 from ..shared.subject_mesh import BoundedCache, SubjectMesh
-from ..shared.training_kernel import harmonic_colors, to_world
 from .config import GAConfig
 from .spec import GA as SPEC
 from .storage import PLY_FILE, read_ga_splats, write_ga_splats
@@ -137,9 +142,10 @@ class GAAvatar(StoredSplatAvatar):
         self.mesh, self.subject, self.refined = mesh, subject, refined
         self.splat_tensors, self.binding = splats, binding
         super().__init__(stored, self._placed, device, cutoffs)
-        self._to_world = WorldTransform(binding, splats["means"], splats["log_scales"], splats["quats"])
+        self._shape = splats["log_scales"], splats["quats"]
+        self._activated = activate(*self._shape)
         occupied = coefficient_count(occupied_degree(splats["sh_rest"])) - 1
-        self._shade = HarmonicColors(splats["sh_dc"], splats["sh_rest"][:, :, :occupied].contiguous())
+        self._shade = harmonic_shader(splats["sh_dc"], splats["sh_rest"][:, :, :occupied])
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GAAvatar:
@@ -160,10 +166,10 @@ class GAAvatar(StoredSplatAvatar):
     def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
         if self.refined is not None:
             pose = self.refined(pose)
-        frames, _ = self.mesh.drive(pose)
+        frames = self.mesh.drive(pose)
         end_stage("drive")
         splats = self.splat_tensors
-        world = self._to_world(frames, splats["means"], splats["log_scales"], splats["quats"])
+        world = to_world(frames, self.binding, splats["means"], *self._shape, self._activated)
         return PlacedSplats(world, torch.sigmoid(splats["opacities"]), partial(self._shade, world.means))
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ...bench.errors import InputError
 from ...bench.io.arrays import check_numbers
-from ..shared.networks import coefficient_count
+from ..ops.harmonics import coefficient_count
 from ..shared.ply import read_names, read_ply, write_ply
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes
 

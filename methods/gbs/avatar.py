@@ -16,12 +16,11 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.files import write_bytes
 from ..avatars.harmonics import turn_harmonics
+from ..ops.harmonics import coefficient_count, sh_degree
 from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
-from ..shared.networks import coefficient_count, sh_degree
 from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .blendshapes import Entries, PointMotions, PosedAttributes, Rig, apply_pose, difference_widths
-from .device_frame import DeviceSplats
 from .points import SurfacePoints, full_barycentric
 
 
@@ -40,10 +39,6 @@ class GBSAvatar(StoredSplatAvatar):
         super().__init__([folder / AVATAR_FILE, folder / SUBJECT_FILE], self._placed, device)
         self._rig, self.stored = rig, stored
         self._last = LastPose(self._posed)
-        self._on_device: LastPose[PlacedSplats] | None = None
-        if torch.device(device).type != "cpu":
-            parts = stored.neutral, stored.entries, stored.differences
-            self._on_device = LastPose(DeviceSplats(rig, *parts))
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GBSAvatar:
@@ -69,8 +64,6 @@ class GBSAvatar(StoredSplatAvatar):
         return apply_pose(stored.neutral, differences, motions)
 
     def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
-        if self._on_device is not None:
-            return self._on_device(pose, end_stage)
         posed = self._last(pose, end_stage)
         degree = sh_degree(self.stored.neutral["sh_rest"])
         return PlacedSplats(posed.world, posed.opacities, lambda center: posed.colors(center, degree))

@@ -15,10 +15,9 @@ from ...datasets.head.arrays import HeadArrays
 from ...datasets.head.geometry import rigid_alignment
 from ...datasets.head.model import chain_transforms
 from ...datasets.head.rotations import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
-from ..shared.binding import WorldSplats, apply_matrices, left_products
-from ..shared.networks import coefficient_count
+from ..ops.harmonics import coefficient_count, harmonic_colors
+from ..ops.splats import WorldSplats, apply_matrices, left_products
 from ..shared.subject_mesh import SubjectMesh
-from ..shared.training_kernel import harmonic_colors
 from .points import SurfacePoints
 
 LARGEST_SCALE = 0.1
@@ -232,7 +231,7 @@ class Rig:
         offsets = places - (turns @ joints[0, :, :, None])[:, :, 0]
         relative = torch.cat([turns.flatten(1), offsets], dim=1)
         linear, offset = (self._weights @ relative).split([9, 3], dim=1)
-        feature = (rotations[0, 1:] - torch.eye(3).to(rotations)).flatten()
+        feature = (rotations[0, 1:] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)).flatten()
         shift = self.at_points((torch.cat([coefficients, feature]) @ self._basis).view(-1, 3))
         offset = offset + arguments["translation"]
         if "eyelids" in arguments and model.eyelid_matrix is not None:

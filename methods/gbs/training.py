@@ -12,14 +12,14 @@ from torch import Tensor
 from ...bench.contracts import Clip
 from ...datasets.head.arrays import HeadArrays
 from ...datasets.head.geometry import triangle_areas
+from ..ops.harmonics import initial_coefficients
+from ..ops.photometric import photometric_loss
 from ..shared.avatar_files import Subject
 from ..shared.loop import recomposited
-from ..shared.networks import initial_coefficients
 from ..shared.optimisation import logit, rows_of_tables
 from ..shared.schedule import Sampler, Timeline, torch_generator
 from ..shared.splat_training import Initial, SplatTrainer
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, pose_key
-from ..shared.training_kernel import photometric_loss
 from .blendshapes import (
     PARTS,
     Entries,

@@ -19,12 +19,12 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.documents import parse_json
 from ...bench.io.files import write_bytes
+from ...bench.native.dispatch import to_device
 from ..shared.avatar_files import SUBJECT_FILE, RefinedTracking, read_shared_head, read_subject
-from ..shared.avatar_kernel import available
-from ..shared.device_frame import to_device
 from ..shared.rendering import Drawn, LastPose, PosedSplats, posed_splats, read_back
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from ..shared.threads import torch_on_one_thread
+from ..splats.cpu import instruction_sets
 from .config import GHAConfig
 from .driving import Driver, HeadMotion, code_size
 from .gaussian_head import POINTS, FeatureSplats, GaussianHead
@@ -84,7 +84,7 @@ class GHAAvatar:
         the difference to the one asked for is added.
         """
         trained = self._tensors["background"]
-        with torch_on_one_thread(available()):
+        with torch_on_one_thread(bool(instruction_sets())):
             drawn = self._head.draw(self._posed(pose), camera, trained)
             image = self._head.sharpen(self._tensors, drawn, trained, bounded=True)
         image = image[: camera.height, : camera.width]
@@ -95,7 +95,7 @@ class GHAAvatar:
         alpha = alpha[: camera.height, : camera.width].clamp(0, 1)
         other = np.asarray([float(channel) for channel in background], np.float32) - self._ground
         if other.any():
-            image = image + (1 - alpha)[..., None] * to_device(other, image.device)
+            image = image + (1 - alpha)[..., None] * to_device(torch.from_numpy(other), image.device)
         return read_back(Drawn(image.clamp(0, 1), alpha.contiguous()))
 
     @torch.no_grad()
@@ -118,9 +118,7 @@ class GHAAvatar:
         motion = self._driver.motion(signal)
         # One vector, so that one copy takes it to a device.
         parts = signal.expression, *motion
-        numbers = to_device(
-            torch.cat([part.flatten() for part in parts]).numpy(), self._tensors["points"].device
-        )
+        numbers = to_device(torch.cat([part.flatten() for part in parts]), self._tensors["points"].device)
         sent = numbers.split([part.numel() for part in parts])
         expression, *moved = (values.view(part.shape) for values, part in zip(sent, parts))
         signal, motion = signal._replace(expression=expression), HeadMotion(*moved)

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...bench.contracts import Camera
-from ..shared.binding import WorldSplats, left_products
+from ..ops.splats import WorldSplats, left_products
 from ..shared.rendering import view_of
 from ..splats import rasterize
 from .config import GHAConfig

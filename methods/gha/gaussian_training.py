@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 from ...bench.contracts import Camera
 from ...bench.errors import InputError
-from ..shared.device_frame import sent
+from ...bench.native.dispatch import to_device
+from ..ops.photometric import photometric_loss
 from ..shared.loop import TrainingImages
 from ..shared.optimisation import Optimiser, logit
 from ..shared.schedule import Sampler, Timeline, log_linear, torch_generator
-from ..shared.training_kernel import photometric_loss
 from .config import GHAConfig
 from .driving import POSE_SIZE, Signal, TrainingScene, mouth_box
 from .gaussian_head import FeatureImage, GaussianHead, feature_background
@@ -121,7 +121,7 @@ class GaussianTraining:
         if not self._config.expression_noise:
             return None
         generator = torch_generator(self._scene.seed, "gha-expression", iteration)
-        noise = sent(torch.randn(len(signal.expression), generator=generator), signal.expression.device)
+        noise = to_device(torch.randn(len(signal.expression), generator=generator), signal.expression.device)
         return self._config.expression_noise * noise
 
     def after_backward(self, iteration: int) -> None:

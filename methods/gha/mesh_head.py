@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..shared.binding import WorldSplats
-from ..shared.networks import ENCODING_SIZE
+from ..ops.planes import ENCODING_SIZE
+from ..ops.splats import WorldSplats
 from .config import GHAConfig
 from .driving import HeadMotion, Signal, influences
 from .networks import Controllers, Mlp, Weights, encode, encode_pose

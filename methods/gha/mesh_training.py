@@ -13,8 +13,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...bench.contracts import FrameKey
+from ...bench.native.dispatch import to_device
 from ..shared.checkpoint import load_checkpoint, save_checkpoint
-from ..shared.device_frame import sent
 from ..shared.loop import CHECKPOINT, Fit, recomposited, train
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import View, view_of
@@ -223,7 +223,7 @@ def soft_overlap(coverage: Tensor, mask: Tensor) -> Tensor:
 
 def _reduced(image: np.ndarray, height: int, width: int, device: str) -> Tensor:
     """(height, width, C) area means in [0, 1] of an 8-bit image."""
-    values = sent(torch.from_numpy(np.array(image, copy=True)), device).float().div_(255)
+    values = to_device(torch.from_numpy(np.array(image, copy=True)), device).float().div_(255)
     if values.shape[:2] == (height, width):
         return values
     planes = F.interpolate(values.permute(2, 0, 1)[None], (height, width), mode="area")

@@ -24,11 +24,11 @@ from torch import Tensor
 
 from ...bench.contracts import Budget, Progress
 from ..shared.avatar_files import TRACKED, RefinedTracking, Subject, finish_fit
-from ..shared.avatar_kernel import available
 from ..shared.loop import Fit, Outcome, train
 from ..shared.method import TrainedMethod
 from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import torch_on_one_thread
+from ..splats.cpu import instruction_sets
 from .avatar import AVATAR_FILE, DRIVING_FILE, GHAAvatar, write_avatar
 from .config import GHAConfig
 from .driving import TrainingScene, training_scene
@@ -55,7 +55,7 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
         self._clock = clock
 
     def _train(self, fit: Fit, config: GHAConfig) -> None:
-        with torch_on_one_thread(available()):
+        with torch_on_one_thread(bool(instruction_sets())):
             self._train_phases(fit, config)
 
     def _train_phases(self, fit: Fit, config: GHAConfig) -> None:

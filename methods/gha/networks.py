@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..shared.networks import ENCODING_SIZE, encode
+from ..ops.planes import ENCODING_SIZE, encode
 from .config import GHAConfig
 from .driving import POSE_SIZE, Influence
 

@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from ...bench.contracts import FloatArray, IntArray
+from ...bench.native.dispatch import to_device
 from ...datasets.head.geometry import vertex_normals
-from ..shared.device_frame import sent
 from ..shared.optimisation import Optimiser
 from ..shared.schedule import log_linear, torch_generator
 from .config import GHAConfig
@@ -74,8 +74,8 @@ class TrackedMotion(NamedTuple):
         """Mean squared error of the network's displacements, relative to the vertices' motion, over a draw of codes
         and vertices."""
         device = self.codes.device
-        rows = sent(torch.randint(self.encoded.shape[0], (POINTS_AT_ONCE,), generator=generator), device)
-        drawn = sent(torch.randint(len(self.codes), (CODES_AT_ONCE,), generator=generator), device)
+        rows = to_device(torch.randint(self.encoded.shape[0], (POINTS_AT_ONCE,), generator=generator), device)
+        drawn = to_device(torch.randint(len(self.codes), (CODES_AT_ONCE,), generator=generator), device)
         found = self.scale * torch.tanh(network(weights, self.encoded[rows], self.codes[drawn]))
         squared = (found - self.moves[drawn[:, None], rows]).square().sum(2)
         return (self.weights[rows] * squared).mean()

@@ -16,6 +16,7 @@ from ...bench.contracts import Camera, Frame, HeadPose
 from ...bench.errors import HeadbenchError, InputError
 from ...bench.io.arrays import Member, read_arrays
 from ...bench.io.documents import read_json
+from ...bench.native.dispatch import fits
 from ..shared.avatar_files import SUBJECT_FILE, read_shared_head, read_subject, write_arrays
 from ..shared.subject_mesh import SubjectMesh, pose_key
 from ..shared.threads import threads
@@ -182,9 +183,8 @@ class Inference:
         self.mouth, self.marching = mouth, marching
         self._isa = "" if backend == "auto" else backend
         table = parameters["table"]
-        module = None if backend == "reference" else kernel.load()
-        fits = module is not None and table.device.type == "cpu" and table.dtype == torch.float32
-        self._trained: Any = self._prepared(module) if fits else None
+        compiled = backend != "reference" and fits(kernel.KERNEL, table)
+        self._trained: Any = self._prepared(kernel.load()) if compiled else None
 
     @torch.no_grad()
     def render(self, scene: PosedRays) -> RayColors:

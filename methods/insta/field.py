@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..shared.networks import sh_basis
+from ...bench.native.dispatch import Operation
+from ..ops.harmonics import sh_basis
 from ..shared.schedule import torch_generator
 from ..shared.threads import threads
 from . import kernel
@@ -95,7 +96,7 @@ class RadianceField:
         """(N, L) outputs of the density network at (N, 3) positions, metres; of (M, K) ``conditions``, sets of
         coefficients, each point sees that of its (N,) ``rows``."""
         weights = [parameters[f"density_{i}"] for i in range(len(self.architecture.density_shapes))]
-        features = encode(self.box.normalised(positions), parameters["table"], self.architecture.levels)
+        features = encode(parameters["table"], self.box.normalised(positions), self.architecture.levels)
         return network(features, conditions, rows, weights)
 
     def density(self, latent: Tensor, distances: Tensor) -> Tensor:
@@ -161,20 +162,12 @@ def table_rows(levels: Sequence[Level]) -> int:
     return levels[-1].first + levels[-1].rows
 
 
-def encode(positions: Tensor, table: Tensor, levels: Sequence[Level], backend: str = "auto") -> Tensor:
-    """(N, levels * features) values at (N, 3) positions in [0, 1]; differentiable in the (rows, features) table.
+@Operation
+def encode(table: Tensor, positions: Tensor, levels: Sequence[Level]) -> Tensor:
+    """(N, levels * features) values at (N, 3) positions in [0, 1]: trilinear sums of eight rows on every level.
 
-    ``backend`` "reference" is the definition in torch, for any type and device; "auto" takes the kernel for float32
-    on the CPU.
+    Compiled, only the (rows, features) table receives a gradient, and the type of the table counts.
     """
-    module = kernel.load() if backend == "auto" else None
-    if module is None or table.device.type != "cpu" or table.dtype != torch.float32:
-        return encode_reference(positions, table, levels)
-    return _Encode.apply(positions.detach().contiguous(), table, tuple(levels))  # type: ignore[no-untyped-call]
-
-
-def encode_reference(positions: Tensor, table: Tensor, levels: Sequence[Level]) -> Tensor:
-    """Reference implementation of the kernel: trilinear sums of eight rows on every level."""
     corners = torch.tensor([[c >> axis & 1 for axis in range(3)] for c in range(8)], device=positions.device)
     parts = []
     for level in levels:
@@ -186,6 +179,11 @@ def encode_reference(positions: Tensor, table: Tensor, levels: Sequence[Level]) 
         rows = level.first + _rows(at, level)
         parts.append((weights[..., None] * table[rows]).sum(1))
     return torch.cat(parts, dim=1)
+
+
+@encode.compiled(kernel.KERNEL)
+def _encode(table: Tensor, positions: Tensor, levels: Sequence[Level]) -> Tensor:
+    return _Encode.apply(positions.detach().contiguous(), table, tuple(levels))  # type: ignore[no-untyped-call]
 
 
 def _rows(at: Tensor, level: Level) -> Tensor:
@@ -217,7 +215,7 @@ class _Encode(torch.autograd.Function):
         return None, by_table, None
 
 
-CPU_BLOCK = 2048  # rows; their activations fit a core's second-level cache
+BLOCK = 2048  # rows; their activations fit a core's second-level cache
 
 
 def layer_shapes(inputs: int, hidden: int, layers: int, outputs: int) -> list[tuple[int, int]]:
@@ -281,5 +279,4 @@ class _Network(torch.autograd.Function):
 
 
 def _blocks(rows: Tensor) -> list[slice]:
-    step = CPU_BLOCK if rows.device.type == "cpu" else max(len(rows), 1)
-    return [slice(start, start + step) for start in range(0, len(rows), step)]
+    return [slice(start, start + BLOCK) for start in range(0, len(rows), BLOCK)]

@@ -12,36 +12,33 @@ from torch import Tensor
 from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...datasets.head.arrays import faces_in_region
 from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
-from ..shared.avatar_kernel import usable
-from ..shared.binding import NORMAL, Frames
-from ..shared.networks import initial_coefficients, smoothing
+from ..ops.harmonics import harmonic_colors, initial_coefficients
+from ..ops.mesh import NORMAL, Frames
+from ..ops.planes import Bounds, line_offsets, plane_colors, smoothing
+from ..ops.splats import directions_to, to_world
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import View
 from ..shared.schedule import Timeline, torch_generator
 from ..shared.splat_training import ShadedSplats, Start, one_per_triangle
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, centroid_displacements
-from ..shared.training_kernel import harmonic_colors, to_world
 from .config import OursConfig
 from .field import (
     COLOR_NETWORK,
     FIRST_LAYER,
-    Bounds,
     CanonicalFrames,
     LocalSplats,
     apply_offsets,
     blend_lines,
-    canonical_directions,
     changed_colors,
+    color_network,
     initial_parameters,
     line_box,
-    line_offsets,
-    line_position,
+    line_table,
+    normalised_weight,
+    offset_layers,
     plane_box,
-    plane_features,
-    shade,
 )
 from .storage import RESIDUAL
-from .training_kernel import canonical_positions, directions_to, plane_colors, table_offsets
 
 FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weight
 
@@ -129,11 +126,7 @@ class OursAppearance:
         prepared = self._prepared(timestep)
         planes = self._config.planes
         means = optimiser["means"] if planes.move_splats else optimiser["means"].detach()
-        positions = (
-            canonical_positions(self.canonical, binding, means)
-            if usable(means)
-            else self.canonical.positions(binding, means)
-        )
+        positions = self.canonical.positions(binding, means)
         splats = LocalSplats(*(optimiser[name] for name in ("means", "log_scales", "quats", "opacities")))
         if self._config.color == "planes" and planes.residual_lr:
             splats = splats._replace(color_change=optimiser[RESIDUAL])
@@ -148,24 +141,15 @@ class OursAppearance:
         world = to_world(frames, binding, splats.means, splats.log_scales, splats.quats)
         seen = world.means if self._config.color == "sh" or planes.move_splats else world.means.detach()
         last = self._turn(iteration) if self._config.direction_jitter else None
-        if usable(seen):
-            directions = directions_to(prepared.turns, binding, seen, view.center, last)
-        else:
-            directions = canonical_directions(prepared.turns, binding, seen, view.center)
-            directions = directions if last is None else directions @ last.t()
+        directions = directions_to(seen, view.center, prepared.turns, binding, last)
         colors = self._colors(optimiser, positions, directions, iteration)
         return ShadedSplats(world, changed_colors(colors, splats), torch.sigmoid(splats.logits), penalty)
 
     def offsets(self, optimiser: Optimiser, positions: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
         """(N, D) offsets; zero outside the lines' box."""
-        if usable(positions):
-            blended = blend_lines(optimiser["lines"], expression, jaw)
-            return table_offsets(optimiser, self.line_box, blended, positions)
-        # Computed outside, too: on a GPU the host would wait for the number of those inside.
         blended = blend_lines(optimiser["lines"], expression, jaw)
-        position = line_position(self.line_box.unit(positions), self._config.lines.resolution)
-        offsets = line_offsets(optimiser, blended, position)
-        return torch.where(self.line_box.contains(positions)[:, None], offsets, 0)
+        table = line_table(blended, normalised_weight(optimiser, 0))
+        return line_offsets(positions, self.line_box, table, offset_layers(optimiser))
 
     def _turn(self, iteration: int) -> Tensor:
         """(3, 3) small random rotation of this iteration."""
@@ -180,10 +164,8 @@ class OursAppearance:
         if self._config.color == "sh":
             degree = min(self._config.sh_degree, iteration // self._degree_every)
             return harmonic_colors(optimiser["sh_dc"], optimiser["sh_rest"], -directions, degree)
-        network = self._network(optimiser)
-        if usable(positions):
-            return plane_colors(network, self.plane_box, positions, directions)
-        return shade(network, plane_features(network, self.plane_box, positions), directions)
+        network = color_network(self._network(optimiser))
+        return plane_colors(positions, directions, self.plane_box, network)
 
     def _network(self, optimiser: Optimiser) -> dict[str, Tensor]:
         """Planes and weights of the colour network, if any."""

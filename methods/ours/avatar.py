@@ -10,16 +10,18 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import HeadPose
+from ...bench.native.dispatch import to_device
 from ..avatars.compact.file import COMPACT_FILE, read_compact
+from ..ops.harmonics import harmonic_shader
+from ..ops.planes import ENCODING_SIZE, Bounds, Shader, shader
+from ..ops.splats import activate, to_world
 from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
-from ..shared.avatar_kernel import HarmonicColors, WorldTransform
 from ..shared.rendering import USUAL, Cutoffs, LastPose, PlacedSplats, StoredSplatAvatar
 from ..shared.subject_mesh import KnownPoses, SubjectMesh
 from .appearance import driving_coefficients
 from .field import (
     FIRST_LAYER,
     LAST_LAYER,
-    Bounds,
     CanonicalFrames,
     LocalSplats,
     apply_offsets,
@@ -27,7 +29,7 @@ from .field import (
     plane_features,
     position_part,
 )
-from .inference import DrivenPose, LineOffsets, PlaneColors
+from .inference import DrivenPose, LineOffsets
 from .storage import FIELD_FILE, RESIDUAL, Field, read_field, splat_columns
 
 
@@ -44,7 +46,7 @@ class OursAvatar(StoredSplatAvatar):
     mesh : the subject's.
     neutral : the splats before an expression changes them.
     line_offsets : what the lines give; None where there are none.
-    colors : what the planes, or spherical harmonics, give.
+    colors : what the planes, or spherical harmonics, give to a camera, see `Shader`.
     """
 
     def __init__(
@@ -65,15 +67,15 @@ class OursAvatar(StoredSplatAvatar):
         self._binding = columns["binding"][:, 0].to(torch.int64)
         self._canonical = CanonicalFrames.of(mesh.frames(mesh.canonical))
         positions = self._canonical.positions(self._binding, self.neutral.means)
-        self._to_world = WorldTransform(self._binding, *self.neutral[:3])
-        self.colors: PlaneColors | HarmonicColors
+        self._activated = activate(self.neutral.log_scales, self.neutral.quats)
+        self.colors: Shader
         self.line_offsets: LineOffsets | None = None
         if "sh_dc" not in tensors:
             features = plane_features(tensors, Bounds(*tensors["plane_box"]), positions)
-            weights = tensors[FIRST_LAYER], tensors[LAST_LAYER]
-            self.colors = PlaneColors(*weights, position_part(tensors, features))
+            of_direction = tensors[FIRST_LAYER][:, -ENCODING_SIZE:].t().contiguous()
+            self.colors = shader(position_part(tensors, features), of_direction, tensors[LAST_LAYER])
         else:
-            self.colors = HarmonicColors(tensors["sh_dc"], tensors["sh_rest"])
+            self.colors = harmonic_shader(tensors["sh_dc"], tensors["sh_rest"])
         self._jaw_bases = tensors["jaw_bases"].cpu().numpy().astype(np.float64)
         if "lines" in tensors:
             self.line_offsets = LineOffsets(tensors, positions)
@@ -118,18 +120,22 @@ class OursAvatar(StoredSplatAvatar):
 
     def _posed(self, pose: HeadPose) -> DrivenPose:
         if self.line_offsets is None:
-            frames, offsets = self.mesh.drive(pose)[0], None
+            offsets = None
         else:
             driving = driving_coefficients(pose, self._expressions, self._jaw_bases)
-            frames, coefficients = self.mesh.drive(pose, np.concatenate(driving))
+            coefficients = to_device(torch.from_numpy(np.concatenate(driving)), self._binding.device)
             offsets = self.line_offsets(coefficients)
+        frames = self.mesh.drive(pose)
         return DrivenPose(frames, self._canonical.turns(frames), offsets)
 
     def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
         posed = self._known(pose)
         end_stage("drive")
         splats = self._changed(posed)
-        world = self._to_world(posed.frames, splats.means, splats.log_scales, splats.quats)
+        shape = splats.log_scales, splats.quats
+        known = shape[0] is self.neutral.log_scales and shape[1] is self.neutral.quats
+        activated = self._activated if known else None
+        world = to_world(posed.frames, self._binding, splats.means, *shape, activated)
 
         def colors(center: Tensor) -> Tensor:
             return changed_colors(self.colors(world.means, center, posed.turns, self._binding), splats)

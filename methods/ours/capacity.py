@@ -20,9 +20,10 @@ from ...datasets.head.arrays import JOINT_NAMES, faces_in_region
 from ...datasets.head.geometry import triangle_areas
 from ...datasets.steps.jaw_bases import IDENTITY, farthest_quaternions, jaw_quaternions
 from ..avatars.compact.simplify import training_poses
+from ..ops.planes import Bounds
 from ..shared.subject_mesh import SubjectMesh, centroid_displacements
 from .config import OursConfig, Planned
-from .field import PLANE_MARGIN, Bounds, line_box, plane_box
+from .field import PLANE_MARGIN, line_box, plane_box
 
 LINE_SAMPLES_PER_PIXEL = 0.5
 SPLATS_PER_PIXEL = 1.0

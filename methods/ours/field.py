@@ -15,18 +15,17 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ..shared import avatar_kernel, device_frame
-from ..shared.binding import Frames, apply_matrices
-from ..shared.networks import (
-    C0,
+from ..ops.mesh import Frames, turns_between
+from ..ops.planes import (
+    AXES,
     ENCODING_SIZE,
     PAIRS,
-    color_network,
-    encode,
-    offset_network,
-    sample_triplane,
-    sum_rows,
+    Bounds,
+    ColorNetwork,
+    OffsetLayers,
+    triplane_features,
 )
+from ..ops.splats import points_on
 from .config import Dynamic, OursConfig
 
 WIDTHS: Mapping[Dynamic, int] = {"opacity": 1, "position": 3, "rotation": 4, "scale": 3, "color": 3}
@@ -84,31 +83,10 @@ def changed_colors(colors: Tensor, splats: LocalSplats) -> Tensor:
     return colors if splats.color_change is None else torch.relu(colors + splats.color_change)
 
 
-AXES = 3
-
-
 class NamedTensors(Protocol):
     """Tensors by name: an optimiser in training, a dict in an avatar."""
 
     def __getitem__(self, name: str, /) -> Tensor: ...
-
-
-class LinePosition(NamedTuple):
-    """Where points lie on the three lines: rows of the (3 L)-row table and linear weights, (N, 6) each."""
-
-    rows: Tensor
-    weights: Tensor
-
-
-def line_position(points: Tensor, resolution: int) -> LinePosition:
-    """Positions of (N, 3) points in [0, 1] on lines of ``resolution`` samples: sample ``t (L - 1)``."""
-    position = (points * (resolution - 1)).clamp(0, resolution - 1)
-    lower = position.floor().clamp_max(resolution - 2)
-    fraction = position - lower
-    start = torch.arange(AXES, device=points.device) * resolution
-    rows = lower.to(torch.int64) + start
-    weights = torch.cat([1 - fraction, fraction], dim=1).to(points.dtype)
-    return LinePosition(torch.cat([rows, rows + 1], dim=1), weights)
 
 
 def blend_lines(lines: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
@@ -125,14 +103,9 @@ def blend_lines(lines: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
     return blended.view(2, *lines.shape[1:])
 
 
-def line_offsets(parameters: NamedTensors, blended: Tensor, position: LinePosition) -> Tensor:
-    """(N, D) offsets: 6 C features -> hidden -> hidden -> D, ReLU, weight-normalised; D = 1 is the opacity logit.
-
-    The features are [e_x e_y e_z j_x j_y j_z]; none of the inputs but the lines and the network has a gradient.
-    """
-    table = line_table(blended, normalised_weight(parameters, 0))
-    return offset_network(
-        sum_rows(table, *position),
+def offset_layers(parameters: NamedTensors) -> OffsetLayers:
+    """The offset network behind its first weights, which are part of `line_table`; weight-normalised."""
+    return OffsetLayers(
         parameters["line_bias_0"],
         *(normalised_weight(parameters, 1), parameters["line_bias_1"]),
         *(normalised_weight(parameters, 2), parameters["line_bias_2"]),
@@ -140,7 +113,10 @@ def line_offsets(parameters: NamedTensors, blended: Tensor, position: LinePositi
 
 
 def line_table(blended: Tensor, first: Tensor) -> Tensor:
-    """(3 L, H): what each sample of the (2, 3, L, C) blended lines adds to the first layer of (H, 6 C) weights."""
+    """(3 L, H): what each sample of the (2, 3, L, C) blended lines adds to the first layer of (H, 6 C) weights.
+
+    The layer's inputs are [e_x e_y e_z j_x j_y j_z], C features of each line.
+    """
     kinds, axes, resolution, channels = blended.shape
     weights = first.view(-1, kinds, axes, channels)
     return torch.einsum("kalc,hkac->alh", blended, weights).reshape(axes * resolution, -1)
@@ -174,21 +150,6 @@ def uniform(shape: tuple[int, ...], bound: float, generator: torch.Generator) ->
 PLANE_MARGIN = 0.005  # metres around the canonical mesh
 PLANE_MARGIN_BELOW = 0.025  # metres more at the bottom: splats of the neck hang below the mesh
 PAPER_HALF_WIDTH = 0.25  # metres
-
-
-class Bounds(NamedTuple):
-    """Axis-aligned box: (3,) corners, metres."""
-
-    low: Tensor
-    high: Tensor
-
-    def unit(self, points: Tensor) -> Tensor:
-        """Map the box to [0, 1]."""
-        return (points - self.low) / (self.high - self.low)
-
-    def contains(self, points: Tensor) -> Tensor:
-        """(N,) whether points lie in the box, its faces included."""
-        return ((points >= self.low) & (points <= self.high)).all(1)
 
 
 def plane_box(canonical: Tensor, variant: str) -> Bounds:
@@ -229,52 +190,27 @@ class CanonicalFrames:
 
     def positions(self, binding: Tensor, means: Tensor) -> Tensor:
         """Canonical positions (N, 3) of local means: k_c R_c mean + T_c."""
-        linear = self.linear.index_select(0, binding)
-        return apply_matrices(linear, means) + self.center.index_select(0, binding)
+        return points_on(means, binding, self.linear, self.center)
 
     def turns(self, frames: Frames) -> Tensor:
         """(F, 3, 3) rotations that take world directions of a posed mesh to canonical ones: R_c R_t^T."""
-        if avatar_kernel.usable(frames.rotation) and not frames.rotation.requires_grad:
-            return avatar_kernel.turns_between(self.rotation, frames.rotation)
-        if device_frame.usable(frames.rotation):
-            return device_frame.turns_between(self.rotation, frames.rotation)
-        return self.rotation @ frames.rotation.transpose(1, 2)
+        return turns_between(self.rotation, frames.rotation)
 
 
-def canonical_directions(turns: Tensor, binding: Tensor, means: Tensor, center: Tensor) -> Tensor:
-    """Unit vectors (N, 3) from world means to the camera, turned to canonical space by each splat's triangle."""
-    directions = torch.nn.functional.normalize(center - means, dim=1)
-    rows = turns.reshape(-1, 9).index_select(0, binding)
-    return torch.nn.functional.normalize(apply_matrices(rows, directions), dim=1)
+def color_network(parameters: NamedTensors) -> ColorNetwork:
+    """The tensors that give colours by place and direction."""
+    return ColorNetwork(*(parameters[name] for name in COLOR_NETWORK))
 
 
 def plane_features(parameters: NamedTensors, box: Bounds, positions: Tensor) -> tuple[Tensor, ...]:
     """Features (N, C_k) of the three planes at canonical positions."""
-    planes = {pair: parameters[name] for (pair, _, _), name in zip(PAIRS, PLANES)}
-    resolution = round(len(planes["xy"]) ** 0.5)
-    return sample_triplane(planes, 2 * box.unit(positions) - 1, resolution)
-
-
-def shade(parameters: NamedTensors, features: tuple[Tensor, ...], directions: Tensor) -> Tensor:
-    """Colours (N, 3) >= 0 of plane features and canonical directions; the way of training."""
-    return color_network(parameters[FIRST_LAYER], parameters[LAST_LAYER], features, directions)
+    return triplane_features([parameters[name] for name in PLANES], box, positions)
 
 
 def position_part(parameters: NamedTensors, features: tuple[Tensor, ...]) -> Tensor:
-    """What plane features, (N, C_k) each, add to the hidden layer; for an avatar it never changes."""
+    """(N, H) what plane features, (N, C_k) each, add to the hidden layer; for an avatar it never changes."""
     joined = torch.cat(features, dim=1)
     return joined @ parameters[FIRST_LAYER][:, : joined.shape[1]].t()
-
-
-def shade_directions(parameters: NamedTensors, from_position: Tensor, directions: Tensor) -> Tensor:
-    """Colours (N, 3) >= 0: hidden layer of position and encoded direction, ReLU, relu(0.5 + C0 * out).
-
-    The same as `shade` up to rounding, where the part of the position is known beforehand.
-    """
-    first, last = parameters[FIRST_LAYER], parameters[LAST_LAYER]
-    of_direction = first[:, first.shape[1] - ENCODING_SIZE :]
-    hidden = torch.addmm(from_position, encode(directions), of_direction.t()).relu_()
-    return torch.relu(0.5 + C0 * (hidden @ last.t()))
 
 
 def initial_parameters(

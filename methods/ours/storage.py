@@ -16,10 +16,11 @@ from ...bench.contracts import HeadAsset
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.files import write_bytes
-from ..shared.networks import ENCODING_SIZE, coefficient_count
+from ..ops.harmonics import coefficient_count
+from ..ops.planes import ENCODING_SIZE, Bounds
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .config import Dynamic
-from .field import COLOR_NETWORK, FIRST_LAYER, LAST_LAYER, PLANES, WIDTHS, Bounds, offset_width
+from .field import COLOR_NETWORK, FIRST_LAYER, LAST_LAYER, PLANES, WIDTHS, offset_width
 
 FIELD_FILE = "avatar.safetensors"
 DYNAMIC = "dynamic"

@@ -18,9 +18,9 @@ from torch import Tensor
 from ...bench.contracts import Budget, ByteArray, Clip, FrameKey, Progress
 from ...bench.errors import InputError
 from ...bench.io.files import reading
-from .avatar_kernel import available
+from ...bench.native.dispatch import is_cuda, pinned, to_device
+from ..splats.cpu import instruction_sets
 from .checkpoint import REMEDY, load_checkpoint, save_checkpoint
-from .device_frame import pinned, sent
 from .optimisation import Optimiser
 from .schedule import Sampler, Timeline
 from .threads import torch_on_one_thread
@@ -119,7 +119,7 @@ def train(
     """
     budget, clock = fit.budget, fit.clock
     check_budget(budget)
-    path, compiled = fit.out / CHECKPOINT, available()
+    path, compiled = fit.out / CHECKPOINT, bool(instruction_sets())
     wait = synchroniser(fit.device)
     saved = load_checkpoint(path, fit.run, fit.device)
     started = clock() if began is None else began
@@ -173,7 +173,7 @@ def train(
 
 def synchroniser(device: str) -> Callable[[], None]:
     """What waits for the work handed to a CUDA device; nothing for others, which do it at once."""
-    return partial(torch.cuda.synchronize, device) if torch.device(device).type == "cuda" else lambda: None
+    return partial(torch.cuda.synchronize, device) if is_cuda(device) else lambda: None
 
 
 def check_budget(budget: Budget) -> None:
@@ -234,7 +234,7 @@ class TrainingImages:
         image = self._ahead[1].result()
         following = self._sampler(iteration + 1)
         self._ahead = (following, self._pool.submit(self._load, following))
-        return sent(image, self._device).to(torch.float32).div_(255)
+        return to_device(image, self._device).to(torch.float32).div_(255)
 
     def close(self) -> None:
         """Stop the decoding thread."""

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ...bench.native.dispatch import to_device
 from ...datasets.head.rotations import quaternion_to_matrix
 from .config import DensifiedTraining
-from .device_frame import sent
 from .schedule import DensifySchedule, torch_generator
 
 EPS = 1e-15
@@ -167,7 +167,7 @@ class Densifier:
 
         Pixels become normalised device units by half the image size, as the published thresholds have it.
         """
-        half = sent(torch.tensor([0.5 * width, 0.5 * height], dtype=gradient.dtype), gradient.device)
+        half = to_device(torch.tensor([0.5 * width, 0.5 * height], dtype=gradient.dtype), gradient.device)
         seen = visible.to(gradient.dtype)
         self._gradient_sum += torch.linalg.vector_norm(gradient * half, dim=1) * seen
         self._views += seen

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Camera, FloatArray, Frame, HeadPose, no_stage
+from ...bench.native.dispatch import is_cuda, on_host, to_device
+from ..ops.splats import WorldSplats
 from ..splats import rasterize
 from ..splats.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from .avatar_files import HEAD_FILE
-from .binding import WorldSplats
-from .device_frame import to_device
 from .subject_mesh import pose_key
 
 Value = TypeVar("Value")
@@ -88,13 +88,13 @@ def draw_splats(
     end_stage("rasterize")
     drawn = Drawn(rendering.image.clamp(0, 1), rendering.alpha.clamp(0, 1))
     end_stage("post")
-    return _copied_ahead(drawn) if drawn.image.is_cuda else drawn
+    return _copied_ahead(drawn) if is_cuda(drawn.image.device) else drawn
 
 
 def _copied_ahead(drawn: Drawn) -> Drawn:
     """Begin to copy a frame: whoever reads it back waits for it alone, not for frames that were drawn after it."""
     joined = _joined(drawn)
-    host = torch.empty(joined.shape, dtype=joined.dtype, pin_memory=joined.is_cuda)
+    host = torch.empty(joined.shape, dtype=joined.dtype, pin_memory=is_cuda(joined.device))
     host.copy_(joined, non_blocking=True)
     ready = torch.cuda.Event()
     ready.record(torch.cuda.current_stream(joined.device))
@@ -110,7 +110,7 @@ def read_back(drawn: Drawn) -> Frame:
     image, alpha = drawn.image, drawn.alpha
     if drawn.copy is not None:
         drawn.copy.ready.synchronize()
-    if drawn.copy is not None or image.device.type != "cpu":
+    if drawn.copy is not None or not on_host(image):
         host = _joined(drawn).cpu() if drawn.copy is None else drawn.copy.host
         image, alpha = host[: image.numel()].view(image.shape), host[image.numel() :].view(alpha.shape)
     return Frame(_numpy(image), _numpy(alpha))
@@ -140,7 +140,8 @@ class View:
 def view_of(camera: Camera, device: str, background: Sequence[float] = ()) -> View:
     """Put a camera and a background on a device, all at once."""
     parts = camera.world_to_camera, camera.K, camera.center, [float(channel) for channel in background]
-    joined = to_device(np.concatenate([np.ravel(part) for part in parts]), device)
+    numbers = np.concatenate([np.ravel(part) for part in parts]).astype(np.float32)
+    joined = to_device(torch.from_numpy(numbers), device)
     transform, K, center, behind = joined.split([16, 9, 3, len(background)])
     return View(camera, transform.view(4, 4), K.view(3, 3), center, behind)
 
@@ -206,6 +207,7 @@ class StoredSplatAvatar:
         cutoffs: Cutoffs = USUAL,
     ):
         self._stored, self._place, self._device, self._cutoffs = stored, place, device, cutoffs
+        self._seen: tuple[PlacedSplats, bytes, Tensor] | None = None
 
     @torch.no_grad()
     def draw(
@@ -217,7 +219,7 @@ class StoredSplatAvatar:
     ) -> Drawn:
         """Draw one frame, stage by stage; see `StagedAvatar`."""
         placed, view = self._place(pose, end_stage), view_of(camera, self._device, background)
-        colors = placed.colors(view.center)
+        colors = self._colors(placed, view)
         end_stage("deform")
         return draw_splats(placed.world, placed.opacities, colors, view, end_stage, self._cutoffs)
 
@@ -233,8 +235,15 @@ class StoredSplatAvatar:
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
         """Splats of a pose in the world; with colours where a camera says from where they are seen."""
         placed = self._place(pose, no_stage)
-        colors = None if camera is None else placed.colors(view_of(camera, self._device).center)
+        colors = None if camera is None else self._colors(placed, view_of(camera, self._device))
         return posed_splats(placed.world, placed.opacities, colors)
+
+    def _colors(self, placed: PlacedSplats, view: View) -> Tensor:
+        """Colours of placed splats; those of the last call again for the same splats seen from the same place."""
+        place = view.camera.center.tobytes()
+        if self._seen is None or self._seen[0] is not placed or self._seen[1] != place:
+            self._seen = placed, place, placed.colors(view.center)
+        return self._seen[2]
 
     def files(self) -> Sequence[Path]:
         """The files that hold the avatar."""

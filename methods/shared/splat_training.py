@@ -10,16 +10,17 @@ import torch
 from torch import Tensor, nn
 
 from ...bench.contracts import Camera, Clip, FrameKey
+from ..ops.mesh import Frames
+from ..ops.photometric import photometric_loss
+from ..ops.splats import WorldSplats
 from ..splats import rasterize
 from ..splats.request import Rendering
-from .binding import Frames, WorldSplats
 from .config import DensifiedTraining, SplatTraining
 from .loop import Fit, Outcome, TrainingImages, train
 from .losses import position_penalty, scale_penalty
 from .optimisation import Densifier, Optimiser
 from .rendering import View, scene_center, scene_extent, view_of
 from .schedule import DensifySchedule, Sampler, Timeline, log_linear
-from .training_kernel import photometric_loss
 
 Initial = Mapping[str, tuple[Tensor, float]]
 """Initial tensors with their learning rates, by name."""

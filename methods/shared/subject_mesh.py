@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Generic, Protocol, TypeVar
@@ -14,9 +13,7 @@ from torch import Tensor
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose
 from ...datasets.head.arrays import check_size
 from ...datasets.head.model import HeadModel
-from . import device_frame
-from .binding import Frames
-from .training_kernel import triangle_frames
+from ..ops.mesh import Frames, triangle_frames
 
 Value = TypeVar("Value")
 
@@ -71,30 +68,12 @@ class SubjectMesh:
 
     def frames(self, vertices: Tensor) -> Frames:
         """Triangle frames of a mesh; differentiable in its vertices."""
-        if vertices.device.type != "cpu":
-            return device_frame.triangles(vertices, self._corners)
         return triangle_frames(vertices, self.faces)
 
     @torch.no_grad()
-    def drive(self, pose: HeadPose, further: FloatArray | None = None) -> tuple[Frames, Tensor]:
-        """Triangle frames of a pose in the world, and ``further`` numbers that drive its frame, as float32.
-
-        On a GPU all of them are sent at once. Raises `InputError` for another head model's pose.
-        """
-        further = np.zeros(0, np.float32) if further is None else further
-        if not device_frame.usable(self._canonical):
-            return self.frames(self.posed(self.arguments([pose]))), torch.from_numpy(further)
-        posed = self._on_device
-        sent = device_frame.to_device(np.concatenate([posed.numbers(pose), further]), self._canonical.device)
-        return self.frames(posed(sent)), sent[posed.numbers.size :]
-
-    @functools.cached_property
-    def _on_device(self) -> device_frame.PosedVertices:
-        return device_frame.PosedVertices(self.model, self._canonical)
-
-    @functools.cached_property
-    def _corners(self) -> Tensor:
-        return device_frame.corners_of(self.faces)
+    def drive(self, pose: HeadPose) -> Frames:
+        """Triangle frames of a pose in the world. Raises `InputError` for another head model's pose."""
+        return self.frames(self.posed(self.arguments([pose])))
 
 
 def centroid_displacements(one: Tensor, other: Tensor, faces: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ...bench.native.dispatch import is_float32, on_host
 from ...bench.native.loader import Kernel
 from ..shared.threads import threads as kernel_threads
 from .request import Rendering, Request
@@ -28,7 +29,7 @@ def instruction_sets() -> dict[str, str]:
 
 def supports(request: Request) -> bool:
     """Whether the kernel takes this request's dtype and device."""
-    return request.means.dtype == torch.float32 and request.means.device.type == "cpu"
+    return on_host(request.means) and is_float32(request.means)
 
 
 def rasterize_cpu(request: Request, backend: str, threads: int | None) -> Rendering:

@@ -29,6 +29,7 @@ from torch.nn.functional import pad
 
 from ...bench.errors import UnavailableError, install_extra
 from ...bench.machine import use_device
+from ...bench.native.dispatch import is_cuda, is_float32, on_host
 from .constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 from .reference import published_radii
 from .request import Rendering, Request
@@ -42,22 +43,22 @@ CHANNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)
 
 
 @functools.cache
-def usable() -> bool:
+def installed() -> bool:
     """Whether there is a GPU and gsplat is installed, without importing it."""
     return torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
 
 
-def usable_or_warn(request: Request) -> bool:
+def draws_or_warns(request: Request) -> bool:
     """Whether gsplat is there and draws this request; if a GPU is left without it, log why and what helps.
 
     It is logged once per process and reason.
     """
     if not supports(request):
-        device = request.means.device.type
-        if request.means.dtype == torch.float32 and device != "cpu":
-            _warn_once(f"gsplat draws on NVIDIA GPUs alone, not on device {device!r}", "Draw on the CPU.")
+        if is_float32(request.means) and not on_host(request.means):
+            kind = str(request.means.device).split(":")[0]
+            _warn_once(f"gsplat draws on NVIDIA GPUs alone, not on device {kind!r}", "Draw on the CPU.")
         return False
-    if not usable():
+    if not installed():
         _warn_once("gsplat is not installed", REMEDY)
         return False
     if not _exact(request):
@@ -78,7 +79,7 @@ def prepare(device: str) -> None:
     Raises `UnavailableError` where gsplat's extension can neither be loaded nor compiled.
     """
     use_device(device)
-    if torch.device(device).type == "cuda" and usable():
+    if is_cuda(device) and installed():
         load()
 
 
@@ -147,7 +148,7 @@ def toolkit_remedy() -> str:
 
 def supports(request: Request) -> bool:
     """Whether gsplat takes this request's dtype and device."""
-    return request.means.dtype == torch.float32 and request.means.device.type == "cuda"
+    return is_cuda(request.means.device) and is_float32(request.means)
 
 
 def _exact(request: Request) -> bool:

@@ -120,10 +120,10 @@ def available_backends(device: str = "cpu") -> tuple[str, ...]:
     """Names `rasterize` accepts as ``backend`` here for tensors on ``device``, besides "auto"; the preferred one first."""
     if device == "cpu":
         return (*cpu.instruction_sets(), "reference")
-    return ("cuda", "reference") if cuda.usable() else ("reference",)
+    return ("cuda", "reference") if cuda.installed() else ("reference",)
 
 
 def _choose(request: Request) -> str:
     if cpu.supports(request) and cpu.KERNEL.load_or_warn():
         return "cpu"
-    return "cuda" if cuda.usable_or_warn(request) else "reference"
+    return "cuda" if cuda.draws_or_warns(request) else "reference"

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from ....bench.contracts import FloatArray
 from ....bench.errors import InputError
-from ...ours.field import FIRST_LAYER, LAST_LAYER, PLANES, Bounds, normalised_weight, plane_features
+from ...ops.harmonics import C0
+from ...ops.planes import Bounds
+from ...ours.field import FIRST_LAYER, LAST_LAYER, PLANES, normalised_weight, plane_features
 from ...ours.storage import RESIDUAL, splat_columns
-from ...shared.networks import C0
 from .container import Arrays, coded, dequantise, from_smallest_three, narrow, smallest_three
 from .precision import Precision
 

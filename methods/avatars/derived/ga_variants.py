@@ -12,6 +12,7 @@ from torch import Tensor
 from ....bench.contracts import Clip, HeadAsset, Variant
 from ...ga.method import GAAvatar
 from ...ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
+from ...ops.harmonics import coefficient_count
 from ...ours.storage import SPLAT_WIDTHS, splat_columns
 from ...shared.avatar_files import (
     SUBJECT_FILE,
@@ -21,7 +22,6 @@ from ...shared.avatar_files import (
     save_shared_head,
     write_subject,
 )
-from ...shared.networks import coefficient_count
 from ...shared.subject_mesh import SubjectMesh
 from ..compact.container import Arrays, Content, read_content, write_content
 from ..compact.encoding import decode_splats, encode_splats

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ....bench.contracts import Camera, FloatArray, HeadPose, Progress, SplatAvatar
-from ...shared.networks import sh_basis
+from ...ops.harmonics import sh_basis
 from ...splats.reference import rotation_matrices
 from ..harmonics import FAR_M, fit_harmonics, sphere
 from ..views import camera_at, direction_of, visibility

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ....bench.contracts import FloatArray
-from ...shared.networks import sh_basis
+from ...ops.harmonics import sh_basis
 
 JOINTS = ("neck", "jaw", "left eye", "right eye")
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ....datasets.head.refit.identity import closest_points
 from ...gbs.points import poisson_disk
-from ...shared.networks import sh_basis
+from ...ops.harmonics import sh_basis
 
 FAR = 0.015
 """Metres from the nearest vertex, from which on a point is given that vertex in place of the nearest triangle. No splat

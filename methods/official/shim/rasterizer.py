@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ...shared.networks import C0
-from ...shared.training_kernel import harmonic_colors
+from ...ops.harmonics import C0, harmonic_colors
 from ...splats import rasterize
 
 NEAR = 0.2

@@ -163,7 +163,7 @@ HEADBENCH_INLINE void sine_cosine(Real x, Real& sine, Real& cosine) {
   cosine = fma(square, cosine, 1.0f);
 }
 
-// The encoding of methods/shared/networks.py, `encode`, of W directions: W numbers of each input side by side.
+// The encoding of methods/ops/planes.py, `encode`, of W directions: W numbers of each input side by side.
 HEADBENCH_INLINE void encode(const Real* direction, float* out) {
   constexpr int kFrequencies = (kEncoding - 3) / 6;
   for (int k = 0; k < 3; ++k) {

@@ -13,7 +13,7 @@ namespace headbench {
 constexpr int kGroupRows = 16;  // rows are allocated in groups of so many
 constexpr int kEncoding = 27;   // of a direction
 constexpr int kPlanes = 3;
-constexpr int kPlaneAxes[kPlanes][2] = {{0, 1}, {0, 2}, {1, 2}};  // PAIRS of methods/shared/networks.py
+constexpr int kPlaneAxes[kPlanes][2] = {{0, 1}, {0, 2}, {1, 2}};  // PAIRS of methods/ops/planes.py
 
 // Box and samples of planes or lines: sample (p - low) / extent (samples - 1), clamped.
 struct Grid {
@@ -21,7 +21,7 @@ struct Grid {
   int samples;
 };
 
-// Positions of splats in canonical space: `CanonicalFrames.positions` of methods/ours/field.py.
+// Positions of splats in canonical space: `points_on` of methods/ops/splats.py.
 struct PositionTraining {
   const std::int64_t* binding;  // (N,) triangles
   const float* linear;          // (F, 3, 3)
@@ -30,7 +30,7 @@ struct PositionTraining {
   float* out;                   // (N, 3) positions; backward: gradients by the local means
 };
 
-// Directions to the camera in canonical space: `canonical_directions` of methods/ours/field.py, then one more rotation.
+// Directions to the camera in canonical space: `directions_to` of methods/ops/splats.py.
 struct DirectionTraining {
   const std::int64_t* binding;  // (N,) triangles
   const float* turns;           // (F, 3, 3) applied to the directions
@@ -43,8 +43,7 @@ struct DirectionTraining {
   float* by_means;             // (N, 3)
 };
 
-// Colours of splats by the planes: `plane_features` and `color_network` of methods/ours/field.py and
-// methods/shared/networks.py.
+// Colours of splats by the planes: `plane_colors` of methods/ops/planes.py.
 struct ColorTraining {
   Grid grid;
   int channels[kPlanes];
@@ -70,7 +69,7 @@ struct ColorTraining {
   float* by_planes[kPlanes];
 };
 
-// Backward pass of the offsets by the lines, `line_offsets` of methods/ours/field.py; the forward pass is `offset_network`.
+// Backward pass of the offsets by the lines, `line_offsets` of methods/ops/planes.py; the forward pass is `offset_network`.
 struct LineTraining {
   OffsetNetwork net;              // units and hidden are the same, `kept` is that of the forward pass
   const float* second_by_output;  // (hidden, units_stride), the weights of the second layer

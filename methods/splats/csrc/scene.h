@@ -161,7 +161,7 @@ constexpr int kHarmonicsBlock = 16;
 constexpr int kDegreeMax = 3;
 
 // Colours of spherical harmonics along the directions from the camera to the splats; the formulas of `sh_to_rgb` in
-// methods/shared/networks.py.
+// methods/ops/planes.py.
 struct Harmonics {
   int degree;
   const float* coefficients;    // (ceil(N / 16), 3, (degree + 1)^2, 16)
@@ -177,7 +177,7 @@ constexpr int kUnitsStep = 16;
 // Splats that go through one layer before the next: what they keep between them stays in the first caches.
 constexpr int kNetworkTile = 64;
 
-// The colour network, `shade_directions` in methods/ours/field.py: what is known of the position, plus what the direction
+// The colour network, `shader` in methods/ops/planes.py: what is known of the position, plus what the direction
 // from the splat to the camera adds, ReLU, a layer. Each coordinate of the direction adds its own part, which a table holds
 // at equidistant samples from -1 to 1.
 struct ColorNetwork {
@@ -193,7 +193,7 @@ struct ColorNetwork {
   float* colors;                // (N, 3)
 };
 
-// The offset network, `offset_network` in methods/shared/networks.py, for M splats: rows of a table interpolated on three
+// The offset network, `OffsetLayers` in methods/ops/planes.py, for M splats: rows of a table interpolated on three
 // axes and added, ReLU, a layer, ReLU, a layer.
 struct OffsetNetwork {
   int units, hidden, outputs;
@@ -259,7 +259,7 @@ struct TrainedHarmonics {
   float* by_vectors;       // (N, 3)
 };
 
-// (1 - w) mean|image - truth| + w (1 - mean SSIM) of methods/shared/losses.py, and its gradient by the image.
+// (1 - w) mean|image - truth| + w (1 - mean SSIM) of methods/ops/photometric.py, and its gradient by the image.
 struct Photometric {
   int height, width;
   const float* image;   // (H, W, 3)

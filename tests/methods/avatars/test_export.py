@@ -23,8 +23,8 @@ from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.method import GBS
+from headbench.methods.ops.harmonics import sh_basis
 from headbench.methods.ours.avatar import OursAvatar
-from headbench.methods.shared.networks import sh_basis
 from headbench.methods.shared.rendering import PosedSplats, view_of
 from headbench.methods.splats import rasterize
 from headbench.methods.trivial.method import NearestCamera

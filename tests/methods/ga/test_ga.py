@@ -7,8 +7,8 @@ from torch import nn
 
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GAAppearance
+from headbench.methods.ops.harmonics import C0, C1
 from headbench.methods.shared.avatar_files import TRACKED
-from headbench.methods.shared.networks import C0, C1
 from headbench.methods.shared.optimisation import Optimiser
 from headbench.methods.shared.rendering import view_of
 from headbench.methods.shared.schedule import Timeline

@@ -26,7 +26,6 @@ from headbench.methods.gbs.blendshapes import (
     initial_rotations,
     nearest_rotation,
 )
-from headbench.methods.gbs.device_frame import DeviceSplats
 from headbench.methods.gbs.points import SurfacePoints, full_barycentric
 
 from ...datasets.head.toy import toy_head
@@ -185,34 +184,6 @@ def test_an_expression_beyond_those_kept_moves_joints_alone(head):
     # At rest joints turn nothing, so where they are does not matter.
     torch.testing.assert_close(one.offset, same.offset, atol=1e-6, rtol=0)
     assert (motions(kept, 0.3).offset - motions(other, 0.3).offset).abs().max() > 1e-5
-
-
-@pytest.mark.parametrize(
-    ("degree", "learnt", "eyelids"), [(3, 3, False), (3, 1, True), (1, 0, False), (0, 0, True)]
-)
-def test_splats_in_few_operations_are_those_of_the_definition(degree, learnt, eyelids):
-    head, rng = toy_head(16, eyelids=eyelids), np.random.default_rng(0)
-    count, expressions = 60, 5
-    rig = Rig(head, np.zeros(6), np.zeros_like(head.template), random_points(head, count), expressions, "cpu")
-    pose = toy_pose(head, rng, 0, "toy")
-    pose = replace(pose, jaw=np.array([0.5, 0, 0]), eyelids=np.array([0.7, -0.4]) if eyelids else None)
-    neutral = neutral_of(rig, degree)
-    owners, moving = np.nonzero(rng.random((count, expressions)) < 0.5)
-    counts = torch.from_numpy(np.bincount(owners, minlength=count))
-    entries = Entries.of(counts, torch.from_numpy(moving), torch.ones(len(owners)))
-    size = len(owners), sum(difference_widths(learnt).values())
-    differences = torch.from_numpy(0.1 * rng.standard_normal(size)).float()
-    found = DeviceSplats(rig, neutral, entries, differences)(pose, lambda stage: None)
-    arguments = rig.arguments([pose])
-    summed = entries.sum(differences, rig.coefficients(arguments))
-    expected = apply_pose(neutral, summed, PointMotions.of(rig.motions(arguments)))
-    torch.testing.assert_close(found.world.means, expected.world.means, atol=1e-6, rtol=0)
-    torch.testing.assert_close(found.world.scales, expected.world.scales)
-    torch.testing.assert_close(found.opacities, expected.opacities)
-    alike = (found.world.quats * expected.world.quats).sum(1).abs()
-    torch.testing.assert_close(alike, torch.ones(count), atol=1e-5, rtol=0)
-    center = torch.tensor([0.1, 0.2, 0.9])
-    torch.testing.assert_close(found.colors(center), expected.colors(center, degree), atol=1e-4, rtol=1e-4)
 
 
 MILLIMETRE = 1e-3

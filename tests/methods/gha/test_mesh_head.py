@@ -26,8 +26,8 @@ from headbench.methods.gha.mesh_head import (
 )
 from headbench.methods.gha.mesh_training import MeshTraining, mesh_phase, roughness, soft_overlap
 from headbench.methods.gha.tracked_motion import TangentDistance, outer_vertices
+from headbench.methods.ops.planes import encode
 from headbench.methods.shared.loop import Fit
-from headbench.methods.shared.networks import encode
 
 from .small import small_config
 

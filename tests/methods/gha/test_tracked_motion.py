@@ -7,7 +7,7 @@ from headbench.datasets.head.model import HeadModel
 from headbench.methods.gha.driving import bounds, training_scene
 from headbench.methods.gha.networks import Controllers
 from headbench.methods.gha.tracked_motion import TrackedMotion
-from headbench.methods.shared.networks import encode
+from headbench.methods.ops.planes import encode
 
 from .small import small_config
 

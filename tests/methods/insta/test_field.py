@@ -11,7 +11,6 @@ from headbench.methods.insta.field import (
     Architecture,
     Prior,
     encode,
-    encode_reference,
     initial_weight,
     layer_shapes,
     make_levels,
@@ -131,7 +130,7 @@ def test_a_linear_function_on_a_dense_level_is_reproduced():
     table[: side**3, 0] = torch.from_numpy(at @ slope + 0.7)
     positions = torch.rand(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     expected = (positions * level.scale) @ torch.from_numpy(slope) + 0.7
-    torch.testing.assert_close(encode(positions, table, [level])[:, 0], expected)
+    torch.testing.assert_close(encode(table, positions, [level])[:, 0], expected)
 
 
 @pytest.mark.parametrize("features", [1, 2, 4, 8])
@@ -143,8 +142,8 @@ def test_kernel_values_and_gradients_are_those_of_float64(features):
     table = torch.randn(table_rows(levels), features, generator=generator).requires_grad_()
     exact = table.detach().double().requires_grad_()
     weights = torch.randn(700, 4 * features, generator=generator)
-    values = encode(positions, table, levels)
-    expected = encode_reference(positions.double(), exact, levels)
+    values = encode(table, positions, levels)
+    expected = encode.definition(exact, positions.double(), levels)
     # Cells are found in float32: a position times a scale of 39 is good to 5e-6 cells.
     torch.testing.assert_close(values.double(), expected, atol=5e-5, rtol=0)
     (values * weights).sum().backward()
@@ -168,7 +167,7 @@ def test_every_instruction_set_encodes_to_the_same_bits(features):
         module.encode(positions, table, levels, out, 1, name)
         np.testing.assert_array_equal(out, found[""])
     clamped = torch.from_numpy(np.nan_to_num(positions).clip(0, 1)).double()
-    expected = encode_reference(clamped, torch.from_numpy(table).double(), levels)
+    expected = encode.definition(torch.from_numpy(table).double(), clamped, levels)
     np.testing.assert_allclose(found[""], expected, atol=1e-4)
 
 
@@ -176,7 +175,7 @@ def test_the_reference_passes_gradcheck():
     levels = make_levels(2, 2, 4, 5)
     positions = torch.rand(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     table = torch.randn(table_rows(levels), 2, dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(lambda rows: encode_reference(positions, rows, levels), (table,))
+    assert torch.autograd.gradcheck(lambda rows: encode.definition(rows, positions, levels), (table,))
 
 
 def test_gradients_do_not_depend_on_the_number_of_threads():
@@ -185,7 +184,7 @@ def test_gradients_do_not_depend_on_the_number_of_threads():
 
     def gradient():
         table = torch.zeros(table_rows(levels), 4, requires_grad=True)
-        encode(positions, table, levels).square().add(encode(positions, table, levels)).sum().backward()
+        encode(table, positions, levels).square().add(encode(table, positions, levels)).sum().backward()
         return table.grad
 
     assert torch.equal(*by_threads(gradient))
@@ -193,7 +192,7 @@ def test_gradients_do_not_depend_on_the_number_of_threads():
 
 def test_a_table_that_does_not_fit_its_levels_is_refused():
     with pytest.raises(ValueError, match="fit"):
-        encode(torch.rand(4, 3), torch.zeros(8, 2), small_levels())
+        encode(torch.zeros(8, 2), torch.rand(4, 3), small_levels())
 
 
 def network_reference(inputs, constants, rows, weights):
@@ -206,7 +205,7 @@ def network_reference(inputs, constants, rows, weights):
 @pytest.mark.parametrize("constants", [0, 3])
 @pytest.mark.parametrize("layers", [1, 3])
 def test_values_and_gradients_are_those_of_autograd(constants, layers, monkeypatch):
-    monkeypatch.setattr(networks, "CPU_BLOCK", 16)  # several blocks, the last one short
+    monkeypatch.setattr(networks, "BLOCK", 16)  # several blocks, the last one short
     generator = torch.Generator().manual_seed(layers)
     inputs = torch.randn(53, 5, generator=generator, dtype=torch.float64)
     others = torch.randn(4, constants, generator=generator, dtype=torch.float64)

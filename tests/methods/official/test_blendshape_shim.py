@@ -9,7 +9,7 @@ import torch
 from headbench.datasets.head.rotations import axis_angle_to_matrix
 from headbench.methods.insta.warp import squared_distances
 from headbench.methods.official.shim import blendshapes as shim
-from headbench.methods.shared.networks import sh_basis
+from headbench.methods.ops.harmonics import sh_basis
 
 
 def draw(*shape, seed=0, dtype=torch.float64):

@@ -11,7 +11,7 @@ import torch
 from headbench.methods.official.method import LAUNCHER
 from headbench.methods.official.shim.cpu import mean_square_distances
 from headbench.methods.official.shim.rasterizer import GaussianRasterizationSettings, GaussianRasterizer
-from headbench.methods.shared.networks import sh_to_rgb
+from headbench.methods.ops.harmonics import harmonic_colors
 from headbench.methods.splats import rasterize
 
 WIDTH, HEIGHT, FOCAL = 40, 24, (50.0, 44.0)
@@ -52,10 +52,9 @@ def test_image_and_gradients_are_the_reference_s(degree):
 
     exact = {name: value.detach().double().requires_grad_() for name, value in given.items()}
     shs, offset = exact["shs"], torch.zeros(30, 2, dtype=torch.float64, requires_grad=True)
-    directions = torch.nn.functional.normalize(exact["means3D"], dim=1)
     rendering = rasterize(
         *(exact["means3D"], exact["rotations"], exact["scales"], exact["opacities"][:, 0]),
-        sh_to_rgb(shs[:, 0], shs[:, 1:].transpose(1, 2), directions, degree),
+        harmonic_colors(shs[:, 0], shs[:, 1:].transpose(1, 2), exact["means3D"], degree),
         *(np.eye(4), np.array([[FOCAL[0], 0, WIDTH / 2], [0, FOCAL[1], HEIGHT / 2], [0, 0, 1]])),
         *(WIDTH, HEIGHT),
         background=[0.2, 0.5, 1.0],

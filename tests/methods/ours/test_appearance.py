@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 import torch
 
+from headbench.bench.native import dispatch
 from headbench.datasets.head.arrays import faces_in_region
 from headbench.methods.ours.appearance import penalty_weights, softened
 from headbench.methods.ours.config import OursConfig
+from headbench.methods.ours.method import Ours
+from headbench.methods.shared.schedule import Timeline
+from headbench.methods.shared.splat_training import BoundTraining
+from headbench.methods.splats.cpu import instruction_sets
 
 from .toy import SMALL, changed, make, place
 
@@ -131,3 +136,25 @@ def test_a_softened_penalty_is_published_but_for_a_parabola_at_0():
     soft.sum().backward()
     np.testing.assert_allclose(soft.detach(), [2.95, 0.05, 0.0125, 0.0, 0.002, 0.05, 0.45])
     np.testing.assert_allclose(offsets.grad, [-1, -1, -0.5, 0, 0.2, 1, 1], atol=1e-12)
+
+
+@pytest.mark.skipif(not instruction_sets(), reason="the compiled kernel is missing")
+def test_training_by_compiled_forms_follows_that_by_definitions(clip, monkeypatch):
+    config = changed(SMALL, splats={"schedule_length": 100}, lines={"start": 10})
+    losses = {}
+    for compiled in (True, False):
+        monkeypatch.setattr(dispatch, "fits", lambda kernel, values, compiled=compiled: compiled)
+        shading, _, binding = make(clip, config)
+        sampler = Ours(config)._sampler(clip, 0)
+        training = BoundTraining(clip, config.splats, shading, sampler, len(binding), "cpu", 0)
+        training.begin(Timeline(100, 100))
+        losses[compiled] = []
+        for iteration in range(1, 31):
+            loss = training.loss(iteration, sampler(iteration))
+            loss.backward()
+            losses[compiled].append(loss.item())
+            training.optimiser.step()
+            training.optimiser.zero_grad()
+        training.close()
+    np.testing.assert_allclose(losses[True], losses[False], rtol=1e-3)
+    assert losses[True] != losses[False]  # so that the compiled forms were used

@@ -5,17 +5,17 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from headbench.methods.ops.mesh import triangle_frames
+from headbench.methods.ops.splats import directions_to
 from headbench.methods.ours.config import OursConfig
 from headbench.methods.ours.field import (
     CanonicalFrames,
-    canonical_directions,
     initial_line_network,
     initial_parameters,
     line_box,
     normalised_weight,
     plane_box,
 )
-from headbench.methods.shared.binding import triangle_frames
 
 GENERATOR = torch.Generator().manual_seed(0)
 
@@ -50,9 +50,9 @@ def test_canonical_directions_follow_head_and_camera_together():
     binding, center = torch.tensor([0, 1, 2, 4]), torch.tensor([0.0, 0.0, 9.0], dtype=torch.float64)
     turn = torch.from_numpy(Rotation.from_rotvec([0.4, -1.2, 0.3]).as_matrix())
     moved = triangle_frames(vertices @ turn.T, faces)
-    still = canonical_directions(canonical.turns(triangle_frames(vertices, faces)), binding, means, center)
+    still = directions_to(means, center, canonical.turns(triangle_frames(vertices, faces)), binding)
     np.testing.assert_allclose(still, torch.nn.functional.normalize(center - means, dim=1), atol=1e-12)
-    after = canonical_directions(canonical.turns(moved), binding, means @ turn.T, turn @ center)
+    after = directions_to(means @ turn.T, turn @ center, canonical.turns(moved), binding)
     np.testing.assert_allclose(after, still, atol=1e-12)
 
 

@@ -9,7 +9,7 @@ from skimage.metrics import structural_similarity
 
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
-from headbench.methods.shared.binding import to_world
+from headbench.methods.ops.splats import to_world
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.loop import check_training_split
 from headbench.methods.shared.rendering import scene_extent

@@ -77,7 +77,7 @@ def test_iterations_count_from_one_and_the_last_makes_no_step(tmp_path):
 
 @pytest.mark.parametrize(("compiled", "expected"), [(True, (1, 3)), (False, (3, 3))])
 def test_torch_has_one_thread_where_kernels_are_compiled(tmp_path, monkeypatch, compiled, expected):
-    monkeypatch.setattr(loop, "available", lambda: compiled)
+    monkeypatch.setattr(loop, "instruction_sets", lambda: {"cpu": ""} if compiled else {})
     seen = []
     with torch_threads(3):
         report = lambda *_: seen.append((torch.get_num_threads(), threads()))

@@ -19,7 +19,7 @@ from .cases import request_of
 
 slow = importlib.import_module("headbench.methods.splats.rasterize")  # the package's name is the function's
 COMPILED_CHANNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)  # by gsplat 1.5 and 1.6 alike, as far as 32
-needs_gpu = pytest.mark.skipif(not cuda.usable(), reason="needs a GPU and gsplat (extra `cuda`)")
+needs_gpu = pytest.mark.skipif(not cuda.installed(), reason="needs a GPU and gsplat (extra `cuda`)")
 
 
 class _AbsoluteGradients(torch.autograd.Function):
@@ -191,7 +191,7 @@ def test_the_extension_is_compiled_when_gsplat_is_loaded(monkeypatch, tmp_path, 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "set_device", lambda device: None)
     monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path / "extensions"))
-    for cached in (cuda.usable, cuda.load):
+    for cached in (cuda.installed, cuda.load):
         cached.cache_clear()
     try:
         with caplog.at_level(logging.INFO, "headbench"):
@@ -207,7 +207,7 @@ def test_the_extension_is_compiled_when_gsplat_is_loaded(monkeypatch, tmp_path, 
         (tmp_path / "gsplat" / "csrc.cpython-311-x86_64-linux-gnu.so").touch()
         assert cuda.compiled()
     finally:
-        for cached in (cuda.usable, cuda.load):
+        for cached in (cuda.installed, cuda.load):
             cached.cache_clear()
         for name in [name for name in sys.modules if name.partition(".")[0] == "gsplat"]:
             del sys.modules[name]
@@ -226,13 +226,13 @@ def test_another_clamp_is_measured_and_warned_of_once(monkeypatch, caplog, clamp
 
 
 def test_without_a_gpu_it_says_so(monkeypatch):
-    for cached in (cuda.usable, cuda.load):
+    for cached in (cuda.installed, cuda.load):
         cached.cache_clear()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(UnavailableError, match=r"needs a GPU.*'\.\[cuda\]'"):
         rasterize(*cloud(3, 8, 8)[:9], backend="cuda")
     assert available_backends("cuda") == ("reference",)
-    for cached in (cuda.usable, cuda.load):
+    for cached in (cuda.installed, cuda.load):
         cached.cache_clear()
 
 
@@ -245,7 +245,7 @@ def test_without_a_gpu_it_says_so(monkeypatch):
     ],
 )
 def test_a_slow_backend_on_a_gpu_is_warned_of_once(monkeypatch, caplog, installed, options, reason):
-    monkeypatch.setattr(cuda, "usable", lambda: installed)
+    monkeypatch.setattr(cuda, "installed", lambda: installed)
     monkeypatch.setattr(cuda, "supports", lambda request: True)
     monkeypatch.setattr(cpu, "supports", lambda request: False)
     monkeypatch.setattr(cuda, "rasterize_cuda", lambda request: "gsplat")

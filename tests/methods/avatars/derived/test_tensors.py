@@ -15,7 +15,7 @@ from headbench.methods.avatars.derived.recipes import (
     read_reduced,
     write_reduced,
 )
-from headbench.methods.shared.networks import PAIRS, sample_plane
+from headbench.methods.ops.planes import PAIRS, sample_plane
 
 
 def ramp_plane(side, channels=2):

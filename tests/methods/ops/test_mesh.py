@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from headbench.methods.shared.binding import to_world, triangle_frames
+from headbench.methods.ops.mesh import triangle_frames
+from headbench.methods.ops.splats import to_world
 
 
 def random_mesh(seed, faces=7):

@@ -1,16 +1,19 @@
-"""Splats bound to the triangles of a posed mesh: local frames and the way to the world.
+"""Frames of the triangles of a posed mesh.
 
 Qian et al., "GaussianAvatars: Rigged 3D Gaussian Splatting", CVPR 2024, section 3.2, with the frame of its code.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from ...bench.native.dispatch import Operation
 from ...datasets.head.rotations import matrix_to_quaternion
+from .kernel import KERNEL, call, empty_like
 
 NORM_FLOOR = 1e-10
 NORMAL = 1
@@ -34,14 +37,7 @@ class Frames(NamedTuple):
     quaternion: Tensor
 
 
-class WorldSplats(NamedTuple):
-    """Splats in the world: (N, 3) means, (N, 4) unit quaternions wxyz, (N, 3) scales; metres."""
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-
-
+@Operation
 def triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
     """Frames of the triangles (v0, v1, v2) of a mesh.
 
@@ -68,40 +64,53 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
     return Frames(rotation, corners.mean(1).t().contiguous(), size, matrix_to_quaternion(rotation))
 
 
-def to_world(
-    frames: Frames, binding: Tensor, means: Tensor, log_scales: Tensor, quats: Tensor
-) -> WorldSplats:
-    """Transform local splats to world space: mean' = k R mean + T, scale' = k exp(s), q' = q(R) q/|q|.
-
-    Parameters
-    ----------
-    binding : (N,) int64, the triangle of each splat.
-    means : (N, 3) in units of the triangle's size.
-    log_scales : (N, 3) logarithms in the same unit.
-    quats : (N, 4), real part first, of any length.
-    """
-    linear = (frames.size[:, None, None] * frames.rotation).flatten(1)
-    # One gather instead of four, and one scatter for its gradient. The quaternion goes along as the matrix that
-    # multiplies by it: products of small matrices are several times faster than sums over columns.
-    turn = left_products(frames.quaternion).flatten(1)
-    packed = torch.cat([linear, frames.center, frames.size[:, None], turn], dim=1)
-    linear, center, size, turn = packed.index_select(0, binding).split([9, 3, 1, 16], dim=1)
-    world_means = apply_matrices(linear, means) + center
-    local = quats / torch.linalg.vector_norm(quats, dim=1, keepdim=True).clamp_min(1e-12)
-    return WorldSplats(world_means, apply_matrices(turn, local), size * log_scales.exp())
+@triangle_frames.compiled(KERNEL)
+def _triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
+    return Frames(*_TriangleFrames.apply(vertices, faces))  # type: ignore[no-untyped-call]
 
 
-def left_products(quaternions: Tensor) -> Tensor:
-    """(F, 4, 4) matrices: ``left_products(q) @ p`` is the Hamilton product q p, real parts first."""
-    w, x, y, z = quaternions.unbind(1)
-    rows = [(w, -x, -y, -z), (x, w, -z, y), (y, z, w, -x), (z, -y, x, w)]
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+class _TriangleFrames(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, vertices: Tensor, faces: Tensor) -> tuple[Tensor, ...]:
+        ctx.save_for_backward(vertices, faces)
+        count, empty = len(faces), vertices.new_empty
+        frames = empty(count, 3, 3), empty(count, 3), empty(count), empty(count, 4)
+        call("triangles", vertices, faces, *frames)
+        return frames
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        vertices, faces = ctx.saved_tensors
+        by_vertices = empty_like(vertices)
+        call("triangles_backward", vertices, faces, *grads, by_vertices)
+        return by_vertices, None
 
 
-def apply_matrices(rows: Tensor, vectors: Tensor) -> Tensor:
-    """Product of each (D, D) matrix, given as a row of (N, D D), with its vector of (N, D)."""
-    size = vectors.shape[1]
-    return torch.bmm(rows.view(-1, size, size), vectors[:, :, None])[:, :, 0]
+@Operation
+def turns_between(to: Tensor, origin: Tensor) -> Tensor:
+    """(F, 3, 3) rotations ``to`` times the transposes of ``origin``: they take directions on one mesh to the other's."""
+    return to @ origin.mT
+
+
+@turns_between.compiled(KERNEL)
+def _turns_between(to: Tensor, origin: Tensor) -> Tensor:
+    return _TurnsBetween.apply(to, origin)  # type: ignore[no-untyped-call]
+
+
+class _TurnsBetween(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, to: Tensor, origin: Tensor) -> Tensor:
+        ctx.save_for_backward(to, origin)
+        turns = empty_like(to)
+        call("turns", to, origin, turns)
+        return turns
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_turns: Tensor) -> tuple[Tensor, Tensor]:
+        to, origin = ctx.saved_tensors
+        return by_turns @ origin, by_turns.mT @ to
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

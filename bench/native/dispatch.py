@@ -1,0 +1,84 @@
+"""Which form of an operation runs. No other file asks a tensor for its device, or whether a kernel takes it.
+
+The definition of an operation is a function of torch tensors that runs on every device and in float64. At most one
+compiled form stands beside it, for float32 in host memory.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, Generic, ParamSpec, TypeVar
+
+from .loader import Kernel
+
+P = ParamSpec("P")
+Result = TypeVar("Result")
+Tensor = Any
+"""A torch tensor; this package does not import torch."""
+
+
+def is_cuda(device: object) -> bool:
+    """Whether a device, or its name, is a CUDA device."""
+    return str(device).split(":")[0] == "cuda"
+
+
+def on_host(values: Tensor) -> bool:
+    """Whether a tensor is in host memory, where numpy and kernels reach it."""
+    return str(values.device) == "cpu"
+
+
+def is_float32(values: Tensor) -> bool:
+    """Whether a tensor has the dtype that compiled forms take."""
+    return str(values.dtype) == "torch.float32"
+
+
+def fits(kernel: Kernel, values: Tensor) -> bool:
+    """Whether the kernel is there and takes a tensor like this one; where it is missing, a warning is logged once."""
+    return on_host(values) and is_float32(values) and kernel.load_or_warn() is not None
+
+
+def pinned(values: Tensor, device: object) -> Tensor:
+    """Host memory that the device copies by itself; from other memory the host would copy it first."""
+    return values.pin_memory() if is_cuda(device) else values
+
+
+def to_device(values: Tensor, device: object) -> Tensor:
+    """Host memory on a device; the host does not wait for the copy."""
+    return pinned(values, device).to(device, non_blocking=True)
+
+
+class Operation(Generic[P, Result]):
+    """A function of tensors that has a definition and may have a compiled form. Decorates the definition.
+
+    The compiled form runs where `fits` says so of the first tensor: the first argument, or its first element if that is a
+    tuple.
+
+    Attributes
+    ----------
+    definition : the decorated function.
+    kernel_form : the compiled form; None where there is none.
+    """
+
+    def __init__(self, definition: Callable[P, Result]) -> None:
+        functools.update_wrapper(self, definition)
+        self.definition = definition
+        self.kernel_form: Callable[P, Result] | None = None
+
+    def compiled(self, kernel: Kernel) -> Callable[[Callable[P, Result]], Callable[P, Result]]:
+        """Decorate the compiled form, which calls functions of ``kernel``."""
+
+        def register(form: Callable[P, Result]) -> Callable[P, Result]:
+            self.kernel_form, self._kernel = form, kernel
+            return form
+
+        return register
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> Result:
+        """Run the form that suits the first tensor."""
+        first: Any = args[0]
+        while isinstance(first, tuple):
+            first = first[0]
+        if self.kernel_form is not None and fits(self._kernel, first):
+            return self.kernel_form(*args, **kwargs)
+        return self.definition(*args, **kwargs)

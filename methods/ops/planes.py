@@ -1,0 +1,321 @@
+"""Tri-planes, lines and the small networks of "ours" that read them."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import embedding_bag
+
+from ...bench.native.dispatch import Operation, to_device
+from .harmonics import C0
+from .kernel import KERNEL, arrays, call, empty_like, pad_units, threads
+from .splats import directions_to
+
+
+def sum_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """(N, C) sums over k of ``weights[:, k] * table[rows[:, k]]``; differentiable in table and weights.
+
+    Parameters
+    ----------
+    table : (T, C).
+    rows : (N, K) int64.
+    weights : (N, K), of the table's dtype.
+    """
+    return embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+
+
+PAIRS = (("xy", 0, 1), ("xz", 0, 2), ("yz", 1, 2))
+"""Planes in the order of their features: name, coordinate along the width, coordinate along the height."""
+
+
+FREQUENCIES = (1.0, 2.0, 4.0, 8.0)
+ENCODING_SIZE = 3 + 2 * 3 * len(FREQUENCIES)
+
+
+def sample_plane(plane: Tensor, coordinates: Tensor, resolution: int) -> Tensor:
+    """Features (N, C) of a (R * R, C) plane at (N, 2) coordinates in [-1, 1], width first; clamped outside.
+
+    Bilinear, align-corners, border padding, as ``torch.nn.functional.grid_sample`` defines them.
+    """
+    position = ((coordinates + 1) * (0.5 * (resolution - 1))).clamp(0, resolution - 1)
+    corner = position.detach().floor().clamp_max(resolution - 2)
+    u, v = (position - corner).unbind(1)
+    column, row = corner.to(torch.int64).unbind(1)
+    first = row * resolution + column
+    indices = torch.stack([first, first + 1, first + resolution, first + resolution + 1], dim=1)
+    weights = torch.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], dim=1)
+    return sum_rows(plane, indices, weights)
+
+
+def encode(values: Tensor) -> Tensor:
+    """(N, 9 D) positional encoding of (N, D) values: identity, then sin and cos at 1, 2, 4, 8 (no pi)."""
+    frequencies = _frequencies(values.dtype, values.device)
+    angles = frequencies[:, None] * values[:, None, :]
+    waves = torch.stack([torch.sin(angles), torch.cos(angles)], dim=2)
+    return torch.cat([values, waves.flatten(1)], dim=1)
+
+
+@functools.cache
+def _frequencies(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`FREQUENCIES` where they are used: made at each call, the host would wait for the device."""
+    on_device: Tensor = to_device(torch.tensor(FREQUENCIES, dtype=dtype), device)
+    return on_device
+
+
+def smoothing(spread: float) -> Tensor:
+    """(9 D,) factors on `encode` of D = 3 values known to the standard deviation ``spread``, which make it its mean.
+
+    Of x + n, n normal: a wave of frequency f keeps exp(-(f spread)^2 / 2) (integrated positional encoding; Barron et al.
+    2021, arXiv 2103.13415, eq. 13).
+    """
+    frequencies = torch.tensor(FREQUENCIES).repeat_interleave(2 * 3)
+    return torch.cat([torch.ones(3), torch.exp(-0.5 * (frequencies * spread) ** 2)])
+
+
+class Bounds(NamedTuple):
+    """Axis-aligned box: (3,) corners, metres."""
+
+    low: Tensor
+    high: Tensor
+
+    def unit(self, points: Tensor) -> Tensor:
+        """Map the box to [0, 1]."""
+        return (points - self.low) / (self.high - self.low)
+
+    def contains(self, points: Tensor) -> Tensor:
+        """(N,) whether points lie in the box, its faces included."""
+        return ((points >= self.low) & (points <= self.high)).all(1)
+
+
+class ColorNetwork(NamedTuple):
+    """What gives colours by place and direction.
+
+    Attributes
+    ----------
+    xy, xz, yz : (R * R, C_k) planes.
+    first, last : (H, C + 27) and (3, H) weights, C the sum of the C_k.
+    """
+
+    xy: Tensor
+    xz: Tensor
+    yz: Tensor
+    first: Tensor
+    last: Tensor
+
+
+def triplane_features(planes: Sequence[Tensor], box: Bounds, positions: Tensor) -> tuple[Tensor, ...]:
+    """Features (N, C_k) of three planes, in the order of `PAIRS`, at positions in the box that they span; clamped outside."""
+    points, resolution = 2 * box.unit(positions) - 1, round(len(planes[0]) ** 0.5)
+    return tuple(
+        # The two coordinates by steps: a list of numbers would be copied to the device.
+        sample_plane(plane, points[:, width : height + 1 : height - width], resolution)
+        for plane, (_, width, height) in zip(planes, PAIRS)
+    )
+
+
+@Operation
+def plane_colors(positions: Tensor, directions: Tensor, box: Bounds, network: ColorNetwork) -> Tensor:
+    """Colours (N, 3) >= 0: [features, encoded direction] -> hidden -> ReLU -> relu(0.5 + C0 * out), no bias.
+
+    Parameters
+    ----------
+    positions, directions : (N, 3), and (N, 3) unit vectors to the camera.
+    box : of the planes.
+    """
+    features = triplane_features(network[:3], box, positions)
+    inputs = torch.cat([*features, encode(directions)], dim=1)
+    hidden = torch.relu(inputs @ network.first.t())
+    return torch.relu(0.5 + C0 * (hidden @ network.last.t()))
+
+
+@plane_colors.compiled(KERNEL)
+def _plane_colors(positions: Tensor, directions: Tensor, box: Bounds, network: ColorNetwork) -> Tensor:
+    return _PlaneColors.apply(torch.stack([*box]), positions, directions, *network)  # type: ignore[no-untyped-call]
+
+
+class _PlaneColors(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, box: Tensor, *inputs: Tensor) -> Tensor:
+        colors = empty_like(inputs[0])
+        ctx.done = call("color_training", *inputs, box, colors)
+        ctx.save_for_backward(*inputs, box, colors)
+        return colors
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_colors: Tensor) -> tuple[Tensor | None, ...]:
+        *inputs, box, colors = ctx.saved_tensors
+        places, weights = inputs[:2], inputs[2:]
+        wanted = any(ctx.needs_input_grad[1:3])
+        by_places = [empty_like(value) if wanted else value.new_empty(0, 3) for value in places]
+        gradients = [empty_like(value) for value in weights]
+        ctx.done.backward(*arrays(*inputs, box, colors, by_colors, *by_places, *gradients), threads())
+        return None, *(by_places if wanted else [None] * 2), *gradients
+
+
+AXES = 3
+
+
+class LinePosition(NamedTuple):
+    """Where points lie on the three lines: rows of the (3 L)-row table and linear weights, (N, 6) each."""
+
+    rows: Tensor
+    weights: Tensor
+
+
+def line_position(points: Tensor, resolution: int) -> LinePosition:
+    """Positions of (N, 3) points in [0, 1] on lines of ``resolution`` samples: sample ``t (L - 1)``."""
+    position = (points * (resolution - 1)).clamp(0, resolution - 1)
+    lower = position.floor().clamp_max(resolution - 2)
+    fraction = position - lower
+    start = torch.arange(AXES, device=points.device) * resolution
+    rows = lower.to(torch.int64) + start
+    weights = torch.cat([1 - fraction, fraction], dim=1).to(points.dtype)
+    return LinePosition(torch.cat([rows, rows + 1], dim=1), weights)
+
+
+class OffsetLayers(NamedTuple):
+    """Layers of the offset network behind its first weights: (H,), (H, H), (H,), (D, H) and (D,)."""
+
+    bias_0: Tensor
+    weight_1: Tensor
+    bias_1: Tensor
+    weight_2: Tensor
+    bias_2: Tensor
+
+    def __call__(self, summed: Tensor) -> Tensor:
+        """(N, D): bias, ReLU, layer, ReLU, layer of what the first weights give, (N, H)."""
+        hidden = torch.relu(summed + self.bias_0)
+        hidden = torch.relu(torch.addmm(self.bias_1, hidden, self.weight_1.t()))
+        return torch.addmm(self.bias_2, hidden, self.weight_2.t())
+
+
+@Operation
+def line_offsets(positions: Tensor, box: Bounds, table: Tensor, layers: OffsetLayers) -> Tensor:
+    """(N, D) offsets at (N, 3) positions, 0 outside the box; without gradient by positions and box.
+
+    Parameters
+    ----------
+    table : (3 L, H) what each sample of the lines adds to the first layer.
+    """
+    # Computed outside, too: on a GPU the host would wait for the number of those inside.
+    position = line_position(box.unit(positions.detach()), len(table) // AXES)
+    offsets = layers(sum_rows(table, *position))
+    return torch.where(box.contains(positions)[:, None], offsets, 0)
+
+
+@line_offsets.compiled(KERNEL)
+def _line_offsets(positions: Tensor, box: Bounds, table: Tensor, layers: OffsetLayers) -> Tensor:
+    return _LineOffsets.apply(positions.detach(), torch.stack([*box]), table, *layers)  # type: ignore[no-untyped-call]
+
+
+class _LineOffsets(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, positions: Tensor, box: Tensor, *weights: Tensor) -> Tensor:
+        offsets = positions.new_zeros(len(positions), len(weights[-1]))
+        ctx.done = call("line_training", *weights, positions, box, offsets)
+        ctx.save_for_backward(*weights)
+        return offsets
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_offsets: Tensor) -> tuple[Tensor | None, ...]:
+        weights = ctx.saved_tensors
+        gradients = [empty_like(value) for value in weights]
+        ctx.done.backward(*arrays(*weights, by_offsets, *gradients), threads())
+        return None, None, *gradients
+
+
+Shader = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+"""Colours (N, 3) >= 0 by the arguments of `splats.directions_to`, without gradients."""
+
+
+@Operation
+def shader(from_position: Tensor, of_direction: Tensor, last: Tensor) -> Shader:
+    """`plane_colors` of positions that stay, for any number of views.
+
+    Parameters
+    ----------
+    from_position : (N, H), what the planes add to the hidden layer.
+    of_direction, last : (27, H) and (3, H) weights of the encoded direction and of the hidden layer.
+    """
+
+    def shade(means: Tensor, center: Tensor, turns: Tensor, binding: Tensor) -> Tensor:
+        directions = directions_to(means, center, turns, binding)
+        hidden = torch.relu(torch.addmm(from_position, encode(directions), of_direction))
+        return torch.relu(0.5 + C0 * (hidden @ last.t()))
+
+    return shade
+
+
+SAMPLES = 512
+"""Of a coordinate of directions, from -1 to 1."""
+
+
+@shader.compiled(KERNEL)
+def _shader(from_position: Tensor, of_direction: Tensor, last: Tensor, samples: int = SAMPLES) -> Shader:
+    """The part of the position in 16 bits (`in_steps`), that of the direction from a table.
+
+    Each coordinate of a direction adds to the hidden layer what its own waves make of it. The table is linear between
+    samples: a wave of the highest frequency, 8, is off by 8^2 / (2 SAMPLES^2) = 1e-4 of its amplitude at most, and more
+    samples would not stay in the first caches. The README of "ours" says what both change of an image.
+    """
+    of_direction, last = pad_units(of_direction, 1), pad_units(last, 1)
+    network = *in_steps(pad_units(from_position, 1)), direction_table(of_direction, samples), last
+
+    def shade(means: Tensor, center: Tensor, turns: Tensor, binding: Tensor) -> Tensor:
+        colors = empty_like(means)
+        call("color_network", *network, means, turns, binding, center, colors)
+        return colors
+
+    return shade
+
+
+def in_steps(values: Tensor) -> tuple[Tensor, Tensor]:
+    """(N, H) int16 and the steps (H,) float32 they count: what is left of a column is half a step, 1.5e-5 of its largest."""
+    largest = values.abs().amax(0) if len(values) else values.new_zeros(values.shape[1])
+    steps = (largest / torch.iinfo(torch.int16).max).clamp_min(torch.finfo(values.dtype).tiny)
+    return (values / steps).round_().to(torch.int16), steps
+
+
+def direction_table(of_direction: Tensor, samples: int) -> Tensor:
+    """(3 L, H): what each coordinate adds to the hidden layer at L samples from -1 to 1, by (27, H) weights of `encode`."""
+    along = torch.linspace(-1, 1, samples, dtype=torch.float64)
+    # The coordinates' turn in each wave.
+    waves = encode(along[:, None].expand(-1, AXES)).unflatten(1, (-1, AXES))
+    weights = of_direction.double().unflatten(0, (-1, AXES))
+    return torch.einsum("lwa,wah->alh", waves, weights).flatten(0, 1).to(of_direction.dtype)
+
+
+OffsetWriter = Callable[[Tensor, Tensor, Tensor], None]
+"""Takes (N, D) offsets, the (M,) int64 rows to write, and a (3 L, H) table of blended lines; without gradients."""
+
+
+@Operation
+def offset_writer(layers: OffsetLayers, position: LinePosition) -> OffsetWriter:
+    """The offset network at places on the lines that stay, for any number of tables."""
+
+    def write(out: Tensor, splats: Tensor, table: Tensor) -> None:
+        out.index_copy_(0, splats, layers(sum_rows(table, *position)))
+
+    return write
+
+
+@offset_writer.compiled(KERNEL)
+def _offset_writer(layers: OffsetLayers, position: LinePosition) -> OffsetWriter:
+    """Units of the first layer that none of a few neighbours turns on are left out of their second layer."""
+    rows, fractions = position.rows[:, :AXES].to(torch.int32), position.weights[:, AXES:]
+    first_bias, second_bias = (pad_units(bias, 0) for bias in (layers.bias_0, layers.bias_1))
+    second, last = pad_units(layers.weight_1.t(), 0, 1), pad_units(layers.weight_2, 1)
+    places = rows.contiguous(), fractions.contiguous()
+
+    def write(out: Tensor, splats: Tensor, table: Tensor) -> None:
+        further = first_bias, *places, second, second_bias, last, layers.bias_2
+        call("offset_network", pad_units(table, 1), *further, splats, out)
+
+    return write
