@@ -69,6 +69,10 @@ def _write(readme: Path, name: str, block: str) -> None:
     write_text(readme, f"{before}{begin}\n{block}\n{end}{after}")
 
 
+DEMO_DIGITS = ("psnr=1", "ssim=3", "lpips=3", "fps=0")
+"""Of the demo's table: those that another processor gives too, see "Reproducibility" in the README."""
+
+
 def demo_block(gallery: Path) -> str:
     """Return the README's block for the stored result of the demo: Markdown."""
     record = RunFolder(gallery).read_manifest()
@@ -80,7 +84,7 @@ def demo_block(gallery: Path) -> str:
         f"{(record.peak_memory_bytes or 0) / 1e9:.1f} GB."
     )
     picture = f"![Ground truth, renders and error maps of every method]({GALLERY}/{PICTURE})"
-    return f"{picture}\n\n{table_text([gallery], 'md').strip()}\n\n{cost}"
+    return f"{picture}\n\n{table_text([gallery], 'md', digits=DEMO_DIGITS).strip()}\n\n{cost}"
 
 
 def _minutes(run_folder: Path) -> list[tuple[str, float | None]]:

@@ -12,8 +12,8 @@ from torch.utils._pytree import tree_flatten, tree_map
 
 from headbench.bench.native.dispatch import Operation
 from headbench.methods.ops import harmonics, kernel, mesh, photometric, planes, splats
+from headbench.methods.shared.threads import torch_threads
 from headbench.methods.splats.cpu import instruction_sets
-from headbench.tests.benchmarks.timing import torch_threads
 
 COUNTS = (0, 1, 3, 8, 15, 16, 17, 33, 1025, 2077)
 """No splat, parts of a vector, more than one task."""

@@ -3,6 +3,8 @@
 import re
 import time
 
+import cv2
+import numpy as np
 import pytest
 
 from headbench.reports.view.command import ViewSettings
@@ -11,6 +13,8 @@ from headbench.reports.view.server import serving
 pytest.importorskip("viser", reason="viser is not installed")
 CANVAS = {"x": 40, "y": 200, "width": 260, "height": 190}
 """Part of the page beside the panel and below viser's note on software WebGL."""
+ALIKE = 0.5
+"""Mean difference of two pictures, of 255."""
 
 
 @pytest.fixture
@@ -56,6 +60,12 @@ def settled(tab, wanted=lambda picture: True):
     return pictures[-1]
 
 
+def alike(picture, other):
+    """Whether two pictures differ by less than the camera moves while the browser still slows its motion down."""
+    one, two = (cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) for data in (picture, other))
+    return np.abs(one.astype(float) - two).mean() < ALIKE
+
+
 def type_value(tab, label, value):
     """Type the value of a slider, as one would; keys on the slider itself turn the camera too."""
     labelled = f"xpath=//*[normalize-space(text())='{label}']"
@@ -78,10 +88,10 @@ def test_a_slider_moves_one_browser_alone(scene, opened):
         one, two = opened(server), opened(server)
         before = settled(one), settled(two)
         type_value(one, "open", "0.4")
-        settled(one, lambda picture: picture != before[0])
-        assert settled(two) == before[1]
+        settled(one, lambda picture: not alike(picture, before[0]))
+        assert alike(settled(two), before[1])
         one.get_by_text("Reset sliders").click()
-        settled(one, lambda picture: picture == before[0])
+        settled(one, lambda picture: alike(picture, before[0]))
 
 
 @pytest.mark.slow
