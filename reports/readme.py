@@ -70,7 +70,7 @@ def _write(readme: Path, name: str, block: str) -> None:
 
 
 DEMO_DIGITS = ("psnr=1", "ssim=3", "lpips=3", "fps=0")
-"""Of the demo's table: those that another processor gives too, see "Reproducibility" in the README."""
+"""Of the demo's table: further ones change with the processor, as the README states below the table."""
 
 
 def demo_block(gallery: Path) -> str:
