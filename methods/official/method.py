@@ -32,7 +32,16 @@ from ...bench.io.documents import read_json
 from ...bench.io.files import check_output_folder, digest_file, write_json
 from ...bench.io.images import probe_image
 from ...datasets.images import write_image
-from ..shared.avatar_files import is_finished, run_digest, write_record
+from ..shared.avatar_files import (
+    HEAD_FILE,
+    SUBJECT_FILE,
+    Subject,
+    is_finished,
+    run_digest,
+    save_shared_head,
+    write_record,
+    write_subject,
+)
 from ..shared.loop import Fit, Outcome, check_budget, check_training_split
 from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import threads
@@ -148,15 +157,18 @@ class OfficialMethod(ABC, Generic[Config]):
 
     @abstractmethod
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
-        """Put what rendering needs of the program's output into the avatar's folder; return more for the record."""
+        """Put what rendering needs of the program's output into the avatar's folder; return more for the record.
+
+        Subject and head model are put beside it.
+        """
 
     @abstractmethod
     def files(self, folder: Path) -> list[Path]:
         """The subject's files that rendering needs."""
 
     def shared_files(self, folder: Path) -> list[Path]:
-        """Files that rendering needs and that are the same for every subject."""
-        return []
+        """The head model."""
+        return [folder / HEAD_FILE]
 
     @abstractmethod
     def write_list(
@@ -361,6 +373,8 @@ class OfficialMethod(ABC, Generic[Config]):
                 raise shrunk.error(f"Leaving the optimiser out of its output {described(shrunk.code)}")
         try:
             kept = self.keep(fit, work)
+            write_subject(fit.out / SUBJECT_FILE, Subject.of(fit.clip))
+            save_shared_head(fit.out, fit.clip.head)
         except (InputError, OSError) as error:
             raise ended.error(
                 f"The training command of {checkout.folder} left no whole avatar: {error}"

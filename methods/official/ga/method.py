@@ -20,15 +20,12 @@ from ....bench.io.arrays import MAX_MAGNITUDE, Member, read_arrays
 from ....bench.io.files import atomic_path
 from ....datasets.head.teeth import RING_LENGTH, ROWS
 from ...shared.avatar_files import (
-    HEAD_FILE,
     SUBJECT_FILE,
     TRACKED,
     RefinedTracking,
     Subject,
     read_shared_head,
     read_subject,
-    save_shared_head,
-    write_subject,
 )
 from ...shared.config import PAPER_ITERATIONS, SplatTraining
 from ...shared.loop import Fit
@@ -135,22 +132,16 @@ class GALayoutMethod(OfficialMethod[Config]):
         return trained(line)
 
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
-        """Their splats and arguments; the subject's shape and offset, without the zeros that their file has beside them."""
+        """Their splats and arguments; the subject is stored without the zeros that their file has beside it."""
         made = self._made(work, fit.budget.iterations or 0)
         for name in self._model_files():
             copy_file(made / name, fit.out / name)
         copy_file(work.model / ARGUMENTS_FILE, fit.out / ARGUMENTS_FILE)
-        write_subject(fit.out / SUBJECT_FILE, Subject.of(fit.clip))
-        save_shared_head(fit.out, fit.clip.head)
         return {}
 
     def files(self, folder: Path) -> list[Path]:
         """Splats, subject, and the arguments that their renderer reads again."""
         return [folder / name for name in (*self._model_files(), SUBJECT_FILE, ARGUMENTS_FILE)]
-
-    def shared_files(self, folder: Path) -> list[Path]:
-        """The head model."""
-        return [folder / HEAD_FILE]
 
     def write_list(
         self,

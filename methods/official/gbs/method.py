@@ -18,13 +18,10 @@ from ....bench.io.files import write_json
 from ....bench.io.images import read_png
 from ...gbs.config import BlendshapeTraining, GBSConfig
 from ...shared.avatar_files import (
-    HEAD_FILE,
     SUBJECT_FILE,
     Subject,
     read_shared_head,
     read_subject,
-    save_shared_head,
-    write_subject,
 )
 from ...shared.loop import Fit
 from ...shared.schedule import DensifySchedule, Timeline
@@ -148,20 +145,14 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         return trained(line)
 
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
-        """What their renderer opens; the subject and the head model."""
+        """What their renderer opens."""
         for name, ours in FILES.items():
             copy_file(work.model / f"{name}{fit.budget.iterations}{Path(ours).suffix}", fit.out / ours)
-        write_subject(fit.out / SUBJECT_FILE, Subject.of(fit.clip))
-        save_shared_head(fit.out, fit.clip.head)
         return {}
 
     def files(self, folder: Path) -> list[Path]:
         """Splats, what their differences begin with, and the subject."""
         return [folder / name for name in (*FILES.values(), SUBJECT_FILE)]
-
-    def shared_files(self, folder: Path) -> list[Path]:
-        """The head model."""
-        return [folder / HEAD_FILE]
 
     def write_list(
         self,

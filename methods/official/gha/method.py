@@ -18,13 +18,10 @@ from ....bench.io.files import read_bytes, write_bytes, write_json
 from ...gha.config import GHAConfig
 from ...gha.driving import code_size
 from ...shared.avatar_files import (
-    HEAD_FILE,
     SUBJECT_FILE,
     Subject,
     read_shared_head,
     read_subject,
-    save_shared_head,
-    write_subject,
 )
 from ...shared.loop import Fit
 from ..checkout import Checkout, Repository
@@ -155,21 +152,15 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
         return None if match is None else (int(match[1]), f"loss {match[2]}")
 
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
-        """Their Gaussians with the networks that drive them, super-resolution, and the subject."""
+        """Their Gaussians with the networks that drive them, and super-resolution."""
         for name in NETWORKS:
             copy_file(_checkpoints(work, "gaussianhead") / name, fit.out / name)
         write_json(fit.out / SIDE_FILE, {"side": training_side(fit.clip)})
-        write_subject(fit.out / SUBJECT_FILE, Subject.of(fit.clip))
-        save_shared_head(fit.out, fit.clip.head)
         return {}
 
     def files(self, folder: Path) -> list[Path]:
         """Gaussians, networks, subject, and the side of the images that it was trained on."""
         return [folder / name for name in (*NETWORKS, SUBJECT_FILE, SIDE_FILE)]
-
-    def shared_files(self, folder: Path) -> list[Path]:
-        """The head model."""
-        return [folder / HEAD_FILE]
 
     def write_list(
         self,

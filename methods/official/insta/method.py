@@ -22,13 +22,10 @@ from ....bench.io.documents import read_json
 from ....bench.io.files import read_bytes, write_bytes, write_json
 from ....bench.io.images import read_pixels
 from ...shared.avatar_files import (
-    HEAD_FILE,
     SUBJECT_FILE,
     Subject,
     read_shared_head,
     read_subject,
-    save_shared_head,
-    write_subject,
 )
 from ...shared.loop import Fit
 from ..checkout import Checkout, Environment, Repository, look_at_program
@@ -111,19 +108,13 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
         return None if match is None else (int(match[1]), f"loss {match[2]}")
 
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
-        """The snapshot; the subject and the head model."""
+        """The snapshot."""
         copy_file(work.model / RECORDED / SNAPSHOT, fit.out / SNAPSHOT)
-        write_subject(fit.out / SUBJECT_FILE, Subject.of(fit.clip))
-        save_shared_head(fit.out, fit.clip.head)
         return {}
 
     def files(self, folder: Path) -> list[Path]:
         """Field with its occupancy grid and settings, and the subject."""
         return [folder / name for name in (SNAPSHOT, SUBJECT_FILE)]
-
-    def shared_files(self, folder: Path) -> list[Path]:
-        """The head model."""
-        return [folder / HEAD_FILE]
 
     def write_list(
         self,
