@@ -14,6 +14,7 @@ from typing_extensions import TypedDict
 from ..configuration import build
 from ..contracts import Avatar, Budget, Clip, FloatArray
 from ..errors import InputError
+from ..io.arrays import MAX_MAGNITUDE, check_numbers
 from ..io.documents import checked, read_json
 from ..io.files import digest, digest_file, entries, write_json
 from ..io.provenance import tool
@@ -177,6 +178,7 @@ def open_avatar(folder: Path, method: str = "") -> StoredAvatar:
             folder, AVATAR_FILE, f"the {AVATAR_FOLDER}", f"a folder without {AVATAR_FILE}", remedy
         )
     record = cast(AvatarRecord, checked(read_json(path), AvatarRecord, path))
+    check_numbers(path, "shape", np.asarray(record["shape"]), MAX_MAGNITUDE)
     if record["made_by"] == "variant":
         remedy = f"Load the trained avatar of {record['method']}, which it was derived from."
         raise InputError(path, "made_by", "an avatar that its method reads", "a variant of a sweep", remedy)

@@ -13,8 +13,10 @@ import numpy as np
 import torch
 
 from ....bench.contracts import Camera, FloatArray, HeadPose, Progress
+from ....bench.errors import InputError
 from ....bench.io.files import check_writable, write_text
 from ....bench.io.provenance import RENDER, note, source_type, tool
+from ....bench.runner.stored import AVATAR_FILE, HEAD_FILE
 from ....bench.specs import Findings
 from ...shared.avatar_files import read_shared_head
 from ...splats import rasterize
@@ -54,7 +56,10 @@ def export_page(settings: ExportHtmlSettings, progress: Progress) -> Findings:
         poses = [clip.poses[t] for t in sorted({key.timestep for key in clip.splits["train"]})]
         rest = replace(rest, rotation=poses[0].rotation, translation=poses[0].translation)
         reach = _reach(poses, head.version, reach)
-    shape = np.asarray(stored.record["shape"])
+    shape, size = np.asarray(stored.record["shape"]), head.shape_basis.shape[2]
+    if len(shape) > size:
+        expected = f"at most {size} coefficients, as {HEAD_FILE} beside it has"
+        raise InputError(stored.folder / AVATAR_FILE, "shape", expected, str(len(shape)))
     shaped = head.template + head.shape_basis[..., : len(shape)] @ shape
     joints = np.asarray(head.joint_regressor @ shaped, np.float64)
     source = Source(avatar, rest, joints[0], joints[1 : 1 + len(JOINTS)])

@@ -1,5 +1,6 @@
 """Avatars as standard splat files, read back by a parser that knows nothing of ours, and drawn."""
 
+import json
 import struct
 from dataclasses import replace
 
@@ -154,6 +155,16 @@ def test_an_avatar_without_splats_is_refused(clip, tmp_path):
         ):
             command(settings(str(tmp_path), out=str(tmp_path / "x")))
         assert not (tmp_path / "x").exists()
+
+
+def test_a_shape_of_another_head_model_is_refused(clip, tmp_path):
+    folder = store(clip, tmp_path / "avatar")
+    record = json.loads((folder / "avatar.json").read_text())
+    (folder / "avatar.json").write_text(json.dumps(record | {"shape": [0.0] * 5000}))
+    with pytest.raises(
+        InputError, match=r"avatar\.json, shape: expected at most \d+ coefficients.*found 5000"
+    ):
+        export_html(ExportHtmlSettings(str(folder), out=str(tmp_path / "x")))
 
 
 def test_colours_that_are_harmonics_are_found_exactly():
