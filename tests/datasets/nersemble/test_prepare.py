@@ -2,6 +2,8 @@
 
 import errno
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -379,3 +381,40 @@ def test_bad_options_are_named(change, key, pristine_recording, tmp_path):
         prepare_nersemble(pristine_recording.settings(tmp_path / "out", **change))
     assert error.value.key == key
     assert not (tmp_path / "out").exists()
+
+
+PEAK = """
+import re, sys
+from pathlib import Path
+from headbench.bench import cli
+assert cli.main(sys.argv[1:]) == 0
+print(re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1])
+"""
+"""Prints the peak memory of a command, kB. That of `resource.getrusage` would count the parent's memory, too."""
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_length_of_a_recording(tmp_path):
+    peaks = []
+    for frames in (6, 60):
+        recording = write_recording(
+            tmp_path / str(frames),
+            images=False,
+            sequences={"EMO-1-shout+laugh": frames, "FREE": 2},
+            size=(800, 800),
+        )
+        words = [
+            *("prepare", "nersemble", "--root", recording.root, "--out", tmp_path / f"out-{frames}"),
+            *("--tracking", recording.tracking, "--head", recording.head, "--subjects", SUBJECT),
+            *("--sequences", "EMO-1,FREE", "--downscale", "1", "--every", "1", "--workers", "2"),
+        ]
+        done = subprocess.run(
+            [sys.executable, "-c", PEAK, *map(str, words)],
+            capture_output=True,
+            text=True,
+            timeout=200,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        peaks.append(int(done.stdout.split()[-1]))
+    assert peaks[1] < 1.1 * peaks[0]
