@@ -14,6 +14,10 @@ EXCEPTIONS = {"pymeshlab"}
 """GPL-3.0, called by `datasets/head/procedural` and `methods/gbs` alone. The README says what follows from it."""
 
 
+CUDA = r"nvidia-|cuda-"
+"""Packages of PyTorch's CUDA build, under NVIDIA's licences. Nothing here is linked to them or distributes them."""
+
+
 def normalised(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
@@ -43,6 +47,7 @@ def unfitting(licences: dict[str, str]) -> set[str]:
     return {
         name
         for name, text in licences.items()
+        if not re.match(CUDA, name)
         if re.search(COPYLEFT, text) or not re.search(FITTING, text, re.IGNORECASE)
     }
 
