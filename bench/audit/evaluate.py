@@ -60,7 +60,9 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
 
     Raises `InputError` for whatever is wrong with settings, capture or images, before anything is written.
     """
-    source, config, clips = Path(settings.folder), *_open(settings)
+    source = Path(settings.folder)
+    stored = open_avatar(source, settings.method) if settings.avatar else None
+    config, clips = _open(settings, {} if stored is None else stored.heads)
     kinds = ("frame", "regional", "temporal", *(["avatar"] if settings.avatar else []))
     metrics = [metric for metric in resolve_metrics(config) if metric.kind in kinds]
     if not any(metric.per_frame for metric in metrics):
@@ -68,12 +70,11 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
     images: dict[tuple[str, FrameKey], Render] = {}
     avatar: Avatar = NoAvatar()
-    if settings.avatar:
+    if stored is not None:
         if len(clips) > 1:
             raise InputError(
                 str(config.data), "", "the capture of the avatar's subject", f"{len(clips)} captures"
             )
-        stored = open_avatar(source, settings.method)
         shown = stored.shows_another(*shown_by(clips[0]))
         if shown:
             expected = f"an avatar of {clips[0].subject}, whom the capture shows"
@@ -129,8 +130,8 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
     return Findings(f"{text}\n{folder.root}", data)
 
 
-def _open(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
-    """The settings to score by, and the captures to score against."""
+def _open(settings: EvaluateSettings, heads: Mapping[str, str]) -> tuple[RunConfig, list[Clip]]:
+    """The settings to score by, with the head models beside an avatar, and the captures to score against."""
     label = check_name(settings.label, "command line", "--label")
     if label in discover("methods"):
         expected = "a name that no registered method has"
@@ -161,16 +162,13 @@ def _open(settings: EvaluateSettings) -> tuple[RunConfig, list[Clip]]:
             frames_per_task=settings.frames_per_task,
         )
         clips = open_clips(config)
-    heads = {}
-    if settings.avatar:
-        heads = {**open_avatar(Path(settings.folder), settings.method).heads, **config.heads}
     config = replace(
         config,
         out=settings.out,
         methods=(label,),
         seeds=(0,),
         settings={},
-        heads=heads,
+        heads={**heads, **config.heads} if settings.avatar else {},
         device=settings.device,
     )
     return config, clips

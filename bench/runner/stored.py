@@ -6,7 +6,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 from typing_extensions import TypedDict
@@ -177,7 +177,7 @@ def open_avatar(folder: Path, method: str = "") -> StoredAvatar:
         raise InputError(
             folder, AVATAR_FILE, f"the {AVATAR_FOLDER}", f"a folder without {AVATAR_FILE}", remedy
         )
-    record = cast(AvatarRecord, checked(read_json(path), AvatarRecord, path))
+    record: AvatarRecord = checked(read_json(path), AvatarRecord, path)
     check_numbers(path, "shape", np.asarray(record["shape"]), MAX_MAGNITUDE)
     if record["made_by"] == "variant":
         remedy = f"Load the trained avatar of {record['method']}, which it was derived from."

@@ -12,8 +12,9 @@ from ...bench.errors import InputError
 from ...bench.io.files import check_writable
 from ...bench.runner.stored import StoredAvatar, open_avatar
 from ...bench.specs import Findings
-from ..ops.harmonics import sh_basis
+from ..ops.harmonics import harmonic_colors
 from ..shared.avatar_files import read_shared_head
+from ..shared.rendering import view_of
 from ..splats import rasterize
 from .command import AvatarOptions, ExportOptions
 from .formats import FORMATS, StoredSplats
@@ -29,15 +30,13 @@ SIZE = 400
 def open_splats(settings: AvatarOptions) -> tuple[StoredAvatar, SplatAvatar]:
     """The stored avatar that a command names, and the avatar, loaded.
 
-    Raises `InputError` as `open_avatar` does, for an avatar that is not one of splats, and where no head model lies beside it.
+    Raises `InputError` as `open_avatar` and `StoredAvatar.load` do, and for an avatar that is not one of splats.
     """
     stored = open_avatar(Path(settings.avatar), settings.method)
     avatar = stored.load()
     if not isinstance(avatar, SplatAvatar):
-        found, remedy = (
-            f"one of {stored.record['method']}",
-            "`headbench view` and `headbench render` show it.",
-        )
+        found = f"one of {stored.record['method']}"
+        remedy = "`headbench view` and `headbench render` show it."
         raise InputError(stored.folder, "", "an avatar of splats", found, remedy)
     return stored, avatar
 
@@ -82,14 +81,12 @@ def _least_psnr(avatar: SplatAvatar, pose: HeadPose, found: StoredSplats) -> flo
         camera = source.camera(
             look(direction_of(azimuth, elevation), 1.5 * distance, extent.mean(axis=0), SIZE)
         )
-        along = torch.nn.functional.normalize(found.means - torch.from_numpy(camera.center).float(), dim=1)
-        harmonics = torch.cat([found.dc[:, :, None], found.rest], dim=2)
-        colors = torch.relu(0.5 + (harmonics * sh_basis(along, DEGREE)[:, None]).sum(2))
-        motion, K = (torch.from_numpy(np.asarray(m, np.float32)) for m in (camera.world_to_camera, camera.K))
+        view = view_of(camera, "cpu", (1.0, 1.0, 1.0))
+        colors = harmonic_colors(found.dc, found.rest, found.means - view.center, DEGREE)
         drawn = rasterize(
             *(found.means, found.quats, found.scales, found.opacities, colors),
-            *(motion, K, camera.width, camera.height),
-            background=torch.ones(3),
+            *(view.world_to_camera, view.K, camera.width, camera.height),
+            background=view.background,
         )
         error = float(np.square(drawn.image.clamp(0, 1).numpy() - avatar.render(camera, pose).rgb).mean())
         worst = min(worst, -10 * float(np.log10(max(error, 1e-12))))

@@ -19,6 +19,7 @@ from ....bench.io.provenance import RENDER, note, source_type, tool
 from ....bench.runner.stored import AVATAR_FILE, HEAD_FILE
 from ....bench.specs import Findings
 from ...shared.avatar_files import read_shared_head
+from ...shared.rendering import view_of
 from ...splats import rasterize
 from ..export import neutral_pose, open_splats
 from ..views import direction_of, look
@@ -160,16 +161,14 @@ def draw(moved: Moved, camera: Camera) -> FloatArray:
     """(H, W, 3) of splats given by axes, on white, by headbench's renderer."""
     turns, scales, _ = np.linalg.svd(moved.axes)
     turns = turns * np.sign(np.linalg.det(turns))[:, None, None]
-    means, quats, sizes, opacities, colors, motion, K = (
+    means, quats, sizes, opacities, colors = (
         torch.from_numpy(np.asarray(values, np.float32))
-        for values in (
-            *(moved.means, quaternions(turns), scales, moved.opacities, moved.colors),
-            *(camera.world_to_camera, camera.K),
-        )
+        for values in (moved.means, quaternions(turns), scales, moved.opacities, moved.colors)
     )
+    view = view_of(camera, "cpu", (1.0, 1.0, 1.0))
     rendering = rasterize(
-        *(means, quats, sizes, opacities, colors, motion, K),
+        *(means, quats, sizes, opacities, colors, view.world_to_camera, view.K),
         *(camera.width, camera.height),
-        background=torch.ones(3),
+        background=view.background,
     )
     return np.asarray(rendering.image.clamp(0, 1).numpy())
