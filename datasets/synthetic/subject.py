@@ -10,7 +10,7 @@ import torch
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
 from ..head.geometry import triangle_areas, unique_pairs, vertex_normals
-from ..head.model import HeadModel, chain_transforms
+from ..head.model import HeadModel, joint_motions
 from ..head.rotations import axis_angle_to_matrix
 from .anatomy import SIDES, Anatomy, Person, measure
 from .glasses import make_glasses
@@ -162,11 +162,10 @@ class RenderedSubject:
         joints = self._model.joints(torch.from_numpy(self.shape), expression)
         angles = np.stack([pose.rotation, pose.neck, pose.jaw, pose.eyes[:3], pose.eyes[3:]])
         rotations = axis_angle_to_matrix(torch.from_numpy(np.asarray(angles, np.float64))[None])
-        world = chain_transforms(rotations, joints, self._model.parents)[0].numpy()
         # The same motion that skinning gives to a tracked vertex of full weight.
-        turned = np.einsum("jab,jb->ja", world[..., :3], joints[0].numpy())
-        offset = world[..., 3] - turned + pose.translation
-        return np.concatenate([world[..., :3], offset[..., None]], axis=-1)
+        motions = joint_motions(rotations, joints, self._model.parents)[0].numpy()
+        motions[..., 3] += pose.translation
+        return motions
 
 
 def _area_around(vertices: FloatArray, faces: IntArray) -> FloatArray:

@@ -13,7 +13,7 @@ from torch.nn.functional import embedding_bag, normalize
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
 from ...datasets.head.arrays import HeadArrays
 from ...datasets.head.geometry import rigid_alignment
-from ...datasets.head.model import chain_transforms
+from ...datasets.head.model import joint_motions, pose_feature
 from ...datasets.head.rotations import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
 from ..ops.harmonics import coefficient_count, harmonic_colors
 from ..ops.splats import WorldSplats, apply_matrices, left_products
@@ -200,9 +200,6 @@ class Rig:
         self.barycentric = torch.from_numpy(points.barycentric).to(like).t()[:, :, None]
         self._weights = self.at_points(model.skinning_weights)
         self.rest = self.at_points(self.mesh.canonical)
-        directions = model.expression_matrix.unflatten(1, (-1, 3))
-        self._joints = (model.joint_regressor @ self.mesh.canonical)[None]
-        self._joint_directions = torch.einsum("jv,evc->ejc", model.joint_regressor, directions).flatten(1)
         self._basis = torch.cat([model.expression_matrix[: self.expressions], model.pose_matrix])
         basis = model.expression_matrix[: self.expressions].t().unflatten(0, (-1, 3))
         used = torch.unique(self._triangles)
@@ -223,17 +220,14 @@ class Rig:
         """What one pose does to each point, (P, 44) in the columns of `PARTS`."""
         model, expression = self.mesh.model, arguments["expression"]
         coefficients = self.coefficients(arguments)
-        angles = torch.cat([arguments[name] for name in ("rotation", "neck", "jaw", "eyes")], dim=1)
-        rotations = axis_angle_to_matrix(angles.unflatten(1, (-1, 3)))
-        joints = self._joints + (expression @ self._joint_directions).unflatten(1, (-1, 3))
-        world = chain_transforms(rotations, joints, model.parents)[0]
-        turns, places = world[:, :, :3], world[:, :, 3]
-        offsets = places - (turns @ joints[0, :, :, None])[:, :, 0]
-        relative = torch.cat([turns.flatten(1), offsets], dim=1)
-        linear, offset = (self._weights @ relative).split([9, 3], dim=1)
-        feature = (rotations[0, 1:] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)).flatten()
+        angles = model.angles(*(arguments[name] for name in ("rotation", "neck", "jaw", "eyes")))
+        rotations = axis_angle_to_matrix(angles)
+        joints = model.rest_joints(self.mesh.canonical[None], expression)
+        motions = joint_motions(rotations, joints, model.parents)[0]
+        blended = (self._weights @ motions.flatten(1)).view(-1, 3, 4)
+        linear, offset = blended[:, :, :3].flatten(1), blended[:, :, 3] + arguments["translation"]
+        feature = pose_feature(rotations)[0]
         shift = self.at_points((torch.cat([coefficients, feature]) @ self._basis).view(-1, 3))
-        offset = offset + arguments["translation"]
         if "eyelids" in arguments and model.eyelid_matrix is not None:
             lids = (arguments["eyelids"][0] @ model.eyelid_matrix).view(-1, 3)
             offset = offset + self.at_points(lids) @ (rotations[0, 0] @ rotations[0, 1]).t()

@@ -1,10 +1,11 @@
 """Every numerical extreme of the head model; faults are found."""
 
 import pytest
+import torch
 
 from headbench.bench.contracts import no_progress
 from headbench.datasets.benchmarks.head import HEAD_EXTREMES, stress, try_extreme
-from headbench.datasets.head.model import FastPosing
+from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.rotations import axis_angle_to_matrix
 
 from .toy import toy_head
@@ -24,10 +25,16 @@ def test_the_whole_head_command_passes():
     assert len(found.data["verdicts"]) == len(HEAD_EXTREMES)
 
 
-def test_a_wrong_fast_path_is_found(monkeypatch):
-    right = FastPosing.forward
-    monkeypatch.setattr(FastPosing, "forward", lambda *a: right(*a) + 1e-9)
-    assert try_extreme(HEAD_EXTREMES[0], HEAD)["verdict"] == "the paths differ"
+def test_rounding_that_is_too_coarse_is_found(monkeypatch):
+    right = HeadModel.forward
+
+    def coarse(model, **arguments):
+        """Vertices in single precision to 1e-4."""
+        vertices = right(model, **arguments)
+        return vertices if vertices.dtype == torch.float64 else vertices * (1 + 1e-4)
+
+    monkeypatch.setattr(HeadModel, "forward", coarse)
+    assert try_extreme(HEAD_EXTREMES[0], HEAD)["verdict"] == "float32 error over 1e-06"
 
 
 def test_gradients_that_are_not_finite_are_found(monkeypatch):

@@ -1,6 +1,5 @@
 """The head model against smplx, against a float64 loop in numpy, and against what rigid motion must do."""
 
-import itertools
 import pickle
 from dataclasses import replace
 
@@ -11,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
-from headbench.datasets.head.model import FastPosing, HeadModel
-from headbench.datasets.head.procedural.model import procedural_head
+from headbench.datasets.head.model import HeadModel
 
 from .flame_files import flame_content
 from .toy import toy_head
@@ -84,14 +82,19 @@ def test_agrees_with_smplx(tmp_path):
     assert (single - expected).abs().max() < 1e-6
 
 
-def test_agrees_with_a_loop():
+# Stored weights sum to 1 to their own precision only, and count as they are.
+UNEVEN = HEAD.skinning_weights * np.linspace(1 - 1e-4, 1 + 1e-4, len(HEAD.template))[:, None]
+
+
+@pytest.mark.parametrize("head", [HEAD, replace(HEAD, skinning_weights=UNEVEN)], ids=["even", "uneven"])
+def test_agrees_with_a_loop(head):
     a = random_arguments(3)
     offset = torch.randn(*MODEL.template.shape, dtype=torch.float64) * 0.01
     eyelids = torch.randn(3, 2, dtype=torch.float64)
-    ours = MODEL(**a, static_offset=offset, eyelids=eyelids)
+    ours = HeadModel(head, dtype=torch.float64)(**a, static_offset=offset, eyelids=eyelids)
     for index in range(3):
         one = {name: value[index] for name, value in a.items()}
-        expected = loop_reference(HEAD, one, offset.numpy(), eyelids[index].numpy())
+        expected = loop_reference(head, one, offset.numpy(), eyelids[index].numpy())
         np.testing.assert_allclose(ours[index], expected, atol=1e-13)
 
 
@@ -178,68 +181,3 @@ def test_pose_arguments_refuse():
     for poses, said in [*cases, ([bad], "expression"), ([], "at least one")]:
         with pytest.raises(InputError, match=said):
             MODEL.pose_arguments(poses)
-
-
-POSED_HEAD = toy_head(16)
-
-
-def draw(model, batch, seed=0, scale=1.0):
-    generator = torch.Generator().manual_seed(seed)
-    like = {"generator": generator, "dtype": model.template.dtype}
-    neutral = model.canonical(torch.randn(1, model.shape_size, **like))
-    expression = torch.randn(batch, model.expression_size, **like)
-    angles = scale * torch.randn(batch, 5, 3, **like)
-    return neutral, expression, angles, torch.randn(batch, 3, **like)
-
-
-def check_paths(model, inputs, close=1e-14):
-    """That the fast and the readable path make the same vertices."""
-    fast, readable = model._fast(*inputs), model._pose(*inputs)
-    assert fast.shape == readable.shape
-    assert fast.is_contiguous()
-    assert (fast - readable).abs().max() < close
-
-
-@pytest.mark.parametrize("head", [POSED_HEAD, procedural_head("2020")], ids=["toy", "procedural"])
-@pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-14), (torch.float32, 2e-6)])
-@pytest.mark.parametrize("batch", [1, 5])
-def test_the_paths_agree(head, dtype, close, batch):
-    model = HeadModel(head, dtype=dtype)
-    check_paths(model, draw(model, batch), close)
-
-
-@pytest.mark.parametrize("still", [m for n in range(6) for m in itertools.combinations(range(5), n)])
-def test_joints_at_rest_may_be_left_out(still):
-    """Every combination of joints at rest, in all poses and in one: what is skipped must not have mattered."""
-    model = HeadModel(POSED_HEAD, dtype=torch.float64)
-    neutral, expression, angles, translation = draw(model, 3, seed=len(still))
-    for poses in ([0], [0, 1, 2]):
-        for joint in still:
-            angles[poses, joint] = 0
-        check_paths(model, (neutral, expression, angles, translation))
-
-
-@pytest.mark.parametrize("still", [(), (0, 1, 2, 3, 4), (1, 2)], ids=["moving", "at rest", "eyes moving"])
-@pytest.mark.parametrize("ones", [m for n in range(5) for m in itertools.combinations(range(4), n)])
-def test_batches_of_one_stand_for_all(ones, still):
-    model = HeadModel(POSED_HEAD, dtype=torch.float64)
-    neutral, expression, angles, translation = draw(model, 4)
-    angles[:, list(still)] = 0
-    inputs = [neutral * torch.linspace(1, 1.1, 4)[:, None, None].double(), expression, angles, translation]
-    for one in ones:
-        inputs[one] = inputs[one][:1]
-    check_paths(model, inputs)
-
-
-def test_weights_that_nearly_sum_to_one_count_as_they_are():
-    weights = POSED_HEAD.skinning_weights * np.linspace(1 - 1e-4, 1 + 1e-4, len(POSED_HEAD.template))[:, None]
-    model = HeadModel(replace(POSED_HEAD, skinning_weights=weights), dtype=torch.float64)
-    check_paths(model, draw(model, 2))
-
-
-def test_directions_that_are_zero_are_left_out():
-    head = procedural_head("2023")
-    used = head.pose_basis.any(axis=(0, 1)).sum()
-    assert used < head.pose_basis.shape[2]
-    posing = FastPosing(head, dtype=torch.float32)
-    assert len(posing.directions) == head.expression_basis.shape[2] + used
