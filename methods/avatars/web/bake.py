@@ -8,13 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from ....bench.contracts import Camera, FloatArray, HeadPose, Progress, SplatAvatar
 from ...ops.harmonics import sh_basis
 from ...splats.reference import rotation_matrices
 from ..harmonics import FAR_M, fit_harmonics, sphere
 from ..views import camera_at, direction_of, visibility
-from .model import JOINTS, Slider, WebAvatar, blended, joint_motions, rotation_of
+from .model import JOINTS, Slider, WebAvatar, blended, rotation_of, slider_motions
 
 AWAY_M = 1.0
 """Distance at which colours are looked at."""
@@ -165,27 +166,18 @@ def _change(
     """What a slider at a step changes before skinning."""
     pose = source.pose([slider], [step])
     seen = source.seen(pose)
-    linear, shift = blended(weights, joint_motions((slider,), np.array([step]), source.joints))
+    linear, shift = blended(weights, slider_motions((slider,), np.array([step]), source.joints))
     means = np.linalg.solve(linear, (seen.means - shift)[..., None])[..., 0] - rest.means
     left, _, right = np.linalg.svd(linear)
     relative = (left @ right).transpose(0, 2, 1) @ seen.rotations @ rest.rotations.transpose(0, 2, 1)
     difference = np.mean([_colors(source, pose, camera) - base for camera, base in zip(few, colors)], axis=0)
     return {
         "means": means,
-        "turns": vector_of(relative),
+        "turns": Rotation.from_matrix(relative).as_rotvec(),
         "log_scales": seen.log_scales - rest.log_scales,
         "logits": seen.logits - rest.logits,
         "colors": difference,
     }
-
-
-def vector_of(rotations: FloatArray) -> FloatArray:
-    """(N, 3) rotation vectors of (N, 3, 3) rotations by less than half a turn; splats alike from both sides may flip."""
-    skew = rotations - rotations.transpose(0, 2, 1)
-    sine = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1) / 2
-    length = np.linalg.norm(sine, axis=1)
-    angle = np.arctan2(length, (np.trace(rotations, axis1=1, axis2=2) - 1) / 2)
-    return np.asarray(sine * np.where(length > 1e-9, angle / np.maximum(length, 1e-9), 1.0)[:, None])
 
 
 def _harmonics(source: Source, middle: FloatArray, degree: int, directions: int) -> FloatArray:
@@ -217,7 +209,7 @@ def _turned(
         return False
     values = [turn.high if slider == turn else 0.0 for slider in sliders]
     pose = source.pose(sliders, values)
-    linear, _ = blended(weights, joint_motions(tuple(sliders), np.array(values), source.joints))
+    linear, _ = blended(weights, slider_motions(tuple(sliders), np.array(values), source.joints))
     camera = camera_at(middle + FAR_M * direction_of(0.0, 0.0))
     found = _colors(source, pose, camera)
     ahead = np.tile([0.0, 0.0, -1.0], (len(found), 1))

@@ -12,9 +12,12 @@ import numpy as np
 import torch
 
 from ....bench.contracts import FloatArray
+from ....datasets.head.model import joint_motions
+from ....datasets.head.rotations import axis_angle_to_matrix
 from ...ops.harmonics import sh_basis
 
 JOINTS = ("neck", "jaw", "left eye", "right eye")
+PARENTS = (-1, 0, 0, 0)
 
 
 class Slider(NamedTuple):
@@ -84,7 +87,7 @@ class WebAvatar:
         def added(morphs: FloatArray) -> FloatArray:
             return np.asarray(np.tensordot(steps, np.asarray(morphs, np.float64), axes=1))
 
-        linear, shift = blended(self.weights, joint_motions(self.sliders, values, self.joints))
+        linear, shift = blended(self.weights, slider_motions(self.sliders, values, self.joints))
         means = self.means + added(self.d_means)
         turn = rotation_of(added(self.d_turns)) @ self.rotations
         axes = linear @ turn * np.exp(self.log_scales + added(self.d_log_scales))[:, None, :]
@@ -99,7 +102,7 @@ class WebAvatar:
         return Moved(means, axes, 1 / (1 + np.exp(-self.logits - added(self.d_logits))), colors.clip(min=0.0))
 
 
-def joint_motions(
+def slider_motions(
     sliders: tuple[Slider, ...], values: FloatArray, joints: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """(4, 3, 3) and (4, 3): where each joint takes a point; the neck takes the others along."""
@@ -107,12 +110,8 @@ def joint_motions(
     for slider, value in zip(sliders, values):
         for joint in slider.joints:
             turns[joint, slider.axis] += value
-    linear = rotation_of(turns)
-    shift = joints - np.einsum("jik,jk->ji", linear, joints)
-    for joint in range(1, len(JOINTS)):
-        shift[joint] = linear[0] @ shift[joint] + shift[0]
-        linear[joint] = linear[0] @ linear[joint]
-    return linear, shift
+    motions = joint_motions(*(torch.from_numpy(part)[None] for part in (rotation_of(turns), joints)), PARENTS)
+    return motions[0, :, :, :3].numpy(), motions[0, :, :, 3].numpy()
 
 
 def blended(weights: FloatArray, motions: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
@@ -126,10 +125,5 @@ def blended(weights: FloatArray, motions: tuple[FloatArray, FloatArray]) -> tupl
 
 
 def rotation_of(vectors: FloatArray) -> FloatArray:
-    """(N, 3, 3) rotations of (N, 3) rotation vectors, by Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=1)
-    x, y, z = (np.asarray(vectors, np.float64) / np.maximum(angle, 1e-12)[:, None]).T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return np.asarray(np.eye(3) + sine * cross + (1 - cosine) * cross @ cross)
+    """(N, 3, 3) rotations of (N, 3) rotation vectors."""
+    return axis_angle_to_matrix(torch.from_numpy(np.asarray(vectors, np.float64))).numpy()

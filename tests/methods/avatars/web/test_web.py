@@ -7,11 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.spatial.transform
 
-from headbench.methods.avatars.web.bake import vector_of
 from headbench.methods.avatars.web.command import ExportHtmlSettings
-from headbench.methods.avatars.web.model import rotation_of
 from headbench.methods.avatars.web.payload import decode, encode
 
 CENTER = np.array([0.0, 0.0, 1.0])
@@ -77,15 +74,6 @@ def test_the_page_allows_its_own_script_alone(exported):
     assert "<title>&lt;script&gt;x&lt;/script&gt;</title>" in text
     assert "digitalsourcetype/trainedAlgorithmicMedia" in text
     assert not re.search(r"https?://(?!cv\.iptc\.org)", text)
-
-
-def test_rotations_agree_with_scipy():
-    vectors = np.random.default_rng(0).normal(size=(50, 3))
-    vectors[0] = 0
-    theirs = scipy.spatial.transform.Rotation.from_rotvec(vectors).as_matrix()
-    assert rotation_of(vectors) == pytest.approx(theirs, abs=1e-12)
-    near = np.linalg.norm(vectors, axis=1) < np.pi
-    assert vector_of(theirs)[near] == pytest.approx(vectors[near], abs=1e-9)
 
 
 @pytest.mark.parametrize("bad", [{"degree": 4}, {"expressions": -1}])
