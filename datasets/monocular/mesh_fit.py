@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import torch
 
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers
 from ...bench.io.files import read_bytes, reading
 from ..head.arrays import JOINT_NAMES, HeadArrays
+from ..head.model import HeadModel
 
 MAX_BYTES = 2**26
 """Of a mesh; FLAME's takes 0.6 MB."""
@@ -30,6 +31,7 @@ WORST_DISTANCE = 1e-4
 _VERTEX = re.compile(rb"^v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
 _TURNING = [JOINT_NAMES.index(name) for name in ("jaw", "left_eye", "right_eye")]
 _STEP, _SMALL, _MOST_STEPS = 1e-6, 1e-9, 30
+_TOGETHER = 32  # meshes posed at once
 _ROWS = 200
 """Vertices of each joint and lid that decide; rounding to eight digits needs no more."""
 
@@ -78,41 +80,37 @@ class MeshFit:
     """Inverts a head model whose root and neck are at rest."""
 
     def __init__(self, head: HeadArrays) -> None:
+        self._model = HeadModel(head, dtype=torch.float64)
         self._template = np.asarray(head.template, np.float64)
         self._shape_basis = np.asarray(head.shape_basis, np.float64)
-        self._weights = np.asarray(head.skinning_weights, np.float64)[:, _TURNING]
-        pose = np.asarray(head.pose_basis, np.float64)
-        # Columns 9(j-1) and on are joint j's.
-        self._correctives = np.stack([pose[:, :, 9 * (j - 1) : 9 * j] for j in _TURNING])
-        self._regressor = np.asarray(head.joint_regressor, np.float64)[_TURNING]
         none = np.zeros((*self._template.shape, 0))
         self._lids = none if head.eyelid_basis is None else np.asarray(head.eyelid_basis, np.float64)
-        parts = [*self._weights.T, *np.abs(self._lids).max(axis=1).T]
+        weights = np.asarray(head.skinning_weights, np.float64)[:, _TURNING]
+        parts = [*weights.T, *np.abs(self._lids).max(axis=1).T]
         strong = [np.flatnonzero(part > 0.1 * part.max(initial=0)) for part in parts]
         picked = [rows[np.asarray(spread(_ROWS, len(rows)), np.int64)] for rows in strong]
         self._rows: IntArray = np.unique(np.concatenate(picked))
 
     def fit_identity(self, mesh: FloatArray) -> Identity:
         """Shape coefficients, jaw and eyes of a (V, 3) mesh without expression, by Gauss and Newton's method."""
-        basis = self._shape_basis
-        vertices, _, size = basis.shape
+        basis = np.moveaxis(self._shape_basis, 2, 0)
+        size = len(basis)
         shape, turns = np.zeros(size), np.zeros(9)
-        moved = np.tensordot(self._regressor, basis, 1)  # (3, 3, S): how joints follow the shape
         for _ in range(_MOST_STEPS):
-            shaped = self._template + basis @ shape
-            posed = self._posed(shaped, turns)
-            matrices = Rotation.from_rotvec(turns.reshape(3, 3)).as_matrix() - np.eye(3)
-            skin = np.eye(3) + np.einsum("vj,jab->vab", self._weights, matrices)
-            by_shape = np.matmul(skin, basis) - np.tensordot(self._weights, matrices @ moved, 1)
-            by_turn = self._derivatives(shaped, turns, posed)
-            jacobian = np.concatenate([by_shape, by_turn], axis=2).reshape(3 * vertices, -1)
-            gram, right = jacobian.T @ jacobian, jacobian.T @ (mesh - posed).ravel()
+            shaped = self._template + self._shape_basis @ shape
+            posed, by_turn = self._linearised(shaped, turns)
+            # For given turns a posed mesh is linear in the mesh at rest but for what the correctives add.
+            still = self._posed(np.zeros_like(shaped)[None], turns[None])
+            parts = np.array_split(basis, max(size // _TOGETHER, 1))
+            by_shape = [self._posed(part, turns[None]) - still for part in parts]
+            jacobian = np.concatenate([*by_shape, by_turn]).reshape(size + 9, -1)
+            gram, right = jacobian @ jacobian.T, jacobian @ (mesh - posed).ravel()
             step = np.linalg.lstsq(gram, right, rcond=1e-13)[0]
             shape, turns = shape + step[:size], turns + step[size:]
             if np.abs(step).max() < _SMALL:
                 break
-        left = self._posed(self._template + basis @ shape, turns) - mesh
-        return Identity(shape, turns, _middle(left))
+        shaped = self._template + self._shape_basis @ shape
+        return Identity(shape, turns, _middle(self._posed(shaped[None], turns[None])[0] - mesh))
 
     def fit_pose(self, mesh: FloatArray, shaped: FloatArray, known: FloatArray | None) -> Pose:
         """Jaw, eyes and eyelids of one mesh.
@@ -124,56 +122,41 @@ class MeshFit:
         known : (9,) jaw and eyes where they are known, so that the eyelids alone are fitted.
         """
         turns, lids = np.zeros(9) if known is None else known, np.zeros(self._lids.shape[2])
-        joints, rows = self._regressor @ shaped, self._rows
+        rows = self._rows
         by_lids = self._lids[rows].reshape(3 * len(rows), -1)
         for _ in range(_MOST_STEPS):
-            posed = self._posed(shaped, turns, rows, joints)
+            posed, by_turn = self._linearised(shaped, turns)
             columns = [by_lids]
             if known is None:
-                columns.append(self._derivatives(shaped, turns, posed, rows, joints).reshape(-1, 9))
-            left = (mesh[rows] - posed).ravel() - by_lids @ lids
+                columns.append(by_turn[:, rows].reshape(9, -1).T)
+            left = (mesh - posed)[rows].ravel() - by_lids @ lids
             step = np.linalg.lstsq(np.hstack(columns), left, rcond=None)[0]
             lids = lids + step[: len(lids)]
             if known is None:
                 turns = turns + step[len(lids) :]
             if np.abs(step).max(initial=0) < _SMALL:
                 break
-        left = mesh - self._posed(shaped, turns, None, joints) - self._lids @ lids
+        left = mesh - self._posed(shaped[None], turns[None])[0] - self._lids @ lids
         return Pose(turns, lids, _middle(left), float(np.linalg.norm(left, axis=1).max()))
 
-    def _posed(
-        self,
-        shaped: FloatArray,
-        turns: FloatArray,
-        rows: IntArray | None = None,
-        joints: FloatArray | None = None,
-    ) -> FloatArray:
-        """Vertices, all or ``rows``, by the formulae of `HeadModel`; ``joints`` saves regressing them."""
-        pick = slice(None) if rows is None else rows
-        matrices = Rotation.from_rotvec(turns.reshape(3, 3)).as_matrix() - np.eye(3)
-        result = shaped[pick]
-        for correctives, matrix in zip(self._correctives, matrices):
-            result = result + correctives[pick] @ matrix.ravel()
-        corrected = result
-        for weight, matrix, joint in zip(
-            self._weights[pick].T, matrices, self._regressor @ shaped if joints is None else joints
-        ):
-            result = result + weight[:, None] * ((corrected - joint) @ matrix.T)
-        return result
+    def _linearised(self, shaped: FloatArray, turns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(V, 3) posed vertices and their (9, V, 3) derivatives by the turns, by forward differences."""
+        posed = self._posed(shaped[None], turns + _STEP * np.eye(10, 9, -1))
+        return posed[0], (posed[1:] - posed[0]) / _STEP
 
-    def _derivatives(
-        self,
-        shaped: FloatArray,
-        turns: FloatArray,
-        posed: FloatArray,
-        rows: IntArray | None = None,
-        joints: FloatArray | None = None,
-    ) -> FloatArray:
-        """(N, 3, 9) derivatives of the posed vertices by the turns, by forward differences."""
-        columns = [
-            (self._posed(shaped, turns + _STEP * one, rows, joints) - posed) / _STEP for one in np.eye(9)
-        ]
-        return np.stack(columns, axis=2)
+    @torch.no_grad()
+    def _posed(self, shaped: FloatArray, turns: FloatArray) -> FloatArray:
+        """(B, V, 3) vertices of (B or 1, V, 3) heads at rest with (B or 1, 9) turns of jaw and eyes."""
+        moving, rest = torch.from_numpy(turns), torch.zeros(1, 3, dtype=torch.float64)
+        still = dict.fromkeys(("rotation", "neck", "translation"), rest)
+        expression = torch.zeros(1, self._model.expression_size, dtype=torch.float64)
+        return self._model(
+            **still,
+            canonical=torch.from_numpy(shaped),
+            expression=expression,
+            jaw=moving[:, :3],
+            eyes=moving[:, 3:],
+        ).numpy()
 
 
 def _middle(left: FloatArray) -> float:
