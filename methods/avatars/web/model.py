@@ -110,7 +110,8 @@ def slider_motions(
     for slider, value in zip(sliders, values):
         for joint in slider.joints:
             turns[joint, slider.axis] += value
-    motions = joint_motions(*(torch.from_numpy(part)[None] for part in (rotation_of(turns), joints)), PARENTS)
+    rotations, rest = (torch.from_numpy(part)[None] for part in (rotation_of(turns), joints))
+    motions = joint_motions(rotations, rest, PARENTS)
     return motions[0, :, :, :3].numpy(), motions[0, :, :, 3].numpy()
 
 
