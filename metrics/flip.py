@@ -20,7 +20,7 @@ import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray
 from ..bench.specs import MetricSpec
-from .pairs import Mask, check_pair, stack_masks
+from .pairs import Mask, check_masks, check_pair
 
 FLIP = MetricSpec(
     name="flip",
@@ -84,7 +84,7 @@ class Flip:
 
     def in_regions(self, image: ByteArray, target: ByteArray, masks: Mapping[str, Mask]) -> dict[str, float]:
         """Mean over each (H, W) boolean mask; regions without a pixel are left out."""
-        stack_masks(masks, target)
+        check_masks(masks, target)
         error = self.map(image, target)
         return {name: float(error[mask].mean()) for name, mask in masks.items() if mask.any()}
 

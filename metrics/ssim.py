@@ -16,7 +16,7 @@ import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray
 from ..bench.specs import MetricSpec
-from .pairs import KERNEL, Mask, check_pair, stack_masks
+from .pairs import Mask, check_masks, check_pair
 
 SSIM = MetricSpec(
     name="ssim",
@@ -33,7 +33,6 @@ SSIM = MetricSpec(
 C1, C2 = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
 
 Border = Literal["valid", "reflect", "zero"]
-_KERNEL_BORDERS: Mapping[Border, int] = {"valid": 0, "reflect": 1, "zero": 2}
 
 
 @dataclass(frozen=True)
@@ -94,61 +93,51 @@ class Ssim:
 
     def __call__(self, image: ByteArray, target: ByteArray) -> float:
         """Mean over all windows of two (H, W, 3) images."""
-        check_pair(image, target, self.form.smallest)
-        if KERNEL.load_or_warn() is None or _blocks(self.form, target) > 1:
-            return float(ssim_map(image, target, self.form).mean())
-        inset = self.form.inset
-        windows = (image.shape[0] - 2 * inset) * (image.shape[1] - 2 * inset)
-        return self._sums(image, target, stack_masks({}, target))[0] / (3 * windows)
+        return float(ssim_map(image, target, self.form).mean())
 
     def in_regions(self, image: ByteArray, target: ByteArray, masks: Mapping[str, Mask]) -> dict[str, float]:
         """Mean over the windows centred in each (H, W) boolean mask; regions without one are left out."""
         check_pair(image, target, self.form.smallest)
-        stack = stack_masks(masks, target)
+        check_masks(masks, target)
         inset, blocks = self.form.inset, _blocks(self.form, target)
-        if blocks > 1:
-            stack = np.stack([_block_means(mask, blocks) >= 0.5 for mask in stack]).astype(np.uint8)
-        centres = stack[:, inset : stack.shape[1] - inset, inset : stack.shape[2] - inset] != 0
-        counts = dict(zip(masks, centres.sum(axis=(1, 2))))
-        if KERNEL.load_or_warn() is None or blocks > 1:
-            local = ssim_map(image, target, self.form).sum(axis=2)
-            sums = [float(local[inside].sum()) for inside in centres]
-        else:
-            sums = self._sums(image, target, stack)[1:]
-        return {name: total / (3 * int(count)) for (name, count), total in zip(counts.items(), sums) if count}
-
-    def _sums(self, image: ByteArray, target: ByteArray, masks: ByteArray) -> list[float]:
-        """Sum of the local similarities of the image, then inside each mask, by the kernel."""
-        module = KERNEL.load()
-        form = self.form
-        arrays = (np.ascontiguousarray(array) for array in (image, target, masks))
-        taps = np.ascontiguousarray(form.weights[form.radius :])
-        border = _KERNEL_BORDERS[form.border]
-        sums: list[float] = module.similarity(
-            *arrays, taps, border, form.covariance_scale, C1, C2, KERNEL.instruction_sets[0]
-        )
-        return sums
+        local = ssim_map(image, target, self.form).mean(axis=2)
+        inside = {name: _block_means(mask, blocks) >= 0.5 for name, mask in masks.items()}
+        centres = {
+            name: mask[inset : mask.shape[0] - inset, inset : mask.shape[1] - inset]
+            for name, mask in inside.items()
+        }
+        return {name: float(local[mask].mean()) for name, mask in centres.items() if mask.any()}
 
 
 def ssim_map(image: ByteArray, target: ByteArray, form: SsimForm = SsimForm()) -> FloatArray:
-    """(H', W', 3) float64 local similarity of two (H, W, 3) 8-bit images, at most 1. The kernel's definition.
+    """(H', W', 3) float64 local similarity of two (H, W, 3) 8-bit images, at most 1.
 
     For the border "valid" H' = H - 2 radius, and entry (i, j) belongs to the window centred on pixel (i + radius,
     j + radius); otherwise there is an entry for every pixel.
     """
+    check_pair(image, target, form.smallest)
+    blocks = _blocks(form, target)
+    # One channel after the other: the filters of a large image take memory.
+    channels = (
+        _channel_map(_block_means(x, blocks), _block_means(y, blocks), form)
+        for x, y in zip(np.moveaxis(image, 2, 0), np.moveaxis(target, 2, 0))
+    )
+    return np.stack([*channels], axis=2)
+
+
+def _channel_map(x: FloatArray, y: FloatArray, form: SsimForm) -> FloatArray:
+    """(H', W') local similarity of one channel, (H, W) from 0 to 255."""
     import cv2
 
-    check_pair(image, target, form.smallest)
     borders = {"valid": cv2.BORDER_REFLECT, "reflect": cv2.BORDER_REFLECT_101, "zero": cv2.BORDER_CONSTANT}
-    blocks, window, inset = _blocks(form, target), form.weights, form.inset
+    window, inset = form.weights, form.inset
 
     def blur(values: FloatArray) -> FloatArray:
         blurred = cv2.sepFilter2D(values, cv2.CV_64F, window, window, borderType=borders[form.border])
-        height, width = values.shape[:2]
+        height, width = values.shape
         return np.asarray(blurred[inset : height - inset, inset : width - inset], dtype=np.float64)
 
     # Only the sum of the two variances enters the formula, so four filters do instead of five.
-    x, y = (_block_means(array, blocks) for array in (image, target))
     mean_x, mean_y = blur(x), blur(y)
     mean_product = mean_x * mean_y
     mean_squares = mean_x * mean_x + mean_y * mean_y
@@ -163,8 +152,8 @@ def _blocks(form: SsimForm, image: ByteArray) -> int:
     return max(1, round(min(image.shape[:2]) / 256)) if form.downsample else 1
 
 
-def _block_means(array: ByteArray, side: int) -> FloatArray:
-    """Means over whole blocks, float64; rows and columns left over at the end are dropped."""
+def _block_means(array: ByteArray | Mask, side: int) -> FloatArray:
+    """Means of an (H, W) array over whole blocks, float64; rows and columns left over at the end are dropped."""
     values = array.astype(np.float64)
     if side == 1:
         return values

@@ -1,13 +1,13 @@
-# headbench_kernel(NAME name FOLDER folder [THREADS] SOURCES file... [AVX512 option...])
+# headbench_kernel(NAME name FOLDER folder [THREADS] SOURCES file...)
 #
 # Build folder/csrc/<file>... as the Python module headbench.<folder>.<name>. Of them variants.cpp is compiled once per
 # instruction set and chosen when run (instruction_sets.h); everything else stays at the platform's baseline. No
 # multiply-add is formed that the source does not ask for: passes that must agree, and variants, compute the same numbers.
-# THREADS adds the thread pool, AVX512 further options for that variant.
+# THREADS adds the thread pool.
 set(HEADBENCH_NATIVE ${CMAKE_CURRENT_LIST_DIR})
 
 function(headbench_kernel)
-  cmake_parse_arguments(KERNEL "THREADS" "NAME;FOLDER" "SOURCES;AVX512" ${ARGN})
+  cmake_parse_arguments(KERNEL "THREADS" "NAME;FOLDER" "SOURCES" ${ARGN})
   string(REPLACE "/" "_" target ${KERNEL_FOLDER}${KERNEL_NAME})
   set(folder ${PROJECT_SOURCE_DIR}/${KERNEL_FOLDER}/csrc)
   list(TRANSFORM KERNEL_SOURCES PREPEND ${folder}/)
@@ -28,7 +28,7 @@ function(headbench_kernel)
   set(options_avx2 -mavx2 -mfma)
   # GCC's own header warns of a register it leaves undefined on purpose (GCC bug 105593).
   set(options_avx512 -mavx2 -mfma -mavx512f -mavx512dq -mavx512bw -mavx512vl -Wno-uninitialized
-    -Wno-maybe-uninitialized ${KERNEL_AVX512})
+    -Wno-maybe-uninitialized)
   set(sets portable)
   if(CMAKE_SYSTEM_PROCESSOR MATCHES "^(x86_64|AMD64|amd64)$")
     list(APPEND sets avx2 avx512)

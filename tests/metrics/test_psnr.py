@@ -8,7 +8,6 @@ from hypothesis.extra import numpy as npst
 from skimage.metrics import peak_signal_noise_ratio
 
 from headbench.bench.errors import InputError
-from headbench.metrics import pairs as structural
 from headbench.metrics.psnr import CAP, psnr, psnr_by_channel, psnr_floored
 
 PAIRS = st.tuples(st.integers(1, 12), st.integers(1, 12)).flatmap(
@@ -95,22 +94,6 @@ def test_a_white_surround_dilutes_the_frame_and_not_the_region():
     assert psnr(image, truth) - psnr.in_regions(image, truth, {"face": inside})["face"] == pytest.approx(10.0)
 
 
-@settings(deadline=None)
-@given(PAIRS, st.integers(0, 3), st.integers(0, 2**32 - 1))
-def test_the_kernel_equals_numpy_exactly(pair, regions, seed):
-    masks = np.random.default_rng(seed).integers(0, 2, (regions, *pair[0].shape[:2]), dtype=np.uint8)
-    expected = structural.squared_errors_numpy(*pair, masks)
-    np.testing.assert_array_equal(structural.squared_errors(*pair, masks), expected)
-
-
-def test_without_the_kernel_numpy_gives_the_same(monkeypatch):
-    image, truth = np.random.default_rng(0).integers(0, 256, (2, 9, 14, 3), dtype=np.uint8)
-    expected = psnr(image, truth)
-    monkeypatch.setitem(structural.KERNEL.__dict__, "imported", ImportError("missing"))
-    assert psnr(image, truth) == expected
-
-
 def test_sums_beyond_32_bits_are_exact():
     white = np.full((3000, 2000, 3), 255, np.uint8)
-    sums = structural.squared_errors(np.zeros_like(white), white, np.ones((1, 3000, 2000), np.uint8))
-    assert (sums == 255**2 * 6_000_000).all()
+    assert psnr(np.zeros_like(white), white) == 0.0

@@ -5,7 +5,6 @@ from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
 from headbench.bench.errors import InputError, UnavailableError
-from headbench.metrics import pairs as structural
 from headbench.metrics.ssim import (
     Ssim,
     SsimForm,
@@ -55,14 +54,6 @@ def test_equals_scikit_image_and_is_symmetric(form, options, seed, height, width
 @EVERY_FORM
 @settings(deadline=None, max_examples=15)
 @PAIRS
-def test_the_kernel_equals_numpy(form, seed, height, width, noise):
-    image, truth = noisy_pair(seed, height, width, noise)
-    assert form(image, truth) == pytest.approx(ssim_map(image, truth, form.form).mean(), abs=1e-12)
-
-
-@EVERY_FORM
-@settings(deadline=None, max_examples=15)
-@PAIRS
 def test_regions_are_means_of_the_map_and_add_up(form, seed, height, width, noise):
     image, truth = noisy_pair(seed, height, width, noise)
     inside = np.random.default_rng(seed).random((height, width)) < 0.3
@@ -73,16 +64,6 @@ def test_regions_are_means_of_the_map_and_add_up(form, seed, height, width, nois
     if centres.any():
         assert values["a"] == pytest.approx(local[centres].mean(), abs=1e-12)
     assert values["all"] == pytest.approx(form(image, truth), abs=1e-12)
-
-
-@pytest.mark.parametrize("name", FORMS)
-def test_without_the_kernel_numpy_gives_the_same(name, monkeypatch):
-    image, truth = noisy_pair(5, 30, 47)
-    masks = {"corner": np.indices((30, 47)).sum(axis=0) < 30}
-    expected = FORMS[name](image, truth), FORMS[name].in_regions(image, truth, masks)
-    monkeypatch.setitem(structural.KERNEL.__dict__, "imported", ImportError("missing"))
-    assert FORMS[name](image, truth) == pytest.approx(expected[0], abs=1e-12)
-    assert FORMS[name].in_regions(image, truth, masks) == pytest.approx(expected[1], abs=1e-12)
 
 
 @EVERY_FORM
@@ -138,23 +119,3 @@ def test_arrays_of_any_layout_have_one_value():
     assert ssim(image[:, ::-1], truth[:, ::-1]) == pytest.approx(expected, abs=1e-12)
     image.flags.writeable = False
     assert ssim(image, truth) == expected
-
-
-@pytest.mark.slow
-def test_an_8k_frame_equals_numpy():
-    image, truth = noisy_pair(0, 4320, 7680)
-    assert ssim(image, truth) == pytest.approx(ssim_map(image, truth).mean(), abs=1e-11)
-
-
-def test_every_instruction_set_gives_the_same_bits():
-    if structural.KERNEL.load_or_warn() is None:
-        pytest.skip("needs the compiled kernel")
-    image, truth = noisy_pair(0, 61, 83)
-    masks = np.zeros((1, 61, 83), np.uint8)
-    masks[0, 10:40, 20:60] = 1
-    taps = SsimForm().weights[5:].copy()
-    module, names = structural.KERNEL.load(), structural.KERNEL.instruction_sets
-    what = (image, truth, masks, taps, 0, 1.0, 6.5, 58.5)
-    assert len({tuple(module.similarity(*what, name)) for name in names}) == 1
-    errors = {tuple(module.squared_error(image, truth, masks, name)) for name in names}
-    assert errors == {tuple(structural.squared_errors_numpy(image, truth, masks).ravel())}
