@@ -1,8 +1,9 @@
 """headbench: a benchmark suite for animatable 3D head avatars.
 
-Everything a plug-in needs is here: specifications to register, the values and protocols of the contracts, errors,
-what readers share, finished runs to read, and the checks of the conformance kit. Names are imported when first
-used, so that ``import headbench`` is light.
+A script opens a capture, trains, renders and scores with `open_clip`, `train`, `load_avatar` and `evaluate`, runs whole
+comparisons with `run`, and reads finished ones with `read_runs`. A plug-in finds here the specifications to register, the
+values and protocols of the contracts, errors, and the checks of the conformance kit. Names are imported when first used,
+so that ``import headbench`` is light.
 """
 
 from importlib import import_module as _import_module
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 from typing import Any as _Any
 
 if _TYPE_CHECKING:
+    from .bench.api import evaluate, list_methods, open_clip, run, train
     from .bench.conformance.methods import check_method
     from .bench.conformance.metrics import check_metric
     from .bench.conformance.readers import check_clip, check_reader
@@ -64,6 +66,7 @@ if _TYPE_CHECKING:
     from .datasets.head.loaders import load_head
     from .datasets.steps.exclude import exclude_given
     from .reports.runs import RunData
+    from .reports.table_report import read_runs
 
 __all__ = [
     "ALL",
@@ -115,14 +118,21 @@ __all__ = [
     "check_method",
     "check_metric",
     "check_reader",
+    "evaluate",
     "exclude_given",
+    "list_methods",
     "load_avatar",
     "load_head",
+    "open_clip",
+    "read_runs",
     "resolve_method",
+    "run",
+    "train",
     "writes",
 ]
 
 _HOMES = {
+    "bench.api": ("evaluate", "list_methods", "open_clip", "run", "train"),
     "bench.runner.adaptation": ("AdaptedClip", "MethodNeeds"),
     "bench.conformance.methods": ("check_method",),
     "bench.conformance.metrics": ("check_metric",),
@@ -137,11 +147,16 @@ _HOMES = {
     "datasets.head.loaders": ("load_head",),
     "datasets.steps.exclude": ("exclude_given",),
     "reports.runs": ("RunData",),
+    "reports.table_report": ("read_runs",),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 
 def __getattr__(name: str) -> _Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("headbench")
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(_import_module(f".{_HOME.get(name, 'bench.contracts')}", __name__), name)

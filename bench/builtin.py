@@ -35,6 +35,7 @@ from .registry import Group, discover, get, resolve
 from .runner.config import (
     DemoConfig,
     RunConfig,
+    build_run_config,
     demo_run_config,
     parse_size,
     resolve_methods,
@@ -70,7 +71,7 @@ def demo(settings: DemoSettings, progress: Progress) -> Findings:
     given = merge({"capture": capture}, {"capture": values.pop("capture", {})})
     config = build(DemoConfig, given["capture"], "--set", "capture.")
     device = str(values.get("device", RunConfig.device))
-    comparison = build(RunConfig, merge(demo_run_config(config, device), values), "--set")
+    comparison = build_run_config(merge(demo_run_config(config, device), values), "--set")
     # Errors before the capture is made, which takes minutes.
     resolve_methods(comparison)
     resolve_metrics(comparison)
@@ -191,7 +192,7 @@ def run(settings: RunSettings, progress: Progress) -> Findings:
         settings.workers,
         source,
     )
-    config = build(RunConfig, values, source)
+    config = build_run_config(values, source)
     check_kind(Path(config.out), "a run")  # before the log is written there
     with _log_file(Path(config.out)):
         return _run(config, execution, unchecked=settings.unchecked)

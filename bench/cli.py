@@ -64,9 +64,11 @@ def _reader_has_gone() -> bool:
 
 def _call(words: list[str]) -> int:
     """Call the command that the words of the command line name."""
-    if words[:1] == ["--version"]:
+    if words and words[0] in ("--version", "-V", "version"):
         show(f"headbench {version('headbench')}")
         return ExitCode.OK
+    if not words or words[0] == "help":
+        words = [*words[1:], "--help"]
     from .commands import call  # with the parser, which takes longer to import than the version to print
 
     return call(words)

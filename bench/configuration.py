@@ -88,6 +88,16 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
         raise InputError(source, prefix.rstrip(".") or cls.__name__, "valid settings", str(error)) from error
 
 
+def setting_paths(cls: Any, prefix: str = "") -> list[str]:
+    """Dotted path of every setting of a dataclass, groups before what they hold."""
+    hints, found = get_type_hints(cls), []
+    for field in dataclasses.fields(cls):
+        found.append(f"{prefix}{field.name}")
+        if dataclasses.is_dataclass(hints[field.name]):
+            found += setting_paths(hints[field.name], f"{prefix}{field.name}.")
+    return found
+
+
 def deciding_settings(config: Any) -> Any:
     """The settings of a dataclass that decide results, as plain values, for digests; other values, None say, as they are.
 

@@ -11,7 +11,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+import pandas as pd
 
 from ..bench.errors import InputError
 from ..bench.io.documents import read_json
@@ -34,6 +36,41 @@ NAMES = {
 
 TASKS = ("novel_view", "self_reenactment")
 QUALITY = {"psnr": 2, "ssim": 3, "lpips": 3}
+
+
+class ComparedRuns(RunSet):
+    """Finished runs on the same frames, as `read_runs` gives them; ``rows.table`` has every number."""
+
+    def table(self) -> pd.DataFrame:
+        """The comparison table: a row for each method, a column for each (task, metric); metrics of no task are of "avatar".
+
+        Values are means over frames, then sequences, subjects and seeds; not a number where one is missing.
+        """
+        metrics = [spec for spec in self.metrics if "comparison" in spec.tables]
+        built = build_table(
+            self.rows, metrics, self.methods, self.tasks, trivial=self.trivial, protocol_ids=self.protocol_ids
+        )
+        columns = pd.MultiIndex.from_tuples(
+            [(column.task or "avatar", column.metric) for column in built.columns], names=["task", "metric"]
+        )
+        values = [[cell.value for cell in row.cells] for row in built.rows]
+        methods = pd.Index([row.method for row in built.rows], name="method")
+        return pd.DataFrame(values, methods, columns, dtype=float)
+
+
+def read_runs(folders: Sequence[Path | str]) -> ComparedRuns:
+    """Read finished runs on the same frames.
+
+    Parameters
+    ----------
+    folders : of the runs. The same method with the same settings and other seeds is one method with more seeds.
+
+    Raises
+    ------
+    InputError
+        For a folder that is no finished run, and for runs that do not score the same frames by the same protocol.
+    """
+    return cast(ComparedRuns, ComparedRuns.read([Path(folder) for folder in folders]))
 
 
 @dataclass(frozen=True)

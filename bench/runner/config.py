@@ -5,14 +5,15 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from ..configuration import build, deciding_settings, merge
+from ..configuration import build, deciding_settings, merge, setting_paths
 from ..contracts import Budget, TaskName
 from ..errors import InputError
 from ..io.files import check_name
@@ -89,6 +90,31 @@ class RunConfig:
             raise ValueError(f"divide is {self.divide}; a whole number from 1")
         if self.frames_per_task is not None and self.frames_per_task < 1:
             raise ValueError(f"frames_per_task is {self.frames_per_task}; at least 1, or none for all")
+
+
+def build_run_config(values: Mapping[str, Any], source: str) -> RunConfig:
+    """Build `RunConfig` as `build` does; a key of a lower level, such as ``iterations``, is answered with its place."""
+    known = {each.name for each in fields(RunConfig)}
+    for key in values:
+        if key not in known and not get_close_matches(key, known, 1, 0.8):
+            places = _setting_places()
+            near = get_close_matches(key, places, 1, 0.7)
+            if near:
+                raise InputError(
+                    source, key, "a setting of a run", repr(key), f"Did you mean {places[near[0]]}?"
+                )
+    return build(RunConfig, values, source)
+
+
+def _setting_places() -> dict[str, str]:
+    """Dotted path of every setting below the first level, by its last word; METHOD stands for any method."""
+    places: dict[str, str] = {}
+    for name, plugin in discover("methods").items():
+        if plugin.spec is not None and plugin.spec.config:
+            for path in setting_paths(resolve(plugin.spec.config)):
+                places.setdefault(path.rpartition(".")[2], f"settings.{name}.{path}")
+    budget = {"budget": "settings.METHOD.budget.iterations"}
+    return places | budget | {path: f"settings.METHOD.budget.{path}" for path in setting_paths(Budget)}
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from ...bench.contracts import FloatArray, HeadAsset, IntArray
+from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, check_arrays, read_arrays
 from ...bench.io.files import atomic_path, digest
@@ -117,6 +117,27 @@ class HeadArrays:
         check_size(file, "template", self.template, self.faces)
         self._validate_motion(file)
         return self
+
+    def __call__(
+        self, pose: HeadPose, shape: FloatArray | None = None, static_offset: FloatArray | None = None
+    ) -> FloatArray:
+        """Vertices (V, 3) in a pose, metres, float64.
+
+        Parameters
+        ----------
+        shape : (S,) identity coefficients; None for the mean head.
+        static_offset : (V, 3) metres, added to the shaped template; None for none.
+
+        Raises
+        ------
+        InputError
+            For a pose of another head model.
+        """
+        from .subject import PosedSubject  # with torch
+
+        shape = np.zeros(self.shape_basis.shape[2]) if shape is None else shape
+        offset = np.zeros(self.template.shape) if static_offset is None else static_offset
+        return PosedSubject(self, shape, offset).meshes([pose])[0]
 
     def fingerprint(self) -> str:
         """Hex digest of the content: version, all arrays, regions and landmarks."""

@@ -43,6 +43,22 @@ def test_output_is_readable_in_every_encoding(monkeypatch, words, encoding):
     assert encoding != "utf-8" or words != ["table"] or "\N{UPWARDS ARROW}" in text
 
 
+@pytest.mark.parametrize(
+    ("words", "shown"),
+    [
+        ("", "usage: headbench "),
+        ("help", "usage: headbench "),
+        ("help run", "usage: headbench run "),
+        ("version", "headbench "),
+        ("-V", "headbench "),
+    ],
+)
+def test_help_and_version_are_found_by_their_usual_words(words, shown, capsys):
+    with suppress(SystemExit):
+        assert cli.main(words.split()) == 0
+    assert capsys.readouterr().out.startswith(shown)
+
+
 def test_what_no_encoding_holds_is_escaped(monkeypatch, tmp_path):
     monkeypatch.setattr(sys, "stderr", io.TextIOWrapper(io.BytesIO(), encoding="ascii"))
     assert cli.main(["table", str(tmp_path / "\N{CJK UNIFIED IDEOGRAPH-9762}\udcff")]) == 2
@@ -55,6 +71,9 @@ def test_what_no_encoding_holds_is_escaped(monkeypatch, tmp_path):
     [
         ("run --data none --out out", "no such folder"),
         ("run --data . --out out --methods our,ga", "Did you mean 'ours'"),
+        ("run --data . --out out --set iteratoins=3", "Did you mean settings.METHOD.budget.iterations?"),
+        ("run --data . --out out --set sedes=3", "Did you mean 'seeds'"),
+        ("demo --out out --set resolutio=3", "Did you mean settings.ours.planes.resolution?"),
         ("run --config run.yaml", "run.yaml, metods: expected one of"),
         ("run --out x", "--data"),
         ("table .", "run.json"),

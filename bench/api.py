@@ -1,0 +1,213 @@
+"""What a script needs to open a capture, train a method on it, and score an avatar, beside `run` for whole comparisons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pandas as pd
+
+from .contracts import Avatar, ByteArray, Clip, FrameKey, TaskName
+from .errors import InputError
+from .io.files import check_output_folder
+from .io.images import quantise
+from .io.lock import locked
+from .protocol import Protocol, make_protocols
+from .registry import discover, get
+from .runner import run as runner
+from .runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
+from .runner.captures import capture_configuration, open_clips, reader_of
+from .runner.config import build_run_config, default_names, resolve_method
+from .runner.scoring import ScoredFrames, check_regions, score_frames
+from .runner.steps import Job, fit
+from .runner.store import RunFolder
+from .runner.stored import open_avatar
+from .specs import MethodSpec, MetricSpec
+
+TASKS: tuple[TaskName, ...] = ("novel_view", "self_reenactment")
+
+
+def list_methods() -> dict[str, MethodSpec]:
+    """The registered methods by name, in the order of tables; plug-ins that cannot be loaded are left out."""
+    found = {name: plugin.spec for name, plugin in discover("methods").items()}
+    return {name: spec for name, spec in found.items() if spec is not None}
+
+
+def open_clip(folder: Path | str, *, reader: str = "", head: str | None = None, **settings: Any) -> Clip:
+    """Open a capture of one subject.
+
+    Parameters
+    ----------
+    folder : of the capture, in a layout that a registered reader knows.
+    reader : name of the reader; "" for the one that finds a capture there.
+    head : file of the head model, for captures that bring none.
+    settings : further settings of the reader.
+
+    Raises
+    ------
+    InputError
+        Where the folder holds no capture, or several, and whatever the reader finds wrong.
+    """
+    config = capture_configuration(str(folder), "", reader, head)
+    clips = open_clips(replace(config, reader_settings={**config.reader_settings, **settings}))
+    if len(clips) > 1:
+        found = f"{len(clips)}: {', '.join(clip.subject for clip in clips)}"
+        raise InputError(folder, "", "the capture of one subject", found, "Name the folder of one of them.")
+    return clips[0]
+
+
+def train(
+    method: str,
+    clip: Clip,
+    out: Path | str,
+    *,
+    preset: str = "fast",
+    seed: int = 0,
+    device: str = "cpu",
+    settings: Mapping[str, Any] | None = None,
+) -> Path:
+    """Train a method on the training frames of a clip, or continue a training that was interrupted.
+
+    The clip is first brought into the form that the method needs, as `run` does: another size, one video, another head model.
+
+    Parameters
+    ----------
+    method : name of a registered method, or "package.module:SPEC".
+    out : folder of avatars; what is trained already with the same settings, data and seed is kept.
+    preset : one of the method's.
+    settings : of the method, over the preset; the key "budget" holds iterations and seconds.
+
+    Returns
+    -------
+    The folder of the avatar, ``out``/SUBJECT/METHOD/seed-N/avatar, for `evaluate` and `load_avatar`.
+
+    Raises
+    ------
+    InputError
+        For an unknown method, preset or setting, for a clip that the method cannot be trained on, and where ``out`` holds an
+        avatar of the same subject, method and seed that was made of something else.
+    """
+    resolved = resolve_method(get("methods", method), preset, settings or {})
+    folder = RunFolder(Path(out))
+    check_output_folder(folder.root)
+    runner.check_settings(resolved)
+    with locked(folder.root):
+        needs = MethodNeeds.of(resolved.spec)
+        step = plan(clip, needs, {})
+        form = step and carry_out(step, needs, folder.adapted / clip.subject, f"adapting {clip.subject}")
+        cell = folder.cell(clip.subject, resolved.spec.name, seed)
+        job = Job(clip, resolved, seed, device, cell, {}, form)
+        job.check()
+        job.check_method()
+        fit(job)
+    return cell.avatar
+
+
+def evaluate(
+    avatar: Path | str | Avatar,
+    clip: Clip,
+    *,
+    tasks: Sequence[TaskName] = TASKS,
+    metrics: Sequence[str] = (),
+    regions: Sequence[str] | None = None,
+    frames_per_task: int | None = None,
+    device: str = "cpu",
+) -> pd.DataFrame:
+    """Render the test frames of a clip and score them, as a run does.
+
+    Parameters
+    ----------
+    avatar : folder of a stored avatar, which is given the clip in the form that its method needs; or an `Avatar`, which is
+        given the clip's own cameras and poses.
+    metrics : names of metrics of frames; none: those that a run takes by default.
+    regions : parts of the frame to score beside the whole; None: the face, where the clip knows it.
+    frames_per_task : score at most so many frames of a task, evenly spaced.
+    device : where a stored avatar renders.
+
+    Returns
+    -------
+    One row for each frame, region and metric: task, sequence, timestep, camera, region, metric, value, status ("ok", or
+    "missing" with a reason), reason.
+
+    Raises
+    ------
+    InputError
+        For a stored avatar of another subject, and for unknown metrics and regions.
+    """
+    names = metrics or [name for name in default_names("metrics") if get("metrics", name).per_frame]
+    specs: list[MetricSpec] = [get("metrics", name) for name in names]
+    for spec in specs:
+        if not spec.per_frame:
+            raise InputError("evaluate", "metrics", "metrics of frames", spec.name)
+    protocols = make_protocols(tasks, [clip], frames_per_task)
+    scored_regions = check_regions(clip, regions)
+    rows: list[dict[str, Any]] = []
+    with TemporaryDirectory() as scratch:
+        form, loaded = AdaptedClip(clip), avatar
+        if isinstance(avatar, (str, Path)):
+            form, loaded = _stored(Path(avatar), clip, device, Path(scratch))
+        for protocol in protocols.values():
+            images = {key: _drawn(loaded, form, protocol, key) for key in protocol.keys}
+            frames = ScoredFrames(images.__getitem__, clip)
+            for scores in score_frames(protocol.keys, frames, specs, scored_regions, device=device).values():
+                rows += [
+                    {
+                        "task": protocol.task,
+                        "sequence": score.key.sequence,
+                        "timestep": score.key.timestep,
+                        "camera": score.key.camera,
+                        **{
+                            name: getattr(score, name)
+                            for name in ("region", "metric", "value", "status", "reason")
+                        },
+                    }
+                    for score in scores
+                ]
+    columns = ["task", "sequence", "timestep", "camera", "region", "metric", "value", "status", "reason"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def run(data: Path | str, out: Path | str, **settings: Any) -> Path:
+    """Run a comparison, or continue one: train, render, measure, write tables and pictures.
+
+    Parameters
+    ----------
+    data, out : capture, and folder for everything that the run makes.
+    settings : further fields of `RunConfig`, such as ``methods=("ga", "ours"), preset="smoke", seeds=(0, 1)``.
+
+    Returns
+    -------
+    The folder of the run, for `read_runs`.
+
+    Raises
+    ------
+    InputError
+        For whatever can be found wrong before the first training.
+    """
+    values = {"data": str(data), "out": str(out), "reader": reader_of(str(data)), **settings}
+    runner.run(build_run_config(values, "run"))
+    return Path(out)
+
+
+def _stored(folder: Path, clip: Clip, device: str, scratch: Path) -> tuple[AdaptedClip, Avatar]:
+    """A stored avatar, and the clip in the form that its method needs."""
+    stored = open_avatar(folder)
+    shown = stored.shows_another(clip.subject, clip.shape, next(iter(clip.poses.values())).head_model)
+    if shown:
+        raise InputError(
+            stored.folder, "subject", f"an avatar of {clip.subject}, whom the clip shows", f"one of {shown}"
+        )
+    needs = MethodNeeds.of(stored.method.spec)
+    step = plan(clip, needs, stored.heads)
+    form = AdaptedClip(clip) if step is None else carry_out(step, needs, scratch, f"adapting {clip.subject}")
+    return form, stored.load(device)
+
+
+def _drawn(avatar: Any, form: AdaptedClip, protocol: Protocol, key: FrameKey) -> ByteArray:
+    """The 8-bit frame of a key of the protocol, at the protocol's size."""
+    seen = form.key(key)
+    frame = avatar.render(form.clip.cameras[seen.camera], form.clip.poses[seen.timestep], protocol.background)
+    return quantise(form.restore(key, frame.rgb))

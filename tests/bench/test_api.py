@@ -1,0 +1,83 @@
+"""The functions of scripts give what the command line gives."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import headbench as hb
+
+from ..fuzz.samples import SETTINGS
+from ..small_run import rows_of, small_run
+
+KEY = ["task", "timestep", "camera", "region", "metric"]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run of ga and of insta, which is trained on another form of the capture."""
+    return small_run(tmp_path_factory.mktemp("api"), "ga", "insta")
+
+
+@pytest.fixture(scope="module")
+def clip(finished):
+    return hb.open_clip(finished.root.parent / "data")
+
+
+@pytest.mark.parametrize("method", ["ga", "insta"])
+def test_train_and_evaluate_give_the_rows_of_a_run(method, finished, clip, tmp_path):
+    settings = SETTINGS.get(method, {})
+    folder = hb.train(method, clip, tmp_path, preset="smoke", settings=settings)
+    before = (folder / "avatar.json").stat().st_mtime_ns
+    assert hb.train(method, clip, tmp_path, preset="smoke", settings=settings) == folder
+    assert (folder / "avatar.json").stat().st_mtime_ns == before  # kept
+    scores = hb.evaluate(folder, clip, metrics=["psnr"])
+    rows = rows_of(finished)
+    rows = rows[(rows.method == method) & (rows.metric == "psnr")]
+    expected, found = (table.set_index(KEY).value.sort_index() for table in (rows, scores))
+    pd.testing.assert_series_equal(found, expected, check_index_type=False, rtol=1e-6)
+
+
+def test_an_avatar_in_memory_is_scored_alike(finished, clip):
+    folder = finished.cell(clip.subject, "ga", 0).avatar
+    stored, loaded = (
+        hb.evaluate(avatar, clip, metrics=["psnr"], frames_per_task=1)
+        for avatar in (folder, hb.load_avatar(folder))
+    )
+    pd.testing.assert_frame_equal(stored, loaded)
+
+
+def test_the_table_of_runs_has_the_means_of_their_rows(finished):
+    table = hb.read_runs([finished.root]).table()
+    rows = rows_of(finished)
+    for task in ("novel_view", "self_reenactment"):
+        part = rows[(rows.method == "ga") & (rows.task == task) & (rows.region == "full")]
+        mean = part.groupby("sequence").value.mean().mean()
+        assert table.loc["ga", (task, "psnr")] == pytest.approx(mean)
+
+
+def test_a_head_is_posed_by_calling_it(clip):
+    pose = next(iter(clip.poses.values()))
+    still = clip.head(pose, clip.shape, clip.static_offset)
+    moved = clip.head(
+        hb.HeadPose(**{**vars(pose), "translation": pose.translation + 1}), clip.shape, clip.static_offset
+    )
+    np.testing.assert_allclose(moved - still, 1, atol=1e-12)
+
+
+def test_what_scripts_get_wrong_is_refused(finished, clip, tmp_path):
+    folder = finished.cell(clip.subject, "ga", 0).avatar
+    cases = [
+        (lambda: hb.open_clip(tmp_path), "a folder with a capture"),
+        (lambda: hb.train("gaa", clip, tmp_path), "Did you mean 'ga'"),
+        (lambda: hb.train("ga", clip, tmp_path, settings={"budget": {"iteratoins": 3}}), "iterations"),
+        (lambda: hb.evaluate(folder, clip, metrics=["storage"]), "metrics of frames"),
+        (lambda: hb.run(tmp_path, tmp_path / "out", sedes=(1,)), "seeds"),
+    ]
+    for call, said in cases:
+        with pytest.raises(hb.InputError, match=said):
+            call()
+
+
+def test_methods_and_version_are_listed():
+    assert {"ga", "ours"} <= hb.list_methods().keys()
+    assert hb.__version__.count(".") == 2
