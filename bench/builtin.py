@@ -49,7 +49,7 @@ Assignments = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.ar
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """Needs no data, no accelerator and no network. Everything lands in OUT: the capture, the avatars, the renders,
+    """Needs no data, no accelerator and no network. Everything is written to OUT: the capture, the avatars, the renders,
     tables (Markdown, CSV, LaTeX) and contact_sheet.png. Started again after a kill it continues.
     """
 
@@ -65,7 +65,7 @@ class DemoSettings:
 
 
 def demo(settings: DemoSettings, progress: Progress) -> Findings:
-    """Compare methods from nothing: make a capture, train, render, measure, print the table."""
+    """Run a complete comparison on a synthetic capture: render it, train, measure, print the table."""
     values = parse_assignments(settings.set)
     capture = {"preset": settings.preset, "seed": settings.seed, "out": settings.out}
     given = merge({"capture": capture}, {"capture": values.pop("capture", {})})
@@ -156,8 +156,8 @@ class RunSettings:
     seeds: str | None = None
     """Seeds of the training, separated by commas: an avatar is trained for each. Default: 0."""
     executor: ExecutorName | None = None
-    """Where cells (a subject, a method, a seed) are worked on: inline, one after another; processes, several at once on this
-    machine; slurm, a job for each. Default: inline."""
+    """Where cells (a subject, a method, a seed) run: inline, one after another; processes, several at once on this machine;
+    slurm, a job for each. Default: inline."""
     workers: int | None = None
     """How many processes, with `--executor processes`. Default: one for each core."""
     unchecked: bool = False
@@ -200,7 +200,7 @@ def run(settings: RunSettings, progress: Progress) -> Findings:
 
 @dataclass(frozen=True)
 class TableSettings:
-    """Several runs make one table: other seeds of the same settings join, other settings are rows of their own."""
+    """Runs are merged into one table: seeds of the same settings are averaged, other settings get rows of their own."""
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of the runs."""
@@ -247,7 +247,7 @@ def table(settings: TableSettings, progress: Progress) -> Findings:
 
 @dataclass(frozen=True)
 class ListSettings:
-    """With --json everything that is known of each."""
+    """--json prints all fields."""
 
     what: tyro.conf.Positional[
         Literal["methods", "presets", "metrics", "profiles", "datasets", "reports", "benchmarks", "commands"]
@@ -302,12 +302,12 @@ class BenchSettings(StressSettings):
 
 
 def bench(settings: BenchSettings, progress: Progress) -> Findings:
-    """Measure the speed of a part of headbench itself on this machine."""
+    """Benchmark a part of headbench itself on this machine."""
     return _measure(settings, "tradeoffs" if settings.tradeoffs else "speed", progress)
 
 
 def stress(settings: StressSettings, progress: Progress) -> Findings:
-    """Try a part of headbench at numerical extremes and print each case and what came out."""
+    """Test a part of headbench at numerical extremes and print the result of each case."""
     return _measure(settings, "stress", progress)
 
 

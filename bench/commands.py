@@ -25,7 +25,7 @@ from .streams import show
 
 Command = Callable[..., int]
 
-_OF_OTHERS = {
+_ALIASES = {
     "compare": "analyze",
     "doctor": "diagnose info",
     "evaluate": "eval evaluation metrics test",
@@ -38,8 +38,8 @@ _OF_OTHERS = {
     "table": "results show",
     "view": "viewer gui",
 }
-WORDS_OF_OTHERS = {word: name for name, words in _OF_OTHERS.items() for word in words.split()}
-"""What other toolkits call their commands, and which of ours does it."""
+COMMAND_ALIASES = {word: name for name, words in _ALIASES.items() for word in words.split()}
+"""Names that other toolkits use for a command, and the command of headbench that does the same."""
 
 
 def call(words: Sequence[str]) -> int:
@@ -122,7 +122,7 @@ def check_known(words: Sequence[str], commands: Mapping[str, Command | dict[str,
     for name, command in commands.items():
         parts = command if isinstance(command, dict) else {"": command}
         described |= {f"{name} {second}".strip(): part for second, part in parts.items()}
-    name = WORDS_OF_OTHERS.get(word.lower().replace("_", "-"), "")
+    name = COMMAND_ALIASES.get(word.lower().replace("_", "-"), "")
     if name not in described:
         name = next(iter(difflib.get_close_matches(word, described, n=1, cutoff=0.5)), "")
     remedy = "`headbench --help` lists them."

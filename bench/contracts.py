@@ -385,7 +385,10 @@ class PreparedMethod(Method, Protocol):
     """A method with something to load or compile for a device that is no part of training. Optional."""
 
     def prepare(self, device: str) -> None:
-        """Do it; called before the clock of a training starts. Raises `UnavailableError` where it cannot be had."""
+        """Load or compile what is needed; the time is not counted as training time.
+
+        Raises `UnavailableError` where it cannot be had.
+        """
 
 
 @runtime_checkable
@@ -425,7 +428,7 @@ class TemporalMetric(Protocol):
 
 
 class Measurement(NamedTuple):
-    """One number for an avatar as a whole, and what else was learnt in measuring it.
+    """One number for an avatar as a whole, and auxiliary values of the measurement.
 
     Metrics of the same implementation are one measurement: `MetricSpec.detail` says which of its numbers each shows.
     """
@@ -454,8 +457,8 @@ class TrainingMetric(Protocol):
 
 
 def no_stage(name: str) -> None:
-    """Take note of no stage."""
+    """Ignore the end of a stage."""
 
 
 def no_progress(done: int, total: int, note: str = "") -> None:
-    """Report to nobody."""
+    """Ignore progress."""

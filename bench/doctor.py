@@ -33,7 +33,7 @@ class DoctorSettings:
     """A setting of a method, as for `headbench run`: `settings.ga-official.checkout=DIR`; repeatable."""
 
 
-class Patient(NamedTuple):
+class PluginStatus(NamedTuple):
     """A plug-in that was looked at."""
 
     group: str
@@ -54,7 +54,7 @@ class Patient(NamedTuple):
 
 
 def doctor(settings: DoctorSettings, progress: Progress) -> Findings:
-    """Say for every method, metric and reader what is missing here, and how to get it.
+    """Report for every method, metric and reader what is missing on this machine, and how to install it.
 
     Raises `InputError` for unknown methods and settings, and for a device that is none.
     """
@@ -76,20 +76,20 @@ def doctor(settings: DoctorSettings, progress: Progress) -> Findings:
         raise unknown("command line", "--set settings", unfit[0], known)
     if not all(isinstance(values, Mapping) for values in chosen.values()):
         raise InputError("command line", "--set settings", "settings.METHOD.KEY=VALUE", "another")
-    patients = [Patient("machine", settings.device, True, tuple(_device(settings.device)))]
+    statuses = [PluginStatus("machine", settings.device, True, tuple(_device(settings.device)))]
     for name in known:
-        patients.append(_method(named.get(name, name), name in named, not named, settings.device, chosen))
-        progress(len(patients), len(known) + 1, name)
+        statuses.append(_method(named.get(name, name), name in named, not named, settings.device, chosen))
+        progress(len(statuses), len(known) + 1, name)
     for group in ("metrics", "datasets") if not named else ():
         for name, plugin in discover(group).items():  # type: ignore[arg-type]
             if plugin.spec is None:
-                patients.append(Patient(group, name, False, (_broken(plugin.error),)))
+                statuses.append(PluginStatus(group, name, False, (_broken(plugin.error),)))
             elif plugin.spec.needs:
                 needs = tuple(_asked(plugin.spec.needs, None, settings.device))
-                patients.append(Patient(group, name, False, needs))
+                statuses.append(PluginStatus(group, name, False, needs))
     if not named:
-        patients.append(Patient("executors", "slurm", False, tuple(_slurm())))
-    ill = [patient for patient in patients if patient.counts and patient.state == "missing"]
+        statuses.append(PluginStatus("executors", "slurm", False, tuple(_slurm())))
+    unavailable = [status for status in statuses if status.counts and status.state == "missing"]
     machine = machine_record(settings.device)
     head = (
         f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 1e9:.0f} GB; "
@@ -98,24 +98,24 @@ def doctor(settings: DoctorSettings, progress: Progress) -> Findings:
     what = "The methods named" if named else "All default methods"
     verdict = (
         f"{what} can run here."
-        if not ill
-        else f"Cannot run here: {', '.join(patient.name for patient in ill)}."
+        if not unavailable
+        else f"Cannot run here: {', '.join(status.name for status in unavailable)}."
     )
     data = {
         "machine": machine,
         "plugins": [
             {
-                "group": patient.group,
-                "name": patient.name,
-                "state": patient.state,
-                "counts": patient.counts,
-                "needs": [need._asdict() for need in patient.needs],
+                "group": status.group,
+                "name": status.name,
+                "state": status.state,
+                "counts": status.counts,
+                "needs": [need._asdict() for need in status.needs],
             }
-            for patient in patients
+            for status in statuses
         ],
     }
-    text = "\n".join([head, *_lines(patients), verdict])
-    return Findings(text, data, not ill, ExitCode.NO_VERDICT if ill else ExitCode.OK)
+    text = "\n".join([head, *_lines(statuses), verdict])
+    return Findings(text, data, not unavailable, ExitCode.NO_VERDICT if unavailable else ExitCode.OK)
 
 
 def _device(device: str) -> Iterator[Need]:
@@ -144,13 +144,13 @@ def _slurm() -> Iterator[Need]:
 
 def _method(
     name: str, named: bool, all_defaults: bool, device: str, chosen: Mapping[str, Mapping[str, Any]]
-) -> Patient:
+) -> PluginStatus:
     from .registry import discover, get, resolve
     from .runner.config import resolve_method
 
     plugin = discover("methods").get(name)
     if plugin is not None and plugin.spec is None:
-        return Patient("methods", name, named, (_broken(plugin.error),))
+        return PluginStatus("methods", name, named, (_broken(plugin.error),))
     spec: MethodSpec = get("methods", name)
     counts = named or (all_defaults and spec.default)
     try:
@@ -160,12 +160,12 @@ def _method(
     except HeadbenchError as error:
         if chosen.get(spec.name):
             raise
-        return Patient("methods", spec.name, counts, (_broken(str(error)),))
+        return PluginStatus("methods", spec.name, counts, (_broken(str(error)),))
     needs = [*_asked(spec.needs, method.config, device)] if spec.needs else []
     if not spec.native and not needs:
         remedy = "See methods/official/README.md; its settings are checked when it is run."
         needs = [Need("checkout and environment", "", remedy)]
-    return Patient("methods", spec.name, counts, tuple(needs))
+    return PluginStatus("methods", spec.name, counts, tuple(needs))
 
 
 def _asked(needs: str, config: Any, device: str) -> Iterator[Need]:
@@ -182,15 +182,15 @@ def _broken(error: str | None) -> Need:
     return Need("its code", "", f"It cannot be used: {error or 'it does not load'}")
 
 
-def _lines(patients: list[Patient]) -> Iterator[str]:
+def _lines(statuses: list[PluginStatus]) -> Iterator[str]:
     group = ""
-    for patient in patients:
-        if patient.group != group:
-            group = patient.group
+    for status in statuses:
+        if status.group != group:
+            group = status.group
             yield f"\n{group}"
-        there = "; ".join(f"{need.what}: {need.found}" for need in patient.needs if need.found)
-        yield f"  {patient.name:<18}{patient.state:<9}{there}".rstrip()
-        for need in patient.missing:
+        there = "; ".join(f"{need.what}: {need.found}" for need in status.needs if need.found)
+        yield f"  {status.name:<18}{status.state:<9}{there}".rstrip()
+        for need in status.missing:
             effect = "" if need.required else " (works without)"
             yield f"    no {need.what}{effect}. {need.remedy}".rstrip()
     yield ""

@@ -25,8 +25,8 @@ class ExitCode(IntEnum):
 
 
 EXIT_CODES = (
-    "Exit codes: 0 done; 1 done, and the answer is negative (a method failed, a number got worse, a check did not pass); "
-    "2 wrong usage, bad input, or a file that cannot be read or written; 3 what a verdict needs is missing or invalid; "
+    "Exit codes: 0 done; 1 done, but a method failed, a number got worse or a check did not pass; "
+    "2 wrong usage, bad input, or a file that cannot be read or written; 3 data needed for a verdict is missing or invalid; "
     "70 unexpected error, please report; 129, 130, 143 ended by SIGHUP, Ctrl-C, SIGTERM."
 )
 
@@ -72,7 +72,7 @@ class InputError(HeadbenchError):
 
 
 def is_damage(error: BaseException) -> bool:
-    """Whether an error of reading tells of the file, and not of the disk, its permissions, or too little memory."""
+    """Whether a reading error is caused by the file's content, and not by the disk, permissions, or lack of memory."""
     cause = error.__cause__
     machine = isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno is not None)
     return not machine and (cause is None or is_damage(cause))

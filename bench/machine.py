@@ -55,7 +55,7 @@ def machine_record(device: str = "cpu") -> dict[str, Any]:
 
 
 def _device_record(device: str) -> dict[str, Any]:
-    """The entry ``device``; none for the CPU, and where a run is described on another machine than it is worked on."""
+    """The entry ``device``; none for the CPU, and where a run is described on another machine than the one that executes it."""
     if not is_cuda(device) or not resolve("torch:cuda").is_available():
         return {}
     use_device(device)

@@ -29,7 +29,7 @@ class VerifySettings(RunOptions):
 
 
 def verify(settings: VerifySettings, progress: Progress = no_progress) -> Findings:
-    """Recompute a run's hashes and metrics from its frames: exit code 1 where anything differs, 3 where it is no run."""
+    """Recompute a run's digests and metrics from its frames: exit code 1 if anything differs, 3 if it is not a run."""
     from .verify import verify_run
 
     return verify_run(settings, progress)
@@ -161,7 +161,7 @@ class EvaluateSettings:
 
 
 def evaluate(settings: EvaluateSettings, progress: Progress = no_progress) -> Findings:
-    """Score a folder of images, or a stored avatar: a method is compared without a plug-in."""
+    """Score a folder of images or a stored avatar, so that a method can be compared without a plug-in."""
     from .evaluate import evaluate_folder
 
     return evaluate_folder(settings, progress)
@@ -188,7 +188,7 @@ class FramesSettings(RunOptions):
     """Tasks to list for a capture; default: those of `headbench run`."""
 
     frames_per_task: int | None = None
-    """For a capture: at most so many frames per subject and task, evenly spaced, as `headbench run` takes them."""
+    """For a capture: maximum number of frames per subject and task, evenly spaced, as in `headbench run`."""
 
     reader: str = ""
     """Which dataset reader opens the capture; default: the one that finds it."""
@@ -196,7 +196,7 @@ class FramesSettings(RunOptions):
 
 @writes("out")
 def frames(settings: FramesSettings, progress: Progress = no_progress) -> Findings:
-    """List the frames to render outside of headbench: names, cameras and pose files as CSV."""
+    """List the frames that `evaluate` needs as CSV: file names, cameras and pose files."""
     from .frames import write_frames
 
     return write_frames(settings)

@@ -37,7 +37,7 @@ from .naming import Render, check_truth, composited, named_renders
 
 
 class NoAvatar:
-    """Stands where a run has an avatar; images of a folder have none, and no metric of one is taken."""
+    """Placeholder for a run's avatar; images of a folder have none, and no metric of one is taken."""
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """There is nothing to render."""

@@ -59,7 +59,7 @@ TIMESTEPS = 4  # of the capture made on the spot
 
 
 def check_plugin(settings: CheckPluginSettings, progress: Progress = no_progress) -> Findings:
-    """Try a method, a reader or a metric and list every breach of its contract; exit code 1 where there is one.
+    """Check a method, reader or metric against its contract and list every violation; exit code 1 if there are any.
 
     Raises `InputError` for wrong usage, and `HeadbenchError` where the plug-in cannot be imported.
     """

@@ -31,10 +31,10 @@ def cell_task(job: Job, capture: int, folder: RunFolder) -> Task:
     """The task of a cell of the run in ``folder``; ``capture`` is the index of its subject's among those that the reader finds."""
     place = job.cell.folder.relative_to(folder.root).as_posix()
     cell = {"subject": job.clip.subject, "method": job.method.spec.name, "seed": job.seed, "capture": capture}
-    return replace(Task.of(folder.root, place, f"{__name__}:work_on_cell", **cell), device=job.device)
+    return replace(Task.of(folder.root, place, f"{__name__}:run_cell", **cell), device=job.device)
 
 
-def work_on_cell(task: Task, report: Callable[[str], None]) -> None:
+def run_cell(task: Task, report: Callable[[str], None]) -> None:
     """Train, render and measure a cell by the record of its run; all but its speed, unless the task is to measure that."""
     job, metrics = _opened.job(Path(task.root), **task.arguments)
     last = time.monotonic()

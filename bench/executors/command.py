@@ -86,14 +86,14 @@ class ExecutionOptions:
 
 @dataclass(frozen=True)
 class StatusSettings:
-    """Looks at a run folder while its cells are worked on, or afterwards, and changes nothing. Exit code 1: a cell failed."""
+    """Shows the progress of a run, or afterwards, and changes nothing. Exit code 1: a cell failed."""
 
     run: tyro.conf.Positional[str]
     """Folder of the run."""
 
 
 def status(settings: StatusSettings, progress: Progress) -> Findings:
-    """Show which cells of a run wait, are worked on, are done or have failed, and the time left."""
+    """Show which cells of a run are waiting, running, done or failed, and the time left."""
     from .status import run_status
 
     return run_status(Path(settings.run))
@@ -114,7 +114,7 @@ class SpeedSettings(RunOptions):
 
 
 def speed(settings: SpeedSettings, progress: Progress) -> Findings:
-    """Measure the speed of a finished run's avatars again, without training, and rewrite its tables and report."""
+    """Measure the speed of a finished run's avatars again, without training, and update its tables and report."""
     from ..runner.speed import measure_speed_again
 
     return measure_speed_again(Path(settings.run), settings, settings.methods, progress)

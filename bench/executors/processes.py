@@ -13,10 +13,10 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from ..start import end_with_parent, starting_workers
-from .ended import Ended
 from .outcome import forget_outcome, read_outcome
+from .results import TaskResult
 from .task import Task
-from .worker import work_on
+from .worker import execute_task
 
 STOP_S = 5.0
 """Seconds that a worker has to end in when it is asked to."""
@@ -45,7 +45,7 @@ class Processes:
 
     @property
     def running(self) -> int:
-        """How many tasks are worked on."""
+        """Number of running tasks."""
         return sum(process.task is not None for process in self._processes)
 
     def submit(self, tasks: Sequence[Task]) -> None:
@@ -54,8 +54,8 @@ class Processes:
             forget_outcome(task.folder, task.speed)
         self._waiting.extend(tasks)
 
-    def poll(self, seconds: float) -> list[Ended]:
-        """Wait until a task ends, at most so long; return those that ended."""
+    def poll(self, seconds: float) -> list[TaskResult]:
+        """Wait at most ``seconds`` for a task to end; return the results of those that ended."""
         self._fill()
         ready = wait([p.connection for p in self._processes if p.task is not None], seconds)
         ended = [self._ended(p) for p in list(self._processes) if p.connection in ready]
@@ -82,7 +82,7 @@ class Processes:
             process.task = self._waiting.popleft()
             process.connection.send(process.task)
 
-    def _ended(self, process: _Process) -> Ended:
+    def _ended(self, process: _Process) -> TaskResult:
         assert process.task is not None
         task, process.task = process.task, None
         try:
@@ -91,13 +91,13 @@ class Processes:
             self._processes.remove(process)
             process.process.join()
             process.connection.close()
-            return Ended(task, f"its process was ended by {_cause(process.process.exitcode)}")
+            return TaskResult(task, f"its process was ended by {_cause(process.process.exitcode)}")
         if error is not None:
             raise error
         outcome = read_outcome(task.folder)
         if task.device != "cpu" and outcome is not None and outcome["status"] == "failed":
             self._replace(process)
-        return Ended(task)
+        return TaskResult(task)
 
     def _replace(self, process: _Process) -> None:
         """End a worker: after an error of CUDA all that a process asks of the device fails."""
@@ -130,7 +130,7 @@ def _serve(connection: Connection) -> None:
             return
         error = None
         try:
-            work_on(task)
+            execute_task(task)
         except Exception as raised:  # noqa: BLE001 - the other process reports it
             error = raised
         connection.send(error)
@@ -138,7 +138,7 @@ def _serve(connection: Connection) -> None:
 
 @contextmanager
 def _threads(count: int | None) -> Iterator[None]:
-    """Let processes that are started in the block have so many threads: their libraries read it when imported."""
+    """Set the number of threads of processes started in the block: libraries read it when they are imported."""
     before = os.environ.get("OMP_NUM_THREADS")
     if count is not None:
         os.environ["OMP_NUM_THREADS"] = str(count)
@@ -153,6 +153,6 @@ def _threads(count: int | None) -> Iterator[None]:
 
 def _cause(code: int | None) -> str:
     if code is not None and code < 0:
-        hint = ", perhaps for want of memory" if -code == signal.SIGKILL else ""
+        hint = ", probably out of memory" if -code == signal.SIGKILL else ""
         return f"{signal.Signals(-code).name}{hint}"
     return f"exit code {code}"

@@ -54,7 +54,7 @@ def execute(
 
     failures = _failed_before(folder)
     schedule = Schedule("cells", lambda task: stored_rows(places[task.place], steady) is not None, execution)
-    failures |= schedule.work_off(left(steady))
+    failures |= schedule.run_all(left(steady))
     if len(steady) < len(metrics):
         write_json(folder.speed_pass, {"failed": failures})
         whole = replace(
@@ -63,7 +63,7 @@ def execute(
             is_done=lambda task: stored_rows(places[task.place], metrics) is not None,
             speed=True,
         )
-        failures |= whole.work_off([replace(task, speed=True) for task in left(metrics)])
+        failures |= whole.run_all([replace(task, speed=True) for task in left(metrics)])
     return Rows.joined(_merged(job, metrics, failures.get(place)) for place, job in places.items())
 
 
@@ -80,7 +80,7 @@ def _merged(job: Job, metrics: Sequence[MetricSpec], failure: str | None) -> Row
 
 
 def machine_of(jobs: Sequence[Job], otherwise: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The machine that cells were worked on; ``otherwise`` where none tells, the names of all where there were several."""
+    """The machine that ran the cells; ``otherwise`` if none is recorded, all names if there were several."""
     outcomes = [read_outcome(job.cell.folder) for job in jobs]
     machines = [outcome["machine"] for outcome in outcomes if outcome is not None and "machine" in outcome]
     if not machines:
@@ -97,6 +97,6 @@ def _all_of(names: Iterable[str]) -> str:
     different = sorted(set(names))
     if len(different) > 1:
         log.warning(
-            "Cells were worked on by %s: their times and speeds do not compare.", ", ".join(different)
+            "Cells were executed by %s: their times and speeds are not comparable.", ", ".join(different)
         )
     return shortened(" and ".join(different), MAX_LABEL - 10)

@@ -1,4 +1,4 @@
-"""Has tasks worked on by an executor: submits them, follows them, starts lost ones again."""
+"""Runs tasks on an executor: submits them, polls their results and restarts lost tasks."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 
 from ..machine import processor_count
 from ..progress import progress
-from .ended import Ended, Executor
 from .outcome import read_outcome
 from .processes import Processes
+from .results import Executor, TaskResult
 from .settings import Execution
 from .slurm import Slurm
 from .task import TASK_LOG, Task
@@ -40,8 +40,8 @@ class Schedule:
     execution: Execution
     speed: bool = False
 
-    def work_off(self, tasks: Sequence[Task]) -> Failures:
-        """Have the tasks worked on, all of one root, whose lock is held; return which failed and why.
+    def run_all(self, tasks: Sequence[Task]) -> Failures:
+        """Run the tasks, all of one root, whose lock is held; return which failed and why.
 
         Raises
         ------
@@ -75,7 +75,7 @@ class Schedule:
         workers = min(self.execution.workers or (cores if device == "cpu" else 1), tasks)
         return Processes(workers, self.execution.threads or max(1, cores // workers))
 
-    def _again(self, ended: Ended, failures: Failures) -> Task | None:
+    def _again(self, ended: TaskResult, failures: Failures) -> Task | None:
         """What to submit again of a task that ended; None where it is done, or failed, which is recorded."""
         task = ended.task
         outcome = read_outcome(task.folder)

@@ -1,4 +1,4 @@
-"""Where the cells of a run are worked on: in this process, in processes of this machine, or as jobs of a cluster."""
+"""Where the cells of a run are executed: in this process, in worker processes, or as jobs of a cluster."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class SlurmSettings:
 
 @dataclass(frozen=True)
 class Execution:
-    """How the cells of a run are worked on. Nothing of it enters a fingerprint.
+    """How the cells of a run are executed. None of these settings enters a fingerprint.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Execution:
     slurm: SlurmSettings = field(default_factory=SlurmSettings)
 
     def __post_init__(self) -> None:
-        """Refuse what nothing can be worked on with."""
+        """Refuse invalid settings."""
         for name in ("workers", "threads"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -99,7 +99,7 @@ def import_submitit() -> Any:
 
 
 def check_executor(execution: Execution, device: str) -> None:
-    """Make sure that cells can be worked on.
+    """Check that cells can be executed.
 
     Raises
     ------

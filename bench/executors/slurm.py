@@ -20,8 +20,8 @@ from typing_extensions import TypedDict
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..io.documents import checked, read_json
 from ..io.files import check_room, digest, write_json
-from .ended import Ended
 from .outcome import forget_outcome, read_outcome
+from .results import TaskResult
 from .settings import Execution, import_submitit
 from .task import Task
 from .worker import FULL_DISK
@@ -32,7 +32,7 @@ MAX_ARRAY = 1000
 ANSWER_S = 60
 """Seconds that Slurm has to answer a question in."""
 POLLS = 3
-"""A job that is gone has left no outcome after so many polls: files may appear late on a network file system."""
+"""Polls after which a job that is gone counts as lost: outcome files may appear late on a network file system."""
 CANCEL_S = 120.0
 """Seconds that cancelled jobs have to end in; Slurm kills them after its KillWait, 30 seconds by default."""
 UNANSWERED = 100
@@ -136,8 +136,8 @@ class Slurm:
             submitted: Submitted = {"speed": self._speed, "jobs": self._numbers}
             write_json(submitted_path(self._root), submitted)
 
-    def poll(self, seconds: float) -> list[Ended]:
-        """Ask Slurm after so many seconds; return the tasks whose jobs have ended."""
+    def poll(self, seconds: float) -> list[TaskResult]:
+        """Wait ``seconds``, then query Slurm; return the results of jobs that have ended."""
         time.sleep(seconds)
         try:
             states = queue()
@@ -171,20 +171,20 @@ class Slurm:
         else:
             submitted_path(self._root).unlink(missing_ok=True)
 
-    def _look(self, job: _Job) -> Ended | None:
+    def _look(self, job: _Job) -> TaskResult | None:
         outcome = read_outcome(job.task.folder)
         if outcome is not None and outcome["speed"] == self._speed and outcome["status"] != "running":
-            return Ended(job.task)
+            return TaskResult(job.task)
         job.polls += 1
         if job.polls < POLLS:
             return None
         state, reason, code = end_of(job.number)
         if state in FINAL and not (job.earlier and state == "CANCELLED"):  # who starts again wants it done
-            return Ended(job.task, f"job {job.number} {FINAL[state]}", again=False)
+            return TaskResult(job.task, f"job {job.number} {FINAL[state]}", again=False)
         if code in FULL_DISK and not job.earlier:  # there may be room since; see `Task.__call__`
             raise OSError(code, f"{os.strerror(code)} (job {job.number})", str(job.task.folder))
         check_room(self._root)  # a job that could not even open its log leaves no reason
-        return Ended(job.task, f"job {job.number} ended as {state}{reason}")
+        return TaskResult(job.task, f"job {job.number} ended as {state}{reason}")
 
     def _submit(self, tasks: Sequence[Task]) -> list[str]:
         submitit = import_submitit()

@@ -104,7 +104,7 @@ def time_left(cells: Sequence[CellState]) -> tuple[float | None, bool]:
 
 
 def cell_states(folder: RunFolder, manifest: Manifest) -> list[CellState]:
-    """State of each cell, in the order in which they are worked on."""
+    """State of each cell, in the order of execution."""
     submitted = read_submitted(folder.root)
     queued = None if submitted is None else _queue()
     jobs = {} if submitted is None else submitted["jobs"]

@@ -53,10 +53,10 @@ class Task:
         """Do it, in a job of its own. Raises what a task cannot be recorded as failed for."""
         os.chdir(self.directory)
         sys.path += [entry for entry in self.path if entry not in sys.path]
-        from .worker import FULL_DISK, work_on
+        from .worker import FULL_DISK, execute_task
 
         try:
-            work_on(self)
+            execute_task(self)
         except OSError as error:
             if error.errno not in FULL_DISK:
                 raise

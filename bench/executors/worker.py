@@ -25,7 +25,7 @@ FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 """Errors of the system that no other task would be spared."""
 
 
-def work_on(task: Task) -> None:
+def execute_task(task: Task) -> None:
     """Do a task. What fails is recorded in ``outcome.json``, with its log in ``job.log``.
 
     Raises

@@ -54,7 +54,7 @@ class GateSettings:
 
 
 def gate(settings: GateSettings, progress: Progress = no_progress) -> Findings:
-    """Hold a run against a committed baseline: exit code 1 where a number got worse, 3 where one is missing.
+    """Compare a run with a committed baseline: exit code 1 if a number got worse, 3 if one is missing.
 
     Results or a baseline that are missing or invalid are a finding too, with exit code 3, so that CI does not
     take them for a usage error. Nothing is written then but the reports asked for, which say so.

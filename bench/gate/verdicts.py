@@ -53,12 +53,12 @@ class Verdict:
 
 
 def _shown(value: float, digits: int, sign: str = "") -> str:
-    """A number with so many digits behind the point; one too large for that to mean anything, in powers of ten."""
+    """Format a number with a fixed number of decimals; very large numbers use scientific notation."""
     return f"{value:{sign}.{digits}f}" if abs(value) < 1e15 else f"{value:{sign}g}"
 
 
 def judge(results: Results, baseline: Baseline, *, speed: bool = False) -> list[Verdict]:
-    """Give every number of baseline and results its verdict, the gravest first.
+    """Give every number of baseline and results its verdict, most severe first.
 
     Numbers of a task whose protocol is not the baseline's are missing: they were measured, but of something else.
     ``speed``: judge machine-bound numbers as well, if both were measured on one machine; else they are unjudged, even
@@ -182,7 +182,7 @@ def headline(verdicts: Sequence[Verdict], code: int) -> str:
 
 
 def to_text(verdicts: Sequence[Verdict], code: int, notes: Sequence[str]) -> str:
-    """Headline, everything that was judged and did not simply pass (the gravest first), notes."""
+    """Headline, everything that was judged and did not simply pass (most severe first), notes."""
     others = [verdict for verdict in verdicts if verdict.outcome not in ("pass", "unjudged")]
     lines = [headline(verdicts, code), *(f"  {verdict}" for verdict in others[:SHOWN])]
     if len(others) > SHOWN:

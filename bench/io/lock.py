@@ -63,7 +63,7 @@ def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
 
 
 def is_locked(folder: Path) -> bool:
-    """Whether a process of this machine works in ``folder``, as far as its lock tells."""
+    """Whether a process of this machine holds the lock of ``folder``."""
     try:
         with open(folder / LOCK_FILE, encoding="utf-8", opener=no_link) as stream:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -41,7 +41,7 @@ def run(
 ) -> Rows:
     """Run a comparison into ``config.out`` and return its rows; ``record`` is added to the manifest.
 
-    ``execution`` says where its cells are worked on, None for this process. ``unchecked`` trains although a capture has an
+    ``execution`` says where its cells are executed, None for this process. ``unchecked`` trains although a capture has an
     error that makes results meaningless (see `DatasetSpec.errors`).
 
     Everything that can be checked is checked before the first long step: settings, device, methods, captures, the

@@ -204,7 +204,7 @@ class RunFolder:
 
     @property
     def speed_pass(self) -> Path:
-        """Here while speed is measured after all cells were worked on: which had failed by then, and why."""
+        """Present while speed is measured at the end of a run: the cells that had failed by then, and why."""
         return self.root / "speed.json"
 
     @property

@@ -43,7 +43,7 @@ PICTURE, NUMBERS = "inspection.png", "inspection.json"
 
 @writes("out")
 def inspect(settings: InspectSettings, progress: Progress = no_progress) -> Findings:
-    """Draw what a capture holds: camera rig, splits, tracked mesh on images, motion by sequence.
+    """Plot the contents of a capture: camera rig, splits, tracked mesh over images, motion by sequence.
 
     Raises `InputError` for a capture that the reader refuses (``headbench lint`` then reports all that is wrong),
     for a clip without training frames that are not excluded, and for counts below 1.

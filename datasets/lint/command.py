@@ -76,7 +76,7 @@ _WIDTH = 100
 
 
 def lint(settings: LintSettings, progress: Progress = no_progress) -> Findings:
-    """Search a capture for faults that make a comparison unfair or wrong; --list explains the codes.
+    """Check a capture for faults that make a comparison unfair or wrong; --list explains the codes.
 
     Passed without errors; with ``strict``, without warnings too.
 

@@ -52,7 +52,7 @@ class PrepareSettings:
     source: Literal["auto", "video", "images"] = "auto"
     """What to take where a sequence has both; "auto" takes images where they come with masks."""
     every: int = 0
-    """Keep every so many frames; 0 stands for 3 with the 73-per-second videos and 1 with VHAP's images."""
+    """Frame stride; 0 stands for 3 with the 73-per-second videos and 1 with VHAP's images."""
     colour: Literal["auto", "none"] = "auto"
     """"auto" corrects colours where the recording has a calibration for that; "none" never."""
     edges: Literal["unblend", "plain"] = "unblend"
@@ -62,7 +62,7 @@ class PrepareSettings:
     """Keep the frames that all cameras have where they differ, instead of an error; tracking of all frames is cut
     with them."""
     workers: int = 0
-    """Cameras worked on at one time; 0 stands for one per processor core."""
+    """Number of cameras processed at a time; 0 stands for one per processor core."""
     check: bool = False
     """Only look whether everything needed is there."""
     union_root: str = ""
@@ -110,7 +110,7 @@ class RecordSettings(CaptureOptions):
 
 
 def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progress) -> Findings:
-    """Turn raw NeRSemble recordings into captures that methods train on; continues after a kill.
+    """Convert raw NeRSemble recordings to captures; an interrupted conversion is continued.
 
     Everything about every subject is checked before the first frame is decoded.
     """
@@ -193,7 +193,7 @@ def _done(results: list[SubjectResult], plans: list[PreparationPlan], settings: 
 
 @writes("out", "a recording")
 def record_nersemble(settings: RecordSettings, progress: Progress = no_progress) -> Findings:
-    """Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to try prepare on.
+    """Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to test `prepare`.
 
     For synthetic captures, as they bring their own head model.
     """

@@ -210,7 +210,7 @@ def _work_off(out: Path, plans: Sequence[SubjectPlan], execution: Execution) -> 
         for name, plan in by_name.items()
     ]
     root.mkdir(exist_ok=True)
-    failed = Schedule("subjects", lambda task: not _left(by_name[task.place]), execution).work_off(tasks)
+    failed = Schedule("subjects", lambda task: not _left(by_name[task.place]), execution).run_all(tasks)
     for name, reason in failed.items():
         raise HeadbenchError(f"Subject {name} failed: {reason} Its log is {root / name / TASK_LOG}.")
     shutil.rmtree(root)

@@ -121,7 +121,7 @@ def _export(settings: ExportOptions, name: str, progress: Progress) -> Findings:
 
 @writes("out", "an avatar")
 def import_ga(settings: ImportGASettings, progress: Progress = no_progress) -> Findings:
-    """Make an avatar of a GaussianAvatars PLY, and of flame_param.npz or its capture.
+    """Import a GaussianAvatars PLY, with its flame_param.npz or its capture, as an avatar of the method ga.
 
     Harmonics of a lower degree are filled up with zeros, and whatever other columns there are is left out. Shape and
     static offset come from flame_param.npz, else from the capture. With both, training timesteps are shown in the pose that

@@ -48,7 +48,7 @@ class HeadSettings:
 
 
 def import_avatar(settings: ImportGASettings, progress: Progress) -> Findings:
-    """Make an avatar of a GaussianAvatars PLY, and of flame_param.npz or its capture.
+    """Import a GaussianAvatars PLY, with its flame_param.npz or its capture, as an avatar of the method ga.
 
     Raises `InputError` for a file that does not fit, and for a folder that holds something already.
     """

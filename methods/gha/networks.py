@@ -32,7 +32,7 @@ class Weights(Protocol):
 
 @dataclass(frozen=True)
 class Mlp:
-    """A perceptron whose inputs come in once more half way: at layer ``len(widths) // 2``, after the hidden values.
+    """A perceptron with a skip connection of its inputs: at layer ``len(widths) // 2``, after the hidden values.
 
     Attributes
     ----------

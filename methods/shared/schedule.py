@@ -1,4 +1,4 @@
-"""When things happen in a run: moments of the published run as fractions of the budget at hand."""
+"""Training schedules: moments of the published run as fractions of the budget at hand."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def _part(text: str) -> Fraction:
 
 
 def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Findings:
-    """Quality against training time and what else a training is given, measured on training frames that are held out.
+    """Plot quality against training time, cameras, timesteps or tracking error, measured on held-out training frames.
 
     Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. Started again, it keeps what is done and
     refuses to leave out points that are there.

@@ -31,7 +31,7 @@ class LeaderboardSettings:
 
 @writes("out")
 def leaderboard_build(settings: LeaderboardSettings, progress: Progress = no_progress) -> Findings:
-    """Make a page, Markdown and HTML, from the result bundles in a folder."""
+    """Build a leaderboard page in Markdown and HTML from the result bundles in a folder."""
     from .page import build
 
     return build(Path(settings.folder), Path(settings.out), settings.title, progress)

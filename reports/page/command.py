@@ -42,7 +42,7 @@ class PageSettings(RunOptions):
 
 
 def report(settings: PageSettings, progress: Progress = no_progress) -> Findings:
-    """Write one HTML file, or a folder, that shows finished runs and opens without a network.
+    """Write a report of finished runs as one HTML file or a folder; it opens without a network.
 
     Raises `InputError` for folders that are no finished runs or do not compare, a file that cannot be written, and
     bytes that do not suffice.

@@ -83,7 +83,7 @@ COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
 
 @writes("out")
 def pareto(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
-    """Quality against size and frame time over finished runs: CSV, and a plot with the Pareto front marked.
+    """Plot quality against size and frame time of finished runs, with the Pareto front, and write CSV.
 
     Write ``points.csv`` and ``pareto.png``. Raises `InputError` for runs that cannot be compared."""
     from ..writers import csv_text
@@ -142,7 +142,7 @@ def _text(
 
 
 def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Findings:
-    """Derive smaller and faster avatars from a run's without training: quality against size and frame time.
+    """Derive smaller and faster variants of a run's avatars without training; quality against size and frame time.
 
     Writes ``points.csv`` and ``pareto.png`` as `headbench pareto` does.
     Raises `InputError` for a folder that is no finished run, and for methods and variants that there are not.

@@ -113,7 +113,7 @@ def run_robustness_test(
 
 
 def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -> Findings:
-    """Render a run's avatars in views and expressions beyond those of training: stability limits, contact sheet.
+    """Render a run's avatars in views and expressions beyond those of training; check stability limits.
 
     Does not pass where a limit is broken. Raises `InputError` for a folder that is no finished run, and for a capture
     that is not the run's.
@@ -128,7 +128,7 @@ def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -
 
 
 def reenact_run(settings: ReenactSettings, progress: Progress = no_progress) -> Findings:
-    """Drive a run's avatars with another subject's expressions: stability limits, frames, contact sheet.
+    """Drive a run's avatars with another subject's expressions; check stability limits.
 
     Does not pass where a limit is broken. Raises `InputError` for a folder that is no finished run, where nobody else
     is there to drive, and for a source tracked with another head model.

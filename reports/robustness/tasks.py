@@ -120,7 +120,7 @@ def rendered_by_tasks(
             return False
 
     left = [task for task in tasks.values() if not is_done(task)]
-    failed = Schedule("avatars", is_done, settings.execution).work_off(left)
+    failed = Schedule("avatars", is_done, settings.execution).run_all(left)
     for place, reason in failed.items():
         raise HeadbenchError(f"{place} failed: {reason} Its log is {out / place / TASK_LOG}.")
     return [

@@ -63,7 +63,7 @@ FIELDS = (
 
 
 def compare_runs(settings: CompareSettings, progress: Progress = no_progress) -> Findings:
-    """Paired differences between methods of finished runs: interval, exact test over subjects, Holm's correction.
+    """Test paired differences between methods of finished runs: interval, exact test over subjects, Holm's correction.
 
     Raises `InputError` for runs, methods and metrics that do not fit.
     """

@@ -90,7 +90,7 @@ class SuiteSettings(ExecutionOptions):
 
 @writes("out")
 def suite(settings: SuiteSettings, progress: Progress = no_progress) -> Findings:
-    """Compare methods on the suite's ten synthetic subjects: capture, train, measure, tables by region and part."""
+    """Run the benchmark suite: ten synthetic subjects, all methods, tables by region and part."""
     from .suite import run_suite
 
     return run_suite(settings, progress)

@@ -60,7 +60,7 @@ class ViewSettings(RunOptions):
 
 
 def view(settings: ViewSettings, progress: Progress = no_progress) -> Findings:
-    """Move avatars in a browser: side by side, from any view, with sliders and recorded sequences.
+    """View avatars in a browser, side by side, with sliders and recorded sequences.
 
     Raises `InputError` for folders without avatars, captures that are not there and a port that is taken, `UnavailableError`
     without viser.

@@ -162,8 +162,8 @@ def test_an_unknown_command_is_answered_with_the_nearest(capsys, words, answer):
 
 def test_words_of_other_toolkits_lead_to_commands_that_exist():
     names = set(registry.discover("commands"))
-    assert set(commands.WORDS_OF_OTHERS.values()) <= names
-    assert not set(commands.WORDS_OF_OTHERS) & names
+    assert set(commands.COMMAND_ALIASES.values()) <= names
+    assert not set(commands.COMMAND_ALIASES) & names
 
 
 def test_help_starts_with_demo_and_run(capsys):

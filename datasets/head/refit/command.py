@@ -69,7 +69,7 @@ class RefitSettings:
     """An angle is found when a step changes it by less than this, radians."""
 
     evaluations: int = 200
-    """At most so many evaluations for a frame."""
+    """Maximum number of evaluations per frame."""
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
@@ -102,7 +102,7 @@ BLOCKS_FOLDER = "refit-blocks"
 
 @writes("out", "captures")
 def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progress) -> Findings:
-    """Fit another head model to a capture's tracking; residuals in millimetres, a heat map.
+    """Refit the tracking of a capture to another head model, with residuals in millimetres and a heat map.
 
     Started again after a kill it continues at the block of timesteps it was at.
 

@@ -74,7 +74,7 @@ class SubmissionWriteSettings:
 
 
 def submission_write(settings: SubmissionWriteSettings, progress: Progress = no_progress) -> Findings:
-    """Write a submission to the NeRSemble benchmark, and say what its codec costs; 3 without the program ffmpeg.
+    """Write a submission to the NeRSemble benchmark and report the loss of its codec; exit code 3 without ffmpeg.
 
     Videos are H.264 of constant rate factor 14, YUV 4:2:0, as the benchmark's documentation says. The cost is measured on
     the encoded frames themselves.
@@ -129,7 +129,7 @@ class SubmissionCheckSettings:
 
 
 def submission_check(settings: SubmissionCheckSettings, progress: Progress = no_progress) -> Findings:
-    """Check a submission to the NeRSemble benchmark as its server does, and decode every frame."""
+    """Check a submission to the NeRSemble benchmark as its server does and decode every frame."""
     from .submission import check_submission
 
     data = None if settings.data is None else Path(settings.data)

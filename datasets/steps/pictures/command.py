@@ -44,7 +44,7 @@ JAW_PICTURE, CLUSTER_PICTURE, NUMBERS = "jaw_bases.png", "expression_clusters.pn
 
 @writes("out")
 def steps(settings: StepsSettings, progress: Progress = no_progress) -> Findings:
-    """Draw the jaw bases and expression clusters that a capture's training frames give, and their numbers.
+    """Plot the jaw bases and expression clusters computed from a capture's training frames.
 
     Raises `InputError` for a capture that the reader refuses, for counts below 1, and for a head without a face
     region.

@@ -46,7 +46,7 @@ DECISIONS_FILE = "tongue.yaml"
 
 @writes("out")
 def tongue(settings: TongueSettings, progress: Progress) -> Findings:
-    """Find the frames that show the tongue; scores, reasons, your overrides, and a contact sheet to review.
+    """Find the frames that show the tongue, for review on a contact sheet and with overrides.
 
     Raises `InputError` before any image is looked at, for captures and decisions that cannot be read.
     """

@@ -202,7 +202,7 @@ class Arrays:
         return dequantise(self.integers(name, *shape), step)
 
     def rest(self) -> Mapping[str, FloatArray]:
-        """What nobody took: it must be float32 throughout, and is stored as it is."""
+        """Remaining arrays: it must be float32 throughout, and is stored as it is."""
         return {name: self.floats(name, *values.shape) for name, values in list(self._left.items())}
 
 

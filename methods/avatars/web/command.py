@@ -39,7 +39,7 @@ class ExportHtmlSettings(AvatarOptions):
 
 
 def export_html(settings: ExportHtmlSettings, progress: Progress = no_progress) -> Findings:
-    """Write one HTML file with an avatar in it and sliders that move it.
+    """Export an avatar as one HTML file with sliders for expressions and joints.
 
     Raises `InputError` for a folder that holds no avatar of splats, and for a file that cannot be written.
     """

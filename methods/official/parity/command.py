@@ -84,7 +84,7 @@ class ParitySettings:
 
 @writes("out", "captures")
 def parity(settings: ParitySettings, progress: Progress = no_progress) -> Findings:
-    """Train a method and its authors' code on one capture with equal settings, and tell how their results differ."""
+    """Train a method and its authors' code on one capture with equal settings and compare the results."""
     from .parity import compare
 
     return compare(settings, progress)

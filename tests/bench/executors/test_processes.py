@@ -47,7 +47,7 @@ def test_a_device_that_is_not_there_fails_each_task(tmp_path):
     for task in tasks:
         task.folder.mkdir()
     schedule = Schedule("tasks", lambda task: True, Execution("processes"))
-    failures = schedule.work_off(tasks)
+    failures = schedule.run_all(tasks)
     assert set(failures) == {"one", "two"}
     for task in tasks:
         assert "device" in failures[task.place]
@@ -125,7 +125,7 @@ def test_kept_cells_are_named_and_changed_code_fails_others(config, rows_of, cap
     runner.run(config, TWO)
     assert caplog.text.count("toy seed 0: kept: trained ") == 3
     assert folder.read_manifest().machine == {**own, "processor": "A and B"}
-    assert "do not compare" in caplog.text
+    assert "not comparable" in caplog.text
     assert _Run.read(folder.root).methods.keys() == {"toy"}
     record = read_json(folder.manifest)
     record["methods"][0]["code"] = "of another"
@@ -200,7 +200,7 @@ def test_machines_of_several_kinds_are_all_named(tmp_path, caplog):
         write_outcome(folder, {"status": "done", "speed": False, "machine": machine})
         jobs.append(SimpleNamespace(cell=SimpleNamespace(folder=folder)))
     assert machine_of(jobs, {})["device"] == {"name": "Card A and Card B", "memory_bytes": 9}
-    assert "Card A, Card B: their times and speeds do not compare" in caplog.text
+    assert "Card A, Card B: their times and speeds are not comparable" in caplog.text
 
 
 def test_time_left_is_by_method_and_shared_out():

@@ -1,0 +1,39 @@
+"""Results of tasks, and what an executor of tasks does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+from .task import Task
+
+
+class TaskResult(NamedTuple):
+    """A task whose process or job has ended; how it ended is in its outcome file, if it wrote one.
+
+    Attributes
+    ----------
+    lost : why there may be no outcome file; "" for a regular end.
+    again : whether to start the task again if there is no outcome.
+    """
+
+    task: Task
+    lost: str = ""
+    again: bool = True
+
+
+class Executor(Protocol):
+    """Runs tasks: in this process, in workers, or on Slurm."""
+
+    @property
+    def running(self) -> int:
+        """Number of running tasks."""
+
+    def submit(self, tasks: Sequence[Task]) -> None:
+        """Start these tasks."""
+
+    def poll(self, seconds: float) -> list[TaskResult]:
+        """Wait at most ``seconds`` for tasks to end; return the results of those that ended."""
+
+    def close(self) -> None:
+        """Release processes and jobs; called once, also after an error."""
