@@ -10,7 +10,7 @@
 #include <vector>
 
 #include "bench/native/module.h"
-#include "bench/native/thread_pool.h"
+#include "bench/native/parallel.h"
 #include "hash_grid.h"
 #include "mesh_search.h"
 #include "rays.h"
@@ -49,20 +49,12 @@ std::shared_ptr<Posed> make_posed(std::shared_ptr<Tree> tree, const Array<const 
   return std::make_shared<Posed>(std::move(tree), vertices.data(), kernels_of(isa).nearest);
 }
 
-// Call body(begin, end) for parts of `count`.
-template <class Body>
-void in_parts(std::int64_t count, int threads, Body body) {
-  ThreadPool::instance().run((count + kPointsPerTask - 1) / kPointsPerTask, threads, [&](std::int64_t task, int) {
-    body(task * kPointsPerTask, std::min(count, (task + 1) * kPointsPerTask));
-  });
-}
-
 void nearest(const Posed& mesh, const Array<const float, -1, 3>& points, const Array<std::int32_t, -1>& triangles,
              const Array<float, -1>& squared, int threads) {
   const auto count = static_cast<std::int64_t>(points.shape(0));
   require(triangles.shape(0) == points.shape(0) && squared.shape(0) == points.shape(0) && threads >= 1);
   nb::gil_scoped_release unlocked;
-  in_parts(count, threads, [&](std::int64_t begin, std::int64_t end) {
+  parallel_for(count, kPointsPerTask, threads, [&](std::int64_t begin, std::int64_t end) {
     for (; begin < end; begin += kLanes) {
       Queries queries;
       for (std::int64_t i = begin; i < std::min(end, begin + kLanes); ++i) queries.add(row(points.data(), i), -1);
@@ -79,7 +71,7 @@ void first_hit(const Posed& mesh, const Array<const float, -1, 3>& origins, cons
   require(directions.shape(0) == origins.shape(0) && triangles.shape(0) == origins.shape(0) &&
           distances.shape(0) == origins.shape(0) && threads >= 1);
   nb::gil_scoped_release unlocked;
-  in_parts(count, threads, [&](std::int64_t begin, std::int64_t end) {
+  parallel_for(count, kPointsPerTask, threads, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
       const Hit hit = mesh.first_hit(row(origins.data(), i), row(directions.data(), i));
       triangles.data()[i] = hit.triangle;

@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <atomic>
 
-#include "bench/native/thread_pool.h"
+#include "bench/native/parallel.h"
 
 namespace headbench::insta {
 
@@ -74,11 +74,10 @@ struct Gathered {
 }  // namespace
 
 Samples march(const Marcher& marcher, const Rays& rays, int threads) {
-  const std::int64_t tasks = (rays.count + kMarchedPerTask - 1) / kMarchedPerTask;
-  std::vector<Samples> parts(tasks);
-  ThreadPool::instance().run(tasks, threads, [&](std::int64_t task, int) {
-    const std::int64_t end = std::min(rays.count, (task + 1) * kMarchedPerTask);
-    for (std::int64_t number = task * kMarchedPerTask; number < end; ++number) march(marcher, rays, number, parts[task]);
+  std::vector<Samples> parts(divided_up(rays.count, kMarchedPerTask));
+  parallel_for(rays.count, kMarchedPerTask, threads, [&](std::int64_t begin, std::int64_t end) {
+    Samples& part = parts[begin / kMarchedPerTask];
+    for (std::int64_t number = begin; number < end; ++number) march(marcher, rays, number, part);
   });
   Samples whole;
   for (const Samples& part : parts) {
@@ -96,13 +95,12 @@ Samples march(const Marcher& marcher, const Rays& rays, int threads) {
 std::int64_t render(const Marcher& marcher, const Kernels& kernels, const Field& field, const float* starts,
                     const std::uint8_t* mouth, float step, const RenderRays& all, const Seen& seen, int threads) {
   std::atomic<std::int64_t> evaluated{0};
-  ThreadPool::instance().run((all.count + kRenderedPerTask - 1) / kRenderedPerTask, threads, [&](std::int64_t task, int) {
-    const std::int64_t begin = task * kRenderedPerTask, end = std::min(all.count, begin + kRenderedPerTask);
+  const Scratch scratch(kernels.scratch(field), threads);
+  parallel_for(all.count, kRenderedPerTask, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
     std::vector<Interval> intervals;
     std::vector<Progress> rays;  // that go on, and beside each what it has gathered
     std::vector<Gathered> gathered;
     Round round((end - begin) * all.round_samples);
-    std::vector<float> scratch(kernels.scratch(field));
     std::fill(seen.color + 3 * begin, seen.color + 3 * end, 0.0f);
     for (std::int64_t number = begin; number < end; ++number) {
       rays.push_back({row(all.origins, number), row(all.directions, number), all.jitter[number], 0});
@@ -122,7 +120,7 @@ std::int64_t render(const Marcher& marcher, const Kernels& kernels, const Field&
           return ++group[ray].samples < all.round_samples;
         });
       }
-      kernels.evaluate(field, starts, step, round.points(), round.count, round.values(), scratch.data());
+      kernels.evaluate(field, starts, step, round.points(), round.count, round.values(), scratch.of(worker));
       evaluated += round.count;
       const Values values = round.values();
       for (std::int64_t at = 0; at < round.count; ++at) {

@@ -3,7 +3,7 @@
 #include <string>
 
 #include "bench/native/module.h"
-#include "tasks.h"
+#include "frame.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -23,7 +23,7 @@ void triangles(const Array<const float, -1, 3>& vertices, const Array<const std:
   const Triangles in{vertices.data(), faces.data(), rotations.data(), centers.data(), sizes.data(), quaternions.data()};
   const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.triangles(in, begin, end); });
+  parallel_for(count, kPerTask, threads, [&](std::int64_t begin, std::int64_t end) { kernels.triangles(in, begin, end); });
 }
 
 void to_world(const Array<const std::int64_t, -1>& binding, const Array<const float, -1, 3, 3>& rotations,
@@ -41,7 +41,7 @@ void to_world(const Array<const std::int64_t, -1>& binding, const Array<const fl
                  quats.data(),   scales.data(),    world_means.data(), world_quats.data(), world_scales.data()};
   const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.to_world(in, begin, end); });
+  parallel_for(count, kPerTask, threads, [&](std::int64_t begin, std::int64_t end) { kernels.to_world(in, begin, end); });
 }
 
 void shade(const Array<const float, -1, 3, -1, kHarmonicsBlock>& coefficients, const Array<const float, -1, 3>& means,
@@ -62,7 +62,7 @@ void shade(const Array<const float, -1, 3, -1, kHarmonicsBlock>& coefficients, c
   for (int k = 0; k < 3; ++k) in.center[k] = center(k);
   const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.shade(in, begin, end); });
+  parallel_for(count, kPerTask, threads, [&](std::int64_t begin, std::int64_t end) { kernels.shade(in, begin, end); });
 }
 
 void turns(const Array<const float, -1, 3, 3>& to, const Array<const float, -1, 3, 3>& from,
@@ -72,7 +72,7 @@ void turns(const Array<const float, -1, 3, 3>& to, const Array<const float, -1, 
   const Turns in{to.data(), from.data(), out.data()};
   const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.turns(in, begin, end); });
+  parallel_for(count, kPerTask, threads, [&](std::int64_t begin, std::int64_t end) { kernels.turns(in, begin, end); });
 }
 
 void color_network(const Array<const std::int16_t, -1, -1>& positions, const Array<const float, -1>& steps, const Array<const float, -1, -1>& table,
@@ -90,7 +90,7 @@ void color_network(const Array<const std::int16_t, -1, -1>& positions, const Arr
   for (int k = 0; k < 3; ++k) net.center[k] = center(k);
   const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.color_network(net, begin, end); });
+  parallel_for(count, kPerTask, threads, [&](std::int64_t begin, std::int64_t end) { kernels.color_network(net, begin, end); });
 }
 
 void offset_network(const Array<const float, -1, -1>& table, const Array<const float, -1>& first_bias, const Array<const std::int32_t, -1, 3>& rows,
@@ -111,7 +111,7 @@ void offset_network(const Array<const float, -1, -1>& table, const Array<const f
   const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
   const Scratch scratch(kernels.offset_scratch(net), threads);
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
+  parallel_for(count, kPerTask, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
     kernels.offset_network(net, begin, end, scratch.of(worker));
   });
 }

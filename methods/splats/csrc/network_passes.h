@@ -549,16 +549,10 @@ inline void line_backward(const LineTraining& in, const LineSums& at, std::int64
   }
 }
 
-inline void add(float* to, const float* from, std::size_t count) {
-  std::size_t k = 0;
-  for (; k + W <= count; k += W) store(to + k, load(to + k) + load(from + k));
-  for (; k < count; ++k) to[k] += from[k];
-}
-
 extern const NetworkKernels network_kernels;
 const NetworkKernels network_kernels = {
     HEADBENCH_ISA_NAME, positions<false>, positions<true>, directions,     directions_backward, color_forward_scratch, color_forward,
     color_backward_scratch, color_backward, scatter_plane,       offset_scratch,        offset_network,
-    line_backward_scratch,  line_backward,  add};
+    line_backward_scratch,  line_backward};
 
 }  // namespace headbench::HEADBENCH_ISA

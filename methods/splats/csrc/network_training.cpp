@@ -13,7 +13,8 @@
 #include <utility>
 #include <vector>
 
-#include "tasks.h"
+#include "bench/native/module.h"
+#include "frame.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -23,11 +24,7 @@ namespace {
 
 constexpr std::int64_t kChunkMin = 2048;  // splats
 constexpr std::int64_t kChunksMax = 32;
-constexpr std::int64_t kSumsPerTask = 8192;  // floats
-constexpr int kBandRows = 16;                // of a plane
-
-std::int64_t divided_up(std::int64_t value, std::int64_t by) { return (value + by - 1) / by; }
-std::int64_t rounded_up(std::int64_t value, std::int64_t step) { return divided_up(value, step) * step; }
+constexpr int kBandRows = 16;  // of a plane
 
 // A multiple of kUnitsStep as an odd number of cache lines.
 int odd_stride(std::int64_t width) {
@@ -56,36 +53,9 @@ void unpad(const float* from, std::int64_t rows, std::int64_t columns, std::int6
   for (std::int64_t row = 0; row < rows; ++row) std::copy_n(from + row * stride, columns, to + row * columns);
 }
 
-// Call body(begin, end, worker's scratch) for chunks of `count` entries.
-template <class Body>
-void share_chunks(std::int64_t count, std::int64_t chunk, std::size_t scratch_floats, int threads, const Body& body) {
-  const Scratch scratch(scratch_floats, threads);
-  ThreadPool::instance().run(divided_up(count, chunk), threads, [&](std::int64_t task, int worker) {
-    body(task * chunk, std::min((task + 1) * chunk, count), scratch.of(worker));
-  });
-}
-
-// Call body(begin, end, accumulator, scratch) for chunks of `count` entries; the sums over all of them in the first
-// `floats` numbers of what is returned.
-template <class Body>
-void sum_chunks(const NetworkKernels& kernels, std::int64_t count, std::size_t floats, std::size_t scratch_floats, int threads,
-                Buffer<float>& sums, const Body& body) {
-  const std::int64_t chunk = std::max(kChunkMin, rounded_up(divided_up(count, kChunksMax), kNetworkTile));
-  const std::int64_t chunks = std::max<std::int64_t>(divided_up(count, chunk), 1);
-  const std::size_t stride = rounded_up(static_cast<std::int64_t>(floats), 16);
-  sums.resize(stride * chunks);
-  if (count == 0) std::fill_n(sums.data(), floats, 0.0f);
-  share_chunks(count, chunk, scratch_floats, threads, [&](std::int64_t begin, std::int64_t end, float* scratch) {
-    float* own = sums.data() + begin / chunk * stride;
-    std::fill_n(own, floats, 0.0f);
-    body(begin, end, own, scratch);
-  });
-  const std::int64_t all = static_cast<std::int64_t>(floats);
-  ThreadPool::instance().run(divided_up(all, kSumsPerTask), threads, [&](std::int64_t task, int) {
-    const std::int64_t begin = task * kSumsPerTask, end = std::min(begin + kSumsPerTask, all);
-    for (std::int64_t other = 1; other < chunks; ++other)
-      kernels.add(sums.data() + begin, sums.data() + other * stride + begin, end - begin);
-  });
+// Splats to a part of a sum: enough that the parts are few.
+std::int64_t summed_chunk(std::int64_t count) {
+  return std::max(kChunkMin, rounded_up(divided_up(count, kChunksMax), kNetworkTile));
 }
 
 // Order of `count` places by their (count, 3) lower samples: by the last number, then the middle one, then the first.
@@ -138,8 +108,10 @@ class ColorPass {
     net.first = pad_transposed(first, in.first.data(), hidden_units_, input_count_, net.inputs, net.units_stride).data();
     net.last = pad(last, in.last.data(), 3, hidden_units_, 3, net.units).data();
     nb::gil_scoped_release unlocked;
-    share_chunks(count_, kChunkMin, kernels_.color_forward_scratch(net), threads,
-              [&](std::int64_t begin, std::int64_t end, float* scratch) { kernels_.color_forward(net, begin, end, scratch); });
+    const Scratch scratch(kernels_.color_forward_scratch(net), threads);
+    parallel_for(count_, kChunkMin, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
+      kernels_.color_forward(net, begin, end, scratch.of(worker));
+    });
   }
 
   void backward(const ColorInputs& in, const Array<const float, -1, 3>& colors, const Array<const float, -1, 3>& by_colors,
@@ -174,10 +146,11 @@ class ColorPass {
     const ColorSums at{0, of_first, of_first + std::size_t{3} * net.units};
     float *first_out = by_first.data(), *last_out = by_last.data();
     nb::gil_scoped_release unlocked;
-    sum_chunks(kernels_, count_, at.end, kernels_.color_backward_scratch(net), threads, sums,
-               [&](std::int64_t begin, std::int64_t end, float* own, float* scratch) {
-                 kernels_.color_backward(net, at, begin, end, own, scratch);
-               });
+    const Scratch scratch(kernels_.color_backward_scratch(net), threads);
+    parallel_sum(count_, summed_chunk(count_), at.end, threads, sums,
+                 [&](std::int64_t begin, std::int64_t end, float* part, int worker) {
+                   kernels_.color_backward(net, at, begin, end, part, scratch.of(worker));
+                 });
     unpad(sums.data() + at.first, hidden_units_, input_count_, net.inputs, first_out);
     unpad(sums.data() + at.last, 3, hidden_units_, net.units, last_out);
     scatter(net, threads);
@@ -231,7 +204,7 @@ class ColorPass {
       starts[k].assign(samples + 1, 0);
       next[k].resize(samples);
     }
-    ThreadPool::instance().run(2, threads, [&](std::int64_t k, int) {
+    parallel_for(2, 1, threads, [&](std::int64_t k, std::int64_t) {
       const int axis = static_cast<int>(k) + 1;
       std::vector<std::uint32_t>& from = starts[k];
       for (std::int64_t i = 0; i < count_; ++i) ++from[row_of(net, i, axis) + 1];
@@ -240,7 +213,7 @@ class ColorPass {
       for (std::int64_t i = 0; i < count_; ++i) orders[k].data()[next[k][row_of(net, i, axis)]++] = static_cast<std::uint32_t>(i);
     });
     const std::int64_t bands = divided_up(samples, kBandRows);
-    ThreadPool::instance().run(kPlanes * bands, threads, [&](std::int64_t task, int) {
+    parallel_for(kPlanes * bands, 1, threads, [&](std::int64_t task, std::int64_t) {
       const int plane = static_cast<int>(task / bands), k = kPlaneAxes[plane][1] - 1;
       const int first = static_cast<int>(task % bands) * kBandRows, last = std::min(first + kBandRows, samples) - 1;
       const std::size_t row_floats = static_cast<std::size_t>(samples) * net.channels[plane];
@@ -281,8 +254,10 @@ class LinePass {
     net.kept = kept_.resize(rounded_up(count_, kGroupRows) * net.units);
     net.offsets = offsets.data();
     nb::gil_scoped_release unlocked;
-    share_chunks(count_, kChunkMin, kernels_.offset_scratch(net), threads,
-              [&](std::int64_t begin, std::int64_t end, float* scratch) { kernels_.offset_network(net, begin, end, scratch); });
+    const Scratch scratch(kernels_.offset_scratch(net), threads);
+    parallel_for(count_, kChunkMin, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
+      kernels_.offset_network(net, begin, end, scratch.of(worker));
+    });
   }
 
   void backward(const LineWeights& in, const Array<const float, -1, -1>& by_offsets, const Array<float, -1, -1>& by_table,
@@ -318,10 +293,11 @@ class LinePass {
         {by_table.data(), by_bias_0.data()}, {by_weight_1.data(), by_bias_1.data()}, {by_weight_2.data(), by_bias_2.data()}};
     nb::gil_scoped_release unlocked;
     Buffer<float> sums;
-    sum_chunks(kernels_, net.count, at.end, kernels_.line_backward_scratch(net), threads, sums,
-               [&](std::int64_t begin, std::int64_t end, float* own, float* scratch) {
-                 kernels_.line_backward(net, at, begin, end, own, scratch);
-               });
+    const Scratch scratch(kernels_.line_backward_scratch(net), threads);
+    parallel_sum(net.count, summed_chunk(net.count), at.end, threads, sums,
+                 [&](std::int64_t begin, std::int64_t end, float* part, int worker) {
+                   kernels_.line_backward(net, at, begin, end, part, scratch.of(worker));
+                 });
     const float* from = sums.data();
     unpad(from + at.table, table_rows_, hidden_, units, written[0].first);
     // An entry's two weights on an axis add up to 1: what the first axis' rows were given is what the bias gets.
@@ -435,7 +411,7 @@ void position_training(const Array<const std::int64_t, -1>& binding, const Array
   const PositionTraining in{binding.data(), linear.data(), centers.data(), values.data(), out.data()};
   const NetworkKernels& kernels = kernels_of(instruction_set);
   nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) {
+  parallel_for(count, kPerTask, threads, [&](std::int64_t begin, std::int64_t end) {
     (backward ? kernels.positions_backward : kernels.positions)(in, begin, end);
   });
 }
@@ -453,7 +429,7 @@ void direction_training(const Array<const std::int64_t, -1>& binding, const Arra
   std::copy_n(center.data(), 3, in.center);
   const NetworkKernels& kernels = kernels_of(instruction_set);
   nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) {
+  parallel_for(count, kPerTask, threads, [&](std::int64_t begin, std::int64_t end) {
     (backward ? kernels.directions_backward : kernels.directions)(in, begin, end);
   });
 }

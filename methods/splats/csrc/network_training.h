@@ -109,7 +109,6 @@ struct NetworkKernels {
   std::size_t (*line_backward_scratch)(const LineTraining&);
   void (*line_backward)(const LineTraining&, const LineSums&, std::int64_t begin, std::int64_t end, float* sums,
                         float* scratch);
-  void (*add)(float* to, const float* from, std::size_t count);  // element by element
 };
 
 HEADBENCH_VARIANTS(NetworkKernels, network_kernels)

@@ -3,7 +3,8 @@
 #include <string>
 #include <vector>
 
-#include "tasks.h"
+#include "bench/native/module.h"
+#include "frame.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -21,11 +22,10 @@ void triangles_backward(const Array<const float, -1, 3>& vertices, const Array<c
   require(below(faces.data(), 3 * count, vertices.shape(0)));
   const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  Buffer<float> by_corners;
-  by_corners.resize(9 * count);
+  const Buffer<float> by_corners(9 * count);
   const TrianglesBackward in{vertices.data(), faces.data(),          by_rotations.data(), by_centers.data(),
                              by_sizes.data(), by_quaternions.data(), by_corners.data()};
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.triangles_backward(in, begin, end); });
+  parallel_for(count, kPerTask, threads, [&](std::int64_t begin, std::int64_t end) { kernels.triangles_backward(in, begin, end); });
   float* out = by_vertices.data();
   std::fill(out, out + 3 * by_vertices.shape(0), 0.0f);
   for (std::size_t corner = 0; corner < 3 * count; ++corner)
@@ -40,7 +40,7 @@ void activate(const Array<const float, -1, 3>& log_scales, const Array<const flo
   const Activation in{log_scales.data(), quats.data(), scales.data(), unit_quats.data()};
   const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.activate(in, begin, end); });
+  parallel_for(count, kPerTask, threads, [&](std::int64_t begin, std::int64_t end) { kernels.activate(in, begin, end); });
 }
 
 // Sum what splats add to the frames of their triangles, each triangle's splats in ascending order.
@@ -52,7 +52,7 @@ void sum_by_triangle(const std::int64_t* binding, std::size_t count, const float
   for (std::size_t triangle = 0; triangle < triangles; ++triangle) starts[triangle + 1] += starts[triangle];
   std::vector<std::int64_t> next(starts.begin(), starts.end() - 1);
   for (std::size_t splat = 0; splat < count; ++splat) order[next[binding[splat]]++] = static_cast<std::int64_t>(splat);
-  share_out(triangles, threads, [&](std::int64_t begin, std::int64_t end, int) {
+  parallel_for(triangles, kPerTask, threads, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t triangle = begin; triangle < end; ++triangle) {
       float sums[kFrameNumbers] = {};
       for (std::int64_t i = starts[triangle]; i < starts[triangle + 1]; ++i)
@@ -96,7 +96,7 @@ void to_world_backward(const Array<const std::int64_t, -1>& binding, const Array
                            by_raw_quats.data(),
                            by_log_scales.data(),
                            wanted ? parts.data() : nullptr};
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.to_world_backward(in, begin, end); });
+  parallel_for(count, kPerTask, threads, [&](std::int64_t begin, std::int64_t end) { kernels.to_world_backward(in, begin, end); });
   if (wanted)
     sum_by_triangle(binding.data(), count, parts.data(), triangles, threads, by_rotations, by_centers, by_sizes,
                     by_quaternions);
@@ -123,7 +123,7 @@ void harmonics(int degree, const Array<const float, -1, 3>& dc, const Array<cons
   in.colors = colors.data();
   const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  share_out(dc.shape(0), threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.harmonics(in, begin, end); });
+  parallel_for(dc.shape(0), kPerTask, threads, [&](std::int64_t begin, std::int64_t end) { kernels.harmonics(in, begin, end); });
 }
 
 void harmonics_backward(int degree, const Array<const float, -1, 3>& dc, const Array<const float, -1, 3, -1>& rest,
@@ -142,7 +142,7 @@ void harmonics_backward(int degree, const Array<const float, -1, 3>& dc, const A
   in.by_vectors = by_vectors.data();
   const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
   nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) { kernels.harmonics_backward(in, begin, end); });
+  parallel_for(count, kPerTask, threads, [&](std::int64_t begin, std::int64_t end) { kernels.harmonics_backward(in, begin, end); });
 }
 
 constexpr int kRowsPerTask = 48;
@@ -159,10 +159,8 @@ double photometric(const Array<const float, -1, -1, 3>& image, const Array<const
   const Photometric in{static_cast<int>(height), static_cast<int>(width), image.data(), truth.data(), window.data(),
                        ssim_weight,              gradient.data(),         l1.data(),    ssim.data()};
   const Scratch scratch(kernels.photometric_scratch(in.width), threads);
-  const int tasks = (in.height + kRowsPerTask - 1) / kRowsPerTask;
-  ThreadPool::instance().run(tasks, std::max(threads, 1), [&](std::int64_t task, int worker) {
-    const int begin = static_cast<int>(task) * kRowsPerTask;
-    kernels.photometric(in, begin, std::min(begin + kRowsPerTask, in.height), scratch.of(worker));
+  parallel_for(in.height, kRowsPerTask, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
+    kernels.photometric(in, static_cast<int>(begin), static_cast<int>(end), scratch.of(worker));
   });
   double l1_sum = 0.0, ssim_sum = 0.0;
   for (std::size_t row = 0; row < height; ++row) {
