@@ -121,7 +121,7 @@ inline void directions(const DirectionTraining& in, std::int64_t begin, std::int
     Real direction[3];
     rotate(in.last, steps.second, direction);
     for (int k = 0; k < 3; ++k) result.keep(k, direction[k]);
-    for (int lane = 0; lane < used; ++lane) result.put(in.directions + 3 * (first + lane), lane);
+    for (int lane = 0; lane < used; ++lane) result.put(in.out + 3 * (first + lane), lane);
   }
 }
 
@@ -141,7 +141,7 @@ inline void directions_backward(const DirectionTraining& in, std::int64_t begin,
     const Real along_first = dot3(by_first, steps.first);
     for (int k = 0; k < 3; ++k)
       gradient.keep(k, fnma(by_first[k], 1.0f, along_first * steps.first[k]) / steps.first_length);
-    for (int lane = 0; lane < used; ++lane) gradient.put(in.by_means + 3 * (first + lane), lane);
+    for (int lane = 0; lane < used; ++lane) gradient.put(in.out + 3 * (first + lane), lane);
   }
 }
 
