@@ -180,30 +180,19 @@ class ColorPass {
   // Gradients by the planes: splats in the order of their lower row of samples, rows dealt out in bands.
   void scatter(const ColorTraining& net, int threads) const {
     const int samples = net.grid.samples;
-    Buffer<std::uint32_t> orders[2];
-    std::vector<std::uint32_t> starts[2], next[2];
-    for (int k = 0; k < 2; ++k) {
-      orders[k].resize(net.count);
-      starts[k].assign(samples + 1, 0);
-      next[k].resize(samples);
-    }
+    Groups splats[2];  // of the second and the third axis
     parallel_for(2, 1, threads, [&](std::int64_t k, std::int64_t) {
-      const int axis = static_cast<int>(k) + 1;
-      std::vector<std::uint32_t>& from = starts[k];
-      for (std::int64_t i = 0; i < net.count; ++i) ++from[row_of(net, i, axis) + 1];
-      for (int row = 0; row < samples; ++row) from[row + 1] += from[row];
-      std::copy(from.begin(), from.end() - 1, next[k].begin());
-      for (std::int64_t i = 0; i < net.count; ++i) orders[k].data()[next[k][row_of(net, i, axis)]++] = static_cast<std::uint32_t>(i);
+      splats[k] = group_by_key(net.count, samples, [&](std::int64_t i) { return row_of(net, i, static_cast<int>(k) + 1); });
     });
     const std::int64_t bands = divided_up(samples, kBandRows);
     parallel_for(kPlanes * bands, 1, threads, [&](std::int64_t task, std::int64_t) {
-      const int plane = static_cast<int>(task / bands), k = kPlaneAxes[plane][1] - 1;
+      const int plane = static_cast<int>(task / bands);
+      const auto& [starts, order] = splats[kPlaneAxes[plane][1] - 1];
       const int first = static_cast<int>(task % bands) * kBandRows, last = std::min(first + kBandRows, samples) - 1;
       const std::size_t row_floats = static_cast<std::size_t>(samples) * net.channels[plane];
       std::fill_n(net.by_planes[plane] + first * row_floats, (last - first + 1) * row_floats, 0.0f);
       for (int row = std::max(first - 1, 0); row <= last; ++row)
-        kernels_.scatter_plane(net, plane, row, orders[k].data() + starts[k][row], starts[k][row + 1] - starts[k][row],
-                               first, last);
+        kernels_.scatter_plane(net, plane, row, order.data() + starts[row], starts[row + 1] - starts[row], first, last);
     });
   }
 

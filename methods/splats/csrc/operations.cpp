@@ -56,7 +56,7 @@ ToWorld bound_splats(Arguments& from, Size& count, Size& triangles) {
   const ToWorld in{from(count),    from(triangles, 3, 3), from(triangles, 3), from(triangles), from(triangles, 4),
                    from(count, 3), from(count, 4),        from(count, 3),     nullptr,         nullptr,
                    nullptr};
-  require(below(in.binding, count, triangles));
+  require(count < std::int64_t{1} << 32 && below(in.binding, count, triangles));
   return in;
 }
 
@@ -73,16 +73,12 @@ void to_world(const nb::tuple& arrays, const std::string& instruction_set, int t
 // Sum what splats add to the frames of their triangles, each triangle's splats in ascending order.
 void sum_by_triangle(const std::int64_t* binding, std::int64_t count, const float* parts, std::int64_t triangles, int threads,
                      float* rotations, float* centers, float* sizes, float* quaternions) {
-  std::vector<std::int64_t> starts(triangles + 1, 0), order(count);
-  for (std::int64_t splat = 0; splat < count; ++splat) ++starts[binding[splat] + 1];
-  for (std::int64_t triangle = 0; triangle < triangles; ++triangle) starts[triangle + 1] += starts[triangle];
-  std::vector<std::int64_t> next(starts.begin(), starts.end() - 1);
-  for (std::int64_t splat = 0; splat < count; ++splat) order[next[binding[splat]]++] = splat;
+  const Groups splats = group_by_key(count, triangles, [&](std::int64_t splat) { return binding[splat]; });
   parallel_for(triangles, kPerTask, threads, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t triangle = begin; triangle < end; ++triangle) {
       float sums[kFrameNumbers] = {};
-      for (std::int64_t i = starts[triangle]; i < starts[triangle + 1]; ++i)
-        for (int k = 0; k < kFrameNumbers; ++k) sums[k] += parts[kFrameNumbers * order[i] + k];
+      for (std::uint32_t i = splats.starts[triangle]; i < splats.starts[triangle + 1]; ++i)
+        for (int k = 0; k < kFrameNumbers; ++k) sums[k] += parts[std::size_t{kFrameNumbers} * splats.order[i] + k];
       std::copy(sums, sums + 9, rotations + 9 * triangle);
       std::copy(sums + 9, sums + 12, centers + 3 * triangle);
       sizes[triangle] = sums[12];
