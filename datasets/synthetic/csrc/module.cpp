@@ -366,14 +366,14 @@ class World {
 }  // namespace headbench::light
 
 NB_MODULE(_light, m) {
-  using headbench::light::World;
+  using namespace headbench;
+  using namespace headbench::light;
   nb::set_leak_warnings(false);  // the renderer of a process lives until it exits
-  m.def("instruction_sets", [] { return headbench::names_of(headbench::runnable_light_kernels()); });
+  m.def("instruction_sets", [] { return names_of(runnable_light_kernels()); });
   nb::class_<World>(m, "World")
-      .def(nb::init<const headbench::Array<const float, -1, 3>&, const headbench::Array<const std::int32_t, -1, 3>&,
-                    const headbench::Array<const std::uint8_t, -1>&, const headbench::Array<const float, -1, 2>&,
-                    const headbench::Array<const float, headbench::light::kPanels, 5, 3>&, const headbench::Array<const float, 3>&,
-                    const headbench::Array<const float, -1, -1, 3>&, std::uint32_t, const std::string&>(),
+      .def(nb::init<const Array<const float, -1, 3>&, const Array<const std::int32_t, -1, 3>&, const Array<const std::uint8_t, -1>&,
+                    const Array<const float, -1, 2>&, const Array<const float, kPanels, 5, 3>&, const Array<const float, 3>&,
+                    const Array<const float, -1, -1, 3>&, std::uint32_t, const std::string&>(),
            "vertices"_a, "faces"_a, "material_of"_a, "materials"_a, "panels"_a, "surroundings"_a, "hemisphere"_a, "seed"_a,
            "instruction_set"_a)
       .def("move", &World::move, "vertices"_a)
