@@ -7,6 +7,7 @@
 // `runnable_table()`: those that this machine can run, the fastest first. A table's first member is `const char* name`.
 #pragma once
 
+#include <initializer_list>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -38,7 +39,8 @@
   }                                                                                  \
   inline std::vector<const Table*> runnable_##table() {                              \
     std::vector<const Table*> found;                                                 \
-    for (const Table* each : {HEADBENCH_RUNNABLE(table), &portable::table})          \
+    using Tables = std::initializer_list<const Table*>;                              \
+    for (const Table* each : Tables{HEADBENCH_RUNNABLE(table), &portable::table})    \
       if (each) found.push_back(each);                                               \
     return found;                                                                    \
   }

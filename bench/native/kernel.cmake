@@ -3,7 +3,7 @@
 # Build folder/csrc/<file>... as the Python module headbench.<folder>.<name>. Of them variants.cpp is compiled once per
 # instruction set and chosen when run (instruction_sets.h); everything else stays at the platform's baseline. No
 # multiply-add is formed that the source does not ask for: passes that must agree, and variants, compute the same numbers.
-# THREADS adds the thread pool.
+# THREADS adds what parallel.h needs.
 set(HEADBENCH_NATIVE ${CMAKE_CURRENT_LIST_DIR})
 
 function(headbench_kernel)
@@ -19,7 +19,7 @@ function(headbench_kernel)
     # Vectors are handed over by inlined functions alone: how others would pass them does not matter.
     -O3 -ffp-contract=off -fno-math-errno -fno-trapping-math -Wall -Wextra -Wno-psabi)
   if(KERNEL_THREADS)
-    target_sources(${target} PRIVATE ${HEADBENCH_NATIVE}/thread_pool.cpp)
+    target_sources(${target} PRIVATE ${HEADBENCH_NATIVE}/thread_pool.cpp ${HEADBENCH_NATIVE}/workspace.cpp)
     target_link_libraries(${target} PRIVATE Threads::Threads)
   endif()
 

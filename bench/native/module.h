@@ -18,4 +18,12 @@ inline void require(bool fits) {
   if (!fits) throw std::invalid_argument("arrays do not fit together");
 }
 
+// Whether all values are indices below `limit`.
+template <class T>
+bool below(const T* values, std::size_t count, std::size_t limit) {
+  bool all = true;
+  for (std::size_t i = 0; i < count; ++i) all &= values[i] >= 0 && static_cast<std::size_t>(values[i]) < limit;
+  return all;
+}
+
 }  // namespace headbench

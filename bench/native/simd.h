@@ -7,16 +7,9 @@
 
 #include <cstdint>
 
-// Vector values must stay in registers: small functions on them are inlined whatever the compiler's estimate says.
-#define HEADBENCH_INLINE inline __attribute__((always_inline))
-// Ask for a cache line that will be read soon.
-#define HEADBENCH_PREFETCH(address) __builtin_prefetch(address)
+#include "inline.h"
 
 #ifdef HEADBENCH_ISA
-#define HEADBENCH_STRING(name) #name
-#define HEADBENCH_STRING_OF(name) HEADBENCH_STRING(name)
-#define HEADBENCH_ISA_NAME HEADBENCH_STRING_OF(HEADBENCH_ISA)
-
 #if defined(HEADBENCH_ISA_avx512)
 #include "simd_avx512.h"
 #elif defined(HEADBENCH_ISA_avx2)

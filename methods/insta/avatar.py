@@ -197,10 +197,9 @@ class Inference:
         color = np.empty((len(rays.origins), 3), np.float32)
         transmittance = np.empty(len(color), np.float32)
         samples = module.render(
-            *(scene.surface.guide(self.space), self._trained, self._starts(scene.condition)),
-            *(self.mouth.numpy().view(np.uint8), rays.origins, rays.directions, rays.jitter),
-            *(self.marching.step, self.marching.round_samples, self.marching.stop_transmittance),
-            *(color, transmittance, self._isa, threads()),
+            *(scene.surface.guide(self.space), self._trained),
+            (self._starts(scene.condition), self.mouth.numpy().view(np.uint8)),
+            *(rays.contiguous(), self.marching, (color, transmittance), self._isa, threads()),
         )
         return RayColors(color, transmittance, samples)
 

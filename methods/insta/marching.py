@@ -32,6 +32,10 @@ class Rays(NamedTuple):
     directions: np.ndarray  # (R, 3) unit length
     jitter: np.ndarray  # (R,) in [0, 1)
 
+    def contiguous(self) -> Rays:
+        """The same rays, in the layout that the kernel takes."""
+        return Rays(*map(np.ascontiguousarray, self))
+
 
 class Samples(NamedTuple):
     """Samples of rays near the surface, ray by ray in order of distance."""
@@ -125,7 +129,7 @@ class PosedSurface:
 
     def first_hit(self, rays: Rays) -> Found:
         """First triangle of each ray and its distance, metres."""
-        origins, directions = np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions)
+        origins, directions, _ = rays.contiguous()
         if self._mesh is None:
             return first_hits(torch.from_numpy(origins), torch.from_numpy(directions), self.corners.float())
         triangles, distances = np.empty(len(origins), np.int32), np.empty(len(origins), np.float32)
@@ -140,9 +144,8 @@ class PosedSurface:
         """
         if self._mesh is None:
             return self._march_reference(rays, first, step, samples_max, space)
-        origins, directions, jitter = map(np.ascontiguousarray, rays)
-        how = (first, jitter, step, samples_max, threads())
-        return Samples(*self.surface.module.march(self.guide(space), origins, directions, *how))
+        how = (rays.contiguous(), first, step, samples_max, threads())
+        return Samples(*self.surface.module.march(self.guide(space), *how))
 
     def reach(self, space: Space) -> np.ndarray:
         """(F,) float32 metres from each triangle of this pose within which the space has density; negative for none."""
@@ -163,7 +166,7 @@ class PosedSurface:
             posed = (self.reach(space), _array(self.matrices.float()), _array(self.centroids.float()))
             falloffs = (blend.own_falloff, blend.neighbour_falloff)
             grid = (space.low, 1 / space.cell, space.free)
-            made = self.surface.module.Guide(self._mesh, *posed, blend.neighbours, *falloffs, *grid)
+            made = self.surface.module.Guide(self._mesh, (*posed, blend.neighbours, *falloffs, *grid))
             self._guide = space, made
         return self._guide[1]
 

@@ -34,8 +34,7 @@ class Rendered(NamedTuple):
     samples: int
 
 
-@dataclass(frozen=True)
-class Marching:
+class Marching(NamedTuple):
     """How rays are sampled; see `InstaConfig`."""
 
     step: float

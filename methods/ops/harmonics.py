@@ -151,8 +151,6 @@ def _harmonic_shader(dc: Tensor, rest: Tensor) -> HarmonicShader:
         means: Tensor, center: Tensor, turns: Tensor | None = None, binding: Tensor | None = None
     ) -> Tensor:
         colors = empty_like(means)
-        turns = means.new_empty(0, 3, 3) if turns is None else turns
-        binding = torch.empty(0, dtype=torch.int64) if binding is None else binding
         call("shade", packed, means, turns, binding, center, colors)
         return colors
 

@@ -31,20 +31,26 @@ def backend(name: str) -> Iterator[None]:
 
 
 def call(name: str, *arguments: Any) -> Any:
-    """Call a function of the kernel, see `arrays`. Results do not depend on the number of threads."""
+    """Call a function of the kernel with `arrays`, which it takes as they are. Results do not depend on the number of threads.
+
+    Raises
+    ------
+    ValueError
+        Where an array's type, shape or layout is not what the function expects.
+    """
     function = getattr(KERNEL.load(), name)
-    return function(*arrays(*arguments), instruction_sets()[_backend.get()], threads())
+    return function(arrays(*arguments), instruction_sets()[_backend.get()], threads())
 
 
-def arrays(*arguments: Any) -> list[Any]:
+def arrays(*arguments: Any) -> tuple[Any, ...]:
     """Tensors as arrays, which reach the kernel faster than tensors do, and other arguments as they are."""
-    return [
+    return tuple(
         value.detach().contiguous().numpy() if isinstance(value, Tensor) else value for value in arguments
-    ]
+    )
 
 
 def empty_like(values: Tensor) -> Tensor:
-    """Memory for a result of this shape, contiguous whatever ``values`` are; a kernel would write to a copy of other memory."""
+    """Memory for a result of this shape, contiguous whatever ``values`` are, as kernels need it."""
     return torch.empty_like(values, memory_format=torch.contiguous_format)
 
 

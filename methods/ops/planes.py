@@ -152,10 +152,10 @@ class _PlaneColors(torch.autograd.Function):
         *inputs, box, colors = ctx.saved_tensors
         places, weights = inputs[:2], inputs[2:]
         wanted = any(ctx.needs_input_grad[1:3])
-        by_places = [empty_like(value) if wanted else value.new_empty(0, 3) for value in places]
+        by_places = [empty_like(value) if wanted else None for value in places]
         gradients = [empty_like(value) for value in weights]
-        ctx.done.backward(*arrays(*inputs, box, colors, by_colors, *by_places, *gradients), threads())
-        return None, *(by_places if wanted else [None] * 2), *gradients
+        ctx.done.backward(arrays(*inputs, box, colors, by_colors, *by_places, *gradients), threads())
+        return None, *by_places, *gradients
 
 
 AXES = 3
@@ -227,7 +227,7 @@ class _LineOffsets(torch.autograd.Function):
     def backward(ctx: Any, by_offsets: Tensor) -> tuple[Tensor | None, ...]:
         weights = ctx.saved_tensors
         gradients = [empty_like(value) for value in weights]
-        ctx.done.backward(*arrays(*weights, by_offsets, *gradients), threads())
+        ctx.done.backward(arrays(*weights, by_offsets, *gradients), threads())
         return None, None, *gradients
 
 

@@ -104,13 +104,11 @@ class _ToWorld(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         binding, *frames, means, quats, scales = ctx.saved_tensors
         wanted = any(ctx.needs_input_grad[:4])
-        by_frames = [
-            empty_like(value) if wanted else value.new_empty(0, *value.shape[1:]) for value in frames
-        ]
+        by_frames = [empty_like(value) if wanted else None for value in frames]
         by_means, by_quats, by_log_scales = (empty_like(value) for value in (means, quats, scales))
         given = binding, *frames, means, quats, scales, *grads
         call("to_world_backward", *given, by_means, by_quats, by_log_scales, *by_frames)
-        return *(by_frames if wanted else [None] * 4), by_means, by_log_scales, by_quats, None, None, None
+        return *by_frames, by_means, by_log_scales, by_quats, None, None, None
 
 
 @Operation
@@ -176,7 +174,7 @@ class _DirectionsTo(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, *fixed: Tensor) -> Tensor:
         directions = empty_like(means)
-        call("direction_training", *fixed, means, means.new_empty(0, 3), directions)
+        call("direction_training", *fixed, means, None, directions)
         ctx.save_for_backward(*fixed, means)
         return directions
 

@@ -92,10 +92,9 @@ class _Rasterize(torch.autograd.Function):
         radii = torch.empty(views, len(means), dtype=torch.int32)
         ctx.frames = [
             KERNEL.load().forward(
-                *_of_view(_arrays(*inputs), view),
-                *_arrays(viewmats[view], Ks[view]),
-                *settings,
-                *_arrays(images[view], alphas[view], radii[view]),
+                _of_view(inputs, view),
+                (*_arrays(viewmats[view], Ks[view]), *settings),
+                _arrays(images[view], alphas[view], radii[view]),
                 instruction_set,
                 threads,
             )
@@ -115,31 +114,30 @@ class _Rasterize(torch.autograd.Function):
         # The kernel adds to those of drawn splats; the others have zero.
         gradients = [torch.zeros_like(value) for value in inputs]
         grad_viewmats, grad_Ks = inputs[0].new_zeros(views, 4, 4), inputs[0].new_zeros(views, 3, 3)
-        absolute = ctx.absolute_like if ctx.needs_input_grad[_ABSOLUTE] else (views, 0, 2)
-        grad_absolute = inputs[0].new_zeros(absolute)
+        absolute = inputs[0].new_zeros(ctx.absolute_like) if ctx.needs_input_grad[_ABSOLUTE] else None
         grad_images = grad_images.contiguous().view(views, *grad_images.shape[-3:])
         grad_alphas = grad_alphas.contiguous().view(views, *grad_alphas.shape[-2:])
         for view, frame in enumerate(ctx.frames):
             KERNEL.load().backward(
                 frame,
-                *_of_view(_arrays(*inputs), view),
-                *_arrays(grad_images[view], grad_alphas[view]),
-                *_of_view(_arrays(*gradients), view),
-                *_arrays(grad_viewmats[view], grad_Ks[view], grad_absolute[view]),
+                _of_view(inputs, view),
+                _arrays(grad_images[view], grad_alphas[view]),
+                _of_view(gradients, view),
+                _arrays(grad_viewmats[view], grad_Ks[view], None if absolute is None else absolute[view]),
                 ctx.threads,
             )
         *of_splats, grad_backgrounds = gradients
-        wanted = grad_absolute if ctx.needs_input_grad[_ABSOLUTE] else None
-        return (*of_splats, wanted, grad_backgrounds, grad_viewmats, grad_Ks, None, None, None, None, None)
+        return (*of_splats, absolute, grad_backgrounds, grad_viewmats, grad_Ks, None, None, None, None, None)
 
 
 _ABSOLUTE = 6  # position among the inputs
 
 
-def _of_view(arrays: Sequence[Any], view: int) -> list[Any]:
-    """One camera's part of the inputs, in the kernel's order; colours may be common to all cameras."""
-    *geometry, colors, offset, background = arrays
-    return [*geometry, colors[view] if colors.ndim == 3 else colors, offset[view], background[view]]
+def _of_view(tensors: Sequence[Tensor], view: int) -> tuple[Any, ...]:
+    """One camera's part of the inputs, in the kernel's order; colours may be common to all cameras, an empty offset is None."""
+    *geometry, colors, offset, background = _arrays(*tensors)
+    own = offset[view] if offset.size else None
+    return (*geometry, colors[view] if colors.ndim == 3 else colors, own, background[view])
 
 
 def peak_flops(backend: str) -> float:
@@ -149,7 +147,7 @@ def peak_flops(backend: str) -> float:
 
 def work(node: Any) -> tuple[int, int]:
     """Pairs of splat and pixel tested, and drawn, by the first camera of an autograd node of the kernel."""
-    return node.frames[0].work(*_of_view(_arrays(*node.saved_tensors), 0))
+    return node.frames[0].work(_of_view(node.saved_tensors, 0))
 
 
 def stage_seconds(node: Any) -> dict[str, float]:
@@ -157,6 +155,6 @@ def stage_seconds(node: Any) -> dict[str, float]:
     return node.frames[0].stage_seconds
 
 
-def _arrays(*tensors: Tensor) -> list[Any]:
+def _arrays(*tensors: Tensor | None) -> tuple[Any, ...]:
     """The tensors' memory as numpy arrays, which reach the kernel faster than tensors do."""
-    return [tensor.detach().numpy() for tensor in tensors]
+    return tuple(None if tensor is None else tensor.detach().numpy() for tensor in tensors)

@@ -9,10 +9,7 @@
 
 #include <cstdint>
 
-#define HEADBENCH_INLINE inline __attribute__((always_inline))
-#define HEADBENCH_STRING(name) #name
-#define HEADBENCH_STRING_OF(name) HEADBENCH_STRING(name)
-#define HEADBENCH_ISA_NAME HEADBENCH_STRING_OF(HEADBENCH_ISA)
+#include "bench/native/inline.h"
 
 namespace headbench::HEADBENCH_ISA {
 

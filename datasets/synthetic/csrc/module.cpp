@@ -8,7 +8,7 @@
 #include <vector>
 
 #include "bench/native/module.h"
-#include "bench/native/thread_pool.h"
+#include "bench/native/parallel.h"
 #include "tree.h"
 
 namespace nb = nanobind;
@@ -55,7 +55,7 @@ class Sides {
 
 // Triangles of vertices below `count`.
 std::vector<std::int32_t> checked(const Array<const std::int32_t, -1, 3>& faces, std::size_t count) {
-  for (std::size_t i = 0; i < faces.size(); ++i) require(faces.data()[i] >= 0 && static_cast<std::size_t>(faces.data()[i]) < count);
+  require(below(faces.data(), faces.size(), count));
   return kept<std::int32_t>(faces);
 }
 
@@ -145,18 +145,17 @@ class World {
     lens.seed = seed;
     const std::int64_t band = kBand * grid, strip_rows = kStripRows * grid;
     const std::vector<Extent> extents = extents_in(lens, rows, columns);
-    std::vector<std::vector<std::int32_t>> seen((rows + strip_rows - 1) / strip_rows);
+    std::vector<std::vector<std::int32_t>> seen(divided_up(rows, strip_rows));
     for (std::size_t i = 0; i < extents.size(); ++i)
       for (std::int64_t strip = extents[i].top / strip_rows; strip * strip_rows < extents[i].bottom; ++strip)
         seen[strip].push_back(static_cast<std::int32_t>(i));
     std::vector<Sample> samples(band * columns);
     Floats narrow(rows * width * 4);
     const Scene scene = current();
-    ThreadPool& pool = ThreadPool::instance();
     for (std::int64_t begin = 0; begin < rows; begin += band) {
       const std::int64_t taken = std::min(band, rows - begin);
-      pool.run((taken + strip_rows - 1) / strip_rows, threads, [&](std::int64_t task, int) {
-        const std::int64_t first = task * strip_rows, count_rows = std::min(strip_rows, taken - first);
+      parallel_for(taken, strip_rows, threads, [&](std::int64_t first, std::int64_t last) {
+        const std::int64_t count_rows = last - first;
         Floats memory(kStripFloats * count_rows * stride_of(columns));
         std::vector<std::int32_t> met(count_rows * stride_of(columns));
         const std::vector<std::int32_t>& triangles = seen[(begin + first) / strip_rows];
@@ -173,10 +172,10 @@ class World {
         }
       });
       gather(threads);
-      pool.run(taken, threads, [&](std::int64_t task, int) {
+      parallel_for(taken, 1, threads, [&](std::int64_t row, std::int64_t) {
         Floats wide(columns * 4);
-        kernels_.shade(scene, samples.data() + task * columns, columns, wide.data());
-        float* out = narrow.data() + (begin + task) * width * 4;
+        kernels_.shade(scene, samples.data() + row * columns, columns, wide.data());
+        float* out = narrow.data() + (begin + row) * width * 4;
         for (std::int64_t x = 0; x < width; ++x) {
           float sums[4] = {};
           for (std::int64_t tap = 0; tap < count; ++tap)
@@ -185,7 +184,7 @@ class World {
         }
       });
     }
-    pool.run(height, threads, [&](std::int64_t y, int) {
+    parallel_for(height, 1, threads, [&](std::int64_t y, std::int64_t) {
       float* out = image.data() + y * width * 4;
       std::fill_n(out, width * 4, 0.0f);
       for (std::int64_t tap = 0; tap < count; ++tap) {
@@ -314,10 +313,8 @@ class World {
   }
 
   void direct(const std::vector<std::int64_t>& sides, const Scene& scene, int threads) {
-    const std::int64_t count = static_cast<std::int64_t>(sides.size());
-    ThreadPool::instance().run((count + kSidesPerTask - 1) / kSidesPerTask, threads, [&](std::int64_t task, int) {
-      for (std::int64_t i = task * kSidesPerTask; i < std::min(count, (task + 1) * kSidesPerTask); ++i)
-        kernels_.direct(scene, sides[i]);
+    parallel_for(sides.size(), kSidesPerTask, threads, [&](std::int64_t begin, std::int64_t end) {
+      for (std::int64_t i = begin; i < end; ++i) kernels_.direct(scene, sides[i]);
     });
     for (const std::int64_t side : sides) states_[side] = kDirect;
   }
@@ -328,8 +325,8 @@ class World {
     const std::vector<std::int64_t> sides = wanted_.take(states_, kFull);
     const std::int64_t count = static_cast<std::int64_t>(sides.size()), rays = scene.rays;
     std::vector<std::int32_t> met(count * rays);
-    ThreadPool::instance().run((count + kSidesPerTask - 1) / kSidesPerTask, threads, [&](std::int64_t task, int) {
-      for (std::int64_t i = task * kSidesPerTask; i < std::min(count, (task + 1) * kSidesPerTask); ++i) {
+    parallel_for(count, kSidesPerTask, threads, [&](std::int64_t begin, std::int64_t end) {
+      for (std::int64_t i = begin; i < end; ++i) {
         kernels_.bounce(scene, sides[i], met.data() + i * rays);
         for (std::int64_t ray = 0; ray < rays; ++ray)
           if (met[i * rays + ray] >= 0) mirrored_.add(met[i * rays + ray]);
@@ -369,14 +366,14 @@ class World {
 }  // namespace headbench::light
 
 NB_MODULE(_light, m) {
-  using headbench::light::World;
+  using namespace headbench;
+  using namespace headbench::light;
   nb::set_leak_warnings(false);  // the renderer of a process lives until it exits
-  m.def("instruction_sets", [] { return headbench::names_of(headbench::runnable_light_kernels()); });
+  m.def("instruction_sets", [] { return names_of(runnable_light_kernels()); });
   nb::class_<World>(m, "World")
-      .def(nb::init<const headbench::Array<const float, -1, 3>&, const headbench::Array<const std::int32_t, -1, 3>&,
-                    const headbench::Array<const std::uint8_t, -1>&, const headbench::Array<const float, -1, 2>&,
-                    const headbench::Array<const float, headbench::light::kPanels, 5, 3>&, const headbench::Array<const float, 3>&,
-                    const headbench::Array<const float, -1, -1, 3>&, std::uint32_t, const std::string&>(),
+      .def(nb::init<const Array<const float, -1, 3>&, const Array<const std::int32_t, -1, 3>&, const Array<const std::uint8_t, -1>&,
+                    const Array<const float, -1, 2>&, const Array<const float, kPanels, 5, 3>&, const Array<const float, 3>&,
+                    const Array<const float, -1, -1, 3>&, std::uint32_t, const std::string&>(),
            "vertices"_a, "faces"_a, "material_of"_a, "materials"_a, "panels"_a, "surroundings"_a, "hemisphere"_a, "seed"_a,
            "instruction_set"_a)
       .def("move", &World::move, "vertices"_a)

@@ -4,15 +4,12 @@
 #include <cstdint>
 
 #include "bench/native/instruction_sets.h"
+#include "bench/native/vector3.h"
 
 namespace headbench::light {
 
 constexpr int kWide = 8;    // children of a node, triangles of a leaf
 constexpr int kPanels = 8;  // one to a lane; those that a scene lacks have no area
-
-struct Vec3 {
-  float x, y, z;
-};
 
 // Boxes of up to eight children. One that is missing has a box that no ray meets.
 struct alignas(32) Node {

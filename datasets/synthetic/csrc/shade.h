@@ -33,12 +33,12 @@ HEADBENCH_INLINE void frame(Vec3 n, Vec3& s, Vec3& t) {
 }
 
 HEADBENCH_INLINE Vec3 normal_of(const Scene& scene, std::int64_t side) {
-  const Vec3 n = at(scene.normals, side >> 1);
+  const Vec3 n = row(scene.normals, side >> 1);
   return side & 1 ? n * -1.0f : n;
 }
 
 HEADBENCH_INLINE Vec3 start_of(const Scene& scene, std::int64_t side, Vec3 normal) {
-  return at(scene.vertices, side >> 1) + normal * kLift;
+  return row(scene.vertices, side >> 1) + normal * kLift;
 }
 
 inline void direct(const Scene& scene, std::int64_t side) {
@@ -91,8 +91,8 @@ inline void direct(const Scene& scene, std::int64_t side) {
 // The side of a corner that stands for a hit: the corner with the largest weight, the side that the ray comes from.
 HEADBENCH_INLINE std::int32_t side_of(const Scene& scene, const Hit& hit, Vec3 along) {
   const std::int32_t* face = scene.faces + 3 * static_cast<std::int64_t>(hit.triangle);
-  const Vec3 a = at(scene.vertices, face[0]);
-  const Vec3 facing = cross(at(scene.vertices, face[1]) - a, at(scene.vertices, face[2]) - a);
+  const Vec3 a = row(scene.vertices, face[0]);
+  const Vec3 facing = cross(row(scene.vertices, face[1]) - a, row(scene.vertices, face[2]) - a);
   const float w = 1.0f - hit.u - hit.v;
   const int corner = w >= hit.u && w >= hit.v ? 0 : hit.u >= hit.v ? 1 : 2;
   return 2 * face[corner] + (dot(facing, along) > 0.0f ? 1 : 0);
@@ -106,7 +106,7 @@ inline void bounce(const Scene& scene, std::int64_t side, std::int32_t* met) {
   const float* directions = scene.hemisphere + 3 * static_cast<std::int64_t>(pattern) * scene.rays;
   std::int32_t likely = 0;
   for (std::int32_t ray = 0; ray < scene.rays; ++ray) {
-    const Vec3 local = at(directions, ray), along = unit(s * local.x + t * local.y + n * local.z);
+    const Vec3 local = row(directions, ray), along = unit(s * local.x + t * local.y + n * local.z);
     const Hit hit = nearest(scene, Ray(from, along), likely);
     met[ray] = hit.triangle < 0 ? kNothing : side_of(scene, hit, along);
   }
@@ -126,7 +126,7 @@ HEADBENCH_INLINE Surface surface_of(const Scene& scene, const Sample& sample) {
   surface.weights[2] = sample.v;
   Vec3 n = {0.0f, 0.0f, 0.0f};
   for (int corner = 0; corner < 3; ++corner)
-    n = n + at(scene.normals, surface.face[corner]) * surface.weights[corner];
+    n = n + row(scene.normals, surface.face[corner]) * surface.weights[corner];
   surface.normal = unit(sample.back ? n * -1.0f : n);
   return surface;
 }
@@ -134,7 +134,7 @@ HEADBENCH_INLINE Surface surface_of(const Scene& scene, const Sample& sample) {
 HEADBENCH_INLINE Vec3 place_of(const Scene& scene, const Surface& surface) {
   Vec3 place = {0.0f, 0.0f, 0.0f};
   for (int corner = 0; corner < 3; ++corner)
-    place = place + at(scene.vertices, surface.face[corner]) * surface.weights[corner];
+    place = place + row(scene.vertices, surface.face[corner]) * surface.weights[corner];
   return place;
 }
 
@@ -148,8 +148,8 @@ HEADBENCH_INLINE void cover(const Scene& scene, const Strip& strip, std::int32_t
                             float* us, float* vs) {
   const Extent extent = strip.extents[triangle];
   const std::int32_t* face = scene.faces + 3 * static_cast<std::int64_t>(triangle);
-  const Vec3 corner = at(scene.vertices, face[0]);
-  const Vec3 edge1 = at(scene.vertices, face[1]) - corner, edge2 = at(scene.vertices, face[2]) - corner;
+  const Vec3 corner = row(scene.vertices, face[0]);
+  const Vec3 edge1 = row(scene.vertices, face[1]) - corner, edge2 = row(scene.vertices, face[2]) - corner;
   const Float8 ax = all(edge1.x), ay = all(edge1.y), az = all(edge1.z);
   const Float8 bx = all(edge2.x), by = all(edge2.y), bz = all(edge2.z);
   const std::int64_t stride = stride_of(strip.columns);
@@ -302,7 +302,7 @@ inline void shade(const Scene& scene, const Sample* samples, std::int64_t count,
     for (int corner = 0; corner < 3; ++corner) {
       const float weight = surface.weights[corner];
       const Reached& reached = scene.reached[2 * static_cast<std::int64_t>(surface.face[corner]) + sample.back];
-      albedo = albedo + at(scene.albedo, surface.face[corner]) * weight;
+      albedo = albedo + row(scene.albedo, surface.face[corner]) * weight;
       light = light + Vec3{reached.all[0], reached.all[1], reached.all[2]} * weight;
       visible = visible + load(reached.visible) * all(weight);
       gloss += scene.gloss[surface.face[corner]] * weight;
@@ -318,7 +318,7 @@ inline void shade(const Scene& scene, const Sample* samples, std::int64_t count,
         seen = sky(scene, place_of(scene, surface), mirrored(sample.towards, surface.normal));
       } else {
         const float* reached = scene.reached[sample.mirrored].direct;
-        const Vec3 other = at(scene.albedo, sample.mirrored >> 1);
+        const Vec3 other = row(scene.albedo, sample.mirrored >> 1);
         seen = {other.x * reached[0], other.y * reached[1], other.z * reached[2]};
       }
       shine[0] = share * seen.x;

@@ -8,21 +8,10 @@ namespace headbench::HEADBENCH_ISA {
 
 using namespace light;
 
-HEADBENCH_INLINE Vec3 operator+(Vec3 a, Vec3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-HEADBENCH_INLINE Vec3 operator-(Vec3 a, Vec3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-HEADBENCH_INLINE Vec3 operator*(Vec3 a, float s) { return {a.x * s, a.y * s, a.z * s}; }
-HEADBENCH_INLINE float dot(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-HEADBENCH_INLINE Vec3 cross(Vec3 a, Vec3 b) {
-  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-}
 HEADBENCH_INLINE Vec3 unit(Vec3 a) {
   const float squared = dot(a, a);
   return squared > 0.0f ? a * (1.0f / sqrtf(squared)) : a;
 }
-HEADBENCH_INLINE Vec3 at(const float* rows, std::int64_t row) {
-  return {rows[3 * row], rows[3 * row + 1], rows[3 * row + 2]};
-}
-
 struct Hit {
   float distance;
   std::int32_t triangle = -1;

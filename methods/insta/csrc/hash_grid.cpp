@@ -4,7 +4,7 @@
 #include <cmath>
 #include <stdexcept>
 
-#include "bench/native/thread_pool.h"
+#include "bench/native/parallel.h"
 
 namespace headbench::insta {
 
@@ -83,10 +83,9 @@ void encode(const Kernels& kernels, const float* positions, std::int64_t count, 
   field.features = features;
   field.table = table;
   const std::int64_t width = features * static_cast<std::int64_t>(levels.size());
-  ThreadPool::instance().run((count + kPointsPerTask - 1) / kPointsPerTask, threads, [&](std::int64_t task, int) {
-    const std::int64_t begin = task * kPointsPerTask, end = std::min(count, begin + kPointsPerTask);
-    std::vector<float> buffer(width * kGroupMax);
-    kernels.encode(field, positions + 3 * begin, end - begin, out + begin * width, buffer.data());
+  const Scratch scratch(width * kGroupMax, threads);
+  parallel_for(count, kPointsPerTask, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
+    kernels.encode(field, positions + 3 * begin, end - begin, out + begin * width, scratch.of(worker));
   });
 }
 
@@ -94,7 +93,7 @@ void encode_backward(const float* positions, std::int64_t count, const float* gr
                      const std::vector<Level>& levels, int features, float* table_gradient, int threads) {
   const auto level_count = static_cast<std::int64_t>(levels.size());
   with_features(features, [&](auto size) {
-    ThreadPool::instance().run(level_count, threads, [&](std::int64_t task, int) {
+    parallel_for(level_count, 1, threads, [&](std::int64_t task, std::int64_t) {
       // The finest levels, whose rows are the most scattered, take the longest: they go first.
       const std::int64_t number = level_count - 1 - task;
       constexpr int kFeatures = decltype(size)::value;

@@ -9,8 +9,8 @@
 #include <utility>
 #include <vector>
 
-#include "bench/native/module.h"
-#include "bench/native/thread_pool.h"
+#include "bench/native/arguments.h"
+#include "bench/native/parallel.h"
 #include "hash_grid.h"
 #include "mesh_search.h"
 #include "rays.h"
@@ -49,20 +49,12 @@ std::shared_ptr<Posed> make_posed(std::shared_ptr<Tree> tree, const Array<const 
   return std::make_shared<Posed>(std::move(tree), vertices.data(), kernels_of(isa).nearest);
 }
 
-// Call body(begin, end) for parts of `count`.
-template <class Body>
-void in_parts(std::int64_t count, int threads, Body body) {
-  ThreadPool::instance().run((count + kPointsPerTask - 1) / kPointsPerTask, threads, [&](std::int64_t task, int) {
-    body(task * kPointsPerTask, std::min(count, (task + 1) * kPointsPerTask));
-  });
-}
-
 void nearest(const Posed& mesh, const Array<const float, -1, 3>& points, const Array<std::int32_t, -1>& triangles,
              const Array<float, -1>& squared, int threads) {
   const auto count = static_cast<std::int64_t>(points.shape(0));
   require(triangles.shape(0) == points.shape(0) && squared.shape(0) == points.shape(0) && threads >= 1);
   nb::gil_scoped_release unlocked;
-  in_parts(count, threads, [&](std::int64_t begin, std::int64_t end) {
+  parallel_for(count, kPointsPerTask, threads, [&](std::int64_t begin, std::int64_t end) {
     for (; begin < end; begin += kLanes) {
       Queries queries;
       for (std::int64_t i = begin; i < std::min(end, begin + kLanes); ++i) queries.add(row(points.data(), i), -1);
@@ -79,7 +71,7 @@ void first_hit(const Posed& mesh, const Array<const float, -1, 3>& origins, cons
   require(directions.shape(0) == origins.shape(0) && triangles.shape(0) == origins.shape(0) &&
           distances.shape(0) == origins.shape(0) && threads >= 1);
   nb::gil_scoped_release unlocked;
-  in_parts(count, threads, [&](std::int64_t begin, std::int64_t end) {
+  parallel_for(count, kPointsPerTask, threads, [&](std::int64_t begin, std::int64_t end) {
     for (std::int64_t i = begin; i < end; ++i) {
       const Hit hit = mesh.first_hit(row(origins.data(), i), row(directions.data(), i));
       triangles.data()[i] = hit.triangle;
@@ -91,58 +83,50 @@ void first_hit(const Posed& mesh, const Array<const float, -1, 3>& origins, cons
 // Where rays through one pose may meet density. Keeps the arrays it was made of.
 class Guide {
  public:
-  Guide(std::shared_ptr<Posed> mesh, Array<const float, -1> reach, Array<const float, -1, 3, 4> matrices,
-        Array<const float, -1, 3> centroids, Array<const std::int32_t, -1, 3> neighbours,
-        Array<const float, -1> own_falloff, Array<const float, -1> neighbour_falloff, const Array<const float, 3>& low,
-        float cells_per_metre, Array<const std::uint8_t, -1, -1, -1> free)
-      : mesh_(std::move(mesh)), reach_(std::move(reach)), matrices_(std::move(matrices)),
-        centroids_(std::move(centroids)), neighbours_(std::move(neighbours)), own_falloff_(std::move(own_falloff)),
-        neighbour_falloff_(std::move(neighbour_falloff)), free_(std::move(free)), low_(row(low.data(), 0)),
-        cells_per_metre_(cells_per_metre) {
-    const std::size_t faces = face_count();
-    require(reach_.shape(0) == faces && matrices_.shape(0) == faces && centroids_.shape(0) == faces &&
-            neighbours_.shape(0) == faces && own_falloff_.shape(0) == faces && neighbour_falloff_.shape(0) == faces);
-    for (std::size_t i = 0; i < 3 * faces; ++i)
-      require(neighbours_.data()[i] < static_cast<std::int64_t>(faces));
+  Guide(std::shared_ptr<Posed> mesh, nb::tuple arguments) : mesh_(std::move(mesh)), arguments_(std::move(arguments)) {
+    Arguments from(arguments_);
+    const std::int64_t faces = face_count();
+    Size x, y, z;
+    reach_ = from(faces);
+    warp_ = {from(faces, 3, 4), from(faces, 3), from(faces, 3), from(faces), from(faces)};
+    const float* low = from(3);
+    grid_ = {row(low, 0), from.number<float>(), {}, from(x, y, z)};
+    for (int axis = 0; axis < 3; ++axis) grid_.size[axis] = static_cast<std::int32_t>(axis == 0 ? x : axis == 1 ? y : z);
+    for (std::int64_t i = 0; i < 3 * faces; ++i) require(warp_.neighbours[i] < faces);
   }
 
-  std::size_t face_count() const { return static_cast<std::size_t>(mesh_->tree().face_count()); }
+  std::int64_t face_count() const { return mesh_->tree().face_count(); }
 
   Marcher marcher(float step) const {
     require(step > 0);
-    const Warp warp{matrices_.data(), centroids_.data(), neighbours_.data(), own_falloff_.data(),
-                    neighbour_falloff_.data()};
-    const Grid grid{low_, cells_per_metre_,
-                    {static_cast<std::int32_t>(free_.shape(0)), static_cast<std::int32_t>(free_.shape(1)),
-                     static_cast<std::int32_t>(free_.shape(2))},
-                    free_.data()};
-    return Marcher(*mesh_, warp, reach_.data(), grid, step);
+    return Marcher(*mesh_, warp_, reach_, grid_, step);
   }
 
  private:
   std::shared_ptr<Posed> mesh_;
-  Array<const float, -1> reach_;
-  Array<const float, -1, 3, 4> matrices_;
-  Array<const float, -1, 3> centroids_;
-  Array<const std::int32_t, -1, 3> neighbours_;
-  Array<const float, -1> own_falloff_, neighbour_falloff_;
-  Array<const std::uint8_t, -1, -1, -1> free_;
-  Vec3 low_;
-  float cells_per_metre_;
+  nb::tuple arguments_;
+  const float* reach_;
+  Warp warp_;
+  Grid grid_;
 };
 
-nb::tuple march_rays(const Guide& guide, const Array<const float, -1, 3>& origins,
-                     const Array<const float, -1, 3>& directions, const Array<const std::int32_t, -1>& first,
-                     const Array<const float, -1>& jitter, float step, int samples_max, int threads) {
-  require(directions.shape(0) == origins.shape(0) && first.shape(0) == origins.shape(0) &&
-          jitter.shape(0) == origins.shape(0) && samples_max >= 1 && threads >= 1);
+Rays read_rays(const nb::tuple& arrays) {
+  Arguments from(arrays);
+  Size count;
+  Rays rays{0, from(count, 3), from(count, 3), from(count)};
+  rays.count = count;
+  return rays;
+}
+
+nb::tuple march_rays(const Guide& guide, const nb::tuple& arrays, const Array<const std::int32_t, -1>& first, float step,
+                     int samples_max, int threads) {
+  const Rays rays = read_rays(arrays);
+  require(static_cast<std::int64_t>(first.shape(0)) == rays.count && samples_max >= 1 && threads >= 1);
   const Marcher marcher = guide.marcher(step);
-  const Rays rays{static_cast<std::int64_t>(origins.shape(0)), origins.data(), directions.data(), first.data(),
-                  jitter.data(), samples_max};
   Samples samples;
   {
     nb::gil_scoped_release unlocked;
-    samples = march(marcher, rays, threads);
+    samples = march(marcher, rays, first.data(), samples_max, threads);
   }
   return nb::make_tuple(given(std::move(samples.positions), 3), given(std::move(samples.directions), 3),
                         given(std::move(samples.distances), 1),
@@ -227,22 +211,21 @@ class Trained {
   Field field_;
 };
 
-std::int64_t render_rays(const Guide& guide, const Trained& trained, const Array<const float, 2, -1>& starts,
-                         const Array<const std::uint8_t, -1>& mouth, const Array<const float, -1, 3>& origins,
-                         const Array<const float, -1, 3>& directions, const Array<const float, -1>& jitter, float step,
-                         int round_samples, float stop_transmittance, const Array<float, -1, 3>& color,
-                         const Array<float, -1>& transmittance, const std::string& isa, int threads) {
-  const std::size_t count = origins.shape(0);
-  require(directions.shape(0) == count && jitter.shape(0) == count && color.shape(0) == count &&
-          transmittance.shape(0) == count && mouth.shape(0) == guide.face_count() && round_samples >= 1 && threads >= 1 &&
-          static_cast<int>(starts.shape(1)) == trained.field().density.layers[0].outputs);
+// `conditions` are those of `Kernels::evaluate` and where the second counts, `marching` and `seen` as in Python.
+std::int64_t render_rays(const Guide& guide, const Trained& trained, const nb::tuple& conditions, const nb::tuple& arrays,
+                         const nb::tuple& marching, const nb::tuple& seen, const std::string& isa, int threads) {
+  const Rays rays = read_rays(arrays);
+  Arguments given(conditions), how(marching), to(seen);
+  const float* starts = given(2, trained.field().density.layers[0].outputs);
+  const std::uint8_t* mouth = given(guide.face_count());
+  const float step = how.number<float>();
+  const Rounds rounds{how.number<std::int32_t>(), how.number<float>()};
+  const Seen out{to(rays.count, 3), to(rays.count)};
+  require(rounds.samples >= 1 && threads >= 1);
   const Kernels& kernels = kernels_of(isa);
   const Marcher marcher = guide.marcher(step);
-  const RenderRays rays{static_cast<std::int64_t>(count), origins.data(), directions.data(), jitter.data(), round_samples,
-                  stop_transmittance};
   nb::gil_scoped_release unlocked;
-  return render(marcher, kernels, trained.field(), starts.data(), mouth.data(), step, rays,
-                {color.data(), transmittance.data()}, threads);
+  return render(marcher, kernels, trained.field(), starts, mouth, step, rays, rounds, out, threads);
 }
 
 }  // namespace
@@ -263,14 +246,8 @@ NB_MODULE(_kernel, m) {
   m.def("first_hit", &first_hit, "mesh"_a, "origins"_a, "directions"_a, "triangles"_a, "distances"_a, "threads"_a,
         "Write the first triangle each ray hits, or -1, and its distance.");
   nb::class_<Guide>(m, "Guide", "Where rays through one pose may meet density.")
-      .def(nb::init<std::shared_ptr<Posed>, Array<const float, -1>, Array<const float, -1, 3, 4>,
-                    Array<const float, -1, 3>, Array<const std::int32_t, -1, 3>, Array<const float, -1>,
-                    Array<const float, -1>, const Array<const float, 3>&, float,
-                    Array<const std::uint8_t, -1, -1, -1>>(),
-           "mesh"_a, "reach"_a, "matrices"_a, "centroids"_a, "neighbours"_a, "own_falloff"_a, "neighbour_falloff"_a,
-           "low"_a, "cells_per_metre"_a, "free"_a);
-  m.def("march", &march_rays, "guide"_a, "origins"_a, "directions"_a, "first"_a, "jitter"_a, "step"_a, "samples_max"_a,
-        "threads"_a,
+      .def(nb::init<std::shared_ptr<Posed>, nb::tuple>(), "mesh"_a, "arguments"_a);
+  m.def("march", &march_rays, "guide"_a, "rays"_a, "first"_a, "step"_a, "samples_max"_a, "threads"_a,
         "Canonical positions and directions, distances from the surface, rays, lattice indices and triangles of samples; where each ray goes on.");
   nb::class_<Trained>(m, "Trained", "The field's parameters.")
       .def(nb::init<const std::vector<LevelTuple>&, Array<const float, -1, -1>, const Array<const float, 3>&, float,
@@ -278,8 +255,8 @@ NB_MODULE(_kernel, m) {
            "levels"_a, "table"_a, "low"_a, "side"_a, "bias"_a, "depth"_a, "scale"_a, "density"_a, "color"_a);
   m.def("instruction_sets", [] { return names_of(runnable_kernels()); },
         "Variants this machine can run, the fastest first.");
-  m.def("render", &render_rays, "guide"_a, "trained"_a, "starts"_a, "mouth"_a, "origins"_a, "directions"_a, "jitter"_a,
-        "step"_a, "round_samples"_a, "stop_transmittance"_a, "color"_a, "transmittance"_a, "isa"_a, "threads"_a,
+  m.def("render", &render_rays, "guide"_a, "trained"_a, "conditions"_a, "rays"_a, "marching"_a, "seen"_a, "isa"_a,
+        "threads"_a,
         "Write what rays see and what they leave; return the number of samples.");
   m.def("encode", &encode_points, "positions"_a, "table"_a, "levels"_a, "out"_a, "threads"_a, "isa"_a = "");
   m.def("encode_backward", &encode_points_backward, "positions"_a, "gradient"_a, "levels"_a, "table_gradient"_a,

@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <atomic>
 
-#include "bench/native/thread_pool.h"
+#include "bench/native/parallel.h"
 
 namespace headbench::insta {
 
@@ -14,9 +14,10 @@ constexpr std::int64_t kMarchedPerTask = 128, kRenderedPerTask = 256;
 void put(std::vector<float>& to, Vec3 v) { to.insert(to.end(), {v.x, v.y, v.z}); }
 
 // The next samples of one ray: those of training are drawn at random, and few lie together.
-void march(const Marcher& marcher, const Rays& rays, std::int64_t number, Samples& out) {
+void march(const Marcher& marcher, const Rays& rays, std::int64_t number, std::int32_t first, std::int32_t samples_max,
+           Samples& out) {
   std::vector<Interval> intervals;
-  Progress progress{row(rays.origins, number), row(rays.directions, number), rays.jitter[number], rays.first[number]};
+  Progress progress{row(rays.origins, number), row(rays.directions, number), rays.jitter[number], first};
   std::int32_t count = 0;
   marcher.start(&progress, 1, intervals);
   marcher.march(&progress, 1, intervals, [&](int, const Sample& sample) {
@@ -26,9 +27,9 @@ void march(const Marcher& marcher, const Rays& rays, std::int64_t number, Sample
     out.rays.push_back(static_cast<std::int32_t>(number));
     out.indices.push_back(sample.index);
     out.triangles.push_back(sample.triangle);
-    return ++count < rays.samples_max;
+    return ++count < samples_max;
   });
-  out.next.push_back(count < rays.samples_max ? -1 : progress.index);
+  out.next.push_back(count < samples_max ? -1 : progress.index);
 }
 
 template <class T>
@@ -73,12 +74,12 @@ struct Gathered {
 
 }  // namespace
 
-Samples march(const Marcher& marcher, const Rays& rays, int threads) {
-  const std::int64_t tasks = (rays.count + kMarchedPerTask - 1) / kMarchedPerTask;
-  std::vector<Samples> parts(tasks);
-  ThreadPool::instance().run(tasks, threads, [&](std::int64_t task, int) {
-    const std::int64_t end = std::min(rays.count, (task + 1) * kMarchedPerTask);
-    for (std::int64_t number = task * kMarchedPerTask; number < end; ++number) march(marcher, rays, number, parts[task]);
+Samples march(const Marcher& marcher, const Rays& rays, const std::int32_t* first, std::int32_t samples_max, int threads) {
+  std::vector<Samples> parts(divided_up(rays.count, kMarchedPerTask));
+  parallel_for(rays.count, kMarchedPerTask, threads, [&](std::int64_t begin, std::int64_t end) {
+    Samples& part = parts[begin / kMarchedPerTask];
+    for (std::int64_t number = begin; number < end; ++number)
+      march(marcher, rays, number, first[number], samples_max, part);
   });
   Samples whole;
   for (const Samples& part : parts) {
@@ -94,15 +95,15 @@ Samples march(const Marcher& marcher, const Rays& rays, int threads) {
 }
 
 std::int64_t render(const Marcher& marcher, const Kernels& kernels, const Field& field, const float* starts,
-                    const std::uint8_t* mouth, float step, const RenderRays& all, const Seen& seen, int threads) {
+                    const std::uint8_t* mouth, float step, const Rays& all, const Rounds& rounds, const Seen& seen,
+                    int threads) {
   std::atomic<std::int64_t> evaluated{0};
-  ThreadPool::instance().run((all.count + kRenderedPerTask - 1) / kRenderedPerTask, threads, [&](std::int64_t task, int) {
-    const std::int64_t begin = task * kRenderedPerTask, end = std::min(all.count, begin + kRenderedPerTask);
+  const Scratch scratch(kernels.scratch(field), threads);
+  parallel_for(all.count, kRenderedPerTask, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
     std::vector<Interval> intervals;
     std::vector<Progress> rays;  // that go on, and beside each what it has gathered
     std::vector<Gathered> gathered;
-    Round round((end - begin) * all.round_samples);
-    std::vector<float> scratch(kernels.scratch(field));
+    Round round((end - begin) * rounds.samples);
     std::fill(seen.color + 3 * begin, seen.color + 3 * end, 0.0f);
     for (std::int64_t number = begin; number < end; ++number) {
       rays.push_back({row(all.origins, number), row(all.directions, number), all.jitter[number], 0});
@@ -119,10 +120,10 @@ std::int64_t render(const Marcher& marcher, const Kernels& kernels, const Field&
         for (int i = 0; i < together; ++i) group[i].samples = 0;
         marcher.march(rays.data() + first, together, intervals, [&](int ray, const Sample& sample) {
           round.add(sample, mouth[sample.triangle] != 0, static_cast<std::int32_t>(first) + ray);
-          return ++group[ray].samples < all.round_samples;
+          return ++group[ray].samples < rounds.samples;
         });
       }
-      kernels.evaluate(field, starts, step, round.points(), round.count, round.values(), scratch.data());
+      kernels.evaluate(field, starts, step, round.points(), round.count, round.values(), scratch.of(worker));
       evaluated += round.count;
       const Values values = round.values();
       for (std::int64_t at = 0; at < round.count; ++at) {
@@ -135,7 +136,7 @@ std::int64_t render(const Marcher& marcher, const Kernels& kernels, const Field&
       std::size_t kept = 0;
       for (std::size_t i = 0; i < count; ++i) {
         seen.transmittance[gathered[i].number] = gathered[i].left;
-        if (gathered[i].samples < all.round_samples || gathered[i].left < all.stop_transmittance) continue;
+        if (gathered[i].samples < rounds.samples || gathered[i].left < rounds.stop_transmittance) continue;
         rays[kept] = rays[i];
         gathered[kept++] = gathered[i];
       }

@@ -19,9 +19,7 @@ namespace headbench::insta {
 struct Rays {
   std::int64_t count;
   const float *origins, *directions;  // (R, 3), directions of unit length
-  const std::int32_t* first;          // (R,) lattice index to start at
   const float* jitter;                // (R,) in [0, 1)
-  std::int32_t samples_max;
 };
 
 struct Samples {
@@ -31,13 +29,11 @@ struct Samples {
   std::vector<std::int32_t> next;  // (R,) lattice index to continue at; -1 where nothing is left
 };
 
-// The next samples of every ray, at most `samples_max` of each.
-Samples march(const Marcher& marcher, const Rays& rays, int threads);
+// The next samples of every ray from its lattice index `first` (R,) on, at most `samples_max` of each.
+Samples march(const Marcher& marcher, const Rays& rays, const std::int32_t* first, std::int32_t samples_max, int threads);
 
-struct RenderRays {
-  std::int64_t count;
-  const float *origins, *directions, *jitter;  // (R, 3), (R, 3), (R,)
-  std::int32_t round_samples;                  // of a ray between two looks at its transmittance
+struct Rounds {
+  std::int32_t samples;  // of a ray between two looks at its transmittance
   float stop_transmittance;
 };
 
@@ -48,6 +44,7 @@ struct Seen {
 
 // `starts` is that of `Kernels`, `mouth` (F,) says where its second row counts. Returns the number of samples.
 std::int64_t render(const Marcher& marcher, const Kernels& kernels, const Field& field, const float* starts,
-                    const std::uint8_t* mouth, float step, const RenderRays& all, const Seen& seen, int threads);
+                    const std::uint8_t* mouth, float step, const Rays& all, const Rounds& rounds, const Seen& seen,
+                    int threads);
 
 }  // namespace headbench::insta

@@ -5,22 +5,9 @@
 #include <limits>
 
 #include "bench/native/simd.h"
+#include "bench/native/vector3.h"
 
 namespace headbench::insta {
-
-struct Vec3 {
-  float x, y, z;
-};
-
-HEADBENCH_INLINE Vec3 operator+(Vec3 a, Vec3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-HEADBENCH_INLINE Vec3 operator-(Vec3 a, Vec3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-HEADBENCH_INLINE Vec3 operator*(float s, Vec3 a) { return {s * a.x, s * a.y, s * a.z}; }
-HEADBENCH_INLINE float dot(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-HEADBENCH_INLINE Vec3 cross(Vec3 a, Vec3 b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
-
-HEADBENCH_INLINE Vec3 row(const float* values, std::int64_t number) {
-  return {values[3 * number], values[3 * number + 1], values[3 * number + 2]};
-}
 
 struct Triangle {
   Vec3 a, b, c;

@@ -11,17 +11,10 @@
 #include <vector>
 
 #include "bench/native/simd.h"
-#include "bench/native/thread_pool.h"
 
 namespace headbench {
 
 namespace {
-
-constexpr std::int64_t kSplatsPerTask = 1024;
-
-std::int64_t task_count(std::int64_t splats) { return (splats + kSplatsPerTask - 1) / kSplatsPerTask; }
-
-std::size_t round_up(std::size_t value, std::size_t step) { return (value + step - 1) / step * step; }
 
 // Gives each stage the time since the one before it ended.
 class StageClock {
@@ -59,7 +52,7 @@ Frame::Frame(const Camera& view, const Splats& splats, const ImageOut& out, std:
   StageClock clock(seconds_);
   const std::size_t count = static_cast<std::size_t>(splats.count);
   const std::size_t tiles = static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
-  data_.records = records_.resize(count * round_up(kGeometry + splats.channels, kRecordUnit));
+  data_.records = records_.resize(count * rounded_up(kGeometry + splats.channels, kRecordUnit));
   data_.depths = depths_.resize(count);
   data_.radii = radii;
   data_.rects = rects_.resize(count);
@@ -67,11 +60,8 @@ Frame::Frame(const Camera& view, const Splats& splats, const ImageOut& out, std:
   data_.transmittances = transmittances_.resize(tiles * kTilePixels);
   data_.last = last_.resize(tiles * kTilePixels);
 
-  ThreadPool& pool = ThreadPool::instance();
-  pool.run(task_count(splats.count), threads, [&](std::int64_t task, int) {
-    const std::int64_t begin = task * kSplatsPerTask;
-    kernels.project(view_, splats, data_, begin, std::min(begin + kSplatsPerTask, splats.count));
-  });
+  parallel_for(splats.count, kPerTask, threads,
+               [&](std::int64_t begin, std::int64_t end) { kernels.project(view_, splats, data_, begin, end); });
   clock.ends(kProject);
   list_drawn(splats.count);
   sort_by_depth();
@@ -80,11 +70,9 @@ Frame::Frame(const Camera& view, const Splats& splats, const ImageOut& out, std:
   fill_tiles(splats, threads);
   clock.ends(kFindPairs);
 
-  const std::size_t scratch_stride = round_up(kernels.scratch_floats(splats.channels), 16);
-  Buffer<float> scratch;
-  scratch.resize(scratch_stride * threads);
-  pool.run(static_cast<std::int64_t>(tiles), threads, [&](std::int64_t tile, int worker) {
-    kernels.draw_tile(view_, splats, data_, out, static_cast<int>(tile), scratch.data() + worker * scratch_stride);
+  const Scratch scratch(kernels.scratch_floats(splats.channels), threads);
+  parallel_for(tiles, 1, threads, [&](std::int64_t tile, std::int64_t, int worker) {
+    kernels.draw_tile(view_, splats, data_, out, static_cast<int>(tile), scratch.of(worker));
   });
   clock.ends(kDraw);
   // Of these the backward pass needs nothing.
@@ -160,19 +148,16 @@ void Frame::reserve_entries() {
 // Counting sort of the entries into tiles. Splats are dealt with in depth order, cut into as many pieces as there
 // are threads; a piece's pairs go behind those of the pieces before it, so the lists do not depend on the cut.
 void Frame::fill_tiles(const Splats& splats, int threads) {
-  ThreadPool& pool = ThreadPool::instance();
-  pool.run(task_count(drawn_count_), threads, [&](std::int64_t task, int) {
-    const std::int64_t begin = task * kSplatsPerTask;
-    kernels_.find_entries(view_, splats, data_, begin, std::min(begin + kSplatsPerTask, drawn_count_));
-  });
+  parallel_for(drawn_count_, kPerTask, threads,
+               [&](std::int64_t begin, std::int64_t end) { kernels_.find_entries(view_, splats, data_, begin, end); });
 
   const std::size_t tiles = static_cast<std::size_t>(view_.tiles_x) * view_.tiles_y;
-  const std::int64_t pieces = std::max<std::int64_t>(1, std::min<std::int64_t>(threads, drawn_count_ / kSplatsPerTask));
+  const std::int64_t pieces = std::max<std::int64_t>(1, std::min<std::int64_t>(threads, drawn_count_ / kPerTask));
   const auto piece_begin = [&](std::int64_t piece) { return drawn_count_ * piece / pieces; };
   std::vector<std::uint32_t> places(pieces * tiles, 0);
   // All splats at once may be counted in any order: the one in which they lie in memory is the fastest.
   const std::uint32_t* counted = pieces == 1 ? data_.drawn : data_.order;
-  pool.run(pieces, threads, [&](std::int64_t piece, int) {
+  parallel_for(pieces, 1, threads, [&](std::int64_t piece, std::int64_t) {
     std::uint32_t* counts = &places[piece * tiles];
     const std::int64_t end = piece_begin(piece + 1);
     for (std::int64_t i = piece_begin(piece); i < end; ++i) {
@@ -195,7 +180,7 @@ void Frame::fill_tiles(const Splats& splats, int threads) {
 
   data_.pairs = pairs_.resize(total);
   data_.places = places_.resize(entry_count_);
-  pool.run(pieces, threads, [&](std::int64_t piece, int) {
+  parallel_for(pieces, 1, threads, [&](std::int64_t piece, std::int64_t) {
     std::uint32_t* place = &places[piece * tiles];
     const std::int64_t end = piece_begin(piece + 1);
     for (std::int64_t i = piece_begin(piece); i < end; ++i) {
@@ -221,48 +206,37 @@ void Frame::backward(const Splats& splats, Gradients grads, float* background, f
   StageClock clock(seconds_);
   const std::int64_t tiles = static_cast<std::int64_t>(view_.tiles_x) * view_.tiles_y;
   const int channels = splats.channels;
-  const std::size_t scratch_stride = round_up(kernels_.scratch_floats(channels), 16);
-  Buffer<float> scratch, records;
-  scratch.resize(scratch_stride * threads);
-  grads.record_stride = static_cast<int>(round_up(kMoments + channels + (grads.means2d_abs ? kAbsolutes : 0), kernels_.lanes));
+  const Scratch scratch(kernels_.scratch_floats(channels), threads);
+  Buffer<float> records;
+  grads.record_stride = static_cast<int>(rounded_up(kMoments + channels + (grads.means2d_abs ? kAbsolutes : 0), kernels_.lanes));
   grads.records = records.resize(data_.tile_begin[tiles] * std::size_t{1} * grads.record_stride);
   std::vector<double> tile_background(static_cast<std::size_t>(tiles) * channels);
   grads.background = tile_background.data();
-  ThreadPool& pool = ThreadPool::instance();
-  pool.run(tiles, threads, [&](std::int64_t tile, int worker) {
-    kernels_.draw_tile_backward(view_, splats, data_, grads, static_cast<int>(tile),
-                               scratch.data() + worker * scratch_stride);
+  parallel_for(tiles, 1, threads, [&](std::int64_t tile, std::int64_t, int worker) {
+    kernels_.draw_tile_backward(view_, splats, data_, grads, static_cast<int>(tile), scratch.of(worker));
   });
 
   clock.ends(kDrawBackward);
 
-  // Tasks of a fixed size, added in order: sums do not depend on the number of threads.
-  const std::int64_t tasks = task_count(drawn_count_);
-  std::vector<double> task_view(static_cast<std::size_t>(tasks) * kViewGradient, 0.0);
-  pool.run(tasks, threads, [&](std::int64_t task, int) {
-    const std::int64_t begin = task * kSplatsPerTask;
-    kernels_.project_backward(view_, splats, data_, grads, begin, std::min(begin + kSplatsPerTask, drawn_count_),
-                             &task_view[task * kViewGradient]);
-  });
+  Buffer<double> by_view;
+  parallel_sum(drawn_count_, kPerTask, kViewGradient, threads, by_view,
+               [&](std::int64_t begin, std::int64_t end, double* part, int) {
+                 kernels_.project_backward(view_, splats, data_, grads, begin, end, part);
+               });
   for (int c = 0; c < channels; ++c) {
     double sum = 0.0;
     for (std::int64_t tile = 0; tile < tiles; ++tile) sum += tile_background[tile * channels + c];
     background[c] = static_cast<float>(sum);
   }
-  for (int k = 0; k < kViewGradient; ++k) {
-    double sum = 0.0;
-    for (std::int64_t task = 0; task < tasks; ++task) sum += task_view[task * kViewGradient + k];
-    view_gradient[k] = static_cast<float>(sum);
-  }
+  for (int k = 0; k < kViewGradient; ++k) view_gradient[k] = static_cast<float>(by_view.data()[k]);
   clock.ends(kProjectBackward);
 }
 
 Work Frame::work(const Splats& splats) const {
-  Buffer<float> scratch;
-  scratch.resize(kernels_.scratch_floats(splats.channels));
+  const Scratch scratch(kernels_.scratch_floats(splats.channels), 1);
   Work work;
   for (int tile = 0; tile < view_.tiles_x * view_.tiles_y; ++tile)
-    kernels_.count_work(view_, splats, data_, tile, scratch.data(), work);
+    kernels_.count_work(view_, splats, data_, tile, scratch.of(0), work);
   return work;
 }
 

@@ -14,8 +14,8 @@
 #include <array>
 
 #include "bench/native/instruction_sets.h"
+#include "bench/native/parallel.h"
 #include "scene.h"
-#include "workspace.h"
 
 namespace headbench {
 
@@ -25,6 +25,8 @@ constexpr const char* kStageNames[kStageCount] = {"project", "sort",          "f
                                                   "draw",    "draw backward", "project backward"};
 
 HEADBENCH_VARIANTS(Kernels, kernels)
+
+constexpr std::int64_t kPerTask = 1024;  // splats or triangles that a thread takes at a time
 
 class Frame {
  public:

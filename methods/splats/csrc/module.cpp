@@ -1,4 +1,4 @@
-// The kernel as a Python module. Arrays are typed and contiguous; outputs are allocated by the caller.
+// The kernel as a Python module. Outputs are allocated by the caller.
 #include <nanobind/stl/map.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/unique_ptr.h>
@@ -11,63 +11,51 @@
 #include <string>
 #include <utility>
 
-#include "bench/native/module.h"
-#include "frame.h"
+#include "calls.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace headbench {
 
-void bind_avatar(nb::module_& m);            // avatar.cpp
-void bind_training(nb::module_& m);          // training.cpp
+void bind_operations(nb::module_& m);        // operations.cpp
 void bind_network_training(nb::module_& m);  // network_training.cpp
 
 namespace {
 
-// The inputs in the order of `rasterize`; `offset` is empty (0, 2) where there is none.
-struct Inputs {
-  Array<const float, -1, 3> means;
-  Array<const float, -1, 4> quats;
-  Array<const float, -1, 3> scales;
-  Array<const float, -1> opacities;
-  Array<const float, -1, -1> colors;
-  Array<const float, -1, 2> offset;
-  Array<const float, -1> background;
+// Inputs of `rasterize`; the offset may be None.
+Splats read_splats(const nb::tuple& arrays, Size& count, Size& channels) {
+  Arguments from(arrays);
+  Splats splats{0, 0, from(count, 3), from(count, 4), from(count, 3), from(count), from(count, channels), from.optional(count, 2),
+                from(channels)};
+  require(channels >= 1 && channels <= kChannelsMax && count < std::int64_t{1} << 32);
+  splats.count = count;
+  splats.channels = static_cast<int>(channels);
+  return splats;
+}
 
-  // Shapes were checked in Python with clear messages; this only keeps memory safe.
-  Splats splats() const {
-    const std::size_t count = means.shape(0);
-    const bool fit = quats.shape(0) == count && scales.shape(0) == count && opacities.shape(0) == count &&
-                     colors.shape(0) == count && (offset.shape(0) == count || offset.shape(0) == 0) &&
-                     background.shape(0) == colors.shape(1) && colors.shape(1) >= 1 &&
-                     colors.shape(1) <= static_cast<std::size_t>(kChannelsMax) && count < (std::size_t{1} << 32);
-    require(fit);
-    return {static_cast<std::int64_t>(count), static_cast<int>(colors.shape(1)), means.data(), quats.data(),
-            scales.data(), opacities.data(), colors.data(), offset.shape(0) ? offset.data() : nullptr,
-            background.data()};
-  }
-};
-
-Camera make_view(const Array<const float, 4, 4>& viewmat, const Array<const float, 3, 3>& K, double near, double far,
-               float eps2d, bool antialiased, double alpha_min, double transmittance_min, std::size_t width, std::size_t height) {
+// World to camera and intrinsics, then the settings in the order of `rasterize`.
+Camera read_camera(const nb::tuple& arguments, std::int64_t width, std::int64_t height) {
+  Arguments from(arguments);
+  const float *viewmat = from(4, 4), *K = from(3, 3);
   Camera view{};
   for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) view.rotation[3 * i + j] = viewmat(i, j);
-    view.translation[i] = viewmat(i, 3);
+    for (int j = 0; j < 3; ++j) view.rotation[3 * i + j] = viewmat[4 * i + j];
+    view.translation[i] = viewmat[4 * i + 3];
   }
-  view.fx = K(0, 0);
-  view.fy = K(1, 1);
-  view.cx = K(0, 2);
-  view.cy = K(1, 2);
-  view.near = near;
-  view.far = far;
-  view.eps2d = eps2d;
-  view.antialiased = antialiased;
+  view.fx = K[0];
+  view.fy = K[4];
+  view.cx = K[2];
+  view.cy = K[5];
+  view.near = from.number<double>();
+  view.far = from.number<double>();
+  view.eps2d = from.number<float>();
+  view.antialiased = from.number<bool>();
+  const double alpha_min = from.number<double>();
   view.alpha_min = static_cast<float>(alpha_min);
   view.log2_alpha_min = static_cast<float>(std::log2(alpha_min));
-  view.transmittance_min = static_cast<float>(transmittance_min);
-  constexpr std::size_t kSizeMax = std::size_t{1} << 19;  // tile indices have 16 bits
+  view.transmittance_min = static_cast<float>(from.number<double>());
+  constexpr std::int64_t kSizeMax = std::int64_t{1} << 19;  // tile indices have 16 bits
   if (width < 1 || height < 1 || width > kSizeMax || height > kSizeMax)
     throw std::invalid_argument("image sides must be from 1 to 2^19 pixels");
   view.width = static_cast<int>(width);
@@ -77,71 +65,49 @@ Camera make_view(const Array<const float, 4, 4>& viewmat, const Array<const floa
   return view;
 }
 
-std::unique_ptr<Frame> forward(const Array<const float, -1, 3>& means, const Array<const float, -1, 4>& quats,
-                               const Array<const float, -1, 3>& scales, const Array<const float, -1>& opacities,
-                               const Array<const float, -1, -1>& colors, const Array<const float, -1, 2>& offset,
-                               const Array<const float, -1>& background, const Array<const float, 4, 4>& viewmat,
-                               const Array<const float, 3, 3>& K, double near, double far, float eps2d,
-                               bool antialiased, double alpha_min, double transmittance_min,
-                               const Array<float, -1, -1, -1>& image, const Array<float, -1, -1>& alpha,
-                               const Array<std::int32_t, -1>& radii, const std::string& instruction_set,
-                               int threads) {
-  const Splats splats = Inputs{means, quats, scales, opacities, colors, offset, background}.splats();
-  const Camera view = make_view(viewmat, K, near, far, eps2d, antialiased, alpha_min, transmittance_min, image.shape(1),
-                              image.shape(0));
-  if (image.shape(2) != colors.shape(1) || alpha.shape(0) != image.shape(0) || alpha.shape(1) != image.shape(1) ||
-      radii.shape(0) != means.shape(0) || threads < 1)
-    throw std::invalid_argument("outputs do not fit the inputs");
-  const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
+std::unique_ptr<Frame> forward(const nb::tuple& inputs, const nb::tuple& camera, const nb::tuple& outputs,
+                               const std::string& instruction_set, int threads) {
+  Size count, channels, height, width;
+  const Splats splats = read_splats(inputs, count, channels);
+  Arguments to(outputs);
+  const ImageOut out{to(height, width, channels), to(height, width)};
+  std::int32_t* radii = to(count);
+  const Camera view = read_camera(camera, width, height);
+  const Kernels& kernels = kernels_of(instruction_set);
+  require(threads >= 1);
   nb::gil_scoped_release unlocked;
-  return std::make_unique<Frame>(view, splats, ImageOut{image.data(), alpha.data()}, radii.data(), kernels, threads);
+  return std::make_unique<Frame>(view, splats, out, radii, kernels, threads);
 }
 
-void backward(Frame& frame, const Array<const float, -1, 3>& means, const Array<const float, -1, 4>& quats,
-              const Array<const float, -1, 3>& scales, const Array<const float, -1>& opacities,
-              const Array<const float, -1, -1>& colors, const Array<const float, -1, 2>& offset,
-              const Array<const float, -1>& background, const Array<const float, -1, -1, -1>& grad_image,
-              const Array<const float, -1, -1>& grad_alpha, const Array<float, -1, 3>& grad_means,
-              const Array<float, -1, 4>& grad_quats, const Array<float, -1, 3>& grad_scales,
-              const Array<float, -1>& grad_opacities, const Array<float, -1, -1>& grad_colors,
-              const Array<float, -1, 2>& grad_offset, const Array<float, -1>& grad_background,
-              const Array<float, 4, 4>& grad_viewmat, const Array<float, 3, 3>& grad_K,
-              const Array<float, -1, 2>& grad_absolute, int threads) {
-  const Splats splats = Inputs{means, quats, scales, opacities, colors, offset, background}.splats();
-  const auto same = [](const auto& a, const auto& b) {
-    for (std::size_t i = 0; i < a.ndim(); ++i)
-      if (a.shape(i) != b.shape(i)) return false;
-    return true;
-  };
-  if (!frame.fits(splats) || !frame.fits(grad_image.shape(1), grad_image.shape(0)) || !same(grad_means, means) ||
-      !same(grad_quats, quats) || !same(grad_scales, scales) || !same(grad_opacities, opacities) ||
-      !same(grad_colors, colors) || !same(grad_offset, offset) || !same(grad_background, background) ||
-      (grad_absolute.shape(0) != 0 && grad_absolute.shape(0) != means.shape(0)) ||
-      grad_image.shape(2) != colors.shape(1) || grad_alpha.shape(0) != grad_image.shape(0) ||
-      grad_alpha.shape(1) != grad_image.shape(1) || threads < 1)
-    throw std::invalid_argument("gradients do not fit the inputs");
+void backward(Frame& frame, const nb::tuple& inputs, const nb::tuple& by_image, const nb::tuple& by_inputs,
+              const nb::tuple& by_camera, int threads) {
+  Size count, channels, height, width;
+  const Splats splats = read_splats(inputs, count, channels);
   Gradients grads{};
-  grads.image = grad_image.data();
-  grads.alpha = grad_alpha.data();
-  grads.means = grad_means.data();
-  grads.quats = grad_quats.data();
-  grads.scales = grad_scales.data();
-  grads.opacities = grad_opacities.data();
-  grads.colors = grad_colors.data();
-  grads.means2d = grad_offset.shape(0) ? grad_offset.data() : nullptr;
-  grads.means2d_abs = grad_absolute.shape(0) ? grad_absolute.data() : nullptr;
+  Arguments given(by_image), to(by_inputs), to_camera(by_camera);
+  grads.image = given(height, width, channels);
+  grads.alpha = given(height, width);
+  grads.means = to(count, 3);
+  grads.quats = to(count, 4);
+  grads.scales = to(count, 3);
+  grads.opacities = to(count);
+  grads.colors = to(count, channels);
+  grads.means2d = to.optional(count, 2);
+  float *background = to(channels), *by_viewmat = to_camera(4, 4), *by_K = to_camera(3, 3);
+  grads.means2d_abs = to_camera.optional(count, 2);
+  require(frame.fits(splats) && frame.fits(width, height) && !grads.means2d == !splats.offset && threads >= 1);
   float view_gradient[kViewGradient];
   {
     nb::gil_scoped_release unlocked;
-    frame.backward(splats, grads, grad_background.data(), view_gradient, threads);
+    frame.backward(splats, grads, background, view_gradient, threads);
   }
   for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) grad_viewmat(i, j) = view_gradient[3 * i + j];
-    grad_viewmat(i, 3) = view_gradient[9 + i];
+    for (int j = 0; j < 3; ++j) by_viewmat[4 * i + j] = view_gradient[3 * i + j];
+    by_viewmat[4 * i + 3] = view_gradient[9 + i];
   }
   for (int i = 0; i < 2; ++i) {
-    grad_K(i, i) = view_gradient[12 + i];
-    grad_K(i, 2) = view_gradient[14 + i];
+    by_K[4 * i] = view_gradient[12 + i];
+    by_K[3 * i + 2] = view_gradient[14 + i];
   }
 }
 
@@ -151,22 +117,17 @@ std::map<std::string, double> stage_seconds(const Frame& frame) {
   return named;
 }
 
-std::pair<std::uint64_t, std::uint64_t> work(const Frame& frame, const Array<const float, -1, 3>& means,
-                                             const Array<const float, -1, 4>& quats,
-                                             const Array<const float, -1, 3>& scales,
-                                             const Array<const float, -1>& opacities,
-                                             const Array<const float, -1, -1>& colors,
-                                             const Array<const float, -1, 2>& offset,
-                                             const Array<const float, -1>& background) {
-  const Splats splats = Inputs{means, quats, scales, opacities, colors, offset, background}.splats();
-  if (!frame.fits(splats)) throw std::invalid_argument("inputs do not fit the frame");
+std::pair<std::uint64_t, std::uint64_t> work(const Frame& frame, const nb::tuple& inputs) {
+  Size count, channels;
+  const Splats splats = read_splats(inputs, count, channels);
+  require(frame.fits(splats));
   const Work work = frame.work(splats);
   return {work.tested, work.drawn};
 }
 
 // Fastest of several short runs, in floating-point operations per second of one thread.
 double peak_flops(const std::string& instruction_set) {
-  const Kernels& kernels = variant_of(runnable_kernels(), instruction_set);
+  const Kernels& kernels = kernels_of(instruction_set);
   constexpr std::int64_t kRounds = 1 << 17;
   constexpr int kRuns = 20;
   double best = std::numeric_limits<double>::infinity();
@@ -190,20 +151,14 @@ NB_MODULE(_kernel, m) {
   m.doc() = "Gaussian splat rasteriser, and what avatars compute before it";
   nb::class_<Frame>(m, "Frame", "A drawn frame: what its backward pass needs.")
       .def_prop_ro("stage_seconds", &stage_seconds, "Processor time of the calling thread by stage.")
-      .def("work", &work, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "offset"_a, "background"_a,
-           "Pairs of splat and pixel tested, and those drawn.");
+      .def("work", &work, "inputs"_a, "Pairs of splat and pixel tested, and those drawn.");
   m.def("peak_flops", &peak_flops, "instruction_set"_a, "Measured multiply-add rate of one thread, flops per second.");
-  m.def("forward", &forward, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "offset"_a, "background"_a,
-        "viewmat"_a, "K"_a, "near"_a, "far"_a, "eps2d"_a, "antialiased"_a, "alpha_min"_a,
-        "transmittance_min"_a, "image"_a, "alpha"_a, "radii"_a, "instruction_set"_a,
-        "threads"_a, "Draw into image, alpha and radii.");
-  m.def("backward", &backward, "frame"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "offset"_a,
-        "background"_a, "grad_image"_a, "grad_alpha"_a, "grad_means"_a, "grad_quats"_a, "grad_scales"_a,
-        "grad_opacities"_a, "grad_colors"_a, "grad_offset"_a, "grad_background"_a, "grad_viewmat"_a, "grad_K"_a,
-        "grad_absolute"_a, "threads"_a,
-        "Add the gradients of drawn splats; write those of background and camera. An empty grad_absolute asks for none.");
-  bind_avatar(m);
-  bind_training(m);
+  m.def("forward", &forward, "inputs"_a, "camera"_a, "outputs"_a, "instruction_set"_a, "threads"_a,
+        "Draw into image, alpha and radii.");
+  m.def("backward", &backward, "frame"_a, "inputs"_a, "by_image"_a, "by_inputs"_a, "by_camera"_a, "threads"_a,
+        "Add the gradients of drawn splats; write those of background and camera. After the camera's come absolute "
+        "gradients of the 2D means, or None.");
+  bind_operations(m);
   bind_network_training(m);
   m.def("instruction_sets", [] { return names_of(runnable_kernels()); }, "Variants this machine can run, the fastest first.");
 }

@@ -121,7 +121,7 @@ inline void directions(const DirectionTraining& in, std::int64_t begin, std::int
     Real direction[3];
     rotate(in.last, steps.second, direction);
     for (int k = 0; k < 3; ++k) result.keep(k, direction[k]);
-    for (int lane = 0; lane < used; ++lane) result.put(in.directions + 3 * (first + lane), lane);
+    for (int lane = 0; lane < used; ++lane) result.put(in.out + 3 * (first + lane), lane);
   }
 }
 
@@ -141,7 +141,7 @@ inline void directions_backward(const DirectionTraining& in, std::int64_t begin,
     const Real along_first = dot3(by_first, steps.first);
     for (int k = 0; k < 3; ++k)
       gradient.keep(k, fnma(by_first[k], 1.0f, along_first * steps.first[k]) / steps.first_length);
-    for (int lane = 0; lane < used; ++lane) gradient.put(in.by_means + 3 * (first + lane), lane);
+    for (int lane = 0; lane < used; ++lane) gradient.put(in.out + 3 * (first + lane), lane);
   }
 }
 
@@ -549,16 +549,10 @@ inline void line_backward(const LineTraining& in, const LineSums& at, std::int64
   }
 }
 
-inline void add(float* to, const float* from, std::size_t count) {
-  std::size_t k = 0;
-  for (; k + W <= count; k += W) store(to + k, load(to + k) + load(from + k));
-  for (; k < count; ++k) to[k] += from[k];
-}
-
 extern const NetworkKernels network_kernels;
 const NetworkKernels network_kernels = {
     HEADBENCH_ISA_NAME, positions<false>, positions<true>, directions,     directions_backward, color_forward_scratch, color_forward,
     color_backward_scratch, color_backward, scatter_plane,       offset_scratch,        offset_network,
-    line_backward_scratch,  line_backward,  add};
+    line_backward_scratch,  line_backward};
 
 }  // namespace headbench::HEADBENCH_ISA

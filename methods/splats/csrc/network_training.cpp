@@ -13,7 +13,7 @@
 #include <utility>
 #include <vector>
 
-#include "tasks.h"
+#include "calls.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -23,11 +23,7 @@ namespace {
 
 constexpr std::int64_t kChunkMin = 2048;  // splats
 constexpr std::int64_t kChunksMax = 32;
-constexpr std::int64_t kSumsPerTask = 8192;  // floats
-constexpr int kBandRows = 16;                // of a plane
-
-std::int64_t divided_up(std::int64_t value, std::int64_t by) { return (value + by - 1) / by; }
-std::int64_t rounded_up(std::int64_t value, std::int64_t step) { return divided_up(value, step) * step; }
+constexpr int kBandRows = 16;  // of a plane
 
 // A multiple of kUnitsStep as an odd number of cache lines.
 int odd_stride(std::int64_t width) {
@@ -56,36 +52,9 @@ void unpad(const float* from, std::int64_t rows, std::int64_t columns, std::int6
   for (std::int64_t row = 0; row < rows; ++row) std::copy_n(from + row * stride, columns, to + row * columns);
 }
 
-// Call body(begin, end, worker's scratch) for chunks of `count` entries.
-template <class Body>
-void share_chunks(std::int64_t count, std::int64_t chunk, std::size_t scratch_floats, int threads, const Body& body) {
-  const Scratch scratch(scratch_floats, threads);
-  ThreadPool::instance().run(divided_up(count, chunk), threads, [&](std::int64_t task, int worker) {
-    body(task * chunk, std::min((task + 1) * chunk, count), scratch.of(worker));
-  });
-}
-
-// Call body(begin, end, accumulator, scratch) for chunks of `count` entries; the sums over all of them in the first
-// `floats` numbers of what is returned.
-template <class Body>
-void sum_chunks(const NetworkKernels& kernels, std::int64_t count, std::size_t floats, std::size_t scratch_floats, int threads,
-                Buffer<float>& sums, const Body& body) {
-  const std::int64_t chunk = std::max(kChunkMin, rounded_up(divided_up(count, kChunksMax), kNetworkTile));
-  const std::int64_t chunks = std::max<std::int64_t>(divided_up(count, chunk), 1);
-  const std::size_t stride = rounded_up(static_cast<std::int64_t>(floats), 16);
-  sums.resize(stride * chunks);
-  if (count == 0) std::fill_n(sums.data(), floats, 0.0f);
-  share_chunks(count, chunk, scratch_floats, threads, [&](std::int64_t begin, std::int64_t end, float* scratch) {
-    float* own = sums.data() + begin / chunk * stride;
-    std::fill_n(own, floats, 0.0f);
-    body(begin, end, own, scratch);
-  });
-  const std::int64_t all = static_cast<std::int64_t>(floats);
-  ThreadPool::instance().run(divided_up(all, kSumsPerTask), threads, [&](std::int64_t task, int) {
-    const std::int64_t begin = task * kSumsPerTask, end = std::min(begin + kSumsPerTask, all);
-    for (std::int64_t other = 1; other < chunks; ++other)
-      kernels.add(sums.data() + begin, sums.data() + other * stride + begin, end - begin);
-  });
+// Splats to a part of a sum: enough that the parts are few.
+std::int64_t summed_chunk(std::int64_t count) {
+  return std::max(kChunkMin, rounded_up(divided_up(count, kChunksMax), kNetworkTile));
 }
 
 // Order of `count` places by their (count, 3) lower samples: by the last number, then the middle one, then the first.
@@ -104,118 +73,105 @@ std::vector<std::uint32_t> order_of_places(const std::int32_t* lower, std::int64
   return order;
 }
 
-Grid grid_of(const Array<const float, 2, 3>& box, std::size_t samples) {
-  require(samples >= 2 && samples < (std::size_t{1} << 15));
+Grid grid_of(const float* box, std::int64_t samples) {
+  require(samples >= 2 && samples < std::int64_t{1} << 15);
   Grid grid{};
   for (int axis = 0; axis < 3; ++axis) {
-    grid.low[axis] = box(0, axis);
-    grid.extent[axis] = box(1, axis) - box(0, axis);
+    grid.low[axis] = box[axis];
+    grid.extent[axis] = box[3 + axis] - box[axis];
   }
   grid.samples = static_cast<int>(samples);
   return grid;
 }
 
-using Plane = Array<const float, -1, -1>;
+const NetworkKernels& network_kernels_of(const std::string& instruction_set) {
+  return variant_of(runnable_network_kernels(), instruction_set);
+}
 
-// What both passes over the colours are given.
+// What both passes over the colours are given, with `first` and `last` as they are before zeros are added.
 struct ColorInputs {
-  Array<const float, -1, 3> positions, directions;
-  Plane xy, xz, yz, first, last;
-  Array<const float, 2, 3> box;
+  Size count, rows, channels[kPlanes], hidden, inputs;
+  ColorTraining net{};
+  const float *first, *last;
+
+  explicit ColorInputs(Arguments& from) {
+    net.positions = from(count, 3);
+    net.directions = from(count, 3);
+    for (int plane = 0; plane < kPlanes; ++plane) {
+      net.planes[plane] = from(rows, channels[plane]);
+      net.channels[plane] = static_cast<int>(channels[plane]);
+      net.features += net.channels[plane];
+    }
+    first = from(hidden, inputs);
+    last = from(3, hidden);
+    const float* box = from(2, 3);
+    net.colors = from(count, 3);
+    std::int64_t samples = 2;
+    while (samples * samples < rows) ++samples;
+    require(samples * samples == rows && inputs == net.features + kEncoding);
+    net.grid = grid_of(box, samples);
+    net.units = static_cast<int>(rounded_up(hidden, kUnitsStep));
+    net.inputs = static_cast<int>(rounded_up(inputs, kUnitsStep));
+    net.units_stride = odd_stride(net.units);
+    net.inputs_stride = odd_stride(net.inputs);
+    net.count = count;
+  }
 };
 
 class ColorPass {
  public:
-  ColorPass(const ColorInputs& in, const Array<float, -1, 3>& colors, const NetworkKernels& kernels, int threads)
-      : kernels_(kernels), count_(static_cast<std::int64_t>(in.positions.shape(0))) {
-    ColorTraining net = describe(in);
-    require(colors.shape(0) == in.positions.shape(0));
-    net.kept_hidden = hidden_.resize(rounded_up(count_, kGroupRows) * net.units);
-    net.lower = lower_.resize(3 * count_);
-    net.fractions = fractions_.resize(3 * count_);
-    net.colors = colors.data();
+  ColorPass(const nb::tuple& arrays, const std::string& instruction_set, int threads)
+      : kernels_(network_kernels_of(instruction_set)) {
+    Arguments from(arrays);
+    const ColorInputs in(from);
+    ColorTraining net = in.net;
+    net.kept_hidden = hidden_.resize(rounded_up(net.count, kGroupRows) * net.units);
+    net.lower = lower_.resize(3 * net.count);
+    net.fractions = fractions_.resize(3 * net.count);
+    done_ = net;
     Buffer<float> first, last;
-    net.first = pad_transposed(first, in.first.data(), hidden_units_, input_count_, net.inputs, net.units_stride).data();
-    net.last = pad(last, in.last.data(), 3, hidden_units_, 3, net.units).data();
-    nb::gil_scoped_release unlocked;
-    share_chunks(count_, kChunkMin, kernels_.color_forward_scratch(net), threads,
-              [&](std::int64_t begin, std::int64_t end, float* scratch) { kernels_.color_forward(net, begin, end, scratch); });
+    net.first = pad_transposed(first, in.first, in.hidden, in.inputs, net.inputs, net.units_stride).data();
+    net.last = pad(last, in.last, 3, in.hidden, 3, net.units).data();
+    const nb::gil_scoped_release unlocked;
+    const Scratch scratch(kernels_.color_forward_scratch(net), threads);
+    parallel_for(net.count, kChunkMin, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
+      kernels_.color_forward(net, begin, end, scratch.of(worker));
+    });
   }
 
-  void backward(const ColorInputs& in, const Array<const float, -1, 3>& colors, const Array<const float, -1, 3>& by_colors,
-                const Array<float, -1, 3>& by_positions, const Array<float, -1, 3>& by_directions,
-                const Array<float, -1, -1>& by_xy, const Array<float, -1, -1>& by_xz, const Array<float, -1, -1>& by_yz,
-                const Array<float, -1, -1>& by_first, const Array<float, -1, -1>& by_last, int threads) const {
-    ColorTraining net = describe(in);
-    const std::size_t all = in.positions.shape(0);
-    require(colors.shape(0) == all && by_colors.shape(0) == all);
-    const std::size_t wanted = by_positions.shape(0);
-    require((wanted == all || wanted == 0) && by_directions.shape(0) == wanted);
-    require(by_first.shape(0) == in.first.shape(0) && by_first.shape(1) == in.first.shape(1));
-    require(by_last.shape(0) == 3 && by_last.shape(1) == in.last.shape(1));
-    const Array<float, -1, -1>* by_planes[kPlanes] = {&by_xy, &by_xz, &by_yz};
-    for (int plane = 0; plane < kPlanes; ++plane) {
-      require(by_planes[plane]->shape(0) == in.xy.shape(0));
-      require(static_cast<int>(by_planes[plane]->shape(1)) == net.channels[plane]);
-      net.by_planes[plane] = by_planes[plane]->data();
-    }
+  void backward(const nb::tuple& arrays, int threads) const {
+    Arguments from(arrays);
+    ColorInputs in(from);
+    ColorTraining net = in.net;
+    require(net.count == done_.count && net.units == done_.units && net.grid.samples == done_.grid.samples);
+    net.by_colors = from(in.count, 3);
+    net.by_positions = from.optional(in.count, 3);
+    net.by_directions = from.optional(in.count, 3);
+    require(!net.by_positions == !net.by_directions);
+    for (int plane = 0; plane < kPlanes; ++plane) net.by_planes[plane] = from(in.rows, in.channels[plane]);
+    float *by_first = from(in.hidden, in.inputs), *by_last = from(3, in.hidden);
     net.kept_hidden = hidden_.data();
     net.lower = lower_.data();
     net.fractions = fractions_.data();
-    net.colors = const_cast<float*>(colors.data());
-    net.by_colors = by_colors.data();
-    net.by_positions = wanted ? by_positions.data() : nullptr;
-    net.by_directions = wanted ? by_directions.data() : nullptr;
-    Buffer<float> first, last, by_features, sums;
-    net.first = pad(first, in.first.data(), hidden_units_, input_count_, net.units, net.inputs_stride).data();
-    net.last = pad(last, in.last.data(), 3, hidden_units_, 3, net.units).data();
-    net.by_features = by_features.resize(count_ * net.features);
+    Buffer<float> first, last, sums;
+    const Buffer<float> by_features(net.count * net.features);
+    net.first = pad(first, in.first, in.hidden, in.inputs, net.units, net.inputs_stride).data();
+    net.last = pad(last, in.last, 3, in.hidden, 3, net.units).data();
+    net.by_features = by_features.data();
     const std::size_t of_first = static_cast<std::size_t>(net.units) * net.inputs;
     const ColorSums at{0, of_first, of_first + std::size_t{3} * net.units};
-    float *first_out = by_first.data(), *last_out = by_last.data();
-    nb::gil_scoped_release unlocked;
-    sum_chunks(kernels_, count_, at.end, kernels_.color_backward_scratch(net), threads, sums,
-               [&](std::int64_t begin, std::int64_t end, float* own, float* scratch) {
-                 kernels_.color_backward(net, at, begin, end, own, scratch);
-               });
-    unpad(sums.data() + at.first, hidden_units_, input_count_, net.inputs, first_out);
-    unpad(sums.data() + at.last, 3, hidden_units_, net.units, last_out);
+    const nb::gil_scoped_release unlocked;
+    const Scratch scratch(kernels_.color_backward_scratch(net), threads);
+    parallel_sum(net.count, summed_chunk(net.count), at.end, threads, sums,
+                 [&](std::int64_t begin, std::int64_t end, float* part, int worker) {
+                   kernels_.color_backward(net, at, begin, end, part, scratch.of(worker));
+                 });
+    unpad(sums.data() + at.first, in.hidden, in.inputs, net.inputs, by_first);
+    unpad(sums.data() + at.last, 3, in.hidden, net.units, by_last);
     scatter(net, threads);
   }
 
  private:
-  ColorTraining describe(const ColorInputs& in) {
-    hidden_units_ = static_cast<std::int64_t>(in.first.shape(0));
-    input_count_ = static_cast<std::int64_t>(in.first.shape(1));
-    return std::as_const(*this).describe(in);
-  }
-
-  ColorTraining describe(const ColorInputs& in) const {
-    ColorTraining net{};
-    std::size_t samples = 2;
-    while (samples * samples < in.xy.shape(0)) ++samples;
-    net.grid = grid_of(in.box, samples);
-    const Plane* planes[kPlanes] = {&in.xy, &in.xz, &in.yz};
-    for (int plane = 0; plane < kPlanes; ++plane) {
-      require(planes[plane]->shape(0) == samples * samples);
-      net.channels[plane] = static_cast<int>(planes[plane]->shape(1));
-      net.features += net.channels[plane];
-      net.planes[plane] = planes[plane]->data();
-    }
-    require(static_cast<std::int64_t>(in.positions.shape(0)) == count_ && in.directions.shape(0) == in.positions.shape(0));
-    require(static_cast<std::int64_t>(in.first.shape(0)) == hidden_units_);
-    require(static_cast<std::int64_t>(in.first.shape(1)) == input_count_ && input_count_ == net.features + kEncoding);
-    require(in.last.shape(0) == 3 && static_cast<std::int64_t>(in.last.shape(1)) == hidden_units_);
-    net.units = static_cast<int>(rounded_up(hidden_units_, kUnitsStep));
-    net.inputs = static_cast<int>(rounded_up(input_count_, kUnitsStep));
-    net.units_stride = odd_stride(net.units);
-    net.inputs_stride = odd_stride(net.inputs);
-    net.count = count_;
-    net.positions = in.positions.data();
-    net.directions = in.directions.data();
-    return net;
-  }
-
   static std::int32_t row_of(const ColorTraining& net, std::int64_t splat, int axis) {
     const std::int32_t lower = net.lower[3 * splat + axis];
     return lower < 0 ? ~lower : lower;
@@ -224,84 +180,72 @@ class ColorPass {
   // Gradients by the planes: splats in the order of their lower row of samples, rows dealt out in bands.
   void scatter(const ColorTraining& net, int threads) const {
     const int samples = net.grid.samples;
-    Buffer<std::uint32_t> orders[2];
-    std::vector<std::uint32_t> starts[2], next[2];
-    for (int k = 0; k < 2; ++k) {
-      orders[k].resize(count_);
-      starts[k].assign(samples + 1, 0);
-      next[k].resize(samples);
-    }
-    ThreadPool::instance().run(2, threads, [&](std::int64_t k, int) {
-      const int axis = static_cast<int>(k) + 1;
-      std::vector<std::uint32_t>& from = starts[k];
-      for (std::int64_t i = 0; i < count_; ++i) ++from[row_of(net, i, axis) + 1];
-      for (int row = 0; row < samples; ++row) from[row + 1] += from[row];
-      std::copy(from.begin(), from.end() - 1, next[k].begin());
-      for (std::int64_t i = 0; i < count_; ++i) orders[k].data()[next[k][row_of(net, i, axis)]++] = static_cast<std::uint32_t>(i);
+    Groups splats[2];  // of the second and the third axis
+    parallel_for(2, 1, threads, [&](std::int64_t k, std::int64_t) {
+      splats[k] = group_by_key(net.count, samples, [&](std::int64_t i) { return row_of(net, i, static_cast<int>(k) + 1); });
     });
     const std::int64_t bands = divided_up(samples, kBandRows);
-    ThreadPool::instance().run(kPlanes * bands, threads, [&](std::int64_t task, int) {
-      const int plane = static_cast<int>(task / bands), k = kPlaneAxes[plane][1] - 1;
+    parallel_for(kPlanes * bands, 1, threads, [&](std::int64_t task, std::int64_t) {
+      const int plane = static_cast<int>(task / bands);
+      const auto& [starts, order] = splats[kPlaneAxes[plane][1] - 1];
       const int first = static_cast<int>(task % bands) * kBandRows, last = std::min(first + kBandRows, samples) - 1;
       const std::size_t row_floats = static_cast<std::size_t>(samples) * net.channels[plane];
       std::fill_n(net.by_planes[plane] + first * row_floats, (last - first + 1) * row_floats, 0.0f);
       for (int row = std::max(first - 1, 0); row <= last; ++row)
-        kernels_.scatter_plane(net, plane, row, orders[k].data() + starts[k][row], starts[k][row + 1] - starts[k][row],
-                               first, last);
+        kernels_.scatter_plane(net, plane, row, order.data() + starts[row], starts[row + 1] - starts[row], first, last);
     });
   }
 
   const NetworkKernels& kernels_;
-  const std::int64_t count_;
-  std::int64_t hidden_units_ = 0, input_count_ = 0;
+  ColorTraining done_{};  // the forward pass, of which only the sizes are still valid
   Buffer<float> hidden_, fractions_;
   Buffer<std::int32_t> lower_;
 };
 
-// The weights that both passes over the lines are given.
+// The weights that both passes over the lines are given; backward also their gradients.
+template <class T>
 struct LineWeights {
-  Array<const float, -1, -1> table;
-  Array<const float, -1> bias_0;
-  Array<const float, -1, -1> weight_1;
-  Array<const float, -1> bias_1;
-  Array<const float, -1, -1> weight_2;
-  Array<const float, -1> bias_2;
+  T *table, *bias_0, *weight_1, *bias_1, *weight_2, *bias_2;
+
+  LineWeights(Arguments& from, Size& rows, Size& hidden, Size& outputs)
+      : table(from(rows, hidden)), bias_0(from(hidden)), weight_1(from(hidden, hidden)), bias_1(from(hidden)),
+        weight_2(from(outputs, hidden)), bias_2(from(outputs)) {}
 };
 
 class LinePass {
  public:
-  LinePass(const LineWeights& in, const Array<const float, -1, 3>& positions, const Array<const float, 2, 3>& box,
-           const Array<float, -1, -1>& offsets, const NetworkKernels& kernels, int threads)
-      : kernels_(kernels), all_(positions.shape(0)), hidden_(in.bias_0.shape(0)), outputs_(in.bias_2.shape(0)),
-        table_rows_(in.table.shape(0)) {
-    require(offsets.shape(0) == all_ && offsets.shape(1) == outputs_ && table_rows_ % 3 == 0);
-    find_places(grid_of(box, table_rows_ / 3), box, positions.data());
+  LinePass(const nb::tuple& arrays, const std::string& instruction_set, int threads)
+      : kernels_(network_kernels_of(instruction_set)) {
+    Arguments from(arrays);
+    const LineWeights<const float> in(from, table_rows_, hidden_, outputs_);
+    const float *positions = from(all_, 3), *box = from(2, 3);
+    float* offsets = from(all_, outputs_);
+    require(table_rows_ % 3 == 0);
+    find_places(grid_of(box, table_rows_ / 3), box, positions);
     Padded weights(*this, in, true);
     OffsetNetwork net = describe(weights);
     net.kept = kept_.resize(rounded_up(count_, kGroupRows) * net.units);
-    net.offsets = offsets.data();
-    nb::gil_scoped_release unlocked;
-    share_chunks(count_, kChunkMin, kernels_.offset_scratch(net), threads,
-              [&](std::int64_t begin, std::int64_t end, float* scratch) { kernels_.offset_network(net, begin, end, scratch); });
+    net.offsets = offsets;
+    const nb::gil_scoped_release unlocked;
+    const Scratch scratch(kernels_.offset_scratch(net), threads);
+    parallel_for(count_, kChunkMin, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
+      kernels_.offset_network(net, begin, end, scratch.of(worker));
+    });
   }
 
-  void backward(const LineWeights& in, const Array<const float, -1, -1>& by_offsets, const Array<float, -1, -1>& by_table,
-                const Array<float, -1>& by_bias_0, const Array<float, -1, -1>& by_weight_1,
-                const Array<float, -1>& by_bias_1, const Array<float, -1, -1>& by_weight_2,
-                const Array<float, -1>& by_bias_2, int threads) const {
-    require(by_offsets.shape(0) == all_ && by_offsets.shape(1) == outputs_);
-    require(by_table.shape(0) == table_rows_ && by_table.shape(1) == hidden_ && by_bias_0.shape(0) == hidden_);
-    require(by_weight_1.shape(0) == hidden_ && by_weight_1.shape(1) == hidden_ && by_bias_1.shape(0) == hidden_);
-    require(by_weight_2.shape(0) == outputs_ && by_weight_2.shape(1) == hidden_ && by_bias_2.shape(0) == outputs_);
+  void backward(const nb::tuple& arrays, int threads) {
+    Arguments from(arrays);
+    const LineWeights<const float> in(from, table_rows_, hidden_, outputs_);
+    const float* by_offsets = from(all_, outputs_);
+    const LineWeights<float> by(from, table_rows_, hidden_, outputs_);
     Padded weights(*this, in, false);
-    LineTraining net{describe(weights), weights.weight_1.data(), odd_stride(weights.units), 0, nullptr, by_offsets.data()};
+    LineTraining net{describe(weights), weights.weight_1.data(), odd_stride(weights.units), 0, nullptr, by_offsets};
     net.net.kept = kept_.data();
-    Buffer<std::int64_t> entries;
-    entries.resize(count_);
+    const Buffer<std::int64_t> entries(count_);
     for (std::int64_t entry = 0, found = 0; entry < count_; ++entry) {
-      const float* gradient = net.by_offsets + splats_.data()[entry] * outputs_;
+      const float* gradient = by_offsets + splats_.data()[entry] * outputs_;
       bool any = false;
-      for (std::size_t output = 0; output < outputs_; ++output) any |= gradient[output] != 0.0f;
+      for (std::int64_t output = 0; output < outputs_; ++output) any |= gradient[output] != 0.0f;
       entries.data()[found] = entry;
       found += any;
       net.count = found;
@@ -314,24 +258,23 @@ class LinePass {
     at.weight_2 = at.bias_1 + units;
     at.bias_2 = at.weight_2 + outputs_ * units;
     at.end = at.bias_2 + outputs_;
-    const std::pair<float*, float*> written[] = {
-        {by_table.data(), by_bias_0.data()}, {by_weight_1.data(), by_bias_1.data()}, {by_weight_2.data(), by_bias_2.data()}};
-    nb::gil_scoped_release unlocked;
+    const nb::gil_scoped_release unlocked;
     Buffer<float> sums;
-    sum_chunks(kernels_, net.count, at.end, kernels_.line_backward_scratch(net), threads, sums,
-               [&](std::int64_t begin, std::int64_t end, float* own, float* scratch) {
-                 kernels_.line_backward(net, at, begin, end, own, scratch);
-               });
-    const float* from = sums.data();
-    unpad(from + at.table, table_rows_, hidden_, units, written[0].first);
+    const Scratch scratch(kernels_.line_backward_scratch(net), threads);
+    parallel_sum(net.count, summed_chunk(net.count), at.end, threads, sums,
+                 [&](std::int64_t begin, std::int64_t end, float* part, int worker) {
+                   kernels_.line_backward(net, at, begin, end, part, scratch.of(worker));
+                 });
+    const float* summed = sums.data();
+    unpad(summed + at.table, table_rows_, hidden_, units, by.table);
     // An entry's two weights on an axis add up to 1: what the first axis' rows were given is what the bias gets.
-    std::fill_n(written[0].second, hidden_, 0.0f);
-    for (std::size_t row = 0; row < table_rows_ / 3; ++row)
-      for (std::size_t unit = 0; unit < hidden_; ++unit) written[0].second[unit] += from[at.table + row * units + unit];
-    unpad(from + at.weight_1, hidden_, hidden_, units, written[1].first);
-    unpad(from + at.bias_1, 1, hidden_, units, written[1].second);
-    unpad(from + at.weight_2, outputs_, hidden_, units, written[2].first);
-    unpad(from + at.bias_2, 1, outputs_, outputs_, written[2].second);
+    std::fill_n(by.bias_0, hidden_, 0.0f);
+    for (std::int64_t row = 0; row < table_rows_ / 3; ++row)
+      for (std::int64_t unit = 0; unit < hidden_; ++unit) by.bias_0[unit] += summed[at.table + row * units + unit];
+    unpad(summed + at.weight_1, hidden_, hidden_, units, by.weight_1);
+    unpad(summed + at.bias_1, 1, hidden_, units, by.bias_1);
+    unpad(summed + at.weight_2, outputs_, hidden_, units, by.weight_2);
+    unpad(summed + at.bias_2, 1, outputs_, outputs_, by.bias_2);
   }
 
  private:
@@ -340,21 +283,14 @@ class LinePass {
     Buffer<float> table, bias_0, weight_1, bias_1, weight_2;
     const float* bias_2;
     int units;
-    Padded(const LinePass& pass, const LineWeights& in, bool transposed) {
-      const std::int64_t hidden = static_cast<std::int64_t>(pass.hidden_), outputs = static_cast<std::int64_t>(pass.outputs_);
-      const std::int64_t width = rounded_up(hidden, kUnitsStep);
-      require(in.table.shape(0) == pass.table_rows_ && in.table.shape(1) == pass.hidden_ && in.bias_0.shape(0) == pass.hidden_);
-      require(in.weight_1.shape(0) == pass.hidden_ && in.weight_1.shape(1) == pass.hidden_);
-      require(in.bias_1.shape(0) == pass.hidden_ && in.weight_2.shape(0) == pass.outputs_);
-      require(in.weight_2.shape(1) == pass.hidden_ && in.bias_2.shape(0) == pass.outputs_);
-      const std::int64_t rows = static_cast<std::int64_t>(pass.table_rows_);
-      pad(table, in.table.data(), rows, hidden, rows, width);
-      pad(bias_0, in.bias_0.data(), 1, hidden, 1, width);
-      (transposed ? pad_transposed : pad)(weight_1, in.weight_1.data(), hidden, hidden, width, odd_stride(width));
-      pad(bias_1, in.bias_1.data(), 1, hidden, 1, width);
-      pad(weight_2, in.weight_2.data(), outputs, hidden, outputs, width);
-      bias_2 = in.bias_2.data();
-      units = static_cast<int>(width);
+    Padded(const LinePass& pass, const LineWeights<const float>& in, bool transposed)
+        : bias_2(in.bias_2), units(static_cast<int>(rounded_up(pass.hidden_, kUnitsStep))) {
+      const std::int64_t rows = pass.table_rows_, hidden = pass.hidden_, outputs = pass.outputs_;
+      pad(table, in.table, rows, hidden, rows, units);
+      pad(bias_0, in.bias_0, 1, hidden, 1, units);
+      (transposed ? pad_transposed : pad)(weight_1, in.weight_1, hidden, hidden, units, odd_stride(units));
+      pad(bias_1, in.bias_1, 1, hidden, 1, units);
+      pad(weight_2, in.weight_2, outputs, hidden, outputs, units);
     }
   };
 
@@ -376,19 +312,16 @@ class LinePass {
   }
 
   // The splats in the box, in the order of their places on the lines, which are as `line_position` has them.
-  void find_places(const Grid& grid, const Array<const float, 2, 3>& box, const float* positions) {
+  void find_places(const Grid& grid, const float* box, const float* positions) {
     const float last = static_cast<float>(grid.samples - 1);
-    Buffer<std::int64_t> found;
-    Buffer<std::int32_t> lower;
-    Buffer<float> rest;
-    found.resize(all_);
-    lower.resize(3 * all_);
-    rest.resize(3 * all_);
+    const Buffer<std::int64_t> found(all_);
+    const Buffer<std::int32_t> lower(3 * all_);
+    const Buffer<float> rest(3 * all_);
     std::int64_t count = 0;
-    for (std::size_t splat = 0; splat < all_; ++splat) {
+    for (std::int64_t splat = 0; splat < all_; ++splat) {
       const float* position = positions + 3 * splat;
       bool inside = true;
-      for (int axis = 0; axis < 3; ++axis) inside &= position[axis] >= box(0, axis) && position[axis] <= box(1, axis);
+      for (int axis = 0; axis < 3; ++axis) inside &= position[axis] >= box[axis] && position[axis] <= box[3 + axis];
       if (!inside) continue;
       for (int axis = 0; axis < 3; ++axis) {
         const float along = (position[axis] - grid.low[axis]) / grid.extent[axis] * last;
@@ -397,7 +330,7 @@ class LinePass {
         lower.data()[3 * count + axis] = row;
         rest.data()[3 * count + axis] = clamped - static_cast<float>(row);
       }
-      found.data()[count++] = static_cast<std::int64_t>(splat);
+      found.data()[count++] = splat;
     }
     count_ = count;
     const std::vector<std::uint32_t> order = order_of_places(lower.data(), count, grid.samples);
@@ -415,94 +348,53 @@ class LinePass {
   }
 
   const NetworkKernels& kernels_;
-  const std::size_t all_, hidden_, outputs_, table_rows_;
+  Size all_, hidden_, outputs_, table_rows_;
   std::int64_t count_ = 0;
   Buffer<std::int64_t> splats_;
   Buffer<std::int32_t> rows_;
   Buffer<float> fractions_, kept_;
 };
 
-const NetworkKernels& kernels_of(const std::string& instruction_set) {
-  return variant_of(runnable_network_kernels(), instruction_set);
+void positions(const nb::tuple& arguments, const std::string& instruction_set, int threads) {
+  Arguments from(arguments);
+  Size count, triangles;
+  const PositionTraining in{from(count), from(triangles, 9), from(triangles, 3), from(count, 3), from(count, 3)};
+  require(below(in.binding, count, triangles));
+  const NetworkKernels& kernels = network_kernels_of(instruction_set);
+  run(from.number<bool>() ? kernels.positions_backward : kernels.positions, in, count, threads);
 }
 
-void position_training(const Array<const std::int64_t, -1>& binding, const Array<const float, -1, 9>& linear,
-                       const Array<const float, -1, 3>& centers, const Array<const float, -1, 3>& values,
-                       const Array<float, -1, 3>& out, bool backward, const std::string& instruction_set, int threads) {
-  const std::size_t count = values.shape(0);
-  require(binding.shape(0) == count && out.shape(0) == count && linear.shape(0) == centers.shape(0));
-  require(below(binding.data(), count, linear.shape(0)));
-  const PositionTraining in{binding.data(), linear.data(), centers.data(), values.data(), out.data()};
-  const NetworkKernels& kernels = kernels_of(instruction_set);
-  nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) {
-    (backward ? kernels.positions_backward : kernels.positions)(in, begin, end);
-  });
+void directions(const nb::tuple& arrays, const std::string& instruction_set, int threads) {
+  Arguments from(arrays);
+  Size count, triangles;
+  const DirectionTraining in{from(count), from(triangles, 3, 3), from(3, 3), from(3), from(count, 3), from.optional(count, 3),
+                             from(count, 3)};
+  require(below(in.binding, count, triangles));
+  const NetworkKernels& kernels = network_kernels_of(instruction_set);
+  run(in.by_directions ? kernels.directions_backward : kernels.directions, in, count, threads);
 }
 
-void direction_training(const Array<const std::int64_t, -1>& binding, const Array<const float, -1, 3, 3>& turns,
-                        const Array<const float, 3, 3>& last, const Array<const float, 3>& center,
-                        const Array<const float, -1, 3>& means, const Array<const float, -1, 3>& by_directions,
-                        const Array<float, -1, 3>& out, const std::string& instruction_set, int threads) {
-  const std::size_t count = means.shape(0);
-  const bool backward = by_directions.shape(0) != 0;
-  require(binding.shape(0) == count && out.shape(0) == count && (!backward || by_directions.shape(0) == count));
-  require(below(binding.data(), count, turns.shape(0)));
-  DirectionTraining in{binding.data(), turns.data(), {}, {}, means.data(), out.data(), by_directions.data(), out.data()};
-  std::copy_n(last.data(), 9, in.last);
-  std::copy_n(center.data(), 3, in.center);
-  const NetworkKernels& kernels = kernels_of(instruction_set);
-  nb::gil_scoped_release unlocked;
-  share_out(count, threads, [&](std::int64_t begin, std::int64_t end, int) {
-    (backward ? kernels.directions_backward : kernels.directions)(in, begin, end);
-  });
+template <class Pass>
+std::unique_ptr<Pass> make(const nb::tuple& arrays, const std::string& instruction_set, int threads) {
+  return std::make_unique<Pass>(arrays, instruction_set, threads);
 }
 
 }  // namespace
 
 void bind_network_training(nb::module_& m) {
-  m.def("position_training", &position_training, "binding"_a, "linear"_a, "centers"_a, "values"_a, "out"_a,
-        "backward"_a, "instruction_set"_a, "threads"_a,
-        "Write canonical positions of local means; backward, the gradients by the means of those by the positions.");
-  m.def("direction_training", &direction_training, "binding"_a, "turns"_a, "last"_a, "center"_a, "means"_a,
-        "by_directions"_a, "out"_a, "instruction_set"_a, "threads"_a,
-        "Write canonical directions; or, where gradients by them are given, the gradients by the means.");
-  using Values = Array<const float, -1, -1>;
-  using Vectors = Array<const float, -1, 3>;
-  using Vector = Array<const float, -1>;
+  const auto define = [&](const char* name, auto function, const char* help) {
+    m.def(name, function, "arguments"_a, "instruction_set"_a, "threads"_a, help);
+  };
+  define("position_training", &positions,
+         "Write canonical positions of local means; backward, the gradients by the means of those by the positions.");
+  define("direction_training", &directions,
+         "Write canonical directions; or, where gradients by them are given, the gradients by the means.");
   nb::class_<ColorPass>(m, "ColorPass", "Colours of the colour network in training, kept for their gradients.")
-      .def("backward", [](const ColorPass& pass, const Vectors& positions, const Vectors& directions, const Plane& xy,
-                          const Plane& xz, const Plane& yz, const Values& first, const Values& last,
-                          const Array<const float, 2, 3>& box, const Vectors& colors, const Vectors& by_colors,
-                          const Array<float, -1, 3>& by_positions, const Array<float, -1, 3>& by_directions,
-                          const Array<float, -1, -1>& by_xy, const Array<float, -1, -1>& by_xz,
-                          const Array<float, -1, -1>& by_yz, const Array<float, -1, -1>& by_first,
-                          const Array<float, -1, -1>& by_last, int threads) {
-        pass.backward({positions, directions, xy, xz, yz, first, last, box}, colors, by_colors, by_positions, by_directions,
-                      by_xy, by_xz, by_yz, by_first, by_last, std::max(threads, 1));
-      });
-  m.def("color_training", [](const Vectors& positions, const Vectors& directions, const Plane& xy, const Plane& xz,
-                             const Plane& yz, const Values& first, const Values& last, const Array<const float, 2, 3>& box,
-                             const Array<float, -1, 3>& colors, const std::string& instruction_set, int threads) {
-    return std::make_unique<ColorPass>(ColorInputs{positions, directions, xy, xz, yz, first, last, box}, colors,
-                                       kernels_of(instruction_set), std::max(threads, 1));
-  }, "Write the colours.");
+      .def("backward", &ColorPass::backward, "arrays"_a, "threads"_a);
+  define("color_training", &make<ColorPass>, "Write the colours.");
   nb::class_<LinePass>(m, "LinePass", "Offsets of the feature lines in training, kept for their gradients.")
-      .def("backward", [](const LinePass& pass, const Values& table, const Vector& bias_0, const Values& weight_1,
-                          const Vector& bias_1, const Values& weight_2, const Vector& bias_2, const Values& by_offsets,
-                          const Array<float, -1, -1>& by_table, const Array<float, -1>& by_bias_0,
-                          const Array<float, -1, -1>& by_weight_1, const Array<float, -1>& by_bias_1,
-                          const Array<float, -1, -1>& by_weight_2, const Array<float, -1>& by_bias_2, int threads) {
-        pass.backward({table, bias_0, weight_1, bias_1, weight_2, bias_2}, by_offsets, by_table, by_bias_0, by_weight_1,
-                      by_bias_1, by_weight_2, by_bias_2, std::max(threads, 1));
-      });
-  m.def("line_training", [](const Values& table, const Vector& bias_0, const Values& weight_1, const Vector& bias_1,
-                            const Values& weight_2, const Vector& bias_2, const Vectors& positions,
-                            const Array<const float, 2, 3>& box, const Array<float, -1, -1>& offsets,
-                            const std::string& instruction_set, int threads) {
-    return std::make_unique<LinePass>(LineWeights{table, bias_0, weight_1, bias_1, weight_2, bias_2}, positions, box, offsets,
-                                      kernels_of(instruction_set), std::max(threads, 1));
-  }, "Write the offsets of the splats in the box, those of no others.");
+      .def("backward", &LinePass::backward, "arrays"_a, "threads"_a);
+  define("line_training", &make<LinePass>, "Write the offsets of the splats in the box, those of no others.");
 }
 
 }  // namespace headbench

@@ -34,13 +34,11 @@ struct PositionTraining {
 struct DirectionTraining {
   const std::int64_t* binding;  // (N,) triangles
   const float* turns;           // (F, 3, 3) applied to the directions
-  float last[9];                // rotation applied to all of them after that
-  float center[3];              // of the camera
+  const float* last;            // (3, 3) rotation applied to all of them after that
+  const float* center;          // (3,) of the camera
   const float* means;           // (N, 3) in the world
-  float* directions;            // (N, 3)
-  // Backward.
-  const float* by_directions;  // (N, 3)
-  float* by_means;             // (N, 3)
+  const float* by_directions;   // (N, 3) backward; null for the forward pass
+  float* out;                   // (N, 3) directions; backward: gradients by the means
 };
 
 // Colours of splats by the planes: `plane_colors` of methods/ops/planes.py.
@@ -109,7 +107,6 @@ struct NetworkKernels {
   std::size_t (*line_backward_scratch)(const LineTraining&);
   void (*line_backward)(const LineTraining&, const LineSums&, std::int64_t begin, std::int64_t end, float* sums,
                         float* scratch);
-  void (*add)(float* to, const float* from, std::size_t count);  // element by element
 };
 
 HEADBENCH_VARIANTS(NetworkKernels, network_kernels)

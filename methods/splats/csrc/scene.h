@@ -168,7 +168,7 @@ struct Harmonics {
   const float* means;           // (N, 3) in the world
   const float* rotations;       // (F, 3, 3) applied to the directions, or null
   const std::int64_t* binding;  // (N,) triangles; null without rotations
-  float center[3];              // of the camera
+  const float* center;          // (3,) of the camera
   float* colors;                // (N, 3)
 };
 
@@ -189,7 +189,7 @@ struct ColorNetwork {
   const float* means;           // (N, 3) in the world
   const float* rotations;       // (F, 3, 3) applied to the directions
   const std::int64_t* binding;  // (N,) triangles
-  float center[3];              // of the camera
+  const float* center;          // (3,) of the camera
   float* colors;                // (N, 3)
 };
 
@@ -234,8 +234,7 @@ struct Activation {
 constexpr int kFrameNumbers = 9 + 3 + 1 + 4;
 
 struct ToWorldBackward {
-  ToWorld splats;          // what `to_world` read
-  const float* raw_quats;  // (N, 4) of any length
+  ToWorld splats;          // what `to_world` read, with quaternions of any length
   const float* by_means;   // (N, 3) in the world
   const float* by_quats;   // (N, 4)
   const float* by_scales;  // (N, 3)

@@ -163,7 +163,7 @@ inline void to_world_backward(const ToWorldBackward& in, std::int64_t begin, std
       size.set(in.splats.sizes + triangle, lane);
       outer.set(in.splats.quaternions + 4 * triangle, lane);
       mean.set(in.splats.means + 3 * splat, lane);
-      quat.set(in.raw_quats + 4 * splat, lane);
+      quat.set(in.splats.quats + 4 * splat, lane);
       scale.set(in.splats.scales + 3 * splat, lane);
       by_mean.set(in.by_means + 3 * splat, lane);
       by_quat.set(in.by_quats + 4 * splat, lane);

@@ -428,3 +428,27 @@ def test_what_would_read_beyond_an_array_is_refused(name: str, place: int, value
     arguments[place] = values
     with pytest.raises(ValueError, match="fit"):
         case.call(case.operation.kernel_form, *arguments)
+
+
+@needs_kernel
+@pytest.mark.parametrize(
+    "out",
+    [
+        torch.zeros(4, 3, dtype=torch.float64).numpy(),
+        torch.zeros(3, 4).t().numpy(),
+        torch.zeros(5, 3).numpy(),
+        torch.zeros(12).numpy(),
+        None,
+    ],
+    ids=["another type", "columns", "more rows", "another rank", "none"],
+)
+def test_memory_for_results_that_does_not_fit_is_refused(out: Any) -> None:
+    normal = numbers(0)
+    with pytest.raises(ValueError, match="array 3 does not fit"):
+        kernel.call("activate", normal(4, 3), normal(4, 4), out, torch.zeros(4, 4))
+
+
+@needs_kernel
+def test_missing_arguments_are_refused() -> None:
+    with pytest.raises(ValueError, match="missing"):
+        kernel.call("activate", numbers(0)(4, 3))

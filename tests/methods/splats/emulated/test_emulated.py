@@ -38,8 +38,8 @@ pytestmark = [
 def driver(tmp_path_factory) -> Path:
     """The kernel and the driver as one program for 64-bit ARM."""
     program = tmp_path_factory.mktemp("driver") / "driver"
-    sources = [Path(__file__).with_name("driver.cpp"), ROOT / "bench/native/thread_pool.cpp"]
-    sources += [SOURCES / name for name in ("frame.cpp", "workspace.cpp")]
+    sources = [Path(__file__).with_name("driver.cpp"), SOURCES / "frame.cpp"]
+    sources += [ROOT / "bench/native" / name for name in ("thread_pool.cpp", "workspace.cpp")]
     compiler = [COMPILER, *OPTIONS, f"-I{ROOT}", f"-I{SOURCES}"]
     for name in ("neon", "portable"):
         sources.append(tmp_path_factory.getbasetemp() / f"{name}.o")

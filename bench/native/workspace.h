@@ -1,4 +1,4 @@
-// Memory for frames, kept from one frame to the next: getting megabytes again from the system costs a page fault for
+// Memory of kernels, kept from one call to the next: getting megabytes again from the system costs a page fault for
 // every four kilobytes.
 #pragma once
 
@@ -24,6 +24,7 @@ template <class T>
 class Buffer {
  public:
   Buffer() = default;
+  explicit Buffer(std::size_t count) { resize(count); }
   Buffer(const Buffer&) = delete;
   Buffer& operator=(const Buffer&) = delete;
   ~Buffer() { release(); }
