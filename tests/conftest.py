@@ -18,6 +18,7 @@ import torch
 from hypothesis import HealthCheck, settings
 
 from headbench.bench.io import files
+from headbench.methods.shared.threads import torch_threads
 
 # How long an example takes says something of the machine's load, nothing of the code. The examples are the same in every
 # run, so that a red run is the change's doing; `make fuzz` looks for new ones.
@@ -41,6 +42,13 @@ def own_cache(tmp_path_factory):
 def seeded():
     """Every test starts from the same random numbers, in whatever order the tests run."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="module")
+def one_torch_thread():
+    """More threads cost small work more processor time than they save."""
+    with torch_threads(1):
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -147,15 +147,6 @@ def test_a_4k_frame_stays_bounded_and_is_made_in_strips(trained, clip):
         assert 0 <= values.min() < values.max() <= 1
 
 
-def test_another_background_shows_where_nothing_is_drawn(trained, clip):
-    avatar, _ = trained
-    camera, pose = views(clip)
-    away = replace(pose, translation=np.array([5.0, 0.0, 0.0]))
-    frame = avatar.render(camera, away, (0.25, 0.5, 0.75))
-    assert frame.alpha.max() == 0
-    np.testing.assert_allclose(frame.rgb, np.broadcast_to([0.25, 0.5, 0.75], frame.rgb.shape), atol=1e-6)
-
-
 def test_the_feature_camera_sees_the_same_points():
     from ..toy_clip import look_at
 
