@@ -66,6 +66,25 @@ def browser():
         browser.close()
 
 
+@pytest.fixture
+def new_tab(browser):
+    """Open a tab of its own context; afterwards no page raised an error, and nothing else is in ``new_tab.faults``."""
+    contexts, faults = [], []
+
+    def new_tab(width=640, height=400, **options):
+        contexts.append(browser.new_context(viewport={"width": width, "height": height}, **options))
+        tab = contexts[-1].new_page()
+        tab.set_default_timeout(20_000)
+        tab.on("pageerror", lambda error: faults.append(str(error)))
+        return tab
+
+    new_tab.faults = faults  # type: ignore[attr-defined]
+    yield new_tab
+    for context in contexts:
+        context.close()
+    assert faults == []
+
+
 @pytest.fixture(scope="session", autouse=True)
 def no_flushes():
     """Leave out the waiting for the disk, which takes more time than all else that tests do with files."""
