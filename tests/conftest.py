@@ -18,6 +18,7 @@ import torch
 from hypothesis import HealthCheck, settings
 
 from headbench.bench.io import files
+from headbench.methods.shared.threads import torch_threads
 
 # How long an example takes says something of the machine's load, nothing of the code. The examples are the same in every
 # run, so that a red run is the change's doing; `make fuzz` looks for new ones.
@@ -44,6 +45,13 @@ def seeded():
 
 
 @pytest.fixture(scope="module")
+def one_torch_thread():
+    """More threads cost small work more processor time than they save."""
+    with torch_threads(1):
+        yield
+
+
+@pytest.fixture(scope="module")
 def browser():
     """Chromium without a screen, with WebGL drawn by the processor."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -56,6 +64,25 @@ def browser():
         browser = driver.chromium.launch(executable_path=chromium, args=flags)
         yield browser
         browser.close()
+
+
+@pytest.fixture
+def new_tab(browser):
+    """Open a tab of its own context; afterwards no page raised an error, and nothing else is in ``new_tab.faults``."""
+    contexts, faults = [], []
+
+    def new_tab(width=640, height=400, **options):
+        contexts.append(browser.new_context(viewport={"width": width, "height": height}, **options))
+        tab = contexts[-1].new_page()
+        tab.set_default_timeout(20_000)
+        tab.on("pageerror", lambda error: faults.append(str(error)))
+        return tab
+
+    new_tab.faults = faults  # type: ignore[attr-defined]
+    yield new_tab
+    for context in contexts:
+        context.close()
+    assert faults == []
 
 
 @pytest.fixture(scope="session", autouse=True)

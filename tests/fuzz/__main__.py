@@ -7,9 +7,7 @@ finding makes the exit code 1 and is shown with the smallest damage that hypothe
 
 from __future__ import annotations
 
-import argparse
 import ctypes
-import multiprocessing
 import os
 import re
 import resource
@@ -19,7 +17,6 @@ import time
 import traceback
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -34,7 +31,7 @@ from headbench.bench.errors import HeadbenchError, InputError
 from .damage import damage
 from .readers import COMMANDS, READERS, Exit, Reader
 from .samples import prepare_samples
-from .watch import Place, forked, load_everything, on_change
+from .watch import Place, forked, in_shares, on_change, options_of
 
 SECONDS = 20.0
 """Processor time that a case may take; twelve times as long by the clock ends the process."""
@@ -224,22 +221,13 @@ def fuzz_in_rounds(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser = options_of(__doc__)
     parser.add_argument("--reader", action="append", default=[], help="the start of names; default: all")
     options = parser.parse_args()
     samples = prepare_samples()
-    load_everything()
     end = time.monotonic() + options.seconds
     chosen = [r.name for r in READERS if not options.reader or r.name.startswith(tuple(options.reader))]
-    shares = [
-        share for share in (chosen[index :: options.workers] for index in range(options.workers)) if share
-    ]
-    with ProcessPoolExecutor(len(shares), multiprocessing.get_context("fork")) as pool:
-        jobs = [pool.submit(fuzz_in_rounds, share, samples, options.seed, end) for share in shares]
-        results = [job.result() for job in jobs]
+    results = in_shares(chosen, options.workers, fuzz_in_rounds, samples, options.seed, end)
     columns = ("accepted", "exit 1", "refused")
     print(f"{'reader':<20}" + "".join(f"{column:>10}" for column in columns))
     tallies = {name: tally for each, _ in results for name, tally in each.items()}

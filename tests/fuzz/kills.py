@@ -8,17 +8,14 @@ first and the last ten come first and then a sample over all; the table states h
 
 from __future__ import annotations
 
-import argparse
 import io
 import json
-import multiprocessing
 import os
 import re
 import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,8 +24,8 @@ import pandas as pd
 
 from headbench.bench import cli
 
-from .samples import AVATAR, PREPARE, SYNTH, prepare_samples
-from .watch import Place, forked, load_everything, on_change
+from .samples import GA, OURS, PREPARE, SYNTH, prepare_samples
+from .watch import Place, forked, in_shares, on_change, options_of
 
 
 class Writer(NamedTuple):
@@ -44,17 +41,16 @@ PAGE = "report.html"  # speeds stand on it
 MEASURED_FILES = ("measure.json", "points.csv", "pareto.png", "cost.*", PAGE)
 MEASURED_TABLES = ("measure.json", "tables/*", "contact_sheet.png", PAGE)
 MEASURED_CURVE = ("fit.json", "measure.json", "curve.csv", "curve.png", PAGE)
-GA, OURS = AVATAR.format("ga"), AVATAR.format("ours")
 PARITY = "parity ga --checkout repository --python ./python --commit= --device cpu-shim --data capture"
-SUBMISSION = "submission render avatar --method ga --data benchmark --participant 393 --out out"
+SUBMISSION = f"submission render {GA} --method ga --data benchmark --participant 393 --out out"
 PROCESSES = "run --config config.json --executor processes --workers 1"
 WRITERS = [
-    Writer("synth", "settings", f"synth {SYNTH} --out out"),
+    Writer("synth", "files", f"synth {SYNTH} --out out"),
     Writer("run", "unfinished", "run --config config.json", (PAGE,)),
     Writer("prepare", "recording", f"{PREPARE} --out out"),
     Writer("record", "synthetic", "record nersemble synthetic/UNION2_900 --out out"),
     Writer("refit", "heads", "refit capture --target head.npz --out out"),
-    Writer("evaluate", "images", "evaluate images --like run --out out --label theirs", (PAGE,)),
+    Writer("evaluate", "run", "evaluate images --like run --out out --label theirs", (PAGE,)),
     Writer("evaluate avatar", "run", f"evaluate {GA} --avatar --like run --out out", MEASURED_FILES),
     Writer("render", "run", f"render {GA} --capture capture --out out --video", ("*.webm",)),
     Writer("sweep", "run", "sweep run --methods ga --variants half", MEASURED_FILES),
@@ -62,13 +58,13 @@ WRITERS = [
     Writer("report", "run", "report run --out report.html"),
     Writer("report split", "run", "report run --split"),
     Writer("bundle", "run", "bundle run --out out.zip --by Somebody --renders"),
-    Writer("leaderboard", "bundles", "leaderboard build . --out out"),
+    Writer("leaderboard", "run", "leaderboard build bundles --out out"),
     Writer("extremes", "run", "extremes run --views 1 --dimensions 1 --methods ga ours"),
     Writer("reenact", "two_subjects", "reenact run --frames 1"),
     Writer("pareto", "run", "pareto run --out out"),
     Writer("speed", "timed", "speed run", MEASURED_TABLES),
-    Writer("gate", "baseline", "gate run --baseline baseline.json --junit a.xml --markdown a.md"),
-    Writer("gate update", "baseline", "gate run --baseline baseline.json --update"),
+    Writer("gate", "run", "gate run --baseline baseline.json --junit a.xml --markdown a.md"),
+    Writer("gate update", "run", "gate run --baseline baseline.json --update"),
     Writer(
         "parity",
         "official",
@@ -78,9 +74,9 @@ WRITERS = [
     Writer("compact", "run", f"compact {OURS} --out out --compare capture"),
     *(Writer(f"export {x}", "run", f"export {x} {GA} --out out.{x}") for x in ("html", "glb", "sog", "ply")),
     Writer("export colmap", "capture", "export colmap capture --out out"),
-    Writer("import ga", "ply", "import ga point_cloud.ply --capture capture --out out"),
-    Writer("submission render", "benchmark", SUBMISSION),
-    Writer("tongue", "exclusions", "tongue capture --out reviewed"),
+    Writer("import ga", "run", f"import ga {GA}/point_cloud.ply --capture capture --out out"),
+    Writer("submission render", "run", SUBMISSION),
+    Writer("tongue", "heads", "tongue capture --out reviewed"),
     *(Writer(name, "capture", f"{name} capture --out out") for name in ("inspect", "steps")),
     Writer("lint", "capture", "lint capture"),
     Writer("verify", "run", "verify run"),
@@ -249,23 +245,15 @@ def kill_all(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser = options_of(__doc__)
     parser.add_argument("--command", action="append", default=[], help="the start of names; default: all")
     parser.add_argument("--at", type=int, help="kill the command before this change only")
     options = parser.parse_args()
     samples = prepare_samples()
-    load_everything()
     chosen = [w.name for w in WRITERS if not options.command or w.name.startswith(tuple(options.command))]
     end = time.monotonic() + options.seconds
-    shares = [
-        share for share in (chosen[index :: options.workers] for index in range(options.workers)) if share
-    ]
-    with ProcessPoolExecutor(len(shares), multiprocessing.get_context("fork")) as pool:
-        jobs = [pool.submit(kill_all, share, samples, options.seed, end, options.at) for share in shares]
-        found = {outcome[0]: outcome for job in jobs for outcome in job.result()}
+    results = in_shares(chosen, options.workers, kill_all, samples, options.seed, end, options.at)
+    found = {outcome[0]: outcome for outcomes in results for outcome in outcomes}
     print(f"{'command':<20}{'changes':>9}{'killed':>8}{'findings':>10}")
     for name, changes, done, findings in found.values():
         print(f"{name:<20}{changes:>9}{done:>8}{len(findings):>10}")

@@ -32,7 +32,7 @@ from headbench.methods.shared.tensor_files import read_safetensors
 from headbench.metrics.lpips_network import SQUEEZE, load_backbone
 from headbench.metrics.torch_file import read_weights
 
-from .samples import AVATAR, BACKBONE, CHECKPOINT, METHODS, NUMBERS, PREPARE, SETTINGS, SYNTH
+from .samples import AVATAR, BACKBONE, CHECKPOINT, GA, METHODS, NUMBERS, OURS, PREPARE, SETTINGS, SYNTH
 
 
 class Exit(Exception):
@@ -108,6 +108,11 @@ def of_file(name: str, file: str, read: Callable[[Path], Any], text: bool = Fals
     return Reader(name, "files", lambda: read(Path(file)), (file,), 10, text)
 
 
+def read_colmap(path: Path) -> object:
+    """The cameras of the model that has a file."""
+    return model_cameras(read_model(path.parent), distortion="left to the images")
+
+
 SMALL = (
     of_file("npz", "plain.npz", read_npz),
     of_file("npz, compressed", "compressed.npz", read_npz),
@@ -121,9 +126,10 @@ SMALL = (
     of_file("ply", "a.ply", lambda path: read_ply(path, ("x", "y", "z"))),
     of_file("png", "a.png", read_pixels),
     of_file("jpeg", "a.jpg", read_pixels),
-    of_file("colmap", "bin/images.bin", lambda path: read_model(path.parent)),
-    of_file("colmap, cameras", "bin/cameras.bin", lambda path: read_model(path.parent)),
-    of_file("colmap, text", "txt/images.txt", lambda path: read_model(path.parent), text=True),
+    of_file("colmap", "bin/images.bin", read_colmap),
+    of_file("colmap, cameras", "bin/cameras.bin", read_colmap),
+    of_file("colmap, text", "txt/images.txt", read_colmap, text=True),
+    of_file("colmap, text cameras", "txt/cameras.txt", read_colmap, text=True),
     of_file("json", "a.json", read_json),
     of_file("yaml", "a.yaml", read_yaml, text=True),
 )
@@ -133,7 +139,7 @@ RUN = ("run/run.json", "run/protocols/*.json", "run/rows.parquet")
 CELLS = (*RUN, "run/901/**/*")
 MEAN = "--methods mean-image --preset smoke --set metrics=psnr --set frames_per_task=1"
 GATE = "gate run --baseline baseline.json"
-OURS = AVATAR.format("ours")
+PLY = f"{GA}/point_cloud.ply"
 EXCLUSIONS = "reviewed/tongue.yaml"
 FUNCTIONS = (
     Reader("capture", "capture", look_at(read_capture, "capture"), cases=25),
@@ -151,19 +157,10 @@ FUNCTIONS = (
         Reader(f"avatar {m}", "run", draw(m, AVATAR.format(m)), (f"{AVATAR.format(m)}/*",), 5)
         for m in METHODS
     ),
-    Reader("avatar compact", "compact", draw("ours", "avatar"), ("avatar/*",)),
-    *(
-        Reader(
-            f"colmap {kind}",
-            "colmap",
-            lambda kind=kind: model_cameras(read_model(kind), distortion="left to the images"),
-            (f"{kind}/sparse/**/*",),
-        )
-        for kind in ("bin", "txt")
-    ),
-    Reader("exclusions", "exclusions", on(read_exclusions, Path(EXCLUSIONS)), (EXCLUSIONS,)),
-    Reader("checkpoint", "checkpoint", on(load_checkpoint, Path(CHECKPOINT), "run", "cpu")),
-    Reader("weights", "weights", on(load_backbone, SQUEEZE, Path(BACKBONE)), cases=4),
+    Reader("avatar compact", "run", draw("ours", "compact"), ("compact/*",)),
+    Reader("exclusions", "heads", on(read_exclusions, Path(EXCLUSIONS)), (EXCLUSIONS,)),
+    Reader("checkpoint", "files", on(load_checkpoint, Path(CHECKPOINT), "run", "cpu"), (CHECKPOINT,)),
+    Reader("weights", "files", on(load_backbone, SQUEEZE, Path(BACKBONE)), (BACKBONE,), 4),
 )
 COMMANDS = tuple(
     Reader(name, sample, command(line), files, cases)
@@ -183,27 +180,21 @@ COMMANDS = tuple(
         ("run table cost", "run", "table run --layout cost --format html", RUN, 3),
         ("run compare", "run", "compare run", RUN, 4),
         ("run pareto", "run", "pareto run --out out", RUN, 3),
-        ("run gate", "baseline", GATE, (*RUN, "baseline.json"), 4),
-        ("baseline", "baseline", GATE, ("baseline.json",), 6),
+        ("run gate", "run", GATE, (*RUN, "baseline.json"), 4),
+        ("baseline", "run", GATE, ("baseline.json",), 6),
         ("run verify", "run", "verify run", CELLS, 3),
-        ("bundle verify", "bundles", "verify renders.zip --data capture", ("renders.zip",), 4),
-        ("leaderboard", "bundles", "leaderboard build . --out out", ("*.zip",), 4),
+        ("bundle verify", "run", "verify bundles/renders.zip --data capture", ("bundles/renders.zip",), 4),
+        ("leaderboard", "run", "leaderboard build bundles --out out", ("bundles/*.zip",), 4),
         ("run extremes", "run", "extremes run --views 1 --dimensions 1", CELLS, 3),
         ("run sweep", "run", "sweep run --methods ga --variants half", CELLS, 3),
         ("run reenact", "two_subjects", "reenact run --frames 1", ("**/*",), 3),
         ("run continued", "run", "run --config config.json", CELLS, 3),
-        ("images", "images", "evaluate images --like run --out out --label theirs", ("images/**/*",), 3),
+        ("images", "run", "evaluate images --like run --out out --label theirs", ("images/**/*",), 3),
         ("avatar export", "run", f"export ply {OURS} --out out.ply --capture capture", (f"{OURS}/*",), 3),
         ("avatar to compact", "run", f"compact {OURS} --out out", ("run/901/ours/**/*",), 3),
-        (
-            "ply import",
-            "ply",
-            "import ga point_cloud.ply --capture capture --out out",
-            ("point_cloud.ply",),
-            4,
-        ),
-        ("exclusions tongue", "exclusions", "tongue capture --out reviewed", (EXCLUSIONS,), 3),
-        ("settings", "settings", "run --config config.yaml", ("**/*",), 6),
+        ("ply import", "run", f"import ga {PLY} --capture capture --out out", (PLY,), 4),
+        ("exclusions tongue", "heads", "tongue capture --out reviewed", (EXCLUSIONS,), 3),
+        ("settings", "files", "run --config config.yaml", ("config.yaml",), 6),
         ("synthetic", "synthetic", f"synth {SYNTH} --out synthetic", ("**/*",), 3),
     )
 )

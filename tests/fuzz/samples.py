@@ -12,7 +12,6 @@ import pickle
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +25,6 @@ import yaml
 from headbench.bench import cli
 from headbench.bench.io.files import digest
 from headbench.bench.rows import Row, Rows
-from headbench.datasets.colmap.writer import export_model
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.methods.shared.avatar_files import read_shared_head
@@ -45,6 +43,7 @@ from ..methods.insta.small import SMALL as SMALL_INSTA
 from ..methods.official.repository import lip_numbers, make_interpreter, make_repository
 
 AVATAR = "run/901/{}/seed-0/avatar"
+GA, OURS = AVATAR.format("ga"), AVATAR.format("ours")
 CHECKPOINT, BACKBONE = "checkpoint.safetensors", "squeezenet1_1-b8a52dc0.pth"
 SYNTH = "--cameras 2 --timesteps 7 --size 16x16"
 PREPARE = (
@@ -83,14 +82,13 @@ def configuration(methods: tuple[str, ...], metrics: tuple[str, ...] = ("psnr", 
     }
 
 
-def with_capture(folder: Path, samples: Path) -> Path:
-    """Copy the capture into a sample; return the folder of the finished run's avatars of it."""
+def with_capture(folder: Path, samples: Path) -> None:
+    """Copy the capture into a sample."""
     shutil.copytree(samples / "capture" / "capture", folder / "capture")
-    return samples / "run" / "run" / "901"
 
 
 def files(folder: Path, samples: Path) -> None:
-    """A small file of every format."""
+    """A small file of every format, a checkpoint of a run called "run", weights of LPIPS at random, and settings."""
     import pycolmap
 
     np.savez(folder / "plain.npz", x=NUMBERS)
@@ -119,6 +117,13 @@ def files(folder: Path, samples: Path) -> None:
     for kind, write in (("bin", model.write_binary), ("txt", model.write_text)):
         (folder / kind).mkdir()
         write(folder / kind)
+    state = {"iteration": 3, "tensors": tensors, "moments": [torch.zeros(2), 0.5, "text"]}
+    save_checkpoint(folder / CHECKPOINT, "run", state)
+    torch.manual_seed(0)
+    torch.save(SQUEEZE.build().state_dict(), folder / BACKBONE)
+    values = {**configuration(METHODS), "data": "nowhere", "seeds": [0, 1], "regions": ["face"]}
+    values["reader_settings"] = {"background": [0, 0, 0]}
+    (folder / "config.yaml").write_text(yaml.safe_dump(values))
 
 
 def capture(folder: Path, samples: Path, subject: str = "901") -> None:
@@ -132,7 +137,7 @@ def capture(folder: Path, samples: Path, subject: str = "901") -> None:
 
 
 def heads(folder: Path, samples: Path) -> None:
-    """Head models of every kind, files with their regions, and a capture of another head model."""
+    """Head models of every kind, files with their regions, a capture of another, and a file of frames to leave out."""
     with_capture(folder, samples)
     head = toy_head(16)
     save_head(folder / "head.npz", head)
@@ -144,6 +149,7 @@ def heads(folder: Path, samples: Path) -> None:
     (folder / "FLAME_masks.pkl").write_bytes(pickle.dumps(masks, protocol=2))
     rings = {name: np.asarray(region).tolist() for name, region in head.regions.items() if "ring" in name}
     (folder / "regions.json").write_text(json.dumps(rings))
+    _main("tongue", str(folder / "capture"), "--out", str(folder / "reviewed"))
 
 
 def recording(folder: Path, samples: Path) -> None:
@@ -166,8 +172,20 @@ def monocular(folder: Path, samples: Path) -> None:
 
 
 def run(folder: Path, samples: Path) -> None:
-    """A finished run of all methods, with its capture."""
+    """A finished run of all methods with its capture, and what is made of it.
+
+    That is a baseline, a compact avatar, bundles with and without renders, a folder of images to evaluate, and a
+    participant's folder of the NeRSemble benchmark.
+    """
     _run(folder, samples, METHODS)
+    with contextlib.chdir(folder):
+        _main("gate", "run", "--baseline", "baseline.json", "--update")
+        _main("compact", OURS, "--out", "compact")
+        Path("bundles").mkdir()
+        for name, options in (("renders", ["--renders"]), ("values", ["--methods", "ours"])):
+            _main("bundle", "run", "--out", f"bundles/{name}.zip", "--by", "Somebody", *options)
+        shutil.copytree(Path(GA).parent / "renders", "images")
+        write_benchmark(Path("benchmark"), read_shared_head(Path(GA)), frames=1)
 
 
 def unfinished(folder: Path, samples: Path) -> None:
@@ -192,81 +210,6 @@ def timed(folder: Path, samples: Path) -> None:
     _run(folder, samples, ("mean-image", "ga"), ("psnr", "fps"))
 
 
-def checkpoint(folder: Path, samples: Path) -> None:
-    """A checkpoint of a run called "run"."""
-    state = {
-        "iteration": 3,
-        "tensors": {"means": torch.zeros(4, 3)},
-        "moments": [torch.zeros(2), 0.5, "text"],
-    }
-    save_checkpoint(folder / CHECKPOINT, "run", state)
-
-
-def compact(folder: Path, samples: Path) -> None:
-    """A compact avatar of ours, with the capture it is of."""
-    avatars = with_capture(folder, samples)
-    _main("compact", str(avatars / "ours" / "seed-0" / "avatar"), "--out", str(folder / "avatar"))
-
-
-def ply(folder: Path, samples: Path) -> None:
-    """A PLY of GaussianAvatars, with the capture it is of."""
-    avatars = with_capture(folder, samples)
-    shutil.copyfile(avatars / "ga" / "seed-0" / "avatar" / "point_cloud.ply", folder / "point_cloud.ply")
-
-
-def benchmark(folder: Path, samples: Path) -> None:
-    """An avatar, and a participant's folder of the NeRSemble benchmark."""
-    shutil.copytree(samples / "run" / "run" / "901" / "ga" / "seed-0" / "avatar", folder / "avatar")
-    head = read_shared_head(folder / "avatar")
-    write_benchmark(folder / "benchmark", head, frames=1)
-
-
-def colmap(folder: Path, samples: Path) -> None:
-    """Sparse models of COLMAP, as text and binary."""
-    clip = read_capture(samples / "capture" / "capture")
-    for kind in ("bin", "txt"):
-        export_model(clip, list(clip.files)[:4], folder / kind, model_format=kind)  # type: ignore[arg-type]
-
-
-def exclusions(folder: Path, samples: Path) -> None:
-    """A file of frames to leave out, with the capture it is of."""
-    with_capture(folder, samples)
-    _main("tongue", str(folder / "capture"), "--out", str(folder / "reviewed"))
-
-
-def baseline(folder: Path, samples: Path) -> None:
-    """A finished run, and the baseline it is compared with."""
-    shutil.copytree(samples / "run", folder, dirs_exist_ok=True)
-    _main("gate", str(folder / "run"), "--baseline", str(folder / "baseline.json"), "--update")
-
-
-def settings(folder: Path, samples: Path) -> None:
-    """A file of settings."""
-    values = {**configuration(METHODS), "data": "nowhere", "seeds": [0, 1], "regions": ["face"]}
-    values["reader_settings"] = {"background": [0, 0, 0]}
-    (folder / "config.yaml").write_text(yaml.safe_dump(values))
-
-
-def weights(folder: Path, samples: Path) -> None:
-    """Weights of LPIPS' smallest backbone, drawn at random."""
-    torch.manual_seed(0)
-    torch.save(SQUEEZE.build().state_dict(), folder / BACKBONE)
-
-
-def images(folder: Path, samples: Path) -> None:
-    """A folder of images to evaluate, and the run whose protocol they follow."""
-    shutil.copytree(samples / "run", folder, dirs_exist_ok=True)
-    shutil.copytree(folder / "run" / "901" / "ga" / "seed-0" / "renders", folder / "images")
-
-
-def bundles(folder: Path, samples: Path) -> None:
-    """A bundle with renders and one without, with the capture they are of."""
-    with_capture(folder, samples)
-    for name, options in (("renders", ["--renders"]), ("values", ["--methods", "ours"])):
-        words = ["--out", str(folder / f"{name}.zip"), "--by", "Somebody", *options]
-        _main("bundle", str(samples / "run" / "run"), *words)
-
-
 def official(folder: Path, samples: Path) -> None:
     """A stand-in for an official repository and its interpreter."""
     with_capture(folder, samples)
@@ -279,33 +222,28 @@ def synthetic(folder: Path, samples: Path) -> None:
     _main("synth", *SYNTH.split(), "--out", str(folder / "synthetic"))
 
 
-SAMPLES: dict[str, Callable[[Path, Path], None]] = {
-    sample.__name__: sample
-    for sample in (
-        *(
-            files,
-            capture,
-            heads,
-            recording,
-            videos,
-            monocular,
-            run,
-            unfinished,
-            two_subjects,
-            timed,
-            checkpoint,
-        ),
-        *(compact, ply, colmap, benchmark, exclusions, baseline, settings, weights, images, bundles),
-        *(official, synthetic),
-    )
-}
+SAMPLES = (
+    files,
+    capture,
+    heads,
+    recording,
+    videos,
+    monocular,
+    run,
+    unfinished,
+    two_subjects,
+    timed,
+    official,
+    synthetic,
+)
 
 
 def make(root: Path) -> None:
     """Make every sample."""
-    for name, build in SAMPLES.items():
-        (root / name).mkdir(parents=True)
-        build(root / name, root)
+    for build in SAMPLES:
+        folder = root / build.__name__
+        folder.mkdir(parents=True)
+        build(folder, root)
 
 
 def prepare_samples(root: Path = Path("build/fuzz")) -> Path:

@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import sys
-import tracemalloc
 from pathlib import Path
 
 import hypothesis
@@ -16,6 +15,7 @@ from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
 
+from ..memory import memory_below
 from . import __main__ as target
 from . import samples
 from .readers import SMALL, Exit, Reader
@@ -69,13 +69,8 @@ def place(files):
 
 def bounded(read, most):
     """Call a reader; its outcome."""
-    tracemalloc.start()
-    try:
+    with memory_below(most):
         return read()
-    finally:
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        assert peak < most
 
 
 @pytest.mark.parametrize(
@@ -87,8 +82,8 @@ def test_a_damaged_file_is_refused_by_its_name(place, reader, damage):
     if reader.text and damage.startswith(("empty", "cut")):
         return  # a part of a text, which is sound
     DAMAGE[damage](path)
-    with pytest.raises(InputError) as caught:
-        bounded(reader.read, CUT)
+    with pytest.raises(InputError) as caught, memory_below(CUT):
+        reader.read()
     # A model of COLMAP without one of its files is none: the folder is named.
     assert caught.value.file in (reader.file, str(Path(reader.file).parent))
     assert str(caught.value).isprintable()

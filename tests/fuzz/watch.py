@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
 import functools
 import importlib
 import importlib.metadata
 import json
+import multiprocessing
 import os
 import shutil
 import stat
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -173,3 +176,21 @@ def load_everything() -> None:
     for package in ("bench", "datasets", "methods", "metrics", "reports"):
         for path in sorted((root / package).rglob("*.py")):
             importlib.import_module(".".join(("headbench", *path.relative_to(root).with_suffix("").parts)))
+
+
+def options_of(description: str) -> argparse.ArgumentParser:
+    """The options that both targets have."""
+    parser = argparse.ArgumentParser(description=description.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    return parser
+
+
+def in_shares(names: Sequence[str], workers: int, work: Callable[..., Any], *arguments: Any) -> list[Any]:
+    """Call ``work`` in each of the forked workers with its share of the names; the results."""
+    load_everything()
+    shares = [share for share in (names[index::workers] for index in range(workers)) if share]
+    with ProcessPoolExecutor(len(shares), multiprocessing.get_context("fork")) as pool:
+        jobs = [pool.submit(work, share, *arguments) for share in shares]
+        return [job.result() for job in jobs]

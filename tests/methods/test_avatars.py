@@ -27,6 +27,7 @@ from headbench.methods.ours.method import Ours
 from headbench.methods.shared.config import SplatTraining
 
 from .ours.toy import SMALL, changed
+from .toy_clip import first_view
 
 FAST = SplatTraining(max_splats=1200, min_densify_every=40, min_settle=20)
 BLENDSHAPES = BlendshapeTraining(
@@ -49,14 +50,9 @@ def fitted(request, clip, tmp_path_factory):
     return request.param, method, folder, avatar
 
 
-def first(clip, split="train"):
-    key = clip.splits[split][0]
-    return clip.cameras[key.camera], clip.poses[key.timestep]
-
-
 def test_splats_of_a_pose(fitted, clip):
     _, _, _, avatar = fitted
-    camera, pose = first(clip)
+    camera, pose = first_view(clip)
     splats = avatar.splats(pose)
     assert splats.colors is None
     count = len(splats.means)
@@ -70,10 +66,10 @@ def test_a_frame_drawn_by_stages_is_the_rendered_one(fitted, clip):
     _, method, folder, avatar = fitted
     assert isinstance(avatar, StagedAvatar)
     fresh, stages = method.load(folder, device="cpu"), []
-    camera, pose = first(clip)
+    camera, pose = first_view(clip)
     drawn = fresh.draw(camera, pose, (0.0, 0.5, 1.0), stages.append)
     assert tuple(stages) == STAGES
-    fresh.draw(*first(clip, "self_reenactment"), (1.0, 1.0, 1.0), stages.append)  # changes nothing
+    fresh.draw(*first_view(clip, "self_reenactment"), (1.0, 1.0, 1.0), stages.append)  # changes nothing
     expected = avatar.render(camera, pose, (0.0, 0.5, 1.0))
     assert all(np.array_equal(a, b) for a, b in zip(fresh.read_back(drawn), expected))
 
@@ -86,7 +82,7 @@ def test_shared_files_are_the_rest_of_what_rendering_needs(fitted, clip, tmp_pat
         (tmp_path / path.name).write_bytes(path.read_bytes())
     moved = method.load(tmp_path, device="cpu")
     assert {path.name for path in moved.files()} == {STORED[name], "subject.npz"}
-    camera, pose = first(clip, "self_reenactment")  # that of training is refined driving signal
+    camera, pose = first_view(clip, "self_reenactment")  # that of training is refined driving signal
     np.testing.assert_array_equal(moved.render(camera, pose).rgb, avatar.render(camera, pose).rgb)
     (tmp_path / avatar.shared_files()[0].name).unlink()
     with pytest.raises(InputError):

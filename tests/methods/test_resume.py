@@ -149,11 +149,3 @@ def test_a_process_killed_outright(unbroken, clip, tmp_path, after_s):
     os.kill(child.pid, signal.SIGKILL)
     assert child.wait() == -signal.SIGKILL
     assert content(fit(name, clip, tmp_path)) == expected
-
-
-def test_seconds_bound_a_run_and_the_avatar_is_whole(clip, tmp_path):
-    avatar = METHODS["ga"]().fit(
-        clip, tmp_path, Budget(seconds=1.0), device="cpu", seed=0, progress=no_progress
-    )
-    key = clip.splits["train"][0]
-    assert avatar.render(clip.cameras[key.camera], clip.poses[key.timestep]).rgb.shape[2] == 3

@@ -21,6 +21,7 @@ from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.spec import GBS
 from headbench.methods.gha.config import GHAConfig
 from headbench.methods.gha.spec import GHA
+from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.spec import INSTA
 from headbench.methods.ours.config import Lines, OursConfig, OuterLayers, Penalty, Planes, PlannedCapacity
 from headbench.methods.ours.spec import OURS
@@ -156,6 +157,16 @@ def test_the_paper_preset_of_gbs_is_the_paper():
         (GBSConfig, {"expressions": -1}),
         (GBSConfig, {"difference_sh_degree": 4}),
         (GBSConfig, {"mask_floor_mm": 6.0}),
+        (InstaConfig, {"level_features": 3}),
+        (InstaConfig, {"ema": 1.0}),
+        *((InstaConfig, {"step": wrong}) for wrong in (0.0, 1e-12, float("nan"))),
+        *((InstaConfig, {"levels": wrong}) for wrong in (0, 10**9)),
+        (InstaConfig, {"final_rate": 0.0}),
+        (InstaConfig, {"log2_table": 0}),
+        (InstaConfig, {"occupancy_resolution": 100_000}),
+        (InstaConfig, {"round_samples": 2**31 - 1}),
+        (InstaConfig, {"prior_scale": 1e-320}),
+        (InstaConfig, {"shell_outside": 1e38}),
         (Planes, {"resolution": 1}),
         (Lines, {"expressions": -1}),
         (Lines, {"dynamic": ()}),

@@ -139,3 +139,19 @@ def toy_clip(
         masks,
         background,
     )
+
+
+def first_view(clip, split: str = "train") -> tuple[Camera, HeadPose]:
+    """Camera and pose of the first frame of a split."""
+    key = clip.splits[split][0]
+    return clip.cameras[key.camera], clip.poses[key.timestep]
+
+
+def check_frame(frame, width: int, height: int) -> None:
+    """A frame has its size, and finite colours and coverage from 0 to 1."""
+    assert frame.rgb.shape == (height, width, 3)
+    for values in (frame.rgb, frame.alpha):
+        assert values.dtype == np.float32
+        assert np.isfinite(values).all()
+        assert values.min() >= 0
+        assert values.max() <= 1

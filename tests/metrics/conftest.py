@@ -7,12 +7,9 @@ from headbench.metrics import lpips_network as weights
 from headbench.metrics.lpips import _load
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+@pytest.fixture(autouse=True, scope="module")
+def one_thread(one_torch_thread):
+    """All of these tests have one thread."""
 
 
 @pytest.fixture

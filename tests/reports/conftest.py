@@ -7,11 +7,11 @@ import pytest
 
 from headbench.bench.manifest import Manifest, MethodRecord, ProtocolRecord
 from headbench.bench.rows import Rows
-from headbench.bench.runner import run as runner
 from headbench.bench.runner.config import RunConfig
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
 
+from ..small_run import run_on
 from .made_rows import TASKS, avatar_row, row
 
 PSNR = MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr")
@@ -102,23 +102,15 @@ def toy_run(make_run):
 
 
 @pytest.fixture
-def make_run(toy, tmp_path, monkeypatch):
+def make_run(toy, tmp_path):
     """Run a toy comparison over two subjects into a folder of that name; changes are settings of the run."""
-    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
-    for subject in ("subject1", "subject2"):
-        (tmp_path / "data" / subject).mkdir(parents=True)
 
-    def make(name, **changes):
-        settings = {
-            "data": str(tmp_path / "data"),
-            "out": str(tmp_path / name),
-            "methods": ("toy_plugin:METHOD",),
-            "metrics": ("toy_plugin:ERROR", "toy_plugin:FILES"),
-            "reader": "toy_plugin:READER",
-            "preset": "smoke",
-        }
-        runner.run(RunConfig(**{**settings, **changes}))
-        return tmp_path / name
+    def make(name, methods=("toy_plugin:METHOD",), **changes):
+        settings = {"metrics": ("toy_plugin:ERROR", "toy_plugin:FILES"), "reader": "toy_plugin:READER"}
+        subjects = ("subject1", "subject2")
+        return run_on(
+            tmp_path / "data", tmp_path / name, *methods, subjects=subjects, **settings | changes
+        ).root
 
     return make
 

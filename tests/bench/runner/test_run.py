@@ -174,12 +174,6 @@ def test_a_list_that_comes_back_short_fails_the_cell(config, toy, monkeypatch):
     assert set(rows[rows["method"] == "toy"]["status"]) == {"ok"}
 
 
-def test_a_method_that_checks_is_asked_before_any_work(config, toy):
-    with pytest.raises(InputError, match="no checkout"):
-        rows_of(config, methods=("toy_plugin:METHOD", "toy_plugin:CHECKING"))
-    assert toy.FITS == []
-
-
 @pytest.mark.parametrize(
     ("needs", "found"),
     [
@@ -448,6 +442,7 @@ def test_a_preset_and_settings_reach_the_method(config):
         ({"settings": {"toy": {"budget": 3}}}, "budget: expected a group of settings"),
         ({"settings": {"toy": 3}}, "settings of toy: expected a group of settings"),
         ({"methods": ("toy_plugin:METHOD", "toy_plugin:SAME_NAME")}, "each method once"),
+        ({"methods": ("toy_plugin:METHOD", "toy_plugin:CHECKING")}, "no checkout"),
         ({"data": "nowhere"}, "no such folder"),
         ({"reader_settings": {"shfit": 1}}, "shfit"),
         ({"methods": ("ors",)}, "Did you mean 'ours'"),

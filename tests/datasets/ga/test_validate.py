@@ -252,16 +252,6 @@ def test_settings_are_checked_too(capture):
     assert fault(capture).file == str(capture.union / DECLARED)
 
 
-def test_parameter_file_with_a_pickle_is_not_unpickled(capture, tmp_path):
-    class Bomb:
-        def __reduce__(self):
-            return (open, (str(tmp_path / "touched"), "w"))
-
-    array("expr", np.array([[Bomb()]], dtype=object))(capture)
-    assert fault(capture).file.endswith("00001.npz")
-    assert not (tmp_path / "touched").exists()
-
-
 def test_leaks_can_be_recorded_but_no_key_in_two_splits(capture):
     shutil.copy(image(capture, "EMO-1-shout+laugh", 0, SERIALS[0]), image(capture, camera=SERIALS[0]))
     clip = read_capture(capture.union, leaks="record")

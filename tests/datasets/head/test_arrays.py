@@ -122,23 +122,6 @@ def test_read_refuses_other_files(tmp_path):
             read_head(tmp_path / "other.npz")
 
 
-def test_flipped_bytes_are_refused_or_harmless(tmp_path):
-    save_head(tmp_path / "head.npz", HEAD)
-    whole = bytearray((tmp_path / "head.npz").read_bytes())
-    refused = 0
-    in_data = range(50, len(whole), len(whole) // 40)
-    in_directory = range(len(whole) - 400, len(whole), 5)  # names, methods, versions, flags
-    for position in (*in_data, *in_directory):
-        broken = whole.copy()
-        broken[position] ^= 0xFF
-        (tmp_path / "broken.npz").write_bytes(broken)
-        try:  # some bytes, such as dates, mean nothing
-            assert read_head(tmp_path / "broken.npz").fingerprint() == HEAD.fingerprint()
-        except InputError:
-            refused += 1
-    assert refused > 60
-
-
 def test_derived_regions_are_the_sets_they_name():
     sets = {name: set(members.tolist()) for name, members in HEAD.regions.items()}
     derived = {name: set(members) for name, members in with_derived_regions(HEAD).regions.items()}

@@ -9,7 +9,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.arrays import RING_REGIONS, STORED, save_head
-from headbench.datasets.head.loaders import EYELID_FILES, flame_version, load_head, read_masks
+from headbench.datasets.head.loaders import EYELID_FILES, flame_version, load_head
 
 from .flame_files import flame_content, legacy_pickle, write_flame
 from .flame_stand_in import LID, lids, masks, write_stand_in
@@ -186,33 +186,29 @@ def test_refuses_what_makes_no_head(tmp_path, key, changes):
     assert caught.value.key == key
 
 
+VALUES = ('"abc"', "[1.5]", "[true]", "[[1]]", "[1e9999]", "[99999999999999999999]")
+BESIDE = {
+    **{text: ("regions", text.encode()) for text in ("[1, 2]", "{", *(f'{{"x": {v}}}' for v in VALUES))},
+    "masks of real numbers": ("masks", pickle.dumps({"face": np.array([0.5])})),
+    "masks in a table": ("masks", pickle.dumps({"face": np.zeros((2, 2), int)})),
+    "masks far away": ("masks", pickle.dumps({"face": np.array([10**6])})),
+    "no masks": ("masks", None),
+}
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_files_beside_a_pickle_are_checked(tmp_path, name):
+    option, content = BESIDE[name]
+    path = write_flame(tmp_path / "flame2020.pkl", FLAME)
+    if content is not None:
+        (tmp_path / "beside.json").write_bytes(content)
+    with pytest.raises(InputError, match="face" if content and option == "masks" else r"beside\.json"):
+        load_head(path, **{option: tmp_path / "beside.json"})
+
+
 def test_refuses_other_files(tmp_path):
     (tmp_path / "flame2020.pkl").write_text("solid head")
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
-    for name in ("flame2020.pkl", "other.npz", "none.npz"):
+    for name in ("flame2020.pkl", "other.npz", "none.npz", "."):
         with pytest.raises(InputError, match=name):
             load_head(tmp_path / name)
-    with pytest.raises(InputError):
-        load_head(tmp_path)
-
-
-def test_masks_are_checked(tmp_path):
-    path = write_flame(tmp_path / "flame2020.pkl", FLAME)
-    bad = {"real.pkl": np.array([0.5]), "table.pkl": np.zeros((2, 2), int), "far.pkl": np.array([10**6])}
-    for name, members in bad.items():
-        (tmp_path / name).write_bytes(pickle.dumps({"face": members}))
-        with pytest.raises(InputError, match="face"):
-            load_head(path, masks=tmp_path / name)
-    with pytest.raises(InputError):
-        read_masks(tmp_path / "none.pkl")
-
-
-VALUES = ('"abc"', "[1.5]", "[true]", "[[1]]", "[1e9999]", "[99999999999999999999]")
-
-
-@pytest.mark.parametrize("text", ["[1, 2]", "{", *(f'{{"x": {value}}}' for value in VALUES)])
-def test_region_files_are_checked(tmp_path, text):
-    path = write_flame(tmp_path / "flame2020.pkl", FLAME)
-    (tmp_path / "regions.json").write_text(text)
-    with pytest.raises(InputError, match=r"regions\.json"):
-        load_head(path, regions=tmp_path / "regions.json")

@@ -2,79 +2,63 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from headbench.datasets.images import read_image, write_image
 
-JSONS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
+from .good_capture import GoodCapture
+
+CAMERA, OTHER = "222200001", "222200004"
+"""The camera that faults are planted at, and the one that it is exchanged with."""
+Plant = Callable[[GoodCapture], None]
 
 
-@dataclass(frozen=True)
-class Rig:
-    """The union folder of a capture, with the cameras that faults are planted at."""
-
-    union: Path
-    camera: str
-    other: str
-
-    def edit(self, change: Callable[[dict], object]) -> None:
-        """Apply ``change`` to every frame of every split."""
-        for name in JSONS:
-            path = self.union / name
-            document = json.loads(path.read_text())
-            for frame in document["frames"]:
-                change(frame)
-            path.write_text(json.dumps(document))
-
-    def frames(self) -> list[dict]:
-        return [frame for name in JSONS for frame in json.loads((self.union / name).read_text())["frames"]]
-
-    def images(self, camera: str = "") -> list[Path]:
-        """Images in the order of timesteps; of one camera where one is given."""
-        frames = [f for f in self.frames() if not camera or f["camera_id"] == camera]
-        return [self.union / f["file_path"] for f in sorted(frames, key=lambda f: f["timestep_index"])]
-
-    def each_image(self, change: Callable[[np.ndarray], np.ndarray], camera: str = "") -> None:
-        for path in self.images(camera):
-            write_image(path, change(read_image(path, (1, 1, 1))))
+def images(capture: GoodCapture, camera: str = "") -> list[Path]:
+    """Images in the order of timesteps; of one camera where one is given."""
+    frames: list[dict] = []
+    capture.each_frame(frames.append)
+    frames = [frame for frame in frames if not camera or frame["camera_id"] == camera]
+    return [capture.union / f["file_path"] for f in sorted(frames, key=lambda f: f["timestep_index"])]
 
 
-def add_noise(rig: Rig, sigma: float, seed: int = 0) -> None:
+def change_images(capture: GoodCapture, change: Callable[[np.ndarray], np.ndarray], camera: str = "") -> None:
+    for path in images(capture, camera):
+        write_image(path, change(read_image(path, (1, 1, 1))))
+
+
+def add_noise(capture: GoodCapture, sigma: float, seed: int = 0) -> None:
     """Sensor noise of ``sigma`` levels in every image."""
     rng = np.random.default_rng(seed)
 
     def noisy(image):
         return np.clip(image + rng.normal(0, sigma, image.shape), 0, 255).round().astype(np.uint8)
 
-    rig.each_image(noisy)
+    change_images(capture, noisy)
 
 
-def exchange(rig: Rig) -> None:
+def exchange(capture: GoodCapture) -> None:
     """Two cameras have each other's calibration."""
     keys = ("transform_matrix", "fl_x", "fl_y", "cx", "cy")
-    known = {f["camera_id"]: {k: f[k] for k in keys} for f in rig.frames()}
-    turn = {rig.camera: rig.other, rig.other: rig.camera}
-    rig.edit(lambda f: f.update(known[turn.get(f["camera_id"], f["camera_id"])]))
+    known: dict[str, dict] = {}
+    capture.each_frame(lambda f: known.update({f["camera_id"]: {k: f[k] for k in keys}}))
+    turn = {CAMERA: OTHER, OTHER: CAMERA}
+    capture.each_frame(lambda f: f.update(known[turn.get(f["camera_id"], f["camera_id"])]))
 
 
-def _move(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Rig], None]:
-    def plant(rig):
-        def edit(frame):
-            if frame["camera_id"] == rig.camera:
-                frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+def _move(change: Callable[[np.ndarray], np.ndarray]) -> Plant:
+    def edit(frame):
+        if frame["camera_id"] == CAMERA:
+            frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
 
-        rig.edit(edit)
-
-    return plant
+    return lambda capture: capture.each_frame(edit)
 
 
-def _aside(metres: float, axis: int) -> Callable[[Rig], None]:
+def _aside(metres: float, axis: int) -> Plant:
     def shift(matrix):
         matrix[:3, 3] += metres * matrix[:3, axis]
         return matrix
@@ -82,17 +66,17 @@ def _aside(metres: float, axis: int) -> Callable[[Rig], None]:
     return _move(shift)
 
 
-def _rotated(degrees: float, axis: int) -> Callable[[Rig], None]:
+def _rotated(degrees: float, axis: int) -> Plant:
     turn = np.eye(4)
     turn[:3, :3] = cv2.Rodrigues(np.radians(degrees) * np.eye(3)[axis])[0]
     return _move(lambda matrix: matrix @ turn)
 
 
-def _late(frames: int) -> Callable[[Rig], None]:
+def _late(frames: int) -> Plant:
     """Images (and masks) of so many frames before, within each sequence."""
 
-    def plant(rig):
-        content = {path: (path.read_bytes(), _mask(path).read_bytes()) for path in rig.images(rig.camera)}
+    def plant(capture):
+        content = {p: (p.read_bytes(), _mask(p).read_bytes()) for p in images(capture, CAMERA)}
         for path in content:
             sequence = [other for other in content if other.parent == path.parent]
             source = sequence[min(max(sequence.index(path) - frames, 0), len(sequence) - 1)]
@@ -106,26 +90,21 @@ def _mask(image: Path) -> Path:
     return image.parent.parent / "fg_masks" / image.name
 
 
-def _blur(sigma: float) -> Callable[[Rig], None]:
-    return lambda rig: rig.each_image(lambda image: cv2.GaussianBlur(image, (0, 0), sigma), rig.camera)
+def _each(change: Callable[[np.ndarray], np.ndarray]) -> Plant:
+    return lambda capture: change_images(capture, change, CAMERA)
 
 
-def _black(rig: Rig) -> None:
-    rig.each_image(np.zeros_like, rig.camera)
+def _freeze(capture: GoodCapture) -> None:
+    first = read_image(images(capture, CAMERA)[0], (1, 1, 1))
+    change_images(capture, lambda image: first, CAMERA)
 
 
-def _freeze(rig: Rig) -> None:
-    first = read_image(rig.images(rig.camera)[0], (1, 1, 1))
-    rig.each_image(lambda image: first, rig.camera)
-
-
-@dataclass(frozen=True)
-class CameraFault:
-    """``code`` must be found, and name ``camera``."""
+class CameraFault(NamedTuple):
+    """``code`` must be found, and name `CAMERA`."""
 
     name: str
     code: str
-    plant: Callable[[Rig], None]
+    plant: Plant
 
 
 CAMERA_FAULTS = (
@@ -136,7 +115,7 @@ CAMERA_FAULTS = (
     CameraFault("tilted by 1 degree", "HB514", _rotated(1.0, 0)),
     CameraFault("2 frames late", "HB515", _late(2)),
     CameraFault("2 frames early", "HB515", _late(-2)),
-    CameraFault("blurred by 4 px", "HB517", _blur(4.0)),
-    CameraFault("black", "HB308", _black),
+    CameraFault("blurred by 4 px", "HB517", _each(lambda image: cv2.GaussianBlur(image, (0, 0), 4.0))),
+    CameraFault("black", "HB308", _each(np.zeros_like)),
     CameraFault("frozen", "HB516", _freeze),
 )

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from headbench.bench.contracts import Camera
 from headbench.datasets.ga.writer import SequencePlan
@@ -16,16 +16,14 @@ from headbench.datasets.synthetic.capture import synthesize
 
 from ..head.toy import toy_head
 from ..tiny_capture import look_at
-from .camera_faults import CAMERA_FAULTS, CameraFault, Rig, add_noise
+from .camera_faults import CAMERA, CAMERA_FAULTS, OTHER, CameraFault, add_noise, change_images
 from .good_capture import HEIGHT, LENGTHS, WIDTH, GoodCapture, good_plan, smooth_poses, write_good_capture
 
 RIG_CODES = {"HB308", "HB513", "HB514", "HB515", "HB516", "HB517"}
 NOISE = 3.0
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread():
-    torch.set_num_threads(1)
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
 def arc(count: int) -> list[Camera]:
@@ -57,8 +55,8 @@ def painted(tmp_path_factory) -> Callable[[int, int], GoodCapture]:
     return write
 
 
-def findings(capture: GoodCapture | Rig):
-    _, found = lint_capture(LintSettings(str(capture.union), views=12, duplicates=60, ignore=("HB616",)))
+def findings(union: Path):
+    _, found = lint_capture(LintSettings(str(union), views=12, duplicates=60, ignore=("HB616",)))
     return {finding.code: finding.message for finding in found}
 
 
@@ -77,14 +75,13 @@ HIDDEN_BY_NOISE = ("HB308", "HB516", "HB517")
 )
 def test_a_fault_of_one_camera_is_found_and_named(fault: CameraFault, noise, painted, tmp_path):
     capture = painted(6, 0).copied(tmp_path / "rig")
-    rig = Rig(capture.union, "222200001", "222200004")
-    fault.plant(rig)
+    fault.plant(capture)
     if noise:
-        add_noise(rig, noise)
-    found = findings(rig)
+        add_noise(capture, noise)
+    found = findings(capture.union)
     assert set(found) == {fault.code}, "the fault, and nothing that follows from it"
     named = {camera.id for camera in arc(6) if camera.id in found[fault.code]}
-    assert named == ({rig.camera, rig.other} if fault.code == "HB513" else {rig.camera})
+    assert named == ({CAMERA, OTHER} if fault.code == "HB513" else {CAMERA})
 
 
 @pytest.mark.parametrize(
@@ -101,8 +98,8 @@ def test_no_camera_of_a_healthy_capture_is_blamed(cameras, seed, noise, tracking
 
     capture.each_parameters(err)
     if noise:
-        add_noise(Rig(capture.union, "", ""), noise)
-    assert not RIG_CODES & findings(capture).keys()
+        add_noise(capture, noise)
+    assert not RIG_CODES & findings(capture.union).keys()
 
 
 @pytest.mark.slow
@@ -118,17 +115,17 @@ def test_no_camera_of_a_synthetic_capture_is_blamed(tmp_path):
         workers=1,
     )
     (union,) = tmp_path.glob("UNION*")
-    assert not RIG_CODES & findings(Rig(union, "", "")).keys()
+    assert not RIG_CODES & findings(union).keys()
 
 
 def test_a_single_camera_is_compared_with_no_other(painted, tmp_path):
     """A black one is still told, by its own images."""
     capture = painted(2, 4).copied(tmp_path / "rig")
-    rig = Rig(capture.union, "222200000", "")
-    for name in ("transforms_train.json", "transforms_val.json", "transforms_test.json"):
+    for part in ("train", "val", "test"):
         capture.edit(
-            name, lambda v: v.update(frames=[f for f in v["frames"] if f["camera_id"] == rig.camera])
+            f"transforms_{part}.json",
+            lambda v: v.update(frames=[f for f in v["frames"] if f["camera_id"] == "222200000"]),
         )
-    assert not RIG_CODES & findings(rig).keys()
-    rig.each_image(np.zeros_like)
-    assert RIG_CODES & findings(rig).keys() == {"HB308"}
+    assert not RIG_CODES & findings(capture.union).keys()
+    change_images(capture, np.zeros_like)
+    assert RIG_CODES & findings(capture.union).keys() == {"HB308"}

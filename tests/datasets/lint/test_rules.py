@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-import torch
 
 from headbench.bench.io.images import ImageInfo
 from headbench.datasets.ga.layout import Declaration
@@ -36,9 +35,7 @@ from .good_capture import (
 PLANTED_APART = {"HB115", "HB510", "HB511", "HB513", "HB514", "HB515", "HB516", "HB517", "HB615"}
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread():
-    torch.set_num_threads(1)
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
 def codes(capture: GoodCapture, **settings) -> list[str]:

@@ -136,14 +136,6 @@ def test_truncated_videos_are_found_before_decoding(videos, monkeypatch):
         assert error.value.file == str(path)
 
 
-def test_a_video_that_ends_early_is_found_when_decoding(videos):
-    sequence = look(videos, every=1)
-    view = sequence.views[SERIALS[0]]
-    with pytest.raises(InputError) as error:
-        [*read_frames(view, range(8))]
-    assert (error.value.file, error.value.key) == (str(view.video), "frame 6")
-
-
 def test_masks_of_another_size_are_named(recording):
     folder = recording.writer.sequence_folder("FREE") / "alpha_maps"
     for path in folder.glob(f"cam_{SERIALS[0]}_*"):
@@ -229,17 +221,6 @@ def test_other_files_are_refused(content, tmp_path):
     assert error.value.file == str(path)
     with pytest.raises(InputError, match="No such file"):
         check_boxes(tmp_path / "none.mp4")
-
-
-def test_a_real_video_and_its_truncations(pristine_videos, tmp_path):
-    video = next(pristine_videos.root.rglob("cam_*.mp4"))
-    check_boxes(video)
-    content = video.read_bytes()
-    path = tmp_path / "video.mp4"
-    for fraction in (0.1, 0.5, 0.9, 0.999):
-        path.write_bytes(content[: int(fraction * len(content))])
-        with pytest.raises(InputError):
-            check_boxes(path)
 
 
 def test_a_rotation_that_a_video_asks_for_is_ignored(tmp_path):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.steps.clusters import expression_displacements, farthest_meshes, mean_vertex_distances
+from headbench.methods.shared.threads import torch_threads
 
 from .clips import make_clip, with_poses
 
@@ -49,13 +49,9 @@ def test_rigid_motion_does_not_matter():
 @pytest.mark.parametrize("threads", [1, 3])
 def test_distances_equal_brute_force_across_blocks(count, threads):
     meshes = random_meshes(count)
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
+    with torch_threads(threads):
         found = mean_vertex_distances(meshes)
         landmarks = farthest_meshes(meshes, count)
-    finally:
-        torch.set_num_threads(before)
     np.testing.assert_allclose(found, brute_force(meshes, meshes), rtol=2e-6, atol=1e-7)
     np.testing.assert_array_equal(found, found.T)
     np.testing.assert_allclose(

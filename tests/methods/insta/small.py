@@ -11,6 +11,7 @@ from headbench.methods.insta.marching import CanonicalSurface, canonical_surface
 from headbench.methods.insta.occupancy import Occupancy
 from headbench.methods.insta.warp import mouth_triangles
 from headbench.methods.shared.subject_mesh import SubjectMesh
+from headbench.methods.shared.threads import torch_threads
 
 SMALL = {
     "levels": 4,
@@ -56,11 +57,8 @@ def make_stage(head, prior=None, **more):
 
 def by_threads(function):
     """What a function gives with one thread and with two."""
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
+    results = []
+    for threads in (1, 2):
+        with torch_threads(threads):
             results.append(function())
-    finally:
-        torch.set_num_threads(before)
     return results

@@ -65,16 +65,26 @@ def all_samples(mesh, rays, space, most):
     return [column[order] for column in columns]
 
 
+def keys_of(samples):
+    """(ray, index) of each sample."""
+    return set(zip(samples[3].tolist(), samples[4].tolist()))
+
+
+def check_alike(one, other, least, lost=0.01):
+    """At least so many samples, of which one part in ``lost`` at most may be in one of the two alone."""
+    keys = keys_of(other)
+    assert len(keys) > least
+    # A sample at its limit of reach, at a cell's wall or between two triangles may go either way by rounding.
+    assert len(keys_of(one) ^ keys) <= lost * len(keys)
+
+
 # Where vertices are thrown about by millimetres the warp has folds, and points passed over may be lost.
 @pytest.mark.parametrize(("roughness", "lost"), [(0.0005, 0.01), (0.003, 0.02)])
 def test_the_kernel_gives_the_samples_of_the_reference(space, roughness, lost):
     pair, rays = [make(backend, roughness) for backend in ("kernel", "reference")], fan()
     ours, theirs = (all_samples(mesh, rays, space, 10_000) for mesh in pair)
-    keys = [set(zip(part[3].tolist(), part[4].tolist())) for part in (ours, theirs)]
-    assert len(keys[1]) > 300
-    # A sample at its limit of reach, at a cell's wall or between two triangles may go either way by rounding.
-    assert len(keys[0] ^ keys[1]) <= lost * len(keys[1])
-    common = sorted(keys[0] & keys[1])
+    check_alike(ours, theirs, 300, lost)
+    common = sorted(keys_of(ours) & keys_of(theirs))
     rows = [{key: row for row, key in enumerate(zip(p[3].tolist(), p[4].tolist()))} for p in (ours, theirs)]
     a, b = ([rows[i][key] for key in common] for i in range(2))
     same = ours[5][a] == theirs[5][b]
@@ -91,9 +101,7 @@ def test_a_head_that_a_pose_enlarges_has_the_same_samples(pair, space):
     first = np.zeros(len(rays.origins), np.int32)
     whole = surface.rest.march(rays, first, STEP, 10_000, space)
     found = surface.pose(1.6 * surface.canonical).march(large, first, 1.6 * STEP, 10_000, space)
-    keys = [set(zip(part.rays.tolist(), part.indices.tolist())) for part in (whole, found)]
-    assert len(keys[0]) > 300
-    assert len(keys[0] ^ keys[1]) <= 0.01 * len(keys[0])
+    check_alike(found, whole, 300)
 
 
 @pytest.mark.parametrize("most", [1, 3, 7])
@@ -117,13 +125,8 @@ def test_rays_together_have_the_samples_of_each_alone(space, occupied, roughness
     mixed = np.random.default_rng(6).permutation(len(rows))
     together = all_samples(mesh, rays, thin, 10_000)
     alone = all_samples(mesh, Rays(*(column[mixed] for column in rays)), thin, 10_000)
-    owners = mixed[alone[3]]
-    keys = [
-        set(zip(together[3].tolist(), together[4].tolist())),
-        set(zip(owners.tolist(), alone[4].tolist())),
-    ]
-    assert len(keys[1]) > 1_000
-    assert len(keys[0] ^ keys[1]) <= lost * len(keys[1])
+    alone[3] = mixed[alone[3]]
+    check_alike(together, alone, 1_000, lost)
 
 
 def test_samples_are_where_they_are_said_to_be(pair, space):
@@ -176,6 +179,4 @@ def test_free_space_is_passed_over_without_losing_a_sample(pair):
     ours, theirs = (
         all_samples(side.surface.pose(gentle), fan(), sheet, 10_000) for side in (mesh, reference)
     )
-    keys = [set(zip(part[3].tolist(), part[4].tolist())) for part in (ours, theirs)]
-    assert len(keys[1]) > 200
-    assert len(keys[0] ^ keys[1]) <= 0.01 * len(keys[1])
+    check_alike(ours, theirs, 200)

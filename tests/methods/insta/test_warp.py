@@ -215,21 +215,6 @@ def test_points_that_are_not_finite_find_nothing(posed):
 
 
 @needs_kernel
-def test_every_instruction_set_finds_the_same_triangles(posed):
-    rng = np.random.default_rng(6)
-    base = posed.vertices.numpy()[rng.integers(0, len(posed.vertices), 600)]
-    points = (base + 0.02 * rng.standard_normal(base.shape)).astype(np.float32)
-    expected = nearest_triangles(torch.from_numpy(points).double(), posed.corners.double())
-    module = kernel.load()
-    for name in module.instruction_sets():
-        mesh = module.posed(posed.surface.tree, posed.vertices.numpy(), name)
-        triangles, squared = np.empty(len(points), np.int32), np.empty(len(points), np.float32)
-        module.nearest(mesh, points, triangles, squared, 1)
-        np.testing.assert_allclose(np.sqrt(squared), expected.values.sqrt(), atol=1e-6)
-        assert (triangles == expected.triangles.numpy()).mean() > 0.995  # but for rounding
-
-
-@needs_kernel
 def test_far_away_and_degenerate_meshes_are_searched_as_well():
     head = toy_head(16)
     flat = torch.from_numpy(head.template).float()

@@ -9,7 +9,7 @@ import numpy as np
 
 from headbench.methods.official.gbs.method import GBSOfficial
 
-from .repository import commit_all
+from .repository import committed
 
 HELD_OUT = 7
 """Frames at the end that the stand-in holds out; another number than the original's, so that it has to be read."""
@@ -128,7 +128,7 @@ def make_blendshapes_repository(folder: Path, vertices: int, change: str = "show
         (folder / f"data/{name}_billboard_tri.obj").write_text("v 0 0 0\n")
     for name in ("back_of_head", "neck_exclude_vertex"):
         (folder / f"data/FLAME2020/{name}.txt").write_text("3\n1\n2\n")
-    return commit_all(folder)
+    return committed(folder)
 
 
 class BlendshapesStandIn(GBSOfficial):

@@ -13,6 +13,7 @@ from headbench.datasets.head.teeth import lip_rings
 from headbench.methods.official.config import GAOfficialConfig
 from headbench.methods.official.ga.method import GAOfficial
 from headbench.methods.official.gha.method import GHAOfficial
+from headbench.methods.official.method import Workplace
 from headbench.methods.official.tga.method import TGAOfficial
 
 BUDGET = Budget(iterations=20)
@@ -26,6 +27,19 @@ def fit(method, clip, out, progress=no_progress, *, budget=BUDGET, seed=0):
 def views(clip, *splits):
     """Camera and pose by key, of the frames of some splits."""
     return {k: (clip.cameras[k.camera], clip.poses[k.timestep]) for s in splits for k in clip.splits[s]}
+
+
+def workplace(folder):
+    """An empty place to export to."""
+    work = Workplace.at(folder)
+    work.make()
+    return work
+
+
+def export(method, clip, folder):
+    """Export the clip's training frames: the place, and the images in it by key."""
+    work = workplace(folder)
+    return work, method.export(TrainingView(clip), method.look(), work, no_progress)
 
 
 LINES_BEGIN = 12
@@ -152,27 +166,13 @@ def make_repository(folder: Path, rings: tuple[list[int], list[int]], sizes: tup
         for name, ring in (("upper", upper), ("lower", lower))
     )
     (folder / "flame_model" / "flame.py").write_text(source)
-    return commit_all(folder)
-
-
-def commit_all(folder: Path) -> str:
-    """Make a repository of a folder; return its commit."""
     return committed(folder)
 
 
 def committed(folder: Path) -> str:
     """Commit all files of a folder; return the commit."""
-    git = [
-        "git",
-        "-C",
-        str(folder),
-        "-c",
-        "user.name=A",
-        "-c",
-        "user.email=a@b.c",
-        "-c",
-        "commit.gpgsign=false",
-    ]
+    options = ("user.name=A", "user.email=a@b.c", "commit.gpgsign=false")
+    git = ["git", "-C", str(folder), *(word for option in options for word in ("-c", option))]
     for words in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "first"]):
         subprocess.run([*git, *words], check=True)
     done = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True)

@@ -14,7 +14,6 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.images import read_pixels
-from headbench.bench.runner.adaptation import TrainingView
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.images import write_image
 from headbench.methods.official.checkout import Checkout
@@ -27,8 +26,8 @@ from headbench.methods.official.spec import GBS_OFFICIAL
 from headbench.methods.shared.schedule import ShuffledEpochs
 
 from .blendshapes_repository import CYLINDER, HELD_OUT, BlendshapesStandIn, make_blendshapes_repository
+from .repository import export, settings, views, workplace
 from .repository import fit as train
-from .repository import settings, views
 
 BUDGET = Budget(iterations=2_000)
 
@@ -53,9 +52,7 @@ def moving_clip(official_clip):
 
 @pytest.fixture
 def exported(method, moving_clip, tmp_path):
-    work = Workplace.at(tmp_path / "work")
-    work.make()
-    return work, method.export(TrainingView(moving_clip), method.look(), work, no_progress)
+    return export(method, moving_clip, tmp_path / "work")
 
 
 def fit(method, clip, out):
@@ -202,9 +199,7 @@ def test_another_head_brings_its_own_lists_and_mouth(exported, moving_clip):
 
 def test_a_head_of_flames_topology_keeps_theirs(moving_clip, tmp_path):
     method = stand_in(tmp_path / "repository", vertices=len(moving_clip.head.template))
-    work = Workplace.at(tmp_path / "work")
-    work.make()
-    method.export(TrainingView(moving_clip), method.look(), work, no_progress)
+    work, _ = export(method, moving_clip, tmp_path / "work")
     assert not (work.input / "offset.txt").exists()
     for name in ("back_of_head", "neck_exclude_vertex"):
         path = work.program / f"data/FLAME2020/{name}.txt"
@@ -215,9 +210,7 @@ def test_eyelid_bases_are_those_of_the_clips_head(official_clip, tmp_path):
     basis = np.random.default_rng(0).standard_normal((*official_clip.head.template.shape, 2))
     clip = replace(official_clip, head=replace(official_clip.head, eyelid_basis=basis))
     method = stand_in(tmp_path / "repository")
-    work = Workplace.at(tmp_path / "work")
-    work.make()
-    method.export(TrainingView(clip), method.look(), work, no_progress)
+    work, _ = export(method, clip, tmp_path / "work")
     for index, side in enumerate("lr"):
         path = work.program / f"FLAME/blendshapes/{side}_eyelid.npy"
         assert np.array_equal(np.load(path), basis[..., index])
@@ -226,8 +219,7 @@ def test_eyelid_bases_are_those_of_the_clips_head(official_clip, tmp_path):
 
 def test_grids_that_nobody_reads_have_one_node(method, official_clip, tmp_path):
     avatar = fit(method, official_clip, tmp_path / "a")
-    work = Workplace.at(tmp_path / "work")
-    work.make()
+    work = workplace(tmp_path / "work")
     listed = [next(iter(views(official_clip, "novel_view").values()))]
     frames = [Listed(0, official_clip.splits["novel_view"][0], *listed[0])]
     method.write_list(tmp_path / "a", frames, (1, 1, 1), method.look(), work)

@@ -12,16 +12,15 @@ from headbench.bench.contracts import Budget, Camera, no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.images import read_png
-from headbench.bench.runner.adaptation import TrainingView
 from headbench.methods.official.config import GHAOfficialConfig
 from headbench.methods.official.ga.windows import square, square_side
 from headbench.methods.official.gha import method as implementation
 from headbench.methods.official.gha.export import MOUTH_ROWS, GHATracking, overshot
-from headbench.methods.official.method import TRAINING_LOG, Workplace, check_export
+from headbench.methods.official.method import TRAINING_LOG, check_export
 from headbench.methods.official.process import ProgramError
 from headbench.methods.shared.avatar_files import Subject
 
-from .repository import BUDGET, HeadAvatarStandIn, fit, make_head_avatar_repository, views
+from .repository import BUDGET, HeadAvatarStandIn, export, fit, make_head_avatar_repository, views
 
 
 @pytest.fixture
@@ -101,9 +100,7 @@ def test_only_training_frames_are_exported_and_to_the_bit(method, official_clip,
     # A neck that is not bent has no pose correctives and skins nothing: the face moves rigidly.
     straight = {t: replace(pose, neck=np.zeros(3, np.float32)) for t, pose in official_clip.poses.items()}
     official_clip = replace(official_clip, poses=straight)
-    work = Workplace(tmp_path / "work")
-    work.make()
-    images = method.export(TrainingView(official_clip), method.look(), work, no_progress)
+    work, images = export(method, official_clip, tmp_path / "work")
     check_export(work, images, official_clip)
     assert set(images.values()) == set(official_clip.splits["train"])
     side = square_side(official_clip.cameras[name] for name in ("00", "01"))

@@ -11,7 +11,6 @@ import pytest
 from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
-from headbench.bench.runner.adaptation import TrainingView
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
 from headbench.datasets.monocular.mesh_fit import read_vertices
 from headbench.methods.official import checkout, needs
@@ -19,12 +18,13 @@ from headbench.methods.official.config import INSTAOfficialConfig
 from headbench.methods.official.insta import export
 from headbench.methods.official.insta.export import HAIR, MOUTH, SKIN, VideoMesh
 from headbench.methods.official.insta.method import INSTAOfficial
-from headbench.methods.official.method import TRAINING_LOG, Listed, Workplace, check_export
+from headbench.methods.official.method import TRAINING_LOG, Listed, check_export
 from headbench.methods.official.process import ProgramError
 from headbench.methods.shared.avatar_files import Subject
 
 from .insta_repository import make_insta_repository
-from .repository import BUDGET, fit, views
+from .repository import BUDGET, fit, views, workplace
+from .repository import export as export_to
 
 GROUND = (1.0, 1.0, 1.0)
 
@@ -58,9 +58,7 @@ def avatar(method, official_clip, tmp_path):
 
 @pytest.fixture
 def exported(method, official_clip, tmp_path):
-    work = Workplace.at(tmp_path / "work")
-    work.make()
-    return work, method.export(TrainingView(official_clip), method.look(), work, no_progress)
+    return export_to(method, official_clip, tmp_path / "work")
 
 
 def test_frames_are_rendered_under_their_keys_on_any_ground(avatar, official_clip, monkeypatch):
@@ -289,8 +287,7 @@ def test_regions_of_another_head_are_red_vertices(method, official_clip, tmp_pat
 
 
 def test_a_list_has_focal_lengths_for_images_of_a_pixel(method, official_clip, tmp_path):
-    work = Workplace.at(tmp_path / "work")
-    work.make()
+    work = workplace(tmp_path / "work")
     mesh = VideoMesh.of(Subject.of(official_clip), official_clip.head, method.look())
     wanted = views(official_clip, "novel_view", "train")
     frames = [Listed(7 + i, key, *view) for i, (key, view) in enumerate(wanted.items())]

@@ -4,7 +4,6 @@ import json
 import math
 import re
 
-import numpy as np
 import pytest
 
 from headbench.bench import cli
@@ -22,7 +21,7 @@ from headbench.methods.shared.config import PAPER_ITERATIONS, SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, ShuffledEpochs, Timeline
 
 from ...datasets.head.toy import toy_head
-from ...datasets.tiny_capture import make_plan, rig, write_tiny_capture
+from ...fuzz import samples
 from .repository import lip_numbers, make_interpreter, make_repository
 
 OFFICIAL = "ga-official (cpu-shim)"
@@ -31,13 +30,8 @@ OFFICIAL = "ga-official (cpu-shim)"
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A directory with a capture, a repository and an interpreter."""
-    head = toy_head(16, version="procedural2020")
-    lengths = {"FREE": 2, "EMO-1-shout+laugh": 3}
-    offset = np.zeros_like(head.template)
-    cameras = rig(24, 32, 12.3, 15.1)[:2]
-    plan = make_plan(lengths=lengths, cameras=cameras, head=head, static_offset=offset, subject="901")
-    write_tiny_capture(tmp_path / "capture", plan)
-    make_repository(tmp_path / "repository", *lip_numbers(head))
+    samples.capture(tmp_path, tmp_path)
+    make_repository(tmp_path / "repository", *lip_numbers(toy_head(16)))
     make_interpreter(tmp_path / "python")
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -12,9 +12,8 @@ from headbench.bench.io.documents import read_json
 from headbench.datasets.steps.clusters import cluster_expressions
 from headbench.datasets.steps.jaw_bases import jaw_quaternions
 from headbench.methods.official.config import TGAOfficialConfig
-from headbench.methods.official.method import Workplace
 
-from .repository import BUDGET, LINES_BEGIN, TensorialStandIn, fit, settings, views
+from .repository import BUDGET, LINES_BEGIN, TensorialStandIn, export, fit, settings, views
 
 
 @pytest.fixture
@@ -35,9 +34,7 @@ def test_it_trains_and_renders_though_their_log_has_no_place(method, official_cl
 
 
 def test_jaw_bases_and_clusters_are_those_of_training(method, official_clip, tmp_path):
-    work = Workplace(tmp_path)
-    work.make()
-    method.export(official_clip, method.look(), work, no_progress)
+    work, _ = export(method, official_clip, tmp_path / "work")
     bases = read_npz(work.input / "sorted_jaw_poses.npz")["jaw_poses"]
     timesteps = sorted({key.timestep for key in official_clip.splits["train"]})
     allowed = jaw_quaternions([official_clip.poses[t] for t in timesteps])

@@ -14,7 +14,8 @@ from headbench.methods.ours.field import blend_lines, line_table, normalised_wei
 from headbench.methods.ours.inference import LineOffsets
 from headbench.methods.shared.subject_mesh import KnownPoses, pose_key
 
-from .toy import REPAIRED, SMALL, changed, store
+from ..toy_clip import first_view
+from .toy import CASES, store
 
 
 def directions(count, seed=0, dtype=torch.float32):
@@ -37,15 +38,6 @@ def test_offsets_are_those_of_training(clip, tmp_path):
     exact = {name: value.double() for name, value in tensors.items()}
     slow = LineOffsets(exact, points.double())(torch.cat([expression, jaw]).double())
     np.testing.assert_allclose(found, slow, atol=1e-5)
-
-
-CASES = {
-    "opacity": SMALL,
-    "others": changed(SMALL, lines={"dynamic": ("position", "rotation", "scale", "color")}),
-    "repaired": REPAIRED,
-    "harmonics": replace(SMALL, color="sh", sh_degree=2),
-    "no lines": changed(SMALL, lines={"enabled": False}),
-}
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -80,8 +72,7 @@ def test_colours_are_kept_for_the_same_pose_and_place_alone(clip, tmp_path, monk
 
 def test_what_an_avatar_hands_out_is_not_what_it_keeps(clip, tmp_path):
     avatar = OursAvatar.read(store(clip, tmp_path), "cpu")
-    key = clip.splits["train"][0]
-    camera, pose = clip.cameras[key.camera], clip.poses[key.timestep]
+    camera, pose = first_view(clip)
     before = avatar.render(camera, pose).rgb.copy()
     splats = avatar.splats(pose, camera)
     for name in ("means", "quats", "scales", "opacities", "colors"):

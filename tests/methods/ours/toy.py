@@ -33,6 +33,14 @@ def changed(config, **settings):
 
 
 REPAIRED = changed(SMALL, planes={"residual_lr": 0.01, "move_splats": False})
+CASES = {
+    "opacity": SMALL,
+    "others": changed(SMALL, lines={"dynamic": ("position", "rotation", "scale", "color")}),
+    "repaired": REPAIRED,
+    "harmonics": replace(SMALL, color="sh", sh_degree=2),
+    "no lines": changed(SMALL, lines={"enabled": False}),
+}
+"""Configurations whose avatars are stored and drawn in other ways."""
 
 
 def make(clip, config=SMALL):

@@ -10,7 +10,6 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
 
 import psutil
 import pytest
@@ -30,7 +29,7 @@ from headbench.methods.splats import rasterize
 
 from .cases import check_kernel, compare_with, float64_truth, kernels, needs_kernel
 
-pytestmark = needs_kernel
+pytestmark = [needs_kernel, pytest.mark.usefixtures("one_torch_thread")]
 
 
 def replaced(scene: SplatScene, **parts) -> SplatScene:
@@ -199,15 +198,6 @@ def test_image_is_affine_in_colours_and_background(seed, size, opacity):
     assert torch.equal(twice.image, 2 * result.image)
     white = rasterize(*scene._replace(colors=torch.ones_like(scene.colors))[:9], backend="cpu")
     torch.testing.assert_close(white.image[..., 0], result.alpha, rtol=0, atol=2e-6)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_torch_thread() -> Iterator[None]:
-    """More threads cost the reference more processor time than they save."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(

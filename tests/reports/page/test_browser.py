@@ -14,29 +14,22 @@ from .test_page import HOSTILE
 
 
 @pytest.fixture
-def opened(browser, tmp_path):
+def opened(new_tab, tmp_path):
     """Open the page of a run at a width; afterwards there was no message, no dialog and no request but for the file."""
-    contexts, faults, requests = [], [], []
+    faults, requests = new_tab.faults, []
 
     def start(run, width=1200, scheme="light", split=False):
         out = tmp_path / "page.html"
         report(PageSettings((str(run),), str(out), split=split, trust=True))
         out = out / "index.html" if split else out
-        context = browser.new_context(viewport={"width": width, "height": 800}, color_scheme=scheme)
-        contexts.append(context)
-        tab = context.new_page()
-        tab.set_default_timeout(10_000)
+        tab = new_tab(width, 800, color_scheme=scheme)
         tab.on("console", lambda message: faults.append(message.text))
-        tab.on("pageerror", lambda error: faults.append(str(error)))
         tab.on("dialog", lambda dialog: faults.append(dialog.message))
         tab.on("request", lambda request: requests.append(request.url))
         tab.goto(out.as_uri())
         return tab
 
     yield start
-    for context in contexts:
-        context.close()
-    assert faults == []
     beside = {url for url in requests if "/page.html/pictures/" in url and url.startswith("file:")}
     assert {Path(url).name for url in {*requests} - beside if not url.startswith("data:")} <= {
         *("page.html", "index.html")

@@ -26,20 +26,8 @@ from headbench.methods.ours.storage import FIELD_FILE, RESIDUAL
 from headbench.methods.shared.avatar_files import read_shared_head
 from headbench.methods.shared.config import SplatTraining
 
-from ...ours.toy import REPAIRED, SMALL, changed, store
-
-CASES = {
-    "opacity": SMALL,
-    "others": changed(SMALL, lines={"dynamic": ("position", "rotation", "scale", "color")}),
-    "repaired": REPAIRED,
-    "harmonics": replace(SMALL, color="sh", sh_degree=2),
-    "no lines": changed(SMALL, lines={"enabled": False}),
-}
-
-
-def first(clip, split="train"):
-    key = clip.splits[split][0]
-    return clip.cameras[key.camera], clip.poses[key.timestep]
+from ...ours.toy import CASES, SMALL, store
+from ...toy_clip import first_view
 
 
 def compacted(folder, precision, poses=()):
@@ -52,7 +40,7 @@ def compacted(folder, precision, poses=()):
 
 @pytest.mark.parametrize("case", CASES)
 def test_without_rounding_only_the_order_of_splats_changes(case, clip, tmp_path):
-    camera, pose = first(clip)
+    camera, pose = first_view(clip)
     before, after = compacted(store(clip, tmp_path, CASES[case], copies=2), EXACT)
     order = torch.argsort(before.field.tensors["splats"][:, -1], stable=True)
     one, other = before.splats(pose, camera), after.splats(pose, camera)
@@ -92,7 +80,7 @@ def test_rounding_stays_within_its_steps(case, clip, tmp_path):
 
 @pytest.mark.parametrize("case", CASES)
 def test_defaults_cost_little_and_each_coarser_part_costs_more(case, clip, tmp_path):
-    camera, pose = first(clip, "self_reenactment")
+    camera, pose = first_view(clip, "self_reenactment")
     folder = store(clip, tmp_path, CASES[case], copies=2)
 
     def error(precision):
@@ -126,7 +114,7 @@ def test_splats_that_no_pose_shows_are_left_out_and_not_missed(clip, tmp_path):
     count = len(before.field.tensors["splats"])
     assert len(after.field.tensors["splats"]) <= count - (count + 2) // 3
     for split in ("train", "novel_view"):
-        camera, pose = first(clip, split)
+        camera, pose = first_view(clip, split)
         np.testing.assert_allclose(before.render(camera, pose).rgb, after.render(camera, pose).rgb, atol=1e-6)
 
 
@@ -142,7 +130,7 @@ def test_a_splat_that_one_expression_shows_stays(clip, tmp_path):
 def test_lines_of_zeros_become_a_part_of_the_opacities(clip, tmp_path):
     before, after = compacted(store(clip, tmp_path, change=lambda v: v["lines"].zero_()), EXACT)
     assert not any(name.startswith("line_d") or name == "lines" for name in after.field.tensors)
-    camera, pose = first(clip)
+    camera, pose = first_view(clip)
     order = torch.argsort(before.field.tensors["splats"][:, -1], stable=True)
     one, other = before.splats(pose, camera), after.splats(pose, camera)
     np.testing.assert_allclose(one.opacities[order], other.opacities, atol=1e-6)
@@ -168,7 +156,7 @@ def test_a_fit_stores_what_its_settings_say(clip, tmp_path):
     assert list(avatar.files()) == [tmp_path / COMPACT_FILE]
     assert list(method.load(tmp_path, device="cpu").files()) == [tmp_path / COMPACT_FILE]
     exact = OursAvatar.read(tmp_path, "cpu", exact=True)
-    camera, pose = first(clip)
+    camera, pose = first_view(clip)
     difference = avatar.render(camera, pose).rgb - exact.render(camera, pose).rgb
     assert 0 < np.mean(difference**2) < 1e-3
     # The compact file and the shared head model are enough.
