@@ -374,7 +374,9 @@ def _read_table(path: Path) -> pa.Table:
         size = os.fstat(stream.fileno()).st_size
         if size > MAX_FILE_BYTES:
             raise InputError(path, "", f"rows of at most {MAX_FILE_BYTES} bytes", f"{size}")
-        about = pq.ParquetFile(stream, **THRIFT_LIMITS).metadata
+        # Reading ahead would leave the file to threads of pyarrow, which may hold it longer than this function.
+        options = {**THRIFT_LIMITS, "pre_buffer": False}
+        about = pq.ParquetFile(stream, **options).metadata
         names = Counter(about.schema.column(index).path for index in range(about.num_columns))
         wrong = [f"{names[name] or 'no'} {name}" for name in COLUMNS if names[name] != 1]
         if wrong:
@@ -387,7 +389,7 @@ def _read_table(path: Path) -> pa.Table:
         unpacked = sum(max(0, group.total_byte_size) for group in groups)
         if unpacked > MAX_UNPACKED_BYTES:
             raise InputError(path, "", f"columns of at most {MAX_UNPACKED_BYTES} bytes", f"{unpacked}")
-        file = pq.ParquetFile(stream, metadata=about, read_dictionary=TEXTS, **THRIFT_LIMITS)
+        file = pq.ParquetFile(stream, metadata=about, read_dictionary=TEXTS, **options)
         table = file.read(columns=list(COLUMNS), use_threads=False, use_pandas_metadata=False)
         table.validate(full=True)
         return table

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from collections.abc import Mapping
@@ -33,13 +34,16 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str,
         size = os.fstat(stream.fileno()).st_size
         if size > MAX_BYTES:
             raise InputError(path, "", f"{EXPECTED} of at most {MAX_BYTES} bytes", f"{size}")
-        if stream.read(4) == b"PK\3\4":
+        is_archive = stream.read(4) == b"PK\3\4"
+        if is_archive:
             with open_archive(path, EXPECTED, members=MAX_MEMBERS, spare_bytes=0, per_byte=1):
                 pass
         stream.seek(0)
+        # A file makes memory for as many bytes as a damaged pickle asks for; bytes in memory give those there are.
+        source = stream if is_archive else io.BytesIO(stream.read())
         with reading(path, EXPECTED):
             try:
-                content = torch.load(stream, map_location="cpu", weights_only=True)
+                content = torch.load(source, map_location="cpu", weights_only=True)
             except UnpicklingError as error:  # whose words advise to load without the switch
                 name = re.search(r"GLOBAL (\S+)", str(error))
                 found = f"the name {name[1]}, which no weights need" if name else "another pickle"

@@ -77,6 +77,7 @@ DAMAGED = {
     "a storage of more numbers than the file has": lie(saved(ONE, NEW), b"K\xc8", LARGE),
     "a storage of fewer": lie(saved(ONE, NEW), b"K\xc8", b"K\x07"),
     "the same in the old layout": saved(ONE, OLD).replace(b"K\xc8", LARGE),
+    "a name longer than the file": saved(ONE, OLD).replace(b"X\5\0\0\0plain", b"X\xff\xff\xff\x7fplain"),
     "a sparse tensor": saved({"plain": torch.zeros(200).to_sparse()}, NEW),
     "another shape": saved({"plain": torch.zeros(201)}, NEW),
     "integers": saved({"plain": torch.zeros(200, dtype=torch.int32)}, NEW),
