@@ -15,12 +15,13 @@ from .errors import InputError
 from .io.files import check_output_folder
 from .io.images import quantise
 from .io.lock import locked
+from .machine import check_device
 from .protocol import Protocol, make_protocols
 from .registry import discover, get
 from .runner import run as runner
 from .runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
 from .runner.captures import capture_configuration, open_clips, reader_of
-from .runner.config import build_run_config, default_names, resolve_method
+from .runner.config import RunConfig, build_run_config, default_names, resolve_methods
 from .runner.scoring import ScoredFrames, check_regions, score_frames
 from .runner.steps import Job, fit
 from .runner.store import RunFolder
@@ -87,10 +88,16 @@ def train(
     Raises
     ------
     InputError
-        For an unknown method, preset or setting, for a clip that the method cannot be trained on, and where ``out`` holds an
-        avatar of the same subject, method and seed that was made of something else.
+        For an unknown method, preset or setting, for a device that is not there or that the method does not compute on, for
+        a clip that the method cannot be trained on, and where ``out`` holds an avatar of the same subject, method and seed
+        that was made of something else.
     """
-    resolved = resolve_method(get("methods", method), preset, settings or {})
+    check_device(device)
+    name = get("methods", method).name
+    config = RunConfig(
+        "", str(out), methods=(method,), preset=preset, device=device, settings={name: dict(settings or {})}
+    )
+    (resolved,) = resolve_methods(config)
     folder = RunFolder(Path(out))
     check_output_folder(folder.root)
     runner.check_settings(resolved)
@@ -137,6 +144,7 @@ def evaluate(
     InputError
         For a stored avatar of another subject, and for unknown metrics and regions.
     """
+    check_device(device)
     names = metrics or [name for name in default_names("metrics") if get("metrics", name).per_frame]
     specs: list[MetricSpec] = [get("metrics", name) for name in names]
     for spec in specs:

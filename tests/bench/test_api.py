@@ -70,6 +70,8 @@ def test_what_scripts_get_wrong_is_refused(finished, clip, tmp_path):
         (lambda: hb.open_clip(tmp_path), "a folder with a capture"),
         (lambda: hb.train("gaa", clip, tmp_path), "Did you mean 'ga'"),
         (lambda: hb.train("ga", clip, tmp_path, settings={"budget": {"iteratoins": 3}}), "iterations"),
+        (lambda: hb.train("ga", clip, tmp_path, device="gpu"), "device"),
+        (lambda: hb.train("insta", clip, tmp_path, device="cuda"), "device"),
         (lambda: hb.evaluate(folder, clip, metrics=["storage"]), "metrics of frames"),
         (lambda: hb.run(tmp_path, tmp_path / "out", sedes=(1,)), "seeds"),
     ]
