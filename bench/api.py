@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 
 import pandas as pd
 
@@ -17,11 +17,11 @@ from .io.images import quantise
 from .io.lock import locked
 from .machine import check_device
 from .protocol import Protocol, make_protocols
-from .registry import discover, get
+from .registry import discover, get, unknown
 from .runner import run as runner
 from .runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
 from .runner.captures import capture_configuration, open_clips, reader_of
-from .runner.config import RunConfig, build_run_config, default_names, resolve_methods
+from .runner.config import build_run_config, default_names, resolve_methods
 from .runner.scoring import ScoredFrames, check_regions, score_frames
 from .runner.steps import Job, fit
 from .runner.store import RunFolder
@@ -37,7 +37,9 @@ def list_methods() -> dict[str, MethodSpec]:
     return {name: spec for name, spec in found.items() if spec is not None}
 
 
-def open_clip(folder: Path | str, *, reader: str = "", head: str | None = None, **settings: Any) -> Clip:
+def open_clip(
+    folder: Path | str, *, reader: str = "", head: Path | str | None = None, **settings: Any
+) -> Clip:
     """Open a capture of one subject.
 
     Parameters
@@ -52,7 +54,7 @@ def open_clip(folder: Path | str, *, reader: str = "", head: str | None = None, 
     InputError
         Where the folder holds no capture, or several, and whatever the reader finds wrong.
     """
-    config = capture_configuration(str(folder), "", reader, head)
+    config = capture_configuration(str(folder), "", reader, None if head is None else str(head))
     clips = open_clips(replace(config, reader_settings={**config.reader_settings, **settings}))
     if len(clips) > 1:
         found = f"{len(clips)}: {', '.join(clip.subject for clip in clips)}"
@@ -62,7 +64,7 @@ def open_clip(folder: Path | str, *, reader: str = "", head: str | None = None, 
 
 def train(
     method: str,
-    clip: Clip,
+    clip: Clip | Path | str,
     out: Path | str,
     *,
     preset: str = "fast",
@@ -77,6 +79,7 @@ def train(
     Parameters
     ----------
     method : name of a registered method, or "package.module:SPEC".
+    clip : as `open_clip` gives it, or its folder.
     out : folder of avatars; what is trained already with the same settings, data and seed is kept.
     preset : one of the method's.
     settings : of the method, over the preset; the key "budget" holds iterations and seconds.
@@ -93,11 +96,17 @@ def train(
         that was made of something else.
     """
     check_device(device)
-    name = get("methods", method).name
-    config = RunConfig(
-        "", str(out), methods=(method,), preset=preset, device=device, settings={name: dict(settings or {})}
-    )
-    (resolved,) = resolve_methods(config)
+    clip = open_clip(clip) if isinstance(clip, (str, Path)) else clip
+    values = {
+        "data": "",
+        "out": str(out),
+        "methods": [method],
+        "preset": preset,
+        "seeds": [seed],
+        "device": device,
+    }
+    chosen = {get("methods", method).name: dict(settings or {})}
+    (resolved,) = resolve_methods(build_run_config({**values, "settings": chosen}, "train"))
     folder = RunFolder(Path(out))
     check_output_folder(folder.root)
     runner.check_settings(resolved)
@@ -115,11 +124,11 @@ def train(
 
 def evaluate(
     avatar: Path | str | Avatar,
-    clip: Clip,
+    clip: Clip | Path | str,
     *,
-    tasks: Sequence[TaskName] = TASKS,
-    metrics: Sequence[str] = (),
-    regions: Sequence[str] | None = None,
+    tasks: str | Sequence[str] = TASKS,
+    metrics: str | Sequence[str] = (),
+    regions: str | Sequence[str] | None = None,
     frames_per_task: int | None = None,
     device: str = "cpu",
 ) -> pd.DataFrame:
@@ -129,6 +138,7 @@ def evaluate(
     ----------
     avatar : folder of a stored avatar, which is given the clip in the form that its method needs; or an `Avatar`, which is
         given the clip's own cameras and poses.
+    clip : as `open_clip` gives it, or its folder.
     metrics : names of metrics of frames; none: those that a run takes by default.
     regions : parts of the frame to score beside the whole; None: the face, where the clip knows it.
     frames_per_task : score at most so many frames of a task, evenly spaced.
@@ -142,16 +152,20 @@ def evaluate(
     Raises
     ------
     InputError
-        For a stored avatar of another subject, and for unknown metrics and regions.
+        For a stored avatar of another subject, and for unknown tasks, metrics and regions.
     """
     check_device(device)
-    names = metrics or [name for name in default_names("metrics") if get("metrics", name).per_frame]
-    specs: list[MetricSpec] = [get("metrics", name) for name in names]
+    clip = open_clip(clip) if isinstance(clip, (str, Path)) else clip
+    for task in _names(tasks):
+        if task not in TASKS:
+            raise unknown("evaluate", "tasks", task, TASKS)
+    default = [name for name in default_names("metrics") if get("metrics", name).per_frame]
+    specs: list[MetricSpec] = [get("metrics", name) for name in _names(metrics) or default]
     for spec in specs:
         if not spec.per_frame:
             raise InputError("evaluate", "metrics", "metrics of frames", spec.name)
-    protocols = make_protocols(tasks, [clip], frames_per_task)
-    scored_regions = check_regions(clip, regions)
+    protocols = make_protocols(cast(Sequence[TaskName], _names(tasks)), [clip], frames_per_task)
+    scored_regions = check_regions(clip, None if regions is None else _names(regions))
     rows: list[dict[str, Any]] = []
     with TemporaryDirectory() as scratch:
         form, loaded = AdaptedClip(clip), avatar
@@ -195,9 +209,18 @@ def run(data: Path | str, out: Path | str, **settings: Any) -> Path:
     InputError
         For whatever can be found wrong before the first training.
     """
-    values = {"data": str(data), "out": str(out), "reader": reader_of(str(data)), **settings}
-    runner.run(build_run_config(values, "run"))
+    values = {"data": str(data), "out": str(out), **settings}
+    runner.run(
+        build_run_config(
+            {"reader": reader_of(str(data)), **values} if "reader" not in values else values, "run"
+        )
+    )
     return Path(out)
+
+
+def _names(given: str | Sequence[str]) -> tuple[str, ...]:
+    """One name or several, each once."""
+    return (given,) if isinstance(given, str) else tuple(dict.fromkeys(given))
 
 
 def _stored(folder: Path, clip: Clip, device: str, scratch: Path) -> tuple[AdaptedClip, Avatar]:

@@ -58,19 +58,20 @@ class ComparedRuns(RunSet):
         return pd.DataFrame(values, methods, columns, dtype=float)
 
 
-def read_runs(folders: Sequence[Path | str]) -> ComparedRuns:
+def read_runs(folders: Path | str | Sequence[Path | str]) -> ComparedRuns:
     """Read finished runs on the same frames.
 
     Parameters
     ----------
-    folders : of the runs. The same method with the same settings and other seeds is one method with more seeds.
+    folders : of the runs, or of one. The same method with the same settings and other seeds is one method with more seeds.
 
     Raises
     ------
     InputError
         For a folder that is no finished run, and for runs that do not score the same frames by the same protocol.
     """
-    return cast(ComparedRuns, ComparedRuns.read([Path(folder) for folder in folders]))
+    several = [folders] if isinstance(folders, (str, Path)) else folders
+    return cast(ComparedRuns, ComparedRuns.read([Path(folder) for folder in several]))
 
 
 @dataclass(frozen=True)

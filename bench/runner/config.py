@@ -86,6 +86,8 @@ class RunConfig:
                 raise ValueError(f"{name} names something twice: {', '.join(map(str, values))}")
         if not re.fullmatch(DEVICES, self.device):
             raise ValueError(f"device is {self.device!r}; cpu, cuda, cuda:1 and the like")
+        if min(self.seeds) < 0:
+            raise ValueError(f"seeds has {min(self.seeds)}; whole numbers from 0")
         if self.divide < 1:
             raise ValueError(f"divide is {self.divide}; a whole number from 1")
         if self.frames_per_task is not None and self.frames_per_task < 1:
@@ -96,7 +98,7 @@ def build_run_config(values: Mapping[str, Any], source: str) -> RunConfig:
     """Build `RunConfig` as `build` does; a key of a lower level, such as ``iterations``, is answered with its place."""
     known = {each.name for each in fields(RunConfig)}
     for key in values:
-        if key not in known and not get_close_matches(key, known, 1, 0.8):
+        if isinstance(key, str) and key not in known and not get_close_matches(key, known, 1, 0.8):
             places = _setting_places()
             near = get_close_matches(key, places, 1, 0.7)
             if near:

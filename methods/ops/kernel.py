@@ -31,7 +31,9 @@ def backend(name: str) -> Iterator[None]:
 
 
 def call(name: str, *arguments: Any) -> Any:
-    """Call a function of the kernel with `arrays`, which it takes as they are. Results do not depend on the number of threads.
+    """Call a function of the kernel with `arrays`. Results do not depend on the number of threads.
+
+    What the kernel writes to has to be contiguous, as `empty_like` makes it.
 
     Raises
     ------

@@ -44,10 +44,19 @@ def test_an_avatar_in_memory_is_scored_alike(finished, clip):
         for avatar in (folder, hb.load_avatar(folder))
     )
     pd.testing.assert_frame_equal(stored, loaded)
+    one = hb.evaluate(
+        folder,
+        finished.root.parent / "data",
+        tasks="novel_view",
+        metrics="psnr",
+        regions="face",
+        frames_per_task=1,
+    )
+    pd.testing.assert_frame_equal(one, stored[stored.task == "novel_view"])
 
 
 def test_the_table_of_runs_has_the_means_of_their_rows(finished):
-    table = hb.read_runs([finished.root]).table()
+    table = hb.read_runs(finished.root).table()
     rows = rows_of(finished)
     for task in ("novel_view", "self_reenactment"):
         part = rows[(rows.method == "ga") & (rows.task == task) & (rows.region == "full")]
@@ -72,12 +81,16 @@ def test_what_scripts_get_wrong_is_refused(finished, clip, tmp_path):
         (lambda: hb.train("ga", clip, tmp_path, settings={"budget": {"iteratoins": 3}}), "iterations"),
         (lambda: hb.train("ga", clip, tmp_path, device="gpu"), "device"),
         (lambda: hb.train("insta", clip, tmp_path, device="cuda"), "device"),
+        (lambda: hb.train("ga", clip, tmp_path, seed=-1), "seeds"),
+        (lambda: hb.train("ga", clip, tmp_path, seed="x"), "seeds"),
+        (lambda: hb.evaluate(folder, clip, tasks="novel_veiw"), "Did you mean 'novel_view'"),
         (lambda: hb.evaluate(folder, clip, metrics=["storage"]), "metrics of frames"),
         (lambda: hb.run(tmp_path, tmp_path / "out", sedes=(1,)), "seeds"),
     ]
     for call, said in cases:
         with pytest.raises(hb.InputError, match=said):
             call()
+    assert not [*tmp_path.iterdir()]
 
 
 def test_methods_and_version_are_listed():
