@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import pandas as pd
 
@@ -21,14 +21,15 @@ from .registry import discover, get, unknown
 from .runner import run as runner
 from .runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
 from .runner.captures import capture_configuration, open_clips, reader_of
-from .runner.config import build_run_config, default_names, resolve_methods
+from .runner.config import ResolvedMethod, build_run_config, default_names, resolve_methods
 from .runner.scoring import ScoredFrames, check_regions, score_frames
 from .runner.steps import Job, fit
 from .runner.store import RunFolder
 from .runner.stored import open_avatar
 from .specs import MethodSpec, MetricSpec
 
-TASKS: tuple[TaskName, ...] = ("novel_view", "self_reenactment")
+TASKS: tuple[TaskName, ...] = get_args(TaskName)
+COLUMNS = ("task", "sequence", "timestep", "camera", "region", "metric", "value", "status", "reason")
 
 
 def list_methods() -> dict[str, MethodSpec]:
@@ -111,9 +112,7 @@ def train(
     check_output_folder(folder.root)
     runner.check_settings(resolved)
     with locked(folder.root):
-        needs = MethodNeeds.of(resolved.spec)
-        step = plan(clip, needs, {})
-        form = step and carry_out(step, needs, folder.adapted / clip.subject, f"adapting {clip.subject}")
+        form = _adapted(clip, resolved, {}, folder.adapted / clip.subject)
         cell = folder.cell(clip.subject, resolved.spec.name, seed)
         job = Job(clip, resolved, seed, device, cell, {}, form)
         job.check()
@@ -141,7 +140,7 @@ def evaluate(
     clip : as `open_clip` gives it, or its folder.
     metrics : names of metrics of frames; none: those that a run takes by default.
     regions : parts of the frame to score beside the whole; None: the face, where the clip knows it.
-    frames_per_task : score at most so many frames of a task, evenly spaced.
+    frames_per_task : maximum number of frames of each task, evenly spaced; None: all.
     device : where a stored avatar renders.
 
     Returns
@@ -166,7 +165,7 @@ def evaluate(
             raise InputError("evaluate", "metrics", "metrics of frames", spec.name)
     protocols = make_protocols(cast(Sequence[TaskName], _names(tasks)), [clip], frames_per_task)
     scored_regions = check_regions(clip, None if regions is None else _names(regions))
-    rows: list[dict[str, Any]] = []
+    rows: list[tuple[Any, ...]] = []
     with TemporaryDirectory() as scratch:
         form, loaded = AdaptedClip(clip), avatar
         if isinstance(avatar, (str, Path)):
@@ -176,20 +175,11 @@ def evaluate(
             frames = ScoredFrames(images.__getitem__, clip)
             for scores in score_frames(protocol.keys, frames, specs, scored_regions, device=device).values():
                 rows += [
-                    {
-                        "task": protocol.task,
-                        "sequence": score.key.sequence,
-                        "timestep": score.key.timestep,
-                        "camera": score.key.camera,
-                        **{
-                            name: getattr(score, name)
-                            for name in ("region", "metric", "value", "status", "reason")
-                        },
-                    }
-                    for score in scores
+                    (protocol.task, s.key.sequence, s.key.timestep, s.key.camera)
+                    + (s.region, s.metric, s.value, s.status, s.reason)
+                    for s in scores
                 ]
-    columns = ["task", "sequence", "timestep", "camera", "region", "metric", "value", "status", "reason"]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(rows, columns=COLUMNS)
 
 
 def run(data: Path | str, out: Path | str, **settings: Any) -> Path:
@@ -210,11 +200,9 @@ def run(data: Path | str, out: Path | str, **settings: Any) -> Path:
         For whatever can be found wrong before the first training.
     """
     values = {"data": str(data), "out": str(out), **settings}
-    runner.run(
-        build_run_config(
-            {"reader": reader_of(str(data)), **values} if "reader" not in values else values, "run"
-        )
-    )
+    if "reader" not in values:
+        values["reader"] = reader_of(str(data))
+    runner.run(build_run_config(values, "run"))
     return Path(out)
 
 
@@ -226,15 +214,18 @@ def _names(given: str | Sequence[str]) -> tuple[str, ...]:
 def _stored(folder: Path, clip: Clip, device: str, scratch: Path) -> tuple[AdaptedClip, Avatar]:
     """A stored avatar, and the clip in the form that its method needs."""
     stored = open_avatar(folder)
-    shown = stored.shows_another(clip.subject, clip.shape, next(iter(clip.poses.values())).head_model)
-    if shown:
-        raise InputError(
-            stored.folder, "subject", f"an avatar of {clip.subject}, whom the clip shows", f"one of {shown}"
-        )
-    needs = MethodNeeds.of(stored.method.spec)
-    step = plan(clip, needs, stored.heads)
-    form = AdaptedClip(clip) if step is None else carry_out(step, needs, scratch, f"adapting {clip.subject}")
+    stored.check_subject(clip)
+    form = _adapted(clip, stored.method, stored.heads, scratch) or AdaptedClip(clip)
     return form, stored.load(device)
+
+
+def _adapted(
+    clip: Clip, method: ResolvedMethod, heads: Mapping[str, str], folder: Path
+) -> AdaptedClip | None:
+    """The clip in the form that a method needs, what takes long kept in a folder; None where it has that form."""
+    needs = MethodNeeds.of(method.spec)
+    step = plan(clip, needs, heads)
+    return None if step is None else carry_out(step, needs, folder, f"adapting {clip.subject}")
 
 
 def _drawn(avatar: Any, form: AdaptedClip, protocol: Protocol, key: FrameKey) -> ByteArray:

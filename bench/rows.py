@@ -71,8 +71,9 @@ MAX_FILE_BYTES = 256 * 2**20
 MAX_TEXT_BYTES = 256 * 2**20
 MAX_UNPACKED_BYTES = 512 * 2**20
 """Of all columns, as the file declares them."""
-THRIFT_LIMITS: Any = {"thrift_string_size_limit": 2**20, "thrift_container_size_limit": 2**16}
-"""Longest text and list in what describes the columns; a list takes its declared length in memory."""
+READING: Any = {"thrift_string_size_limit": 2**20, "thrift_container_size_limit": 2**16, "pre_buffer": False}
+"""Longest text and list in what describes the columns; a list takes its declared length in memory. Without reading ahead,
+which would leave the file to threads of pyarrow that may hold it longer than the reader."""
 SPARE_ROWS = 100_000
 """Rows that a file may have beyond one a byte: repeated rows, such as those of a metric that is missing, pack well."""
 JOINED_AT_ONCE = 64
@@ -374,9 +375,7 @@ def _read_table(path: Path) -> pa.Table:
         size = os.fstat(stream.fileno()).st_size
         if size > MAX_FILE_BYTES:
             raise InputError(path, "", f"rows of at most {MAX_FILE_BYTES} bytes", f"{size}")
-        # Reading ahead would leave the file to threads of pyarrow, which may hold it longer than this function.
-        options = {**THRIFT_LIMITS, "pre_buffer": False}
-        about = pq.ParquetFile(stream, **options).metadata
+        about = pq.ParquetFile(stream, **READING).metadata
         names = Counter(about.schema.column(index).path for index in range(about.num_columns))
         wrong = [f"{names[name] or 'no'} {name}" for name in COLUMNS if names[name] != 1]
         if wrong:
@@ -389,7 +388,7 @@ def _read_table(path: Path) -> pa.Table:
         unpacked = sum(max(0, group.total_byte_size) for group in groups)
         if unpacked > MAX_UNPACKED_BYTES:
             raise InputError(path, "", f"columns of at most {MAX_UNPACKED_BYTES} bytes", f"{unpacked}")
-        file = pq.ParquetFile(stream, metadata=about, read_dictionary=TEXTS, **options)
+        file = pq.ParquetFile(stream, metadata=about, read_dictionary=TEXTS, **READING)
         table = file.read(columns=list(COLUMNS), use_threads=False, use_pandas_metadata=False)
         table.validate(full=True)
         return table

@@ -29,7 +29,7 @@ from ..runner.config import ResolvedMethod, RunConfig, RunOptions, default_names
 from ..runner.run import describe, make_jobs, write_reports
 from ..runner.steps import DIGESTS, Job, measure, render
 from ..runner.store import Cell, RunFolder
-from ..runner.stored import avatar_digest, open_avatar, shown_by
+from ..runner.stored import avatar_digest, open_avatar
 from ..specs import Findings, MethodSpec
 from .background import check_background
 from .command import EvaluateSettings
@@ -75,10 +75,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
             raise InputError(
                 str(config.data), "", "the capture of the avatar's subject", f"{len(clips)} captures"
             )
-        shown = stored.shows_another(*shown_by(clips[0]))
-        if shown:
-            expected = f"an avatar of {clips[0].subject}, whom the capture shows"
-            raise InputError(stored.folder, "subject", expected, f"one of {shown}")
+        stored.check_subject(clips[0])
         avatar, of = stored.load(config.device), stored.method
         method = images_method(config.methods[0], avatar_digest(source)[:12])
         method = replace(method, spec=replace(method.spec, resolution=of.spec.resolution))

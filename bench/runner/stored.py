@@ -144,6 +144,13 @@ class StoredAvatar:
         """File of the head model beside the avatar, by its version: what `adaptation.plan` refits a capture to."""
         return {self.record["head_model"]: str(self.folder / HEAD_FILE)} if self.record["head_digest"] else {}
 
+    def check_subject(self, clip: Clip) -> None:
+        """Raise `InputError` where the avatar shows another subject than a clip."""
+        shown = self.shows_another(*shown_by(clip))
+        if shown:
+            expected = f"an avatar of {clip.subject}, whom the capture shows"
+            raise InputError(self.folder, "subject", expected, f"one of {shown}")
+
     def shows_another(self, subject: str, shape: FloatArray, head_model: str) -> str:
         """The name of the subject that the avatar shows, if that is another than the one given; else "".
 

@@ -1,5 +1,7 @@
 """The functions of scripts give what the command line gives."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -85,6 +87,7 @@ def test_what_scripts_get_wrong_is_refused(finished, clip, tmp_path):
         (lambda: hb.train("ga", clip, tmp_path, seed="x"), "seeds"),
         (lambda: hb.evaluate(folder, clip, tasks="novel_veiw"), "Did you mean 'novel_view'"),
         (lambda: hb.evaluate(folder, clip, metrics=["storage"]), "metrics of frames"),
+        (lambda: hb.evaluate(folder, replace(clip, subject="x", shape=clip.shape + 1)), "avatar of x"),
         (lambda: hb.run(tmp_path, tmp_path / "out", sedes=(1,)), "seeds"),
     ]
     for call, said in cases:

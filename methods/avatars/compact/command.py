@@ -44,7 +44,7 @@ class CompactSettings(CaptureOptions):
 
 @writes("out", "an avatar")
 def compact(settings: CompactSettings, progress: Progress = no_progress) -> Findings:
-    """Compress an avatar of ours to about a fifteenth of its size; with a capture, measure the loss of quality.
+    """Compress an avatar of the method ours to about a fifteenth of its size; with a capture, measure the loss of quality.
 
     With a capture, each part's cost in quality is measured alone.
     """
