@@ -125,10 +125,12 @@ class MeshFit:
         rows = self._rows
         by_lids = self._lids[rows].reshape(3 * len(rows), -1)
         for _ in range(_MOST_STEPS):
-            posed, by_turn = self._linearised(shaped, turns)
             columns = [by_lids]
             if known is None:
+                posed, by_turn = self._linearised(shaped, turns)
                 columns.append(by_turn[:, rows].reshape(9, -1).T)
+            else:
+                posed = self._posed(shaped[None], turns[None])[0]
             left = (mesh - posed)[rows].ravel() - by_lids @ lids
             step = np.linalg.lstsq(np.hstack(columns), left, rcond=None)[0]
             lids = lids + step[: len(lids)]

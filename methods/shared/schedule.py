@@ -1,4 +1,4 @@
-"""Training schedules: moments of the published run as fractions of the budget at hand."""
+"""Training schedules: moments of the published run as fractions of the budget."""
 
 from __future__ import annotations
 

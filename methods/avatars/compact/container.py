@@ -202,7 +202,7 @@ class Arrays:
         return dequantise(self.integers(name, *shape), step)
 
     def rest(self) -> Mapping[str, FloatArray]:
-        """Remaining arrays: it must be float32 throughout, and is stored as it is."""
+        """Remaining arrays; they must be float32 throughout and are stored as they are."""
         return {name: self.floats(name, *values.shape) for name, values in list(self._left.items())}
 
 
