@@ -12,6 +12,7 @@ from typing import Any as _Any
 
 if _TYPE_CHECKING:
     from .bench.api import evaluate, list_methods, open_clip, run, train
+    from .bench.condition import PLAIN, Condition, Named
     from .bench.conformance.methods import check_method
     from .bench.conformance.metrics import check_metric
     from .bench.conformance.readers import check_clip, check_reader
@@ -53,6 +54,7 @@ if _TYPE_CHECKING:
     from .bench.runner.stored import load_avatar
     from .bench.specs import (
         BenchmarkSpec,
+        ConditionSpec,
         DatasetSpec,
         Findings,
         MethodSpec,
@@ -70,6 +72,7 @@ if _TYPE_CHECKING:
 
 __all__ = [
     "ALL",
+    "PLAIN",
     "STAGES",
     "AdaptedClip",
     "Avatar",
@@ -79,6 +82,8 @@ __all__ = [
     "Camera",
     "CheckedMethod",
     "Clip",
+    "Condition",
+    "ConditionSpec",
     "DatasetSpec",
     "DependentOptions",
     "Findings",
@@ -96,6 +101,7 @@ __all__ = [
     "MethodSpec",
     "Metric",
     "MetricSpec",
+    "Named",
     "Need",
     "PreparedMethod",
     "ProfileSpec",
@@ -134,6 +140,7 @@ __all__ = [
 _HOMES = {
     "bench.api": ("evaluate", "list_methods", "open_clip", "run", "train"),
     "bench.runner.adaptation": ("AdaptedClip", "MethodNeeds"),
+    "bench.condition": ("PLAIN", "Condition", "Named"),
     "bench.conformance.methods": ("check_method",),
     "bench.conformance.metrics": ("check_metric",),
     "bench.conformance.readers": ("check_clip", "check_reader"),

@@ -10,6 +10,7 @@ from typing import Any, cast, get_args
 
 import pandas as pd
 
+from .condition import PLAIN
 from .contracts import Avatar, ByteArray, Clip, FrameKey, TaskName
 from .errors import InputError
 from .io.files import check_output_folder
@@ -110,7 +111,7 @@ def train(
     (resolved,) = resolve_methods(build_run_config({**values, "settings": chosen}, "train"))
     folder = RunFolder(Path(out))
     check_output_folder(folder.root)
-    runner.check_settings(resolved)
+    runner.check_settings([(resolved, PLAIN)])
     with locked(folder.root):
         form = _adapted(clip, resolved, {}, folder.adapted / clip.subject)
         cell = folder.cell(clip.subject, resolved.spec.name, seed)

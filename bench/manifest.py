@@ -1,20 +1,17 @@
 """``run.json``: what made the numbers of a run. Written by a run, read by everything that looks at one.
 
-It names protocols by their hashes; each lies in a file of its own, ``protocols/<hash>.json`` in the run folder or, shared
-by several runs, in the folder above.
+It names protocols by their hashes; each lies in a file of its own, ``protocols/<hash>.json`` in the run folder.
 """
 
 from __future__ import annotations
 
 import json
-import os
 from collections import Counter
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from typing_extensions import TypedDict
-
+from .condition import label_of
 from .contracts import FrameKey
 from .errors import InputError
 from .io.documents import checked, read_json, shown
@@ -22,16 +19,15 @@ from .io.files import check_name, digest, write_json, write_text
 from .protocol import Protocol
 from .runner.config import RunConfig
 from .specs import LABEL, MetricSpec, is_label
-
-Derived = TypedDict("Derived", {"from": str, "variant": str, "change": str})
-"""From which method's avatar one was derived without training, which variant it is, and what was changed."""
+from .upgrade import upgraded_manifest
 
 
 @dataclass(frozen=True)
 class MethodRecord:
-    """A method as it ran; see `ResolvedMethod.record`. ``needs`` are those of a form other than the clip's own.
+    """A method as it ran under a condition; see `ResolvedMethod.record`.
 
-    ``code`` is the digest of its code, see `bench.source`; None for a folder of images, which has none.
+    ``needs`` are those of a form other than the clip's own. ``code`` is the digest of its code, see `bench.source`; None for a
+    folder of images, which has none. ``change`` says in words what a condition changed in an avatar, "" for nothing.
     """
 
     name: str
@@ -41,8 +37,14 @@ class MethodRecord:
     config: dict[str, Any] | None
     budget: dict[str, Any]
     needs: dict[str, Any] | None = None
-    derived: Derived | None = None
     code: str | None = None
+    condition: str = ""
+    change: str = ""
+
+    @property
+    def label(self) -> str:
+        """As tables and folders name it."""
+        return label_of(self.name, self.condition)
 
 
 @dataclass(frozen=True)
@@ -104,25 +106,21 @@ class ProtocolRecord:
 
 
 PROTOCOLS = "protocols"
-"""Folder of the protocols of one run, or of several."""
+"""Folder of a run's protocols."""
 
 
 def protocol_path(folder: Path, protocol: str) -> Path:
-    """The file of the protocol with a hash, in a run folder or in the folder of several runs."""
+    """The file of the protocol with a hash, in a run folder."""
     return folder / PROTOCOLS / f"{protocol}.json"
 
 
 def _read_protocol(run: Path, task: str, name: str) -> ProtocolRecord:
-    """Read the protocol with the hash ``name``. Raises `InputError` where it is not in the run's folder nor in the one above."""
+    """Read the protocol with the hash ``name``. Raises `InputError` where it is not in the run's folder."""
     check_name(name, run, f"protocols.{task}")
-    home = Path(os.path.abspath(run)).parent  # "." has no parent
     path = protocol_path(run.parent, name)
     if not path.exists():
-        shared = protocol_path(home.parent, name)
-        if not shared.exists():
-            expected = f"the protocol of {task} that {run.name} names, here or as {shared}"
-            raise InputError(path, "", expected, "no such file", "Copy it from where the run was made.")
-        path = shared
+        expected = f"the protocol of {task} that {run.name} names"
+        raise InputError(path, "", expected, "no such file", "Copy it from where the run was made.")
     record = checked(read_json(path), ProtocolRecord, path)
     if (record.task, record.hash) != (task, name):
         raise InputError(path, "task, hash", f"{task}, {name}", f"{record.task}, {record.hash}")
@@ -147,9 +145,6 @@ class Manifest:
     adapted : clips that were brought into another form for a method.
     seconds, peak_memory_bytes : of the run's last start; None until it ended.
     capture_seconds : how long the demo's capture took to make.
-    evaluated : the folder of images that were scored in place of renders.
-    sweep_of : the run whose avatars these were derived from.
-    curve_of : the run whose methods were trained with parts of their budgets.
     """
 
     configuration: RunConfig
@@ -164,10 +159,7 @@ class Manifest:
     seconds: float | None = None
     peak_memory_bytes: int | None = None
     capture_seconds: float | None = None
-    evaluated: str | None = None
-    sweep_of: str | None = None
-    curve_of: str | None = None
-    format: Literal[1] = 1
+    format: Literal[2] = 2
 
     @classmethod
     def read(cls, path: Path) -> Manifest:
@@ -175,13 +167,13 @@ class Manifest:
 
         Names that folders and files are found by are checked as `check_name` does.
         """
-        record = read_json(path)
-        if record.get("format") != 1:
-            raise InputError(path, "format", "1", shown(record.get("format")))
+        record = upgraded_manifest(read_json(path))
+        if record.get("format") != 2:
+            raise InputError(path, "format", "1 or 2", shown(record.get("format")))
         hashes = checked(record.get(PROTOCOLS), dict[str, str], path, PROTOCOLS)
         manifest = checked({**record, PROTOCOLS: {}}, cls, path)
         named: dict[str, set[str]] = {
-            "methods": {method.name for method in manifest.methods},
+            "methods": {method.label for method in manifest.methods},
             "metrics, tables": {table for metric in manifest.metrics for table in metric.tables},
             "clips": {clip.subject for clip in manifest.clips},
             PROTOCOLS: set(hashes),
@@ -193,8 +185,12 @@ class Manifest:
             for text in texts:
                 if not is_label(text):
                     raise InputError(path, key, LABEL, repr(text))
-        for key in ("methods", "metrics"):
-            count = Counter(entry.name for entry in getattr(manifest, key))
+        labels = {
+            "methods": [m.label for m in manifest.methods],
+            "metrics": [m.name for m in manifest.metrics],
+        }
+        for key, names_of in labels.items():
+            count = Counter(names_of)
             twice = [name for name, number in count.items() if number > 1]
             if twice:
                 raise InputError(path, key, "each name once", ", ".join(twice))
@@ -210,21 +206,17 @@ class Manifest:
             "machine, processor": [str(self.machine.get("processor", ""))],
         }
 
-    def write(self, path: Path, shared: Path | None = None) -> None:
-        """Write the protocols and ``run.json``, each file atomically.
-
-        ``shared`` is the folder of the protocols' folder where several runs share it, the one above the run's; None: the
-        run's own folder.
-        """
+    def write(self, path: Path) -> None:
+        """Write the protocols and ``run.json``, each file atomically."""
         for protocol in self.protocols.values():
-            file = protocol_path(shared or path.parent, protocol.hash)
+            file = protocol_path(path.parent, protocol.hash)
             write_text(file, json.dumps(asdict(protocol), separators=(",", ":")) + "\n")
         own = replace(self, protocols={})
         record = {name: value for name, value in asdict(own).items() if value is not None}
         record[PROTOCOLS] = {task: protocol.hash for task, protocol in self.protocols.items()}
         for method in record["methods"]:
-            for name in ("needs", "derived", "code"):
-                if method[name] is None:
+            for name in ("needs", "code", "condition", "change"):
+                if not method[name]:
                     del method[name]
         for metric in record["metrics"]:
             del metric["default"], metric["needs"]

@@ -16,15 +16,27 @@ from importlib.metadata import Distribution, EntryPoint, entry_points
 from typing import Any, Literal
 
 from .errors import HeadbenchError, InputError
-from .specs import BenchmarkSpec, CommandSpec, DatasetSpec, MethodSpec, MetricSpec, ProfileSpec, ReportSpec
+from .specs import (
+    BenchmarkSpec,
+    CommandSpec,
+    ConditionSpec,
+    DatasetSpec,
+    MethodSpec,
+    MetricSpec,
+    ProfileSpec,
+    ReportSpec,
+)
 
-Group = Literal["methods", "datasets", "metrics", "profiles", "reports", "benchmarks", "commands"]
+Group = Literal[
+    "methods", "datasets", "metrics", "profiles", "reports", "conditions", "benchmarks", "commands"
+]
 SPEC_TYPES: dict[str, type] = {
     "methods": MethodSpec,
     "datasets": DatasetSpec,
     "metrics": MetricSpec,
     "profiles": ProfileSpec,
     "reports": ReportSpec,
+    "conditions": ConditionSpec,
     "benchmarks": BenchmarkSpec,
     "commands": CommandSpec,
 }

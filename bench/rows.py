@@ -18,9 +18,11 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from .condition import label_of
 from .errors import InputError, is_damage, shortened
 from .io.files import atomic_path, open_regular, reading
 from .specs import LABEL, is_label
+from .upgrade import upgraded_rows
 
 log = logging.getLogger(__name__)
 FRAME = ["subject", "sequence", "timestep", "camera"]
@@ -31,6 +33,8 @@ STATUSES = ("ok", "missing", "failed")
 @dataclass(frozen=True)
 class Row:
     """One measured value, or why there is none. Per-avatar values have no task, timestep -1 and no camera.
+
+    ``condition`` names what was changed against the plain comparison, see `bench.condition.Condition`; "" for nothing.
 
     ``machine``, ``threads`` and ``other_cores`` are of times alone, see `machine.ProcessorLoad`: "", 0 and NaN elsewhere, and
     where they were not recorded.
@@ -53,6 +57,7 @@ class Row:
     machine: str = ""
     threads: int = 0
     other_cores: float = math.nan
+    condition: str = ""
 
 
 COLUMNS = tuple(f.name for f in fields(Row))
@@ -130,7 +135,7 @@ class Rows:
             raise InputError(path, "", "the rows of a finished run", "no such file", "Start the run again.")
         with reading(path, ROWS):
             table = _read_table(path)
-        return cls(_checked(table, path))
+        return cls(upgraded_rows(_checked(table, path)))
 
     def write(self, path: Path) -> None:
         """Write them as Parquet, atomically."""
@@ -156,13 +161,16 @@ class Rows:
         region: str | All,
         seeds: Collection[int] | All,
         subject: str | All = ALL,
+        condition: str | All = "",
     ) -> pd.DataFrame:
         """Return the rows that agree with everything named, a table with the columns of `Row`.
 
-        ``task`` "" is for metrics of the avatar as a whole, whose region is the full image.
+        ``task`` "" is for metrics of the avatar as a whole, whose region is the full image. ``condition`` "" is the plain
+        comparison.
         """
         table = self._table
         wanted = {"method": method, "metric": metric, "task": task, "region": region, "subject": subject}
+        wanted["condition"] = condition
         chosen = np.ones(len(table), dtype=bool)
         for column, value in wanted.items():
             if value is not ALL:
@@ -173,8 +181,9 @@ class Rows:
 
     @property
     def failed(self) -> list[str]:
-        """Methods that have a failed row, sorted."""
-        return sorted(set(self._table.loc[self._table["status"] == "failed", "method"].unique()))
+        """Labels of methods and conditions that have a failed row, sorted."""
+        failed = self._table.loc[self._table["status"] == "failed", ["method", "condition"]].drop_duplicates()
+        return sorted(label_of(str(method), str(condition)) for method, condition in failed.to_numpy())
 
     @property
     def tasks(self) -> set[str]:
@@ -215,13 +224,25 @@ class Rows:
 
     def frames(self, task: str, region: str) -> set[tuple[str, str, int, str]]:
         """Frames of a task: those that any method has a row for in a region."""
-        own = self.select(method=ALL, metric=ALL, task=task, region=region, seeds=ALL)
+        own = self.select(method=ALL, condition=ALL, metric=ALL, task=task, region=region, seeds=ALL)
         own = own[own["timestep"] >= 0]
         return set(own[FRAME].drop_duplicates().itertuples(index=False, name=None))
 
     def renamed(self, labels: Mapping[str, str]) -> Rows:
         """The same rows, every method under another name."""
         return Rows(self._table.assign(method=[labels[str(name)] for name in self._table["method"]]))
+
+    def labelled(self) -> Rows:
+        """The same rows with `label_of` of method and condition as the method: each label is an entry of a table."""
+        table = self._table
+        labels = [label_of(str(m), str(c)) for m, c in zip(table["method"], table["condition"])]
+        return Rows(table.assign(method=pd.Series(labels, table.index, dtype="str"), condition=""))
+
+    def without(self, other: Rows) -> Rows:
+        """The rows of cells (subject, method, condition, seed) that ``other`` has no rows of."""
+        cell = ["subject", "method", "condition", "seed"]
+        own, theirs = (pd.MultiIndex.from_frame(rows._table[cell]) for rows in (self, other))
+        return Rows(self._table[~own.isin(theirs)])
 
     def in_single_precision(self) -> Rows:
         """The same rows, values to the 24 bits of float32 (7 digits, more than tables show): half the bytes of a file."""
@@ -248,7 +269,7 @@ class Rows:
 
         Raises `InputError` for new rows in whose place there is none.
         """
-        identity = ["method", "seed", "task", *FRAME, "region", "metric"]
+        identity = ["method", "condition", "seed", "task", *FRAME, "region", "metric"]
         own, others = (pd.MultiIndex.from_frame(table[identity]) for table in (self._table, new._table))
         places = own.get_indexer(others)
         if (places < 0).any():
@@ -282,7 +303,7 @@ class Rows:
     def check(self) -> None:
         """Raise `InputError` for rows that repeat a frame, and for a method of several versions."""
         rows = self._table
-        identity = ["method", "version", "seed", "task", *FRAME, "region", "metric"]
+        identity = ["method", "condition", "version", "seed", "task", *FRAME, "region", "metric"]
         repeated = rows[rows.duplicated(identity)]
         if len(repeated):
             where = " ".join(str(repeated.iloc[0][column]) for column in identity)
@@ -295,10 +316,10 @@ class Rows:
 
     def values_lacking(self, other: Rows) -> list[str]:
         """What ``other`` has measured values of and these rows have none of, whatever the version and protocol."""
-        columns = ["metric", "region", "method", "seed", "task", *FRAME]
+        columns = ["metric", "region", "method", "seed", "task", *FRAME, "condition"]
         theirs, own = (r._table.loc[r._table["status"] == "ok", columns] for r in (other, self))
         lacking = theirs[~pd.MultiIndex.from_frame(theirs).isin(pd.MultiIndex.from_frame(own))]
-        return [" ".join(map(str, row)) for row in lacking.itertuples(index=False, name=None)]
+        return [" ".join(map(str, row)).rstrip() for row in lacking.itertuples(index=False, name=None)]
 
     def check_kept(self, path: Path, **planned: Iterable[str | int]) -> None:
         """Refuse, before any work, to replace these rows, read from ``path``, by rows that lack some of them.
@@ -338,7 +359,7 @@ class Rows:
                 raise InputError(source, f"protocol of {task}", str(expected.get(task)), found[0])
 
     def _of(self, method: str | All) -> pd.DataFrame:
-        return self.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+        return self.select(method=method, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
 
 
 DISCARD = "Choose another --out. To discard the results in this file, delete it: trained avatars are kept."
@@ -377,7 +398,8 @@ def _read_table(path: Path) -> pa.Table:
             raise InputError(path, "", f"rows of at most {MAX_FILE_BYTES} bytes", f"{size}")
         about = pq.ParquetFile(stream, **READING).metadata
         names = Counter(about.schema.column(index).path for index in range(about.num_columns))
-        wrong = [f"{names[name] or 'no'} {name}" for name in COLUMNS if names[name] != 1]
+        columns = [name for name in COLUMNS if name != "condition" or names[name]]  # version 1 has none
+        wrong = [f"{names[name] or 'no'} {name}" for name in columns if names[name] != 1]
         if wrong:
             raise InputError(path, "columns", f"once each {', '.join(COLUMNS)}", ", ".join(wrong))
         groups = [about.row_group(index) for index in range(about.num_row_groups)]
@@ -388,8 +410,10 @@ def _read_table(path: Path) -> pa.Table:
         unpacked = sum(max(0, group.total_byte_size) for group in groups)
         if unpacked > MAX_UNPACKED_BYTES:
             raise InputError(path, "", f"columns of at most {MAX_UNPACKED_BYTES} bytes", f"{unpacked}")
-        file = pq.ParquetFile(stream, metadata=about, read_dictionary=TEXTS, **READING)
-        table = file.read(columns=list(COLUMNS), use_threads=False, use_pandas_metadata=False)
+        file = pq.ParquetFile(
+            stream, metadata=about, read_dictionary=[name for name in TEXTS if name in columns], **READING
+        )
+        table = file.read(columns=columns, use_threads=False, use_pandas_metadata=False)
         table.validate(full=True)
         return table
 

@@ -266,6 +266,29 @@ class DatasetSpec:
 
 
 @dataclass(frozen=True)
+class ConditionSpec:
+    """A change that conditions of a run name, see `bench.condition.Condition`.
+
+    Attributes
+    ----------
+    name, summary : str
+        What conditions call it, and what it does.
+    kind : str
+        "clip": ``implementation`` names a function ``(clip, config, **parameters) -> clip``, where ``config`` is the
+        `RunConfig`; what takes long it keeps in ``config.out``.
+        "derive": a function ``(method spec, avatar folder, folder to write, clip, device, **parameters) -> Avatar``.
+        "drive": a function ``(job, avatar, folder to write, progress, **parameters) -> Rows``.
+    implementation : str
+        "package.module:function".
+    """
+
+    name: str
+    summary: str
+    kind: Literal["clip", "derive", "drive"]
+    implementation: str
+
+
+@dataclass(frozen=True)
 class ReportSpec:
     """A view of stored results: ``implementation`` names a function ``(run_folder) -> files written``.
 

@@ -18,13 +18,16 @@ from ..bench.io.images import encode_image, read_png
 from ..bench.rows import ALL, Rows
 from ..bench.runner.scoring import FULL
 from ..bench.runner.store import RunFolder
-from .suite.suite import results
-from .table_report import table_text
+from .runs import RunSet
+from .suite.suite import suite_report
+from .table_report import table_of, table_text
+from .writers import to_markdown
 
 GALLERY = "reports/gallery"
 SUITE = f"{GALLERY}/suite"
 PICTURE = "contact_sheet.jpg"
 RESULTS = "results.md"
+OURS = "ours"
 
 
 def publish_demo(out: Path, readme: Path) -> None:
@@ -38,19 +41,20 @@ def publish_demo(out: Path, readme: Path) -> None:
 
 
 def publish_suite(out: Path, readme: Path) -> None:
-    """Copy manifest and rows of each run of a suite beside the README, and write its tables and the block made of them."""
+    """Copy manifest and rows of a suite's run beside the README, and write its tables and the block made of them."""
     target = readme.parent / SUITE
-    for folder in _runs(out):
-        _copy(RunFolder(folder), RunFolder(target / folder.name), target)
+    _copy(RunFolder(out / "run"), RunFolder(target / "run"))
     write_text(target / RESULTS, suite_results(target))
     _write(readme, "suite", suite_block(target))
 
 
-def _copy(source: RunFolder, target: RunFolder, shared: Path | None = None) -> None:
-    """Manifest, without this machine's folders, and rows of a run; protocols into the folder of several runs, ``shared``."""
+def _copy(source: RunFolder, target: RunFolder) -> None:
+    """Manifest, without this machine's folders, protocols and rows of a run."""
     manifest = source.read_manifest()
     target.root.mkdir(parents=True, exist_ok=True)
-    without_paths(manifest, tuple(method.name for method in manifest.methods)).write(target.manifest, shared)
+    without_paths(manifest, tuple(dict.fromkeys(method.name for method in manifest.methods))).write(
+        target.manifest
+    )
     Rows.read(source.rows).in_single_precision().write(target.rows)
 
 
@@ -93,7 +97,7 @@ def _minutes(run_folder: Path) -> list[tuple[str, float | None]]:
     Not the run's own length: of one that was continued it is that of its last part.
     """
     rows = Rows.read(RunFolder(run_folder).rows)
-    trained = rows.select(method=ALL, metric="training_time", task="", region=FULL, seeds=ALL)
+    trained = rows.select(method=ALL, condition=ALL, metric="training_time", task="", region=FULL, seeds=ALL)
     ended = trained["status"] == "ok"
     return [
         (str(m), float(v) if ok else None) for m, v, ok in zip(trained["method"], trained["value"], ended)
@@ -101,24 +105,20 @@ def _minutes(run_folder: Path) -> list[tuple[str, float | None]]:
 
 
 def suite_results(folder: Path) -> str:
-    """All tables of the stored runs of the suite."""
-    return results(folder / "run", _runs(folder))
-
-
-def _runs(folder: Path) -> list[Path]:
-    """Folders of a suite's runs, the comparison itself first."""
-    return [folder / "run", *sorted(folder.glob("ablation-*"))]
+    """All tables of the stored run of the suite."""
+    return suite_report(folder / "run", OURS)
 
 
 def suite_block(folder: Path) -> str:
     """Return the README's block for the stored results of the suite: Markdown."""
-    minutes = [value for each in _runs(folder) for _, value in _minutes(each)]
+    runs = RunSet.read([folder / "run"])
+    minutes = [value for _, value in _minutes(folder / "run")]
     hours = sum(value for value in minutes if value is not None) / 60
     interrupted = (
         f", not counting {minutes.count(None)} that were interrupted and continued" if None in minutes else ""
     )
     return (
-        f"{table_text([folder / 'run'], 'md').strip()}\n\n"
+        f"{to_markdown(table_of(runs.only([*runs.ranked, *runs.trivial]))).strip()}\n\n"
         f"[Tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
         f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{interrupted}."
     )

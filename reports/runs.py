@@ -46,12 +46,12 @@ class RunData:
     @property
     def methods(self) -> tuple[str, ...]:
         """Names of the methods."""
-        return tuple(method.name for method in self.manifest.methods)
+        return tuple(method.label for method in self.manifest.methods)
 
     @property
     def trivial(self) -> tuple[str, ...]:
         """Names of the methods that are trivial baselines."""
-        return tuple(method.name for method in self.manifest.methods if method.trivial)
+        return tuple(method.label for method in self.manifest.methods if method.trivial)
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -199,7 +199,7 @@ class RunSet:
         rows = Rows.joined([run.rows.renamed(own) for run, own in zip(runs, labels)])
         rows.check()
         records = {
-            own[method.name]: method for run, own in zip(runs, labels) for method in run.manifest.methods
+            own[method.label]: method for run, own in zip(runs, labels) for method in run.manifest.methods
         }
         tasks = tuple(dict.fromkeys(task for run in runs for task in run.tasks))
         trivial = tuple(label for label, record in records.items() if record.trivial)
@@ -226,6 +226,12 @@ class RunSet:
         }
         return replace(self, rows=rows, tasks=tasks, metrics=metrics, keys=chosen, part=part.text)
 
+    def only(self, labels: Sequence[str]) -> RunSet:
+        """The same runs with some of their methods."""
+        records = {label: record for label, record in self.records.items() if label in labels}
+        trivial = tuple(label for label in self.trivial if label in records)
+        return replace(self, rows=self.rows.of_methods(labels), records=records, trivial=trivial)
+
     @property
     def methods(self) -> tuple[str, ...]:
         """Labels, in order."""
@@ -233,8 +239,14 @@ class RunSet:
 
     @property
     def ranked(self) -> tuple[str, ...]:
-        """Labels of methods that are no trivial baselines, in order."""
-        return tuple(label for label in self.records if label not in self.trivial)
+        """Labels of methods that are neither trivial baselines nor changed by a condition, in order."""
+        return tuple(label for label in self.records if label not in (*self.trivial, *self.changed))
+
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """Labels of methods under a condition; none where all are, as in a curve."""
+        changed = tuple(label for label, record in self.records.items() if record.condition)
+        return changed if len(changed) + len(self.trivial) < len(self.records) else ()
 
     @property
     def protocol_ids(self) -> dict[str, str]:
@@ -309,8 +321,8 @@ def _labels(runs: Sequence[RunData]) -> list[dict[str, str]]:
     trainings: dict[str, list[_Training]] = {}
     for index, run in enumerate(runs):
         for record in run.manifest.methods:
-            seeds = run.rows.seeds(record.name)
-            known = trainings.setdefault(record.name, [])
+            seeds = run.rows.seeds(record.label)
+            known = trainings.setdefault(record.label, [])
             same = next((t for t in known if t.record == record and not t.seeds & seeds), None)
             if same is None:
                 known.append(_Training(record, [index], seeds))

@@ -29,6 +29,27 @@ PAGE = ReportSpec(
     implementation="headbench.reports.page.report:write_page",
 )
 
+CURVE = ReportSpec(
+    name="curve",
+    summary="Quality over what trainings were given, as a table, CSV and a plot.",
+    implementation="headbench.reports.curve.curve:curve_report",
+    writes=False,
+)
+
+PARETO = ReportSpec(
+    name="pareto",
+    summary="Quality over size and frame time with the Pareto front, as a table, CSV and a plot.",
+    implementation="headbench.reports.pareto.command:pareto",
+    writes=False,
+)
+
+SUITE = ReportSpec(
+    name="suite",
+    summary="Results of the suite by region and sequence, with differences from a method and ablations.",
+    implementation="headbench.reports.suite.suite:suite_report",
+    writes=False,
+)
+
 STATISTICS = BenchmarkSpec(
     name="statistics",
     summary="tests and intervals on simulated comparisons: do they reject and cover as often as stated?",

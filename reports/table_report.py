@@ -307,6 +307,7 @@ def table_of(
         list(names),
         tasks,
         trivial=runs.trivial,
+        changed=runs.changed,
         protocol_ids=runs.protocol_ids,
         image_size=runs.image_size,
         machine=runs.machine,

@@ -66,7 +66,7 @@ class TableCell:
 
 @dataclass(frozen=True)
 class TableRow:
-    """A method's cells, one per column; a trivial baseline is never ranked."""
+    """A method's cells, one per column; ``trivial``: it is not ranked, as a baseline or under a condition."""
 
     method: str
     version: str
@@ -182,6 +182,7 @@ PUBLISHED = "Columns headed published: figures from papers, of other data and co
 AVATAR_TITLE = "Avatar"
 METHODS_TITLE = "Methods"
 TRIVIAL_TITLE = "Trivial baselines (not ranked)"
+CONDITIONS_TITLE = "Under other conditions (not ranked)"
 
 
 def build_table(
@@ -191,6 +192,7 @@ def build_table(
     tasks: Sequence[str],
     *,
     trivial: Sequence[str] = (),
+    changed: Sequence[str] = (),
     protocol_ids: Mapping[str, str],
     image_size: str = "",
     machine: str = "",
@@ -210,6 +212,7 @@ def build_table(
     metrics : columns of the table, in order; those per frame appear once in each task, the others last.
     methods : in order; one without rows is shown as not measured.
     trivial : those of ``methods`` that are trivial baselines: listed apart, not ranked.
+    changed : likewise those under conditions that change them, see `RunSet.changed`.
     keys : frames of each task, where more are scored than there are rows of.
     protocol_ids : readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` (where the rows do not
         tell on which one speed was measured), ``part`` and the sentences of ``missing``.
@@ -244,12 +247,15 @@ def build_table(
             )
             for c in columns
         )
-        lines.append(TableRow(method, ", ".join(rows.versions(method)), method in trivial, cells))
+        lines.append(
+            TableRow(method, ", ".join(rows.versions(method)), method in (*trivial, *changed), cells)
+        )
     bests = [_best(rows, lines, index, column) for index, column in enumerate(columns)]
     lines = _ranked(lines, columns, bests)
     groups = (
         (METHODS_TITLE, tuple(line for line in lines if not line.trivial)),
-        (TRIVIAL_TITLE, tuple(line for line in lines if line.trivial)),
+        (CONDITIONS_TITLE, tuple(line for line in lines if line.method in changed)),
+        (TRIVIAL_TITLE, tuple(line for line in lines if line.method in trivial)),
     )
     return Table(
         columns=columns,

@@ -19,6 +19,7 @@ from ..io.documents import MAX_JSON_BYTES, checked, parse_json
 from ..io.files import atomic_path, check_writable, digest_file, write_json
 from ..io.provenance import RENDER, source_type
 from ..manifest import PROTOCOLS, Manifest, protocol_path
+from ..rows import Rows
 from ..runner.steps import DIGESTS
 from ..runner.store import STAGES, RunFolder
 from ..specs import Findings
@@ -71,8 +72,9 @@ def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> 
     check_writable(out, "--out")
     manifest = folder.read_manifest()
     manifest.check_done(folder.manifest)
-    rows = folder.read_rows(manifest)
-    known = tuple(method.name for method in manifest.methods)
+    folder.read_rows(manifest)
+    rows = Rows.read(folder.rows)
+    known = tuple(dict.fromkeys(method.name for method in manifest.methods))
     for name in settings.methods:
         if name not in known:
             raise InputError(folder.manifest, "methods", f"methods of the run: {', '.join(known)}", name)
@@ -117,12 +119,16 @@ def without_paths(manifest: Manifest, methods: tuple[str, ...]) -> Manifest:
         for key, value in config.reader_settings.items()
     }
     # A configuration may name a method by its module.
-    ran = [method.name for method in manifest.methods]
+    ran = list(dict.fromkeys(method.name for method in manifest.methods))
     asked = dict(zip(ran, config.methods)) if len(ran) == len(config.methods) else {}
+    labels = {method.label for method in manifest.methods if method.name in methods}
+    conditions = [c for c in config.conditions if not c.methods or set(c.methods) & set(methods)]
     config = replace(
         config,
         data=named(config.data),
         out="",
+        source=config.source and named(config.source),
+        conditions=tuple(replace(c, methods=tuple(m for m in c.methods if m in methods)) for c in conditions),
         methods=tuple(asked.get(name, name) for name in methods),
         settings={name: value for name, value in config.settings.items() if name in methods},
         reader_settings=settings,
@@ -132,11 +138,8 @@ def without_paths(manifest: Manifest, methods: tuple[str, ...]) -> Manifest:
         manifest,
         configuration=config,
         methods=tuple(method for method in manifest.methods if method.name in methods),
-        adapted=tuple(record for record in manifest.adapted if record.method in methods),
+        adapted=tuple(record for record in manifest.adapted if record.method in labels),
         paths=None,
-        evaluated=manifest.evaluated and named(manifest.evaluated),
-        sweep_of=manifest.sweep_of and named(manifest.sweep_of),
-        curve_of=manifest.curve_of and named(manifest.curve_of),
     )
 
 
@@ -145,8 +148,9 @@ def _cell_files(
 ) -> dict[str, Path]:
     """Records of the cells, and their frames if asked for, by their place in the run."""
     files: dict[str, Path] = {}
-    for clip, method, seed in product(manifest.clips, methods, manifest.configuration.seeds):
-        cell = folder.cell(clip.subject, method, seed)
+    labels = [method.label for method in manifest.methods if method.name in methods]
+    for clip, label, seed in product(manifest.clips, labels, manifest.configuration.seeds):
+        cell = folder.cell(clip.subject, label, seed)
         paths = [cell.folder / f"{name}.json" for name in STAGES if cell.step(name) is not None]
         if renders:
             state = cell.step(DIGESTS)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
+from ..condition import PLAIN
 from ..contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
 from ..errors import HeadbenchError, InputError
 from ..io.files import (
@@ -100,11 +101,11 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
     check_kind(folder.root, "a run")
     check_output_folder(folder.root)
     with locked(folder.root):
-        manifest = describe(config, [method], metrics, clips, protocols)
-        manifest = replace(manifest, evaluated=str(source))
+        manifest = describe(config, [(method, PLAIN)], metrics, clips, protocols)
         folder.check_kept(manifest)
         jobs = [
-            replace(job, method=method) for job in make_jobs(config, adapted_for, clips, protocols, folder)
+            replace(job, method=method)
+            for job in make_jobs(config, [(m, PLAIN) for m in adapted_for], clips, protocols, folder)
         ]
         manifest.write(folder.manifest)
         parts = []
@@ -134,7 +135,9 @@ def _open(settings: EvaluateSettings, heads: Mapping[str, str]) -> tuple[RunConf
         expected = "a name that no registered method has"
         raise InputError("command line", "--label", expected, repr(label), f"For example {label}-official.")
     folder = RunFolder(Path(settings.out))
-    held = [method.name for method in folder.read_manifest().methods] if folder.manifest.exists() else [label]
+    held = (
+        [method.label for method in folder.read_manifest().methods] if folder.manifest.exists() else [label]
+    )
     if held != [label]:
         expected, found = f"a new folder, or one with {label} alone", f"a run of {', '.join(held)}"
         raise InputError("command line", "--out", expected, found, "Its results would be lost.")

@@ -11,6 +11,7 @@ from typing import Any
 
 import pandas as pd
 
+from ..condition import Condition
 from ..contracts import Avatar, Clip, FrameKey, Progress, no_progress
 from ..errors import ExitCode, HeadbenchError, InputError
 from ..io.files import digest, digest_file
@@ -20,7 +21,7 @@ from ..protocol import Protocol, make_protocols
 from ..registry import get, resolve
 from ..rows import ALL, FRAME, Rows
 from ..runner.captures import Plugins, open_run_clips, synthesis_arguments
-from ..runner.config import resolve_methods, resolve_metrics
+from ..runner.config import resolve_cells, resolve_metrics
 from ..runner.run import load, make_jobs
 from ..runner.steps import DIGESTS, Job, measure, recorded_frames
 from ..runner.store import Cell, RunFolder
@@ -29,7 +30,7 @@ from .bundle import read_bundle
 from .command import VerifySettings
 from .evaluate import NoAvatar, images_method
 
-KEY = ["method", "seed", "task", *FRAME, "region", "metric"]
+KEY = ["method", "condition", "seed", "task", *FRAME, "region", "metric"]
 SHOWN = 20
 PIXELS_PER_BYTE = 100
 """Of the captures that are made again for a bundle; its renders have about one of a byte, a run scores a tenth of them at
@@ -139,15 +140,16 @@ def _verify(
     config, clips = open_run_clips(
         folder.root, settings, out=scratch, altered=True, remembered=False, used=used
     )
-    rows = folder.read_rows(manifest)
-    images = [images_method(method.name, method.version) for method in manifest.methods]
-    methods = resolve_methods(config) if avatars else images
+    folder.read_rows(manifest)
+    rows = Rows.read(folder.rows)
+    images = [(images_method(m.name, m.version), Condition(m.condition)) for m in manifest.methods]
+    cells = resolve_cells(config) if avatars else images
     metrics = [metric for metric in resolve_metrics(config) if metric.per_frame or avatars]
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
     report = _Report([*_clips(folder, manifest, clips), *_protocols(folder, manifest, protocols)])
     if not report.mismatches:
         rows.check_protocols(folder.rows, {task: protocol.hash for task, protocol in protocols.items()})
-        jobs = make_jobs(config, methods, clips, protocols, folder, scratch)
+        jobs = make_jobs(config, cells, clips, protocols, folder, scratch)
         for index, job in enumerate(jobs):
             _verify_cell(job, metrics, rows, folder.rows, report)
             progress(index + 1, len(jobs), job.name)
@@ -186,7 +188,13 @@ def _protocols(
 def _verify_cell(job: Job, metrics: Sequence[MetricSpec], rows: Rows, file: Path, report: _Report) -> None:
     method = job.method.spec
     own = rows.select(
-        method=method.name, metric=ALL, task=ALL, region=ALL, seeds=(job.seed,), subject=job.clip.subject
+        method=method.name,
+        condition=job.condition.name,
+        metric=ALL,
+        task=ALL,
+        region=ALL,
+        seeds=(job.seed,),
+        subject=job.clip.subject,
     )
     if len(own) and (own["status"] == "failed").all():
         report.unverified += len(own)
@@ -196,7 +204,7 @@ def _verify_cell(job: Job, metrics: Sequence[MetricSpec], rows: Rows, file: Path
     digests = {**(state.get("files", {}) if state and trained else {}), **recorded_frames(job)}
     found = list(_files(job, digests, report))
     report.mismatches += found
-    if not method.implementation:
+    if not method.implementation or job.condition.derive:
         avatar: Avatar = NoAvatar()
     else:
         made_of = "none" if state is None else state["fingerprint"]

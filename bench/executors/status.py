@@ -113,7 +113,7 @@ def cell_states(folder: RunFolder, manifest: Manifest) -> list[CellState]:
     works = is_locked(folder.root)
     found = []
     for clip, method, seed in product(manifest.clips, manifest.methods, manifest.configuration.seeds):
-        key = clip.subject, method.name, seed
+        key = clip.subject, method.label, seed
         cell = folder.cell(*key)
         place = cell.folder.relative_to(folder.root).as_posix()
         outcome = read_outcome(cell.folder)

@@ -10,13 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
+from ..condition import Named
 from ..configuration import build_arguments
 from ..contracts import Clip, Progress
 from ..errors import HeadbenchError, InputError
 from ..io.files import check_name
 from ..progress import progress
 from ..registry import discover, get, resolve
-from ..specs import LABEL, DatasetSpec, ResolutionRule, is_label
+from ..specs import LABEL, ConditionSpec, DatasetSpec, ResolutionRule, is_label
 from .adaptation import MethodNeeds, carry_out, plan
 from .config import RunConfig, RunOptions
 from .store import RunFolder
@@ -44,7 +45,7 @@ def open_clips(config: RunConfig, *, remembered: bool = True, only: int | None =
     found = found_captures(spec, root, config.reader_settings, remembered=remembered)
     for path, read in found if only is None else found[only : only + 1]:
         with progress(f"reading {path.name}") as report:
-            clips.append(_reduced(_checked(read(report)), config))
+            clips.append(changed(_reduced(_checked(read(report)), config), config.clip, config))
     subjects = [clip.subject for clip in clips]
     if len(set(subjects)) != len(subjects):
         raise InputError(root, "subject", "a different subject in each capture", ", ".join(subjects))
@@ -243,6 +244,10 @@ def _configurations(
         beside = [] if relative is None else [os.path.normpath(run.resolve() / relative)]
         tried = [*beside, path]
         places[key] = [place for place in tried if Path(place).exists()]
+        if (
+            not places[key] and key == "source"
+        ):  # needed to derive avatars again, not to read what was measured
+            places[key] = [path]
         if not places[key]:
             remedy = _REMEDIES.get(key, "Put it there.")
             raise InputError(
@@ -253,8 +258,9 @@ def _configurations(
         group, _, name = key.partition(".")
         if name:
             {"reader_settings": settings, "heads": heads}[group][name] = place
+    source = places["source"][0] if "source" in places else ""
     for place in places["data"]:
-        yield replace(config, data=place, reader_settings=settings, heads=heads)
+        yield replace(config, data=place, reader_settings=settings, heads=heads, source=source)
 
 
 _REMEDIES = {
@@ -271,12 +277,16 @@ def _named(config: RunConfig) -> dict[str, str]:
         for key, value in config.reader_settings.items()
         if isinstance(value, str) and Path in (hints.get(key), *get_args(hints.get(key)))
     }
-    return {"data": config.data, **files, **{f"heads.{key}": path for key, path in config.heads.items()}}
+    source = {"source": config.source} if config.source else {}
+    heads = {f"heads.{key}": path for key, path in config.heads.items()}
+    return {"data": config.data, **files, **heads, **source}
 
 
 def _check_registered(config: RunConfig, manifest: Path, used: tuple[Plugins, ...]) -> None:
     """Refuse names that would import a module which a run folder names: it may come from anybody."""
     named: dict[str, Sequence[str]] = {"reader": (config.reader,)}
+    changes = [(c.clip, c.derive, c.drive) for c in config.conditions]
+    named["conditions"] = [each.name for change in changes for each in change] + [config.clip.name]
     if "methods" in used:
         named["methods"] = config.methods
     if "metrics" in used:
@@ -288,6 +298,20 @@ def _check_registered(config: RunConfig, manifest: Path, used: tuple[Plugins, ..
                     "Give --trust to import it, if you trust who made the run; or register it as a plug-in."
                 )
                 raise InputError(manifest, f"configuration.{key}", "registered names", repr(name), remedy)
+
+
+def changed(clip: Clip, change: Named, config: RunConfig) -> Clip:
+    """The clip after a registered change; the clip itself for none.
+
+    Raises `InputError` for a change that is not registered, or that is not of clips.
+    """
+    if not change:
+        return clip
+    spec: ConditionSpec = get("conditions", change.name)
+    if spec.kind != "clip":
+        raise InputError("conditions", change.name, "a change of clips", f"one of kind {spec.kind!r}")
+    result: Clip = resolve(spec.implementation)(clip, config, **change.parameters)
+    return result
 
 
 def _reduced(clip: Clip, config: RunConfig) -> Clip:

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from ..condition import PLAIN, Condition, Named
 from ..configuration import build, deciding_settings, merge, setting_paths
 from ..contracts import Budget, TaskName
 from ..errors import InputError
@@ -57,6 +58,9 @@ class RunConfig:
         taken at is then that of the reduced images.
     heads : files of further head models by version, for methods that want another than a capture was tracked
         with; their tracking is refitted.
+    conditions : what is changed against the plain comparison, each a set of cells of its own; see `Condition`.
+    clip : registered change of every capture, of the scored frames as well, such as other held-out frames.
+    source : folder of a finished run whose avatars are taken instead of training; "" for none.
     """
 
     data: str
@@ -75,9 +79,23 @@ class RunConfig:
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
     divide: int = 1
     heads: dict[str, str] = field(default_factory=dict)
+    conditions: tuple[Condition, ...] = (PLAIN,)
+    clip: Named = field(default_factory=Named)
+    source: str = ""
 
     def __post_init__(self) -> None:
         """Refuse what could only fail later."""
+        names = [condition.name for condition in self.conditions]
+        if not names or len(set(names)) != len(names):
+            raise ValueError(f"conditions: at least one, each name once; found {', '.join(names) or 'none'}")
+        for condition in self.conditions:
+            changed = replace(condition, methods=(), drive=Named()) != PLAIN
+            if changed and not condition.name:
+                raise ValueError("conditions: a name for each one that changes something; found none")
+            if condition.derive and not self.source:
+                raise ValueError(
+                    f"conditions: {condition.name} derives avatars; source has to name their run"
+                )
         for name in ("methods", "seeds", "tasks", "metrics", "metric_profiles"):
             values = getattr(self, name)
             if not values:
@@ -178,6 +196,33 @@ def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:
     if stray:
         raise unknown("settings", "method", min(stray), [spec.name for spec in specs])
     return [resolve_method(spec, config.preset, config.settings.get(spec.name, {})) for spec in specs]
+
+
+def resolve_cells(config: RunConfig) -> list[tuple[ResolvedMethod, Condition]]:
+    """Resolve every method of a run under each condition that applies to it, method by method.
+
+    Raises `InputError` as `resolve_methods` does, and for a condition of a method that the run does not have.
+    """
+    methods = resolve_methods(config)
+    names = [method.spec.name for method in methods]
+    for condition in config.conditions:
+        check_name(condition.name or "plain", "settings", "name of a condition")
+        for name in condition.methods:
+            if name not in names:
+                raise unknown("settings", f"conditions, methods of {condition.name}", name, names)
+    cells = []
+    for asked, method in zip(config.methods, methods):
+        for condition in config.conditions:
+            if not condition.applies_to(method.spec.name):
+                continue
+            changed = method
+            if condition.settings:
+                spec: MethodSpec = get("methods", asked)
+                settings = merge(config.settings.get(spec.name, {}), condition.settings)
+                changed = resolve_method(spec, config.preset, settings)
+                changed = replace(changed, spec=replace(changed.spec, name=method.spec.name))
+            cells.append((replace(changed, budget=condition.part_of(changed.budget)), condition))
+    return cells
 
 
 def resolve_method(spec: MethodSpec, preset: str, settings: Mapping[str, Any]) -> ResolvedMethod:

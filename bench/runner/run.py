@@ -5,58 +5,95 @@ from __future__ import annotations
 import logging
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..condition import Condition, label_of
 from ..contracts import Avatar, CheckedMethod, Clip
-from ..errors import HeadbenchError, InputError, UnavailableError
+from ..errors import HeadbenchError, InputError, UnavailableError, is_damage
 from ..executors.outcome import outcome_path
 from ..executors.settings import Execution, check_executor
-from ..io.files import atomic_path, check_kind, check_output_folder, output_inside
+from ..io.files import atomic_path, check_kind, check_output_folder, digest, output_inside
 from ..io.lock import locked
 from ..machine import check_device_answers, machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
 from ..progress import duration, run_progress
 from ..protocol import Protocol, make_protocols, missing_tasks
 from ..registry import discover, get, resolve
-from ..rows import Rows
+from ..rows import DISCARD, Rows
 from ..specs import DatasetSpec, MetricSpec
 from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
-from .captures import open_clips, open_run_clips, relative_paths, run_configuration
-from .config import ResolvedMethod, RunConfig, RunOptions, resolve_methods, resolve_metrics
+from .captures import changed, open_clips, open_run_clips, relative_paths, run_configuration
+from .config import ResolvedMethod, RunConfig, RunOptions, resolve_cells, resolve_metrics
 from .scoring import check_regions, make_metric
-from .steps import Job, failed_rows, fit, measure, reason_of, render, steps_ahead
+from .steps import Job, derive, failed_rows, fit, measure, reason_of, render, steps_ahead
 from .store import RunFolder
 
 log = logging.getLogger(__name__)
 
 
 def run(
-    config: RunConfig, execution: Execution | None = None, *, unchecked: bool = False, **record: Any
+    config: RunConfig,
+    execution: Execution | None = None,
+    *,
+    unchecked: bool = False,
+    clips: Sequence[Clip] | None = None,
+    reports: bool = True,
+    **record: Any,
 ) -> Rows:
-    """Run a comparison into ``config.out`` and return its rows; ``record`` is added to the manifest.
-
-    ``execution`` says where its cells are executed, None for this process. ``unchecked`` trains although a capture has an
-    error that makes results meaningless (see `DatasetSpec.errors`).
+    """Run the cells of a configuration into ``config.out`` and return the rows of the whole folder.
 
     Everything that can be checked is checked before the first long step: settings, device, methods, captures, the
     output folder, and that no other process works in it. A method that fails is recorded as failed and the others
-    go on. Started again with the same configuration after a kill, it keeps what is done and continues what is not.
+    go on. Started again with the same configuration after a kill, it keeps what is done and continues what is not. In a
+    folder that has other methods, seeds, metrics, conditions or frames it adds what is new, see `grown`.
+
+    Parameters
+    ----------
+    execution : Execution, optional
+        Where the cells are executed. Default: one after another in this process.
+    unchecked : bool
+        Train although a capture has an error that makes results meaningless (see `DatasetSpec.errors`).
+    clips : sequence of Clip, optional
+        The captures of the configuration, if they are open already.
+    reports : bool
+        Write the registered reports at the end.
+    record : Any
+        Added to the manifest.
     """
-    methods, metrics = resolve_methods(config), resolve_metrics(config)
+    resolve_cells(config)  # before a folder is made
+    resolve_metrics(config)
+    check_executor(execution or Execution(), config.device)
+    check_kind(Path(config.out), "a run")
+    check_output_folder(Path(config.out))
+    with locked(Path(config.out)):
+        return run_locked(config, execution, unchecked=unchecked, clips=clips, reports=reports, **record)
+
+
+def run_locked(
+    config: RunConfig,
+    execution: Execution | None = None,
+    *,
+    unchecked: bool = False,
+    clips: Sequence[Clip] | None = None,
+    reports: bool = True,
+    **record: Any,
+) -> Rows:
+    """Run the cells of a configuration as `run` does, into a folder whose lock is held."""
+    start = time.perf_counter()
+    folder = RunFolder(Path(config.out))
+    config = grown(config, folder)
+    cells, metrics = resolve_cells(config), resolve_metrics(config)
     execution = execution or Execution()
     check_executor(execution, config.device)
-    folder = RunFolder(Path(config.out))
-    check_kind(folder.root, "a run")
-    check_output_folder(folder.root)
-    start = time.perf_counter()
-    with locked(folder.root):
-        rows = _run(config, methods, metrics, folder, execution, unchecked, record)
+    rows = _run(config, cells, metrics, folder, execution, clips, unchecked, record)
+    if reports:
         write_reports(folder.root)  # with the captures gone from memory
     log.info("finished in %s: %s", duration(time.perf_counter() - start), folder.root)
     return rows
@@ -64,35 +101,35 @@ def run(
 
 def _run(
     config: RunConfig,
-    methods: Sequence[ResolvedMethod],
+    cells: Sequence[tuple[ResolvedMethod, Condition]],
     metrics: Sequence[MetricSpec],
     folder: RunFolder,
     execution: Execution,
+    clips: Sequence[Clip] | None,
     unchecked: bool,
     record: Mapping[str, Any],
 ) -> Rows:
     start = time.perf_counter()
-    for method in methods:
-        method.create()  # an implementation that cannot be imported or made is not to be found out hours later
-    clips = open_clips(config)
-    for method in methods:
-        cells = [folder.cell(clip.subject, method.spec.name, seed) for clip in clips for seed in config.seeds]
-        if not all(cell.ended("measure") for cell in cells):
-            check_settings(method)
+    clips = open_clips(config) if clips is None else clips
+    for method, condition in cells:
+        places = product([clip.subject for clip in clips], config.seeds)
+        label = label_of(method.spec.name, condition.name)
+        if not all(folder.cell(subject, label, seed).ended("measure") for subject, seed in places):
+            check_settings([(method, condition)])
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
-    planned = describe(config, methods, metrics, clips, protocols)
+    planned = describe(config, cells, metrics, clips, protocols)
     folder.check_kept(planned)
-    jobs = make_jobs(config, methods, clips, protocols, folder)
+    jobs = make_jobs(config, cells, clips, protocols, folder)
     for job in jobs:
         job.check()
         job.check_method()
     warn_of_missing_metrics(metrics, clips[0])
-    if not unchecked:
+    if not unchecked and not config.source:
         for clip in {job.clip.subject: job.clip for job in jobs if not job.cell.ended("fit")}.values():
             check_capture(config, clip)
 
     forms = tuple(
-        AdaptedRecord(**adaptation.record(job.clip, job.adapted, job.method.spec.name))
+        AdaptedRecord(**adaptation.record(job.clip, job.adapted, job.label))
         for job in jobs
         if job.adapted is not None and job.seed == config.seeds[0]
     )
@@ -105,7 +142,7 @@ def _run(
     if execution.executor == "inline":
         rows = run_jobs(jobs, metrics)
     else:
-        from ..executors.run import execute, machine_of
+        from .tasks import execute, machine_of
 
         rows = execute(jobs, metrics, folder, execution)
         manifest = replace(manifest, machine=dict(machine_of(jobs, manifest.machine)))
@@ -117,11 +154,59 @@ def _run(
     return rows
 
 
-def check_settings(method: ResolvedMethod) -> None:
-    """Let a method that can tell refuse its settings before anything is made that takes long."""
-    made = method.create()
-    if isinstance(made, CheckedMethod):
-        made.check(None, method.budget)
+def grown(config: RunConfig, folder: RunFolder) -> RunConfig:
+    """The configuration together with what the run in the folder has already: methods, seeds, tasks, metrics, conditions.
+
+    Raises `InputError` where a setting of both, which decides results of all cells, has another value.
+    """
+    if not folder.rows.is_file() or not folder.manifest.is_file():
+        return config
+    try:
+        earlier = folder.read_manifest().configuration
+    except InputError as error:
+        if not is_damage(error):
+            raise
+        log.warning("%s It is written again.", error)
+        return config  # rows that would be lost are an error when they are written
+    for name in ("preset", "device", "divide", "clip", "source"):
+        before, now = getattr(earlier, name), getattr(config, name)
+        if before != now and not (name == "source" and _same_place(before, now)):
+            raise InputError(
+                folder.manifest, f"configuration.{name}", f"{before}, as in this run", str(now), DISCARD
+            )
+    union: dict[str, Any] = {
+        name: tuple(dict.fromkeys((*getattr(earlier, name), *getattr(config, name))))
+        for name in ("methods", "seeds", "tasks", "metrics", "metric_profiles")
+    }
+    named = {condition.name: condition for condition in (*earlier.conditions, *config.conditions)}
+    for condition in config.conditions:
+        before_methods = {c.name: c.methods for c in earlier.conditions}.get(condition.name)
+        if before_methods is not None:
+            both = () if () in (before_methods, condition.methods) else (*before_methods, *condition.methods)
+            named[condition.name] = replace(condition, methods=tuple(dict.fromkeys(both)))
+    frames = (earlier.frames_per_task, config.frames_per_task)
+    return replace(
+        config,
+        **union,
+        conditions=tuple(named.values()),
+        settings={**earlier.settings, **config.settings},
+        frames_per_task=None if None in frames else max(frames),  # type: ignore[type-var]
+    )
+
+
+def _same_place(first: str, second: str) -> bool:
+    return bool(first and second) and Path(first).resolve() == Path(second).resolve()
+
+
+def check_settings(cells: Iterable[tuple[ResolvedMethod, Condition]]) -> None:
+    """Create each method of some cells, and let it refuse its settings before anything that takes long.
+
+    Raises `InputError` for settings that a method refuses, and whatever importing or creating it raises.
+    """
+    for method, _ in cells:
+        made = method.create()
+        if isinstance(made, CheckedMethod):
+            made.check(None, method.budget)
 
 
 def write_reports(run_folder: Path) -> list[Path]:
@@ -142,61 +227,88 @@ def write_reports(run_folder: Path) -> list[Path]:
 
 def make_jobs(
     config: RunConfig,
-    methods: Sequence[ResolvedMethod],
+    cells: Sequence[tuple[ResolvedMethod, Condition]],
     clips: Sequence[Clip],
     protocols: Mapping[str, Protocol],
     folder: RunFolder,
     out: Path | None = None,
 ) -> list[Job]:
-    """Make the cells of a comparison, each clip in the form that its method needs; first make sure that all can be had.
+    """Make the cells of a run, each clip in the form that its method and condition need.
 
     Parameters
     ----------
-    folder : run folder of the cells.
-    out : where to keep what took long in adapting clips, its lock is held; what ``folder`` kept is copied there first,
-        since nothing is written in a run by what looks at it. None: ``folder`` itself.
+    cells : sequence of (ResolvedMethod, Condition)
+        See `resolve_cells`.
+    folder : RunFolder
+        Run folder of the cells.
+    out : Path, optional
+        Where to keep what took long in adapting clips, its lock is held; what ``folder`` kept is copied there first, since
+        nothing is written in a run by what looks at it. Default: ``folder`` itself.
+
+    Raises
+    ------
+    InputError
+        For a region that a clip does not know, and for a form that a clip cannot be brought into.
     """
     regions = {clip.subject: check_regions(clip, config.regions) if protocols else () for clip in clips}
-    adapted = _adapt(clips, methods, config, folder, RunFolder(out or folder.root))
+    forms = _Forms(config, folder, RunFolder(out or folder.root))
+    forms.plan([(clip, method, condition) for clip in clips for method, condition in cells])
+    source = RunFolder(Path(config.source)) if config.source else None
     return [
         Job(
             clip,
             method,
             seed,
             config.device,
-            folder.cell(clip.subject, method.spec.name, seed),
+            folder.cell(clip.subject, label_of(method.spec.name, condition.name), seed),
             protocols,
-            adapted.get((clip.subject, MethodNeeds.of(method.spec))),
+            forms.of(clip, method, condition),
             regions[clip.subject],
+            condition,
+            None if source is None else source.cell(clip.subject, method.spec.name, seed),
         )
         for clip in clips
-        for method in methods
+        for method, condition in cells
         for seed in config.seeds
     ]
 
 
-def _adapt(
-    clips: Sequence[Clip],
-    methods: Sequence[ResolvedMethod],
-    config: RunConfig,
-    run: RunFolder,
-    out: RunFolder,
-) -> dict[tuple[str, MethodNeeds], AdaptedClip]:
-    """Bring every clip into every form that a method needs, once each."""
-    planned = {}
-    for clip in clips:
-        for needs in {MethodNeeds.of(method.spec): None for method in methods}:
-            step = adaptation.plan(clip, needs, config.heads)
-            if step is not None:
-                planned[clip.subject, needs] = step
-    with output_inside(out.root):
-        if out.root != run.root:
-            for subject in {subject for subject, _ in planned}:
-                _copy_kept(run.adapted / subject, out.adapted / subject)
-        return {
-            (subject, needs): adaptation.carry_out(step, needs, out.adapted / subject, f"adapting {subject}")
-            for (subject, needs), step in planned.items()
-        }
+class _Forms:
+    """Clips in the forms that methods and conditions need, each made once."""
+
+    def __init__(self, config: RunConfig, run: RunFolder, out: RunFolder):
+        self._config, self._run, self._out = config, run, out
+        self._changed: dict[str, Clip] = {}
+        self._made: dict[tuple[str, MethodNeeds], AdaptedClip] = {}
+
+    def plan(self, cells: Sequence[tuple[Clip, ResolvedMethod, Condition]]) -> None:
+        """Check that every form can be had, then make them."""
+        planned = {}
+        for clip, method, condition in cells:
+            changed, needs = self._clip(clip, condition), MethodNeeds.of(method.spec)
+            if (changed.fingerprint, needs) not in planned:
+                step = adaptation.plan(changed, needs, self._config.heads)
+                planned[changed.fingerprint, needs] = (changed, step)
+        with output_inside(self._out.root):
+            if self._out.root != self._run.root:
+                for subject in {changed.subject for changed, step in planned.values() if step is not None}:
+                    _copy_kept(self._run.adapted / subject, self._out.adapted / subject)
+            for (fingerprint, needs), (changed, step) in planned.items():
+                if step is not None:
+                    folder, label = self._out.adapted / changed.subject, f"adapting {changed.subject}"
+                    self._made[fingerprint, needs] = adaptation.carry_out(step, needs, folder, label)
+
+    def of(self, clip: Clip, method: ResolvedMethod, condition: Condition) -> AdaptedClip | None:
+        """The form of a clip; None where it is the clip itself."""
+        changed = self._clip(clip, condition)
+        made = self._made.get((changed.fingerprint, MethodNeeds.of(method.spec)))
+        return made or (None if changed is clip else AdaptedClip(changed))
+
+    def _clip(self, clip: Clip, condition: Condition) -> Clip:
+        key = digest(clip.fingerprint, asdict(condition.clip))
+        if key not in self._changed:
+            self._changed[key] = changed(clip, condition.clip, self._config)
+        return self._changed[key]
 
 
 def _copy_kept(source: Path, folder: Path) -> None:
@@ -213,16 +325,21 @@ def _copy_kept(source: Path, folder: Path) -> None:
 def run_jobs(jobs: Sequence[Job], metrics: Sequence[MetricSpec]) -> Rows:
     """Fit, render and measure cell by cell, under one line of progress; a cell that fails has failed rows."""
     with run_progress({job.name: steps_ahead(job, metrics) for job in jobs}) as line:
-        return Rows.joined([_run_cell(replace(job, line=line), metrics) for job in jobs])
+        return Rows.joined([_run_inline(replace(job, line=line), metrics) for job in jobs])
 
 
-def _run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
+def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
+    """Train or derive the avatar of a cell, render its frames and measure them; each stage continues where it was."""
+    avatar = fit(job) if job.source is None else derive(job)
+    render(job, avatar)
+    return measure(job, avatar, metrics)
+
+
+def _run_inline(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
     log.info("%s", job.name)
     outcome_path(job.cell.folder).unlink(missing_ok=True)  # of a process or a job that worked on it earlier
     try:
-        avatar = fit(job)
-        render(job, avatar)
-        return measure(job, avatar, metrics)
+        return run_cell(job, metrics)
     except HeadbenchError as error:
         log.error("%s failed: %s", job.name, error)
         return failed_rows(job, metrics, reason_of(error))
@@ -230,6 +347,8 @@ def _run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
         log.exception("%s failed", job.name)
         check_device_answers(job.device)
         return failed_rows(job, metrics, reason_of(error))
+    finally:
+        job.created.clear()  # so that a run does not hold every method that it has created
 
 
 def warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
@@ -264,7 +383,7 @@ def check_capture(config: RunConfig, clip: Clip) -> None:
 
 def describe(
     config: RunConfig,
-    methods: Sequence[ResolvedMethod],
+    cells: Sequence[tuple[ResolvedMethod, Condition]],
     metrics: Sequence[MetricSpec],
     clips: Sequence[Clip],
     protocols: Mapping[str, Protocol],
@@ -273,7 +392,10 @@ def describe(
     return Manifest(
         configuration=config,
         paths=relative_paths(config),
-        methods=tuple(MethodRecord(**method.record()) for method in methods),
+        methods=tuple(
+            MethodRecord(**method.record(), condition=condition.name, change=condition.summary)
+            for method, condition in cells
+        ),
         metrics=tuple(metrics),
         clips=tuple(
             ClipRecord(
@@ -310,12 +432,12 @@ def trained(
         there or whose training did not end, and a run without any avatar to look at.
     """
     folder = RunFolder(run)
-    resolved = resolve_methods(run_configuration(run, options))
-    names = [method.spec.name for method in resolved]
+    resolved = [cell for cell in resolve_cells(run_configuration(run, options)) if not cell[1].name]
+    names = [method.spec.name for method, _ in resolved]
     for name in methods:
         if name not in names:
             raise InputError(folder.manifest, "methods", ", ".join(names), name)
-    wanted = [m for m in resolved if (m.spec.name in methods if methods else not m.spec.trivial)]
+    wanted = [(m, c) for m, c in resolved if (m.spec.name in methods if methods else not m.spec.trivial)]
     if not wanted:
         raise InputError(folder.manifest, "methods", "a method that is no trivial baseline", ", ".join(names))
     config, clips = open_run_clips(run, options, out=out, only=only)
@@ -329,6 +451,6 @@ def trained(
 
 
 def load(job: Job) -> Avatar:
-    """Read the avatar of a cell."""
-    avatar: Avatar = job.method.create().load(job.cell.avatar, device=job.device)
+    """Read the avatar of a cell, which was trained for it or for its source."""
+    avatar: Avatar = job.create().load((job.source or job.cell).avatar, device=job.device)
     return avatar

@@ -10,6 +10,7 @@ from typing import Any
 
 import pandas as pd
 
+from ..condition import label_of
 from ..contracts import Progress
 from ..errors import InputError
 from ..executors.settings import is_speed
@@ -19,7 +20,7 @@ from ..progress import log_to_file
 from ..rows import ALL, Rows
 from ..specs import Findings, MetricSpec
 from .captures import open_run_clips
-from .config import RunOptions, resolve_methods, resolve_metrics
+from .config import RunOptions, resolve_cells, resolve_metrics
 from .run import load, make_jobs, write_reports
 from .steps import Job, measure, reason_of
 from .store import RunFolder
@@ -74,7 +75,8 @@ def measure_speed_again(
     folder.read_manifest().check_done(folder.manifest)
     with locked(folder.root), log_to_file(folder.root / "run.log"):
         jobs, metrics = _jobs(folder, options, methods)
-        rows = folder.read_rows(folder.read_manifest())
+        folder.read_rows(folder.read_manifest())
+        rows = Rows.read(folder.rows)
         changes: list[Change] = []
         failures: dict[str, str] = {}
         left_out = [job.name for job in jobs if _failed(rows, job)]
@@ -124,14 +126,12 @@ def _jobs(
     if not any(map(is_speed, metrics)):
         found = ", ".join(spec.name for spec in metrics)
         raise InputError(folder.manifest, "metrics", "a metric of speed, such as fps", found)
-    known = {method.spec.name: method for method in resolve_methods(config)}
-    if names := [method.name for method in manifest.methods if method.name not in known]:
-        expected = "those of a plain run: the avatars of others were derived, or trained in part"
-        raise InputError(folder.manifest, "methods", expected, ", ".join(names))
+    cells = [cell for cell in resolve_cells(config) if not cell[1].derive]
+    known = dict.fromkeys(method.spec.name for method, _ in cells)
     for name in methods:
         if name not in known:
             raise InputError(folder.manifest, "methods", ", ".join(known), name)
-    chosen = [method for name, method in known.items() if not methods or name in methods]
+    chosen = [cell for cell in cells if not methods or cell[0].spec.name in methods]
     protocols = {task: record.protocol(folder.manifest) for task, record in manifest.protocols.items()}
     use_device(config.device)
     return make_jobs(config, chosen, clips, protocols, folder), metrics
@@ -142,7 +142,7 @@ def _with_cells(rows: Rows, folder: RunFolder, metrics: Sequence[MetricSpec]) ->
 
     They differ where an earlier call was killed after it had written a cell's file and before it wrote the run's.
     """
-    table = rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    table = rows.select(method=ALL, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
     failed = set(_cells(table[table["status"] == "failed"]))
     again: list[Rows] = []
     for place in _cells(table):
@@ -157,15 +157,16 @@ def _with_cells(rows: Rows, folder: RunFolder, metrics: Sequence[MetricSpec]) ->
 
 
 def _cells(table: pd.DataFrame) -> list[tuple[str, str, int]]:
-    """Subject, method and seed of rows, each once."""
-    places = table[["subject", "method", "seed"]].drop_duplicates()
-    return [(str(subject), str(method), int(seed)) for subject, method, seed in places.to_numpy()]
+    """Subject, label of method and condition, and seed of rows, each once."""
+    places = table[["subject", "method", "condition", "seed"]].drop_duplicates()
+    return [(str(s), label_of(str(m), str(c)), int(seed)) for s, m, c, seed in places.to_numpy()]
 
 
 def _failed(rows: Rows, job: Job) -> bool:
     """Whether the run has failed rows of a cell."""
     own = rows.select(
         method=job.method.spec.name,
+        condition=job.condition.name,
         metric=ALL,
         task=ALL,
         region=ALL,
@@ -200,7 +201,7 @@ def _changes(job: Job, metrics: Sequence[MetricSpec], before: Rows, after: Rows)
         old, new = (_row_of(rows, job, metric) for rows in (before, after))
         yield Change(
             job.clip.subject,
-            job.method.spec.name,
+            job.label,
             job.seed,
             metric.name,
             metric.unit,
@@ -213,7 +214,13 @@ def _changes(job: Job, metrics: Sequence[MetricSpec], before: Rows, after: Rows)
 def _row_of(rows: Rows, job: Job, metric: MetricSpec) -> pd.Series[Any]:
     method, subject = job.method.spec.name, job.clip.subject
     found = rows.select(
-        method=method, metric=metric.name, task="", region=ALL, seeds=(job.seed,), subject=subject
+        method=method,
+        condition=job.condition.name,
+        metric=metric.name,
+        task="",
+        region=ALL,
+        seeds=(job.seed,),
+        subject=subject,
     )
     if len(found) != 1:
         raise InputError("rows", f"{metric.name} of {job.name}", "one row", f"{len(found)}")

@@ -8,14 +8,14 @@ import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from ..condition import PLAIN, Condition, label_of
 from ..contracts import (
     Avatar,
-    Budget,
     Camera,
     CheckedMethod,
     Clip,
@@ -28,19 +28,20 @@ from ..contracts import (
     Progress,
 )
 from ..errors import HeadbenchError, InputError, UnavailableError, is_damage
-from ..io.files import check_name, digest, digest_file, grouped_writes, refuse_links
+from ..io.files import digest, digest_file, grouped_writes, refuse_links
 from ..io.images import quantise, read_png, write_png
 from ..machine import PeakMemory, ProcessorLoad, machine_name, processor_seconds, use_device
 from ..progress import RunProgress, duration, progress
 from ..protocol import Protocol
+from ..registry import get, resolve
 from ..rows import ALL, Row, Rows
 from ..source import code_digest, is_outside
-from ..specs import MetricSpec
+from ..specs import ConditionSpec, MetricSpec
 from .adaptation import AdaptedClip, TrainingView
 from .config import ResolvedMethod
 from .scoring import FULL, ScoredFrames, make_metric, score_frames
-from .store import Cell, RunFolder, StepState, avatar_files
-from .stored import VARIANT_MARK, shown_by, write_avatar_record
+from .store import Cell, StepState, avatar_files
+from .stored import shown_by, write_avatar_record
 
 log = logging.getLogger(__name__)
 RESULT_FORMAT = 1  # raise when a step changes what it leaves behind
@@ -54,8 +55,9 @@ RECORD_EVERY_S = 10.0
 class Job:
     """One cell with all it needs.
 
-    ``clip`` is what is compared: the ground truth of every metric. ``adapted`` is its form for this method, None where
-    that is the clip itself. ``regions`` are measured beside the whole frame. ``line`` shows the progress of the run.
+    ``clip`` is what is compared: the ground truth of every metric. ``adapted`` is its form for this method and condition, None
+    where that is the clip itself. ``regions`` are measured beside the whole frame. ``source`` is the cell whose avatar is taken
+    instead of training. ``line`` shows the progress of the run.
     """
 
     clip: Clip
@@ -66,7 +68,16 @@ class Job:
     protocols: Mapping[str, Protocol]
     adapted: AdaptedClip | None = None
     regions: tuple[str, ...] = ()
+    condition: Condition = PLAIN
+    source: Cell | None = None
     line: RunProgress | None = None
+    created: list[Any] = field(default_factory=list, repr=False, compare=False)
+
+    def create(self) -> Any:
+        """The `Method` of this cell, created when it is first asked for."""
+        if not self.created:
+            self.created.append(self.method.create())
+        return self.created[0]
 
     def progress(self, step: str) -> AbstractContextManager[Progress]:
         """The progress of a step: of the run if this is a cell of one, else of its own."""
@@ -79,14 +90,19 @@ class Job:
 
     @property
     def name(self) -> str:
-        return f"{self.clip.subject} {self.method.spec.name} seed {self.seed}"
+        return f"{self.clip.subject} {self.label} seed {self.seed}"
+
+    @property
+    def label(self) -> str:
+        """The method with the condition, as tables and folders name it."""
+        return label_of(self.method.spec.name, self.condition.name)
 
     @property
     def fit_fingerprint(self) -> str:
         """Digest of everything the trained avatar depends on."""
-        return digest(
-            RESULT_FORMAT, self.method.identity(), self.seed, self.device, self.form.clip.fingerprint
-        )
+        made_of = {**self.method.identity(), "name": self.label}
+        derived = [asdict(self.condition.derive)] if self.condition.derive else []
+        return digest(RESULT_FORMAT, made_of, self.seed, self.device, self.form.clip.fingerprint, *derived)
 
     @property
     def frame_paths(self) -> dict[Path, tuple[Protocol, FrameKey]]:
@@ -97,20 +113,6 @@ class Job:
             for key in protocol.keys
             if key.subject == self.clip.subject
         }
-
-    def variant(self, name: str, folder: RunFolder, *, budget: Budget | None = None) -> Job:
-        """The cell of a variant of the method, "METHOD+NAME", or of the method itself (""), in another folder.
-
-        ``budget`` None: that of the method. Raises `InputError` for what cannot name a folder.
-        """
-        spec = self.method.spec
-        if name:
-            name = check_name(
-                f"{spec.name}{VARIANT_MARK}{name}", spec.variants or spec.name, "name of a variant"
-            )
-        spec = replace(spec, name=name or spec.name)
-        method = replace(self.method, spec=spec, budget=budget or self.method.budget)
-        return replace(self, method=method, cell=folder.cell(self.clip.subject, spec.name, self.seed))
 
     def check(self) -> None:
         """Refuse a folder that holds an avatar made of something else, or by other code, or links out of it.
@@ -140,7 +142,7 @@ class Job:
 
     def check_method(self) -> None:
         """Let a method that can tell refuse what it could not train or render; not where all is done already."""
-        method = self.method.create()
+        method = self.create()
         if isinstance(method, CheckedMethod) and not self.cell.is_done("measure", self.fit_fingerprint):
             method.check(TrainingView(self.form.clip), self.method.budget)
 
@@ -150,8 +152,8 @@ def steps_ahead(job: Job, metrics: Sequence[MetricSpec]) -> dict[str, str]:
     trained = job.cell.is_done("fit", job.fit_fingerprint)
     if trained and job.cell.is_done("measure", job.fit_fingerprint):
         return {}
-    method = job.method.spec.name
-    steps = {} if trained else {TRAINING: method}
+    method = job.label
+    steps = {} if trained or job.source is not None else {TRAINING: method}
     steps[RENDERING] = method
     if any(spec.per_frame for spec in metrics):
         steps |= {f"measuring {task}": "" for task in job.protocols}
@@ -166,7 +168,7 @@ def fit(job: Job) -> Avatar:
     A method sees the images of the training split alone. The record's seconds are those since the last of ``interruptions``. An avatar
     with damaged files is trained again, with a warning.
     """
-    method = job.method.create()
+    method = job.create()
     earlier = job.cell.step("fit")
     if earlier is not None and earlier["status"] == "done":
         damaged = job.cell.damage(earlier.get("files", {}))
@@ -220,6 +222,32 @@ def fit(job: Job) -> Avatar:
     else:
         log_kept(job)
     avatar: Avatar = method.load(job.cell.avatar, device=job.device)
+    return avatar
+
+
+def derive(job: Job) -> Avatar:
+    """Take the avatar of the job's ``source``, or what its condition derives from that without training.
+
+    Raises `InputError` where the source has no trained avatar.
+    """
+    assert job.source is not None
+    state = job.source.step("fit")
+    if state is None or state["status"] != "done":
+        found = "none" if state is None else "one whose training did not end"
+        raise InputError(job.source.folder, "fit.json", "a trained avatar", found, "Start the run again.")
+    derived_from = digest(state["fingerprint"], state.get("files"))
+    change, clip = job.condition.derive, job.form.clip
+    if change:
+        spec: ConditionSpec = get("conditions", change.name)
+        avatar: Avatar = resolve(spec.implementation)(
+            job.method.spec, job.source.avatar, job.cell.avatar, clip, job.device, **change.parameters
+        )
+        origin = {"variant": job.condition.name, "of": derived_from}
+        write_avatar_record(job.cell.avatar, job.method, *shown_by(clip), "variant", origin)
+    else:
+        avatar = job.create().load(job.source.avatar, device=job.device)
+    files = job.cell.digests(path for path in job.cell.avatar.rglob("*") if path.is_file())
+    job.cell.finish("fit", job.fit_fingerprint, derived_from=derived_from, files=files)
     return avatar
 
 
@@ -366,7 +394,7 @@ def measure(
     repeated = {spec.implementation for spec in again}
     rendered = recorded_frames(job)
     earlier = {
-        spec.name: old.select(method=ALL, metric=spec.name, task=ALL, region=ALL, seeds=ALL)
+        spec.name: old.select(method=ALL, condition=ALL, metric=spec.name, task=ALL, region=ALL, seeds=ALL)
         for spec in metrics
     }
     fingerprints = {spec.name: _measure_fingerprint(job, spec, rendered) for spec in metrics}
@@ -424,7 +452,7 @@ def measure(
 
 def _replaced(rows: Rows) -> dict[str, Any]:
     """Values of a cell that are about to be replaced, and how they were measured, as its record keeps them."""
-    table = rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    table = rows.select(method=ALL, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
     table = table[table["status"] == "ok"]
     first = table.iloc[0]
     conditions = {name: first[name].item() for name in ("threads", "other_cores")}
@@ -599,4 +627,5 @@ def _row(
         protocol=protocol.hash if protocol else "",
         status=status,
         reason=reason,
+        condition=job.condition.name,
     )

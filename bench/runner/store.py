@@ -3,7 +3,7 @@
 ::
 
     run.json                      resolved configuration, machine, hashes of protocols, fingerprints
-    protocols/<hash>.json         frames and rules of a task; also found in the folder above, for several runs
+    protocols/<hash>.json         frames and rules of a task
     run.log
     rows.parquet                  one row per method, seed, frame and metric
     <subject>/<method>/seed-<n>/
@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, Required
 
@@ -174,6 +174,17 @@ def _kept_design(manifest: Manifest) -> dict[str, str]:
     }
 
 
+def _has_all_frames(planned: Manifest, earlier: Manifest, key: str) -> bool:
+    """Whether a planned run scores the frames that an earlier one scored of the same captures, and possibly more."""
+    if key == "tasks":
+        return set(earlier.protocols) <= set(planned.protocols)
+    task = key.rpartition(" ")[2]
+    new, old = planned.protocols.get(task), earlier.protocols.get(task)
+    if new is None or old is None:
+        return new is not None
+    return set(old.keys) <= set(new.keys) and replace(new, keys=old.keys, hash=old.hash) == old
+
+
 def avatar_files(folder: Path) -> list[Path]:
     """Files of an avatar's folder, sorted, without logs of official programs and files of operating systems."""
     files = (path for path in folder.rglob("*") if path.is_file() and path.suffix != ".log")
@@ -240,16 +251,17 @@ class RunFolder:
             return
         earlier.check_kept(
             self.rows,
-            method=[method.name for method in planned.methods],
+            method=dict.fromkeys(method.name for method in planned.methods),
             seed=planned.configuration.seeds,
             metric=[metric.name for metric in planned.metrics],
         )
         try:
-            before = _kept_design(self.read_manifest())
+            manifest = self.read_manifest()
+            before = _kept_design(manifest)
         except InputError:
             return  # not readable; rows that would be lost are an error of `write_rows`
         for key, value in _kept_design(planned).items():
-            if value != before.get(key):
+            if value != before.get(key) and not _has_all_frames(planned, manifest, key):
                 raise InputError(self.rows, key, f"{before.get(key)}, as in the earlier run", value, DISCARD)
 
     def write_rows(self, rows: Rows) -> None:
@@ -266,10 +278,13 @@ class RunFolder:
         return Manifest.read(self.manifest)
 
     def read_rows(self, manifest: Manifest) -> Rows:
-        """Read ``rows.parquet``. Raises `InputError` for rows of methods, metrics and tasks that the run does not have."""
-        rows = Rows.read(self.rows)
+        """Read ``rows.parquet``, each method under a condition by its label, see `Rows.labelled`.
+
+        Raises `InputError` for rows of methods, metrics and tasks that the run does not have.
+        """
+        rows = Rows.read(self.rows).labelled()
         for what, found, known in (
-            ("method", rows.methods, {method.name for method in manifest.methods}),
+            ("method", rows.methods, {method.label for method in manifest.methods}),
             ("metric", rows.metrics, {metric.name for metric in manifest.metrics}),
             ("task", rows.tasks, manifest.protocols.keys()),
         ):

@@ -35,8 +35,6 @@ TRAINING_FILE = "training.json"
 """Where methods record how a training went. Its "losses", if any, are pairs of an iteration and the loss up to there."""
 SAME_SHAPE = 1e-4
 """Largest difference of two shape coefficients of one subject; files hold float32."""
-VARIANT_MARK = "+"
-"""Between the name of a method and what makes a variant of it."""
 
 Maker = Literal["training", "import", "compact", "variant"]
 
@@ -104,9 +102,8 @@ def shown_by(clip: Clip) -> tuple[str, FloatArray, str]:
 
 
 def registered_name(method: ResolvedMethod) -> str:
-    """Name of a method without what its settings or a variant add to it."""
-    label = getattr(method.config, "label", "")
-    name = method.spec.name.partition(VARIANT_MARK)[0]
+    """Name of a method without what its settings add to it."""
+    label, name = getattr(method.config, "label", ""), method.spec.name
     return name.removesuffix(f" ({label})") if label else name
 
 

@@ -1,142 +1,77 @@
-"""Trains the methods of a run with parts of their budgets and measures them on held-out training frames."""
+"""The points of a curve, read from the run of all its trainings: a table, ``curve.csv`` and ``curve.png``."""
 
 from __future__ import annotations
 
-import logging
-import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
-from itertools import product
 from pathlib import Path
 from typing import Any
 
-from ...bench.contracts import Budget, Clip
-from ...bench.errors import InputError
+from ...bench.condition import Condition
+from ...bench.contracts import Budget
 from ...bench.io.files import write_text
-from ...bench.machine import check_device
-from ...bench.manifest import MethodRecord
-from ...bench.protocol import Protocol, make_protocols
-from ...bench.rows import ALL, Rows, earlier_rows
-from ...bench.runner.captures import open_run_clips, run_configuration
-from ...bench.runner.config import ResolvedMethod, RunConfig, resolve_methods, resolve_metrics
-from ...bench.runner.run import describe, make_jobs, run_jobs, warn_of_missing_metrics
+from ...bench.manifest import ClipRecord, MethodRecord
+from ...bench.rows import ALL, Rows
 from ...bench.runner.scoring import FULL
-from ...bench.runner.steps import Job
-from ...bench.runner.store import RunFolder
-from ...bench.runner.stored import VARIANT_MARK
 from ...bench.specs import Findings, MetricSpec
 from ..aggregate import subject_means
+from ..runs import RunData
 from ..writers import csv_text
-from .command import CurveSettings
-from .held_out import CAMERA, TIMESTEPS, HeldOutClip, hold_out, reduced
 from .plot import CurvePanel, write_plot
 from .points import HELD_OUT, MEASURED, CurvePoint, column, mean, mean_point, points_text
-from .tracking import clips_by_level, tracking_error
 
-log = logging.getLogger(__name__)
 AXES = {
     "cameras": "Training cameras",
     "timesteps": "Training timesteps",
     "tracking_error": "Level of tracking error",
 }
-METRICS: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "primitives")
-"""Metrics of a curve, whether the run took them or not, as the canonical profile defines them."""
 
 
-def curve(settings: CurveSettings, out: Path) -> Findings:
-    """Train, measure, write ``curve.csv`` and ``curve.png`` into ``out``, whose lock is held; return points and a table.
+def curve_report(out: Path, over: str) -> Findings:
+    """Write ``curve.csv`` and ``curve.png`` of the run in ``out``; return its points and a table of their means.
 
-    Started again, it keeps trainings that ended. One that was interrupted begins again, since its time is asked for.
+    Parameters
+    ----------
+    over : str
+        What the trainings were given parts of: "budget", "cameras", "timesteps" or "tracking_error".
 
     Raises
     ------
     InputError
-        For a method that the run does not have or that has no budget, a capture that is not the run's or has too few
-        frames to hold some out, and a folder with trainings of other settings, or with some that would be left out.
+        For a folder that is not the run of a curve.
     """
-    run = RunFolder(Path(settings.run))
-    wanted = _wanted(settings, run)
-    config, clips = open_run_clips(run.root, settings, out=out)
-    programs = [method.spec.name for method in wanted if not method.spec.native]
-    if programs and not settings.trust:
-        expected = "methods that run no program which the run folder names"
-        remedy = "Give --trust to run it, if you trust who made the run; or name other methods."
-        raise InputError(run.manifest, "configuration.settings", expected, ", ".join(programs), remedy)
-    check_device(config.device)
-    held = [hold_out(clip, settings.camera, settings.every) for clip in clips]
-    tasks = tuple(task for task in (CAMERA, TIMESTEPS) if all(task in clip.splits for clip in held))
-    config = replace(
-        config,
-        tasks=tasks,
-        frames_per_task=settings.frames,
-        metrics=METRICS,
-        metric_profiles=("canonical",),
-        regions=(),
+    run = RunData.read(out)
+    config = run.manifest.configuration
+    conditions = {condition.name: condition for condition in config.conditions}
+    tasks, metrics = run.tasks, run.metrics
+    points = [
+        _point(run, record, conditions[record.condition], clip)
+        for record in run.manifest.methods
+        for clip in run.manifest.clips
+    ]
+    names = list(dict.fromkeys(point.method for point in points))
+    order = [clip.subject for clip in run.manifest.clips]
+    points.sort(
+        key=lambda p: (names.index(p.method), p.part, p.tracking_error or 0.0, order.index(p.subject))
     )
-    metrics = resolve_metrics(config)
-    subjects: list[Clip] = [*held]
-    protocols = make_protocols(tasks, subjects, settings.frames)
-    folder = RunFolder(out)
-    hashes = [protocol.hash for protocol in protocols.values()]
-    earlier = earlier_rows(folder.rows)
-    if earlier is not None and settings.over == "tracking_error":
-        # Before the tracking of new levels is written.
-        names = [
-            f"{method.spec.name}{VARIANT_MARK}{_of_level(level)}"
-            for method, level in product(wanted, settings.tracking_errors)
-        ]
-        earlier.check_kept(folder.rows, method=names, protocol=hashes)
-    trainings = _trainings(config, settings, wanted, held, protocols, run, folder)
-    jobs = [job for training in trainings for job in training.jobs]
-    for job in jobs:
-        job.check()
-        job.check_method()
-    if earlier is not None:
-        earlier.check_kept(
-            folder.rows,
-            method=dict.fromkeys(job.method.spec.name for job in jobs),
-            seed=config.seeds,
-            protocol=hashes,
-        )
-    warn_of_missing_metrics(metrics, held[0])
-    manifest = replace(
-        describe(config, [], metrics, subjects, protocols),
-        methods=tuple({job.method.spec.name: MethodRecord(**job.method.record()) for job in jobs}.values()),
-        curve_of=settings.run,
-    )
-    manifest.write(folder.manifest)
-    for job in jobs:
-        _drop_interrupted(job)
-    rows = run_jobs(jobs, metrics)
-    folder.write_rows(rows)
-    replace(manifest, status="done").write(folder.manifest)
-
-    names, order = [m.spec.name for m in wanted], [clip.subject for clip in clips]
-    trainings.sort(
-        key=lambda t: (
-            names.index(t.method.spec.name),
-            t.part,
-            tracking_error(t.clip) or 0.0,
-            order.index(t.clip.subject),
-        )
-    )
-    points = [_point(training, rows, metrics, tasks) for training in trainings]
     groups: dict[tuple[str, Fraction, float | None], list[CurvePoint]] = {}
     for point in points:
         groups.setdefault((point.method, point.part, point.tracking_error), []).append(point)
     means = [mean_point(group) for group in groups.values()]
-    missing = {spec.label: _reason(rows, spec) for spec in metrics if spec.per_frame and _reason(rows, spec)}
+    missing = {
+        spec.label: _reason(run.rows, spec) for spec in metrics if spec.per_frame and _reason(run.rows, spec)
+    }
     write_text(out / "curve.csv", csv_text(_lines(points)))
     clock = "processor_seconds" if config.device == "cpu" else "seconds"
-    where = f"{settings.every}th training timestep" if settings.every > 2 else "second training timestep"
+    every = config.clip.parameters["every"]
+    where = f"{every}th training timestep" if every > 2 else "second training timestep"
     axis = f"{'Processor seconds' if clock == MEASURED[0] else 'Seconds'} of training"
-    axis = axis if settings.over == "budget" else AXES[settings.over]
+    axis = axis if over == "budget" else AXES[over]
     write_plot(
         out / "curve.png",
         [
             [
-                _panel(means, spec, task, clock if settings.over == "budget" else settings.over, missing)
+                _panel(means, spec, task, clock if over == "budget" else over, missing)
                 for spec in metrics
                 if spec.per_frame
             ]
@@ -144,158 +79,61 @@ def curve(settings: CurveSettings, out: Path) -> Findings:
         ],
         axis,
         f"Held out of every training: a training camera, every {where}. No test frame was looked at."
-        + (f" Bars: 95 % intervals of the mean over {len(clips)} subjects." if len(clips) > 1 else ""),
+        + (f" Bars: 95 % intervals of the mean over {len(order)} subjects." if len(order) > 1 else ""),
     )
+    held = {clip.subject: _step(clip.steps, "hold_out") for clip in run.manifest.clips}
+    failed = run.rows.failed
     data = {
         "out": out,
-        "held_out": {clip.subject: clip.steps[-1].parameters for clip in held},
+        "held_out": held,
         "points": [point.flat() for point in points],
         "missing": missing,
-        "failed": rows.failed,
+        "failed": failed,
     }
-    return Findings(points_text(means, metrics, tasks, held, missing, rows.failed), data, not rows.failed)
+    return Findings(points_text(means, metrics, tasks, held, missing, failed), data, not failed)
 
 
-def _wanted(settings: CurveSettings, run: RunFolder) -> list[ResolvedMethod]:
-    """The methods to train, each with a budget."""
-    trained = {record.name for record in run.read_manifest().methods}
-    resolved = [m for m in resolve_methods(run_configuration(run.root, settings)) if m.spec.name in trained]
-    names = ", ".join(method.spec.name for method in resolved) or "none that it trained"
-    for name in settings.methods:
-        if name not in [method.spec.name for method in resolved]:
-            raise InputError(run.manifest, "methods", f"methods of the run: {names}", name)
-    wanted = [
-        m for m in resolved if (m.spec.name in settings.methods if settings.methods else not m.spec.trivial)
-    ]
-    if not wanted:
-        raise InputError(run.manifest, "methods", "a method that is no trivial baseline", names)
-    for method in wanted:
-        if method.budget == Budget():
-            expected = "iterations or seconds, to train with a part of"
-            raise InputError(
-                run.manifest,
-                f"budget of {method.spec.name}",
-                expected,
-                "none",
-                "Name other methods with --methods.",
-            )
-        method.create()
-    return wanted
-
-
-def _budgets(whole: Budget, parts: Iterable[Fraction]) -> dict[Budget, Fraction]:
-    """Parts of a budget by what they come to, an iteration at least; the largest of those that come to the same."""
-    return {
-        Budget(
-            None if whole.iterations is None else max(1, round(whole.iterations * part)),
-            None if whole.seconds is None else whole.seconds * float(part),
-        ): part
-        for part in parts
-    }
-
-
-@dataclass(frozen=True)
-class _Given:
-    """What a training is given: ``part`` of its budget or of the frames, and ``clips``, one for each subject."""
-
-    name: str
-    part: Fraction
-    clips: Sequence[HeldOutClip]
-
-
-@dataclass(frozen=True)
-class _Training:
-    """A method with its whole budget, and what it is given of that and of the frames: a job for each seed."""
-
-    method: ResolvedMethod
-    part: Fraction
-    clip: HeldOutClip
-    jobs: tuple[Job, ...]
-
-
-def _given(settings: CurveSettings, config: RunConfig, held: Sequence[HeldOutClip]) -> Iterator[_Given]:
-    """What the trainings are given besides parts of their budgets; the whole first."""
-    if settings.over == "budget":
-        yield _Given("", Fraction(1), held)
-    elif settings.over == "tracking_error":
-        for level, clips in clips_by_level(config, [clip.source for clip in held], settings.tracking_errors):
-            found = [hold_out(clip, settings.camera, settings.every) for clip in clips]
-            yield _Given(_of_level(level), Fraction(1), found)
-    else:
-        for part in reversed(settings.parts):
-            yield _Given(_named(part), part, [reduced(clip, settings.over, part) for clip in held])
-
-
-def _of_level(level: float) -> str:
-    return f"tracking-{level:g}"
-
-
-def _named(part: Fraction) -> str:
-    return str(part).replace("/", "-")
-
-
-def _trainings(
-    config: RunConfig,
-    settings: CurveSettings,
-    wanted: Sequence[ResolvedMethod],
-    held: Sequence[HeldOutClip],
-    protocols: Mapping[str, Protocol],
-    run: RunFolder,
-    folder: RunFolder,
-) -> list[_Training]:
-    """Every training; the whole first: start-up, such as imports, falls where it weighs least."""
-    found: list[_Training] = []
-    different: dict[tuple[str, ...], _Given] = {}
-    for given in _given(settings, config, held):
-        different.setdefault(tuple(clip.fingerprint for clip in given.clips), given)
-    for given in different.values():
-        bases = make_jobs(config, wanted, given.clips, protocols, run, folder.root)
-        for method, (clip, whole) in product(wanted, zip(given.clips, held)):
-            parts = {method.budget: given.part}
-            if settings.over == "budget":
-                parts = _budgets(method.budget, settings.parts)
-            own = [job for job in bases if (job.clip, job.method.spec.name) == (clip, method.spec.name)]
-            for budget, part in reversed(parts.items()):
-                # The frames to measure are those of all trainings, whatever each is given.
-                jobs = [job if clip is whole else replace(job, clip=whole, adapted=job.form) for job in own]
-                name = given.name or _named(part)
-                named = tuple(job.variant(name, folder, budget=budget) for job in jobs)
-                found.append(_Training(method, part, clip, named))
-    return found
-
-
-def _drop_interrupted(job: Job) -> None:
-    """Remove what a killed training left, so that it begins again and its time is known."""
-    state = job.cell.step("fit")
-    if state is not None and state["status"] != "done":
-        if job.cell.avatar.exists():
-            log.info("%s: its training was interrupted; it begins again", job.name)
-            shutil.rmtree(job.cell.avatar)
-        (job.cell.folder / "fit.json").unlink()
-
-
-def _point(
-    training: _Training, rows: Rows, metrics: Sequence[MetricSpec], tasks: Sequence[str]
-) -> CurvePoint:
-    job = training.jobs[0]
-    name, subject = job.method.spec.name, job.clip.subject
-    records: list[Mapping[str, Any]] = [job.cell.step("fit") or {} for job in training.jobs]
-    cost = {key: mean([_number(record.get(key)) for record in records]) for key in MEASURED}
+def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipRecord) -> CurvePoint:
+    seeds = run.manifest.configuration.seeds
+    cells = [run.folder.cell(clip.subject, record.label, seed) for seed in seeds]
+    records: list[Mapping[str, Any]] = [cell.step("fit") or {} for cell in cells]
+    cost = {key: mean([_number(each.get(key)) for each in records]) for key in MEASURED}
     values: dict[str, float | None] = {}
-    for spec in metrics:
-        for task in tasks if spec.per_frame else ("",):
-            chosen = rows.select(
-                method=name, metric=spec.name, task=task, region=FULL, seeds=ALL, subject=subject
+    for spec in run.metrics:
+        for task in run.tasks if spec.per_frame else ("",):
+            chosen = run.rows.select(
+                method=record.label, metric=spec.name, task=task, region=FULL, seeds=ALL, subject=clip.subject
             )
             whole = len(chosen) and (chosen["status"] == "ok").all()
-            values[column(spec, task)] = subject_means(chosen)[subject] if whole else None
-    keys = training.clip.splits["train"]
-    cameras, timesteps = (len({getattr(key, name) for key in keys}) for name in ("camera", "timestep"))
-    method = training.method.spec.name
-    level = tracking_error(training.clip)
-    return CurvePoint(
-        method, subject, training.part, job.method.budget, cameras, timesteps, level, cost, values, {}
+            values[column(spec, task)] = subject_means(chosen)[clip.subject] if whole else None
+    added = next(
+        (a.steps for a in run.manifest.adapted if (a.subject, a.method) == (clip.subject, record.label)), []
     )
+    given = {**_step(clip.steps, "hold_out")["training"], **_step(added, "reduce_training")}
+    part = condition.part if condition.part != 1 else Fraction(condition.clip.parameters.get("part", "1"))
+    return CurvePoint(
+        record.name,
+        clip.subject,
+        part,
+        Budget(**record.budget),
+        len(given["cameras"]),
+        len(given["timesteps"]),
+        condition.clip.parameters.get("level", _tracking_error(clip)),
+        cost,
+        values,
+        {},
+    )
+
+
+def _step(steps: Sequence[Mapping[str, Any]], name: str) -> Mapping[str, Any]:
+    """Parameters of a processing step, none where it was not done."""
+    return next((step["parameters"] for step in steps if step["name"] == name), {})
+
+
+def _tracking_error(clip: ClipRecord) -> float | None:
+    """The level of tracking error of a synthetic capture; None for a recording."""
+    made = clip.steps[0]["parameters"].get("synthetic") if clip.steps else None
+    return float(made.get("tracking_error", 0.0)) if made else None
 
 
 def _number(value: object) -> float | None:

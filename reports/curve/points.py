@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from statistics import fmean, stdev
+from typing import Any
 
 from scipy.stats import t as student_t
 
 from ...bench.contracts import Budget
 from ...bench.specs import MetricSpec
-from .held_out import CAMERA, TIMESTEPS, HeldOutClip
 
-HELD_OUT: Mapping[str, str] = {CAMERA: "camera", TIMESTEPS: "timesteps"}
+HELD_OUT: Mapping[str, str] = {"novel_view": "camera", "self_reenactment": "timesteps"}
 """What is held out, by the task that it is measured as."""
 MEASURED = ("processor_seconds", "seconds", "peak_memory_bytes")
 """What the record of a training says of its cost."""
@@ -99,7 +99,7 @@ def points_text(
     points: Sequence[CurvePoint],
     metrics: Sequence[MetricSpec],
     tasks: Sequence[str],
-    held: Sequence[HeldOutClip],
+    held: Mapping[str, Mapping[str, Any]],
     missing: Mapping[str, str],
     failed: Sequence[str],
 ) -> str:
@@ -126,14 +126,11 @@ def points_text(
         given += _shown(point.tracking_error, 2, 10) if tracked else ""
         lines.append(f"{point.method:<{wide}}{given}{''.join([*cost, *cells])}")
     lines.append("Means over subjects. Held out of every training; no test frame was looked at:")
-    for clip in held:
-        parameters = clip.steps[-1].parameters
+    for subject, parameters in held.items():
         steps = ", ".join(map(str, parameters["timesteps"][:6])) + (
             ", ..." if len(parameters["timesteps"]) > 6 else ""
         )
-        lines.append(
-            f"  {clip.subject}: camera {parameters['camera'] or 'none'}, timesteps {steps or 'none'}"
-        )
+        lines.append(f"  {subject}: camera {parameters['camera'] or 'none'}, timesteps {steps or 'none'}")
     lines += [f"{label} missing: {reason}" for label, reason in missing.items()]
     return "\n".join([*lines, *(f"failed: {name}" for name in failed)])
 

@@ -43,7 +43,7 @@ class Submission:
         return (
             self.file.name,
             self.bundle.by,
-            ", ".join(method.name for method in self.manifest.methods),
+            ", ".join(method.label for method in self.manifest.methods),
             self.bundle.comment,
             self.bundle.headbench,
             str(self.manifest.machine.get("processor", "")),

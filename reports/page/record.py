@@ -39,10 +39,10 @@ def record_of(run: RunData) -> dict[str, Any]:
             for task, p in manifest.protocols.items()
         ],
         "clips": [(clip.subject, clip.fingerprint) for clip in manifest.clips],
-        "methods": [(m.name, m.version, json.dumps(m.budget)) for m in manifest.methods],
+        "methods": [(m.label, m.version, json.dumps(m.budget)) for m in manifest.methods],
         "configuration": json.dumps(_without_folders(asdict(manifest.configuration)), indent=1, default=str),
         "settings": json.dumps(
-            _without_folders({m.name: m.config for m in manifest.methods}), indent=1, default=str
+            _without_folders({m.label: m.config for m in manifest.methods}), indent=1, default=str
         ),
         "excluded": _excluded(excluded),
     }

@@ -1,9 +1,8 @@
-"""``headbench pareto`` and ``headbench sweep``."""
+"""``headbench pareto``."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,9 +10,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.io.files import check_kind, check_output_folder, output_inside, write_text
-from ...bench.io.lock import locked
-from ...bench.runner.config import RunOptions
+from ...bench.io.files import check_output_folder, write_text
 from ...bench.specs import Findings, writes
 
 if TYPE_CHECKING:
@@ -44,56 +41,22 @@ class ParetoSettings:
             raise ValueError("runs: at least one folder")
 
 
-@dataclass(frozen=True)
-class SweepSettings(RunOptions):
-    """Quality against size and frame time of what can be derived from a run's avatars without training."""
-
-    run: tyro.conf.Positional[str]
-    """Folder of a finished run."""
-
-    out: str | None = None
-    """Folder to write, a run folder itself; default: `sweep` in the folder of the run. A sweep in it is continued: variants may
-    be added, but none left out."""
-
-    methods: tuple[str, ...] = ()
-    """Methods to derive from; default: all that know how."""
-
-    variants: tuple[str, ...] = ()
-    """Variants to derive, by name; default: all. The trained avatar itself is always measured."""
-
-    frames: int | None = None
-    """Score at most so many frames per subject and task, evenly spaced; default: those of the run."""
-
-    task: str = "novel_view"
-    """Task whose frames give the quality in the plot."""
-
-    metric: str = ""
-    """Metric of quality in the plot; default: the first of frames that the run has."""
-
-    time: str = ""
-    """Metric of frame time in the plot, in ms: latency_p50 (default), processor_time on a machine with other work."""
-
-    def __post_init__(self) -> None:
-        if self.frames is not None and self.frames < 1:
-            raise ValueError(f"frames is {self.frames}; at least 1")
-
-
 COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
 
 
 @writes("out")
-def pareto(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
-    """Plot quality against size and frame time of finished runs, with the Pareto front, and write CSV.
+def pareto_runs(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
+    """Plot quality against size and frame time of finished runs, with the Pareto front, and write CSV."""
+    return pareto(settings.runs, Path(settings.out), settings.task, settings.metric, settings.time)
 
-    Write ``points.csv`` and ``pareto.png``. Raises `InputError` for runs that cannot be compared."""
+
+def pareto(runs: Sequence[str], out: Path, task: str, metric_name: str = "", time: str = "") -> Findings:
+    """Write ``points.csv`` and ``pareto.png`` of finished runs. Raises `InputError` for runs that cannot be compared."""
     from ..writers import csv_text
     from .plot import write_plot
     from .points import Point, front_of, read_points
 
-    out = Path(settings.out)
-    points, left_out, metric, note = read_points(
-        [Path(r) for r in settings.runs], settings.task, settings.metric, settings.time
-    )
+    points, left_out, metric, note = read_points([Path(r) for r in runs], task, metric_name, time)
     check_output_folder(out)
     rising = metric.higher_is_better
     fronts = {cost: front_of(points, cost, higher_is_better=rising) for cost in COSTS}
@@ -105,9 +68,9 @@ def pareto(settings: ParetoSettings, progress: Progress = no_progress) -> Findin
     write_text(out / "points.csv", csv_text(lines))
     unit = f", {metric.unit}" if metric.unit else ""
     labels = dict(COSTS)
-    if settings.time:
-        labels["milliseconds"] = f"{settings.time.replace('_', ' ').capitalize()}, ms"
-    quality = f"{metric.label}{unit}, {settings.task.replace('_', ' ')}"
+    if time:
+        labels["milliseconds"] = f"{time.replace('_', ' ').capitalize()}, ms"
+    quality = f"{metric.label}{unit}, {task.replace('_', ' ')}"
     write_plot(out / "pareto.png", points, labels, quality, higher_is_better=rising)
     data = {
         "out": out,
@@ -139,21 +102,3 @@ def _text(
         lines.append("METHOD+VARIANT was derived from the trained avatar, without training.")
     lines += [f"Frame times: {note}"] if note else []
     return "\n".join([*lines, *(f"left out: {text}" for text in left_out)])
-
-
-def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Findings:
-    """Derive smaller and faster variants of a run's avatars without training; quality against size and frame time.
-
-    Writes ``points.csv`` and ``pareto.png`` as `headbench pareto` does.
-    Raises `InputError` for a folder that is no finished run, and for methods and variants that there are not.
-    """
-    from ...bench.runner.store import RunFolder
-    from .sweep import sweep
-
-    out = Path(settings.out) if settings.out else Path(settings.run) / "sweep"
-    RunFolder(Path(settings.run)).read_manifest()  # before a folder is made in what is no run
-    check_kind(out, "a run")
-    with nullcontext() if settings.out else output_inside(Path(settings.run)), locked(out):
-        sweep(settings, out, progress)
-        what = settings.task, settings.metric, settings.time
-        return pareto(ParetoSettings((str(out),), str(out), *what), progress)

@@ -98,28 +98,26 @@ def read_points(
             raise InputError(folder, "time", f"a metric in ms: {', '.join(times) or 'none'}", time)
         check_same_protocol(runs[0], data, task)
         measured = conditions(data.rows, data.metrics, data.methods)
+        derived = {c.name for c in data.manifest.configuration.conditions if c.derive}
         for record in data.manifest.methods:
             if record.trivial:
                 continue
+            label = record.label
             quality, size, speed, latency = (
-                summarise(data.rows, record.name, name, where)
+                summarise(data.rows, label, name, where)
                 for name, where in ((metric, task), (SIZE, ""), (SPEED, ""), (time or LATENCY, ""))
             )
             if quality.value is None:
-                left_out.append(f"{record.name} of {folder}: {quality.reason}")
+                left_out.append(f"{label} of {folder}: {quality.reason}")
                 continue
             milliseconds, timed = latency.value, time or LATENCY
             if milliseconds is None and not time and speed.value:
                 milliseconds, timed = 1000.0 / speed.value, SPEED
-            if milliseconds is not None and record.name in measured.get(timed, {}):
-                label = record.name if len(folders) == 1 else f"{record.name} of {folder}"
-                timings[label] = measured[timed][record.name]
-            derived = record.derived
-            source, variant = (derived["from"], derived["variant"]) if derived else ("", "")
+            if milliseconds is not None and label in measured.get(timed, {}):
+                timings[label if len(folders) == 1 else f"{label} of {folder}"] = measured[timed][label]
+            source, variant = (record.name, record.condition) if record.condition in derived else ("", "")
             costs = size.value, milliseconds
-            points.append(
-                Point(str(folder), record.name, source, variant, quality.value, *costs, data.machine)
-            )
+            points.append(Point(str(folder), label, source, variant, quality.value, *costs, data.machine))
     if spec is None or not points:
         found_instead = "; ".join(left_out) or "none"
         raise InputError("runs", "", "a method, no trivial baseline, with a value", found_instead)

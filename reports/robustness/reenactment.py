@@ -10,6 +10,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
+from ...bench.condition import PLAIN
 from ...bench.contracts import Camera, Clip, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
 from ...bench.errors import InputError
 from ...bench.io.files import digest
@@ -214,7 +215,7 @@ def _sources(jobs: Sequence[Job], settings: ReenactSettings) -> list[Job]:
     folder = RunFolder((Path(settings.out) if settings.out else Path(settings.run) / TASK) / "sources")
     config = run_configuration(Path(settings.run), replace(settings, data=settings.source))
     config = replace(config, out=str(folder.root))
-    methods = list({job.method.spec.name: job.method for job in jobs}.values())
+    methods = [(m, PLAIN) for m in {job.method.spec.name: job.method for job in jobs}.values()]
     return make_jobs(replace(config, seeds=(0,)), methods, open_clips(config), {}, folder)
 
 

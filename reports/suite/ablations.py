@@ -21,17 +21,17 @@ def ablation_table(runs: RunSet, method: str) -> Table:
 
     Parameters
     ----------
-    runs : a run with ``method``, then of each ablation a run that has nothing else; their folders give the rows' names.
+    runs : RunSet
+        A run with ``method`` as it is and under the conditions that are its ablations, and with nothing else.
     """
-    in_first = [record.name for record in runs.runs[0].manifest.methods if not record.trivial]
-    own, ablations = runs.ranked[in_first.index(method)], runs.ranked[len(in_first) :]
+    ablations = [label for label, record in runs.records.items() if record.condition]
     table = table_of(runs)
     bound = {spec.name for spec in runs.metrics if spec.machine_bound}
     kept = tuple(column for column in table.columns if column.metric not in bound)
     columns, tested = [], []
     for column in kept:
         found = compare(
-            *(runs.rows, [(label, own) for label in ablations]),
+            *(runs.rows, [(label, method) for label in ablations]),
             task=column.task,
             metric=column.metric,
             higher_is_better=column.higher_is_better,
@@ -41,8 +41,8 @@ def ablation_table(runs: RunSet, method: str) -> Table:
         tested += [each for each in found if each.p_holm is not None]
     versions = {row.method: row.version for row in table.rows}
     rows = tuple(
-        TableRow(run.folder.root.name, versions[label], False, cells)
-        for run, label, cells in zip(runs.runs[1:], ablations, zip(*columns), strict=True)
+        TableRow(runs.records[label].condition, versions[label], False, cells)
+        for label, cells in zip(ablations, zip(*columns), strict=True)
     )
     return replace(table, columns=kept, groups=(("Ablations", rows),), notes=(), marking=_marking(tested))
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...bench.condition import PLAIN
 from ...bench.contracts import Avatar, Camera, Clip, FloatArray, FrameKey, HeadPose
 from ...bench.errors import HeadbenchError, InputError
 from ...bench.runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
@@ -176,7 +177,9 @@ def _opened(path: Path, settings: ViewSettings, kept: Path, missing: list[str]) 
     config = replace(config, device=settings.device or config.device)
     source = _source(settings, config)
     seeds = (cell[2],) if cell else config.seeds
-    for job in make_jobs(replace(config, seeds=seeds), methods, clips, {}, RunFolder(run), kept):
+    for job in make_jobs(
+        replace(config, seeds=seeds), [(m, PLAIN) for m in methods], clips, {}, RunFolder(run), kept
+    ):
         state = job.cell.step("fit")
         if state is None or state.get("status") != "done":
             why = "not trained" if state is None else "its training did not end"

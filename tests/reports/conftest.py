@@ -1,5 +1,6 @@
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -69,7 +70,15 @@ def write_manifest():
         Manifest(
             configuration=RunConfig(data="data", out=str(folder.root), seeds=tuple(seeds)),
             methods=tuple(
-                MethodRecord(name, "1", "m:M", name in trivial, config, {})
+                MethodRecord(
+                    name.partition("+")[0],
+                    "1",
+                    "m:M",
+                    name in trivial,
+                    config,
+                    {},
+                    condition=name.partition("+")[2],
+                )
                 for name, config in methods.items()
             ),
             metrics=tuple(metrics),
@@ -145,7 +154,11 @@ def write_run(tmp_path, write_manifest):
                 rows += [row(method, spec.name, number, subject, **place) for place in places]
             else:
                 rows.append(avatar_row(method, spec.name, number, subject))
-        Rows.of(rows).write(folder.rows)
+        labels = (each.method.partition("+") for each in rows)
+        Rows.of(
+            replace(each, method=name, condition=condition)
+            for each, (name, _, condition) in zip(rows, labels, strict=True)
+        ).write(folder.rows)
         return folder.root
 
     return write

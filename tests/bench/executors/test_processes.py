@@ -11,10 +11,8 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.errors import InputError
-from headbench.bench.executors.cell import _Run
 from headbench.bench.executors.outcome import read_outcome, write_outcome
 from headbench.bench.executors.processes import Processes
-from headbench.bench.executors.run import machine_of
 from headbench.bench.executors.schedule import Schedule
 from headbench.bench.executors.settings import Execution
 from headbench.bench.executors.status import CellState, time_left
@@ -24,6 +22,7 @@ from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import is_locked
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.store import RunFolder
+from headbench.bench.runner.tasks import _Run, machine_of
 
 TWO = Execution("processes", workers=2, threads=1)
 OPTIONS = ("--executor", "processes", "--workers", "1", "--set", "execution.threads=1")
@@ -126,7 +125,7 @@ def test_kept_cells_are_named_and_changed_code_fails_others(config, rows_of, cap
     assert caplog.text.count("toy seed 0: kept: trained ") == 3
     assert folder.read_manifest().machine == {**own, "processor": "A and B"}
     assert "not comparable" in caplog.text
-    assert _Run.read(folder.root).methods.keys() == {"toy"}
+    assert _Run.read(folder.root).cells.keys() == {"toy"}
     record = read_json(folder.manifest)
     record["methods"][0]["code"] = "of another"
     write_json(folder.manifest, record)

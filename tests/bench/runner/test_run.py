@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.condition import PLAIN, Condition
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
@@ -229,11 +230,6 @@ BOTH = {"methods": ("toy_plugin:METHOD", "toy_plugin:MIRROR"), "seeds": (0, 1)}
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"methods": ("toy_plugin:METHOD",)}, r"rows\.parquet, methods: .*mirror, toy.*without mirror"),
-        ({"seeds": (1, 2)}, "seeds: .*0, 1.*without 0"),
-        ({"metrics": ("toy_plugin:ERROR", "psnr")}, "metrics: .*without files"),
-        ({"tasks": ("novel_view",)}, "tasks: .*found novel_view"),
-        ({"frames_per_task": 1}, "frames of novel_view: "),
         ({"regions": ()}, "regions: "),
         ({"data": "more"}, "captures or frames of novel_view: "),
     ],
@@ -251,6 +247,49 @@ def test_a_run_that_would_lose_rows_is_refused(config, refuses, tmp_path, change
     assert (folder.rows.read_bytes(), folder.manifest.read_bytes()) == before
     folder.rows.unlink()  # as the error says, for those who want that
     assert len(rows_of(config, **changes))
+
+
+@pytest.mark.parametrize(
+    "less",
+    [
+        {"methods": ("toy_plugin:METHOD",)},
+        {"seeds": (1,)},
+        {"metrics": ("toy_plugin:ERROR",)},
+        {"tasks": ("novel_view",)},
+        {"frames_per_task": 1},
+    ],
+)
+def test_results_that_are_not_asked_for_again_are_kept(config, toy, less):
+    config = replace(config, **BOTH)
+    before = rows_of(config)
+    toy.FITS.clear()
+    assert rows_of(config, **less).equals(before)
+    assert not toy.FITS
+
+
+def test_another_preset_is_refused(config, refuses):
+    runner.run(config)
+    refuses(config, "configuration.preset: expected smoke, as in this run", preset="fast")
+
+
+def test_frames_may_be_added(config, toy):
+    few = rows_of(config, frames_per_task=1)
+    toy.FITS.clear()
+    every = rows_of(config)
+    assert not toy.FITS
+    assert len(every) > len(few)
+    same = [name for name in few if name != "protocol"]
+    assert len(every.merge(few, on=same)) == len(few)
+
+
+def test_a_condition_is_a_cell_and_a_column(config, toy):
+    changed = Condition("half", ("toy",), {"level": 0.75})
+    plain = rows_of(config)
+    rows = rows_of(config, conditions=(PLAIN, changed))
+    assert set(rows["condition"]) == {"", "half"}
+    assert rows[rows["condition"] == ""].reset_index(drop=True).equals(plain)
+    cell = RunFolder(Path(config.out)).cell("subject1", "toy+half", 0)
+    assert cell.step("fit")["method"]["config"]["level"] == 0.75
 
 
 def test_methods_seeds_and_metrics_may_be_added(config, toy):

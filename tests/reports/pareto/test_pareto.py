@@ -21,7 +21,7 @@ from headbench.bench.io.files import plain
 from headbench.bench.rows import Row, Rows
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
-from headbench.reports.pareto.command import COSTS, ParetoSettings, pareto
+from headbench.reports.pareto.command import COSTS, ParetoSettings, pareto_runs
 from headbench.reports.pareto.plot import label_points, write_plot
 from headbench.reports.pareto.points import Point, pareto_front
 
@@ -64,7 +64,7 @@ def test_points_of_several_runs_and_which_are_on_the_front(make_run, tmp_path):
     small = make_run("small", ours=(28.0, 0.10, 1.0, 200.0), ga=(27.0, 0.05, 2.0, 400.0))
     of_large = {"ours": (30.0, 0.04, 4.0, 50.0), "ga": (29.0, 0.06, 4.0, 100.0), "floor": (50.0, 0, 0.1, 1e4)}
     large = make_run("large", **of_large)
-    found = pareto(ParetoSettings((small, large), str(tmp_path / "out")))
+    found = pareto_runs(ParetoSettings((small, large), str(tmp_path / "out")))
     rows = {(r["run"].rsplit("/", 1)[-1], r["method"]): r for r in table(tmp_path / "out")}
     assert set(rows) == {("small", "ours"), ("small", "ga"), ("large", "ours"), ("large", "ga")}
     on_size = {key for key, r in rows.items() if r["on_front_of_megabytes"] == "1"}
@@ -85,7 +85,7 @@ def test_points_of_several_runs_and_which_are_on_the_front(make_run, tmp_path):
 
 def test_the_published_result_has_its_points(tmp_path):
     gallery = Path(__file__).parents[3] / "reports" / "gallery"
-    points = pareto(ParetoSettings((str(gallery),), str(tmp_path / "out"))).data["points"]
+    points = pareto_runs(ParetoSettings((str(gallery),), str(tmp_path / "out"))).data["points"]
     assert len(points) == 5  # its rows are of two regions
     assert all(point["megabytes"] and point["milliseconds"] for point in points)
 
@@ -94,7 +94,7 @@ def test_a_metric_where_less_is_better_turns_the_front_round(make_run, tmp_path)
     folder = make_run(
         "r", ours=(28.0, 0.10, 1.0, 200.0), ga=(27.0, 0.05, 2.0, 400.0), gbs=(30.0, 0.2, 3.0, 9.0)
     )
-    pareto(ParetoSettings((folder,), str(tmp_path / "out"), metric="lpips"))
+    pareto_runs(ParetoSettings((folder,), str(tmp_path / "out"), metric="lpips"))
     marks = {r["method"]: r["on_front_of_megabytes"] for r in table(tmp_path / "out")}
     assert marks == {"ours": "1", "ga": "1", "gbs": "0"}
 
@@ -109,7 +109,7 @@ def test_what_does_not_compare_or_is_not_there_is_refused(make_run, tmp_path):
         ((one,), {"time": "processor_time"}, "metric in ms: none"),
     ):
         with pytest.raises(InputError, match=message):
-            pareto(ParetoSettings(folders, str(tmp_path / "out"), **changes))
+            pareto_runs(ParetoSettings(folders, str(tmp_path / "out"), **changes))
     assert not (tmp_path / "out").exists()
 
 
@@ -123,7 +123,7 @@ def test_frame_time_is_the_named_metric_or_else_the_median(make_run, tmp_path):
     manifest.write_text(json.dumps(record))
     Rows(pd.concat(parts, ignore_index=True)).write(rows)
     for time, expected in (("", 4.0), ("processor_time", 9.0)):
-        pareto(ParetoSettings((folder,), str(tmp_path / "out"), time=time))
+        pareto_runs(ParetoSettings((folder,), str(tmp_path / "out"), time=time))
         assert float(table(tmp_path / "out")[0]["milliseconds"]) == expected
 
 
@@ -144,7 +144,7 @@ def test_frame_times_that_do_not_compare_have_a_note(make_run, tmp_path, change_
         rows.loc[own & (rows["method"] == "ga"), "other_cores"] = 0.75
         rows.loc[own & (rows["method"] == "floor"), "threads"] = 1  # no point
         Rows(rows).write(RunFolder(Path(folder)).rows)
-    found = pareto(ParetoSettings(tuple(folders), str(tmp_path / "out"), time=time))
+    found = pareto_runs(ParetoSettings(tuple(folders), str(tmp_path / "out"), time=time))
     names = ", ".join(f"ga of {folder}" for folder in folders) if several else "ga"
     note = f"{names}: Measured under load: other processes used up to 0.75 cores."
     assert found.data["note"] == note
@@ -154,8 +154,16 @@ def test_frame_times_that_do_not_compare_have_a_note(make_run, tmp_path, change_
 def test_derived_avatars_are_told_from_trained_ones(make_run, tmp_path, change_manifest):
     folder = make_run("r", **{"ga": (28.0, 0.1, 4.0, 100.0), "ga+half": (27.9, 0.1, 2.0, 100.0)})
     derived = {"from": "ga", "variant": "half", "change": "16-bit floats"}
-    change_manifest(Path(folder), lambda m: m["methods"][1].update(derived=derived))
-    text = pareto(ParetoSettings((folder,), str(tmp_path / "out"))).text
+
+    def as_version_1(manifest):
+        for method in manifest["methods"]:
+            if method["name"] == "ga" and method.pop("condition", ""):
+                method |= {"name": "ga+half", "derived": derived}
+        manifest |= {"format": 1, "sweep_of": "somewhere"}
+        del manifest["configuration"]["conditions"]
+
+    change_manifest(Path(folder), as_version_1)
+    text = pareto_runs(ParetoSettings((folder,), str(tmp_path / "out"))).text
     assert "derived from the trained avatar" in text
     trained, derived = table(tmp_path / "out")
     assert (trained["derived_from"], trained["variant"]) == ("", "")

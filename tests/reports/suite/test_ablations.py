@@ -2,6 +2,7 @@
 
 import pytest
 
+from headbench.bench.condition import PLAIN, Condition
 from headbench.reports.runs import RunSet
 from headbench.reports.statistics.comparisons import PairedComparison
 from headbench.reports.suite.ablations import _cell, ablation_table
@@ -10,27 +11,23 @@ from headbench.reports.table_report import table_of
 
 def test_rows_are_ablations_and_cells_their_differences(make_run):
     both = ("toy_plugin:MIRROR", "toy_plugin:METHOD")
-    whole = make_run("whole", methods=both, settings={"toy": {"level": 0.25}})
-    less = make_run("less", settings={"toy": {"level": 0.5}})
-    table = ablation_table(RunSet.read([whole, less]), "toy")
+    conditions = (PLAIN, Condition("less", ("toy",), {"level": 0.5}))
+    runs = RunSet.read(
+        [make_run("run", methods=both, settings={"toy": {"level": 0.25}}, conditions=conditions)]
+    )
+    table = ablation_table(runs, "toy")
     (row,) = table.rows
     assert row.method == "less"
-    plain = {line.method: line for line in table_of(RunSet.read([whole, less])).rows}
+    plain = {line.method: line for line in table_of(runs).rows}
     assert "mirror" in plain
-    wanted = [
-        b.value - a.value for a, b in zip(plain["toy (level=0.25)"].cells, plain["toy (level=0.5)"].cells)
-    ]
+    wanted = [b.value - a.value for a, b in zip(plain["toy"].cells, plain["toy+less"].cells)]
     assert [cell.value for cell in row.cells] == pytest.approx(wanted)
     assert any(wanted)
     assert [float(cell.text.split()[0]) for cell in row.cells] == pytest.approx(wanted, abs=1e-3)
 
 
 def test_speeds_of_different_runs_are_not_compared(write_run):
-    folders = [
-        write_run("whole", {"ours": 30.0}),
-        write_run("less", {"ours": 29.0}, {"ours": {"less": True}}),
-    ]
-    runs = RunSet.read(folders)
+    runs = RunSet.read([write_run("run", {"ours": 30.0, "ours+less": 29.0})])
     table = ablation_table(runs, "ours")
     assert "fps" in {column.metric for column in table_of(runs).columns}
     assert "fps" not in {column.metric for column in table.columns}

@@ -5,10 +5,10 @@ import re
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.experiments import suite as module
+from headbench.bench.experiments.suite import ABLATIONS
 from headbench.bench.registry import get
 from headbench.bench.runner.config import resolve_method
-from headbench.reports.suite import suite as module
-from headbench.reports.suite.command import ABLATIONS
 
 SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16x16")
 

@@ -1,16 +1,15 @@
 """A sweep of toy avatars: rows of known levels, resumed and refused."""
 
-import pandas as pd
 import pytest
 
-from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
+from headbench.bench.experiments import sweep as module
+from headbench.bench.experiments.sweep import sweep_run
+from headbench.bench.experiments.sweep_settings import SweepSettings
 from headbench.bench.io.documents import read_json
+from headbench.bench.rows import ALL, Rows
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.store import RunFolder
-from headbench.reports.pareto import sweep as module
-from headbench.reports.pareto.command import SweepSettings
-from headbench.reports.pareto.sweep import sweep
 
 from ...small_run import run_on
 
@@ -29,8 +28,12 @@ def finished(toy, tmp_path, monkeypatch):
 
 def swept(run, **settings):
     """Table of the rows of a sweep."""
-    sweep(SweepSettings(str(run), trust=True, **settings), run / "sweep", no_progress)
-    return pd.read_parquet(RunFolder(run / "sweep").rows)
+    sweep_run(SweepSettings(str(run), trust=True, metric="error", **settings))
+    return (
+        Rows.read(RunFolder(run / "sweep").rows)
+        .labelled()
+        .select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    )
 
 
 def test_variants_are_scored_like_the_run_itself(finished, toy):
@@ -42,9 +45,11 @@ def test_variants_are_scored_like_the_run_itself(finished, toy):
     assert set(rows["metric"]) == {"error", "files"}  # nothing was trained: no metric of training
     record, original = (read_json(RunFolder(path).manifest) for path in (finished / "sweep", finished))
     assert record["protocols"]["novel_view"] == original["protocols"]["novel_view"]
-    derived = {entry["name"]: entry.get("derived") for entry in record["methods"]}
-    assert derived["varying"] is None
-    assert derived["varying+dark"] == {"from": "varying", "variant": "dark", "change": "level 0.25"}
+    assert [entry.get("condition", "") for entry in record["methods"]] == ["", "dark", "light"]
+    assert record["configuration"]["conditions"][1]["derive"] == {
+        "name": "variant",
+        "parameters": {"name": "dark"},
+    }
 
 
 def test_only_the_named_variants_and_frames_are_measured(finished, toy):
@@ -60,21 +65,14 @@ def test_a_second_sweep_measures_nothing_again(finished, toy, monkeypatch):
     def never(*arguments):
         raise AssertionError("measured again")
 
-    monkeypatch.setattr(toy, "mean_error", never)
     monkeypatch.setattr(toy, "files_in_avatar", never)
     assert swept(finished).equals(first)
 
 
-@pytest.mark.parametrize(
-    ("settings", "match"),
-    [({"variants": ("light",)}, r"without varying\+dark"), ({"frames": 1}, "frames of novel_view")],
-)
-def test_a_sweep_that_would_lose_rows_is_refused(finished, toy, settings, match):
-    swept(finished)
-    toy.MADE.clear()
-    with pytest.raises(InputError, match=match):
-        swept(finished, **settings)
-    assert toy.MADE == []
+def test_a_sweep_keeps_what_is_not_named_again(finished, toy):
+    first = swept(finished)
+    assert swept(finished, variants=("light",)).equals(first)
+    assert swept(finished, frames=1).equals(first)
 
 
 def test_variants_of_another_training_are_refused(finished, toy):

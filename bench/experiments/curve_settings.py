@@ -1,21 +1,16 @@
-"""``headbench curve``."""
+"""Settings of ``headbench curve``."""
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import dataclass
 from fractions import Fraction
-from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from ...bench.contracts import Progress, no_progress
-from ...bench.io.files import check_kind, output_inside
-from ...bench.io.lock import locked
-from ...bench.options import DependentOptions
-from ...bench.runner.config import RunOptions
-from ...bench.specs import Findings
+from ..executors.command import ExecutionOptions
+from ..options import DependentOptions
+from ..runner.config import RunOptions
 
 MOST_TRACKING_ERROR = 4.0
 """What `headbench synth` takes at most."""
@@ -24,7 +19,7 @@ LEVELS = (0.0, 1.0, 2.0)
 
 
 @dataclass(frozen=True)
-class CurveSettings(RunOptions):
+class CurveSettings(RunOptions, ExecutionOptions):
     """Quality against training time, cameras, timesteps or tracking error: trains each method with parts of them.
 
     Each part or level is a whole training of its own. Quality is measured on training frames that are held out of every training,
@@ -95,22 +90,3 @@ def _part(text: str) -> Fraction:
     if not 0 < part <= 1:
         raise ValueError(f"fractions: {text!r} is no number above 0 and at most 1, such as 1/4 or 0.25")
     return part
-
-
-def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Findings:
-    """Plot quality against training time, cameras, timesteps or tracking error, measured on held-out training frames.
-
-    Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. Started again, it keeps what is done and
-    refuses to leave out points that are there.
-    Raises `InputError` for a folder that is no finished run, and for methods without a budget.
-    """
-    from ...bench.runner.store import RunFolder
-    from .curve import curve
-
-    run = RunFolder(Path(settings.run))
-    run.read_manifest().check_done(run.manifest)  # before a folder is made in what is no run
-    name = "curve" if settings.over == "budget" else f"curve-{settings.over.replace('_', '-')}"
-    out = Path(settings.out) if settings.out else run.root / name
-    check_kind(out, "a run")
-    with nullcontext() if settings.out else output_inside(run.root), locked(out):
-        return curve(settings, out)

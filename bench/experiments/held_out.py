@@ -1,16 +1,16 @@
-"""A clip with some of its training frames held out, to choose settings without looking at test frames."""
+"""Clips with training frames held out, and with fewer training cameras or timesteps: registered changes of clips."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from ...bench.contracts import (
+from ..contracts import (
     ByteArray,
     Camera,
     Clip,
@@ -21,8 +21,9 @@ from ...bench.contracts import (
     StepRecord,
     TaskName,
 )
-from ...bench.errors import HeadbenchError, InputError
-from ...bench.io.files import digest
+from ..errors import HeadbenchError, InputError
+from ..io.files import digest
+from ..runner.config import RunConfig
 
 CAMERA: TaskName = "novel_view"
 TIMESTEPS: TaskName = "self_reenactment"
@@ -67,13 +68,15 @@ class HeldOutClip:
         return key
 
 
-def hold_out(clip: Clip, camera: str, every: int) -> HeldOutClip:
-    """Hold out a camera and every n-th timestep of a clip's training split.
+def hold_out(clip: Clip, config: RunConfig | None = None, *, camera: str = "", every: int = 8) -> HeldOutClip:
+    """Hold out a camera and every n-th timestep of a clip's training split, so that no test frame is looked at.
 
     Parameters
     ----------
-    camera : its name; "": the training camera nearest to the mean position of all, none where there is only one.
-    every : the middle one of every so many training timesteps, counted in their order, is held out.
+    camera : str
+        Its name; "": the training camera nearest to the mean position of all, none where there is only one.
+    every : int
+        The middle one of every so many training timesteps, counted in their order, is held out.
 
     Raises
     ------
@@ -98,53 +101,63 @@ def hold_out(clip: Clip, camera: str, every: int) -> HeldOutClip:
         found = f"{len(cameras)} cameras and {len(timesteps)} timesteps"
         expected = "frames to train with and others to hold out"
         raise InputError(where, "splits.train", expected, found)
-    step = StepRecord("hold_out", {"camera": camera, "timesteps": held}, clip.fingerprint)
-    return HeldOutClip(
-        source=clip,
-        subject=clip.subject,
-        head=clip.head,
-        shape=clip.shape,
-        static_offset=clip.static_offset,
-        cameras=clip.cameras,
-        poses=clip.poses,
+    training = {
+        "cameras": sorted({key.camera for key in splits["train"]}),
+        "timesteps": sorted({key.timestep for key in splits["train"]}),
+    }
+    step = StepRecord(
+        "hold_out", {"camera": camera, "timesteps": held, "training": training}, clip.fingerprint
+    )
+    return replace(
+        _as_held_out(clip),
         splits={name: tuple(keys) for name, keys in splits.items() if keys},
-        excluded=clip.excluded,
-        background=clip.background,
         steps=(*clip.steps, step),
         fingerprint=digest(clip.fingerprint, "hold_out", camera, held),
     )
 
 
-Part = Literal["cameras", "timesteps"]
-"""Of what a training may see a part only."""
+def fewer_cameras(clip: Clip, config: RunConfig | None = None, *, part: str) -> Clip:
+    """A clip with a part of its training cameras, one at least.
 
-
-def reduced(clip: HeldOutClip, what: Part, part: Fraction) -> HeldOutClip:
-    """A clip with a part of its training cameras or timesteps, one at least, spread evenly; held-out frames stay.
-
-    Of cameras the first is the one nearest to the mean position of all, each further one that farthest from those taken
-    (Gonzalez, "Clustering to minimize the maximum intercluster distance", 1985), so that fewer are among more.
+    The first is the one nearest to the mean position of all, each further one that farthest from those taken (Gonzalez,
+    "Clustering to minimize the maximum intercluster distance", 1985), so that fewer are among more.
     """
+    names = _spread(clip.cameras, sorted({key.camera for key in clip.splits["train"]}))
+    return _reduced(clip, "cameras", names[: count_of(len(names), part)])
+
+
+def fewer_timesteps(clip: Clip, config: RunConfig | None = None, *, part: str) -> Clip:
+    """A clip with a part of its training timesteps, one at least, spread evenly."""
+    timesteps = sorted({key.timestep for key in clip.splits["train"]})
+    count = count_of(len(timesteps), part)
+    chosen = [timesteps[(2 * i + 1) * len(timesteps) // (2 * count)] for i in range(count)]
+    return _reduced(clip, "timesteps", chosen)
+
+
+def count_of(whole: int, part: str) -> int:
+    """How many a part of so many is, one at least."""
+    return max(1, round(whole * Fraction(part)))
+
+
+def _reduced(clip: Clip, what: str, chosen: Sequence[Any]) -> Clip:
+    """A clip whose training frames are those of some cameras or timesteps; held-out frames stay."""
     train = clip.splits["train"]
-    chosen: list[Any]
-    if what == "cameras":
-        names = _spread(clip.cameras, sorted({key.camera for key in train}))
-        chosen = names[: max(1, round(len(names) * part))]
-        keys = tuple(key for key in train if key.camera in chosen)
-    else:
-        timesteps = sorted({key.timestep for key in train})
-        count = max(1, round(len(timesteps) * part))
-        chosen = [timesteps[(2 * i + 1) * len(timesteps) // (2 * count)] for i in range(count)]
-        keys = tuple(key for key in train if key.timestep in chosen)
+    keys = tuple(key for key in train if getattr(key, what.removesuffix("s")) in chosen)
     if len(keys) == len(train):
         return clip
-    step = StepRecord("reduce_training", {what: chosen}, clip.fingerprint)
+    step = StepRecord("reduce_training", {what: list(chosen)}, clip.fingerprint)
     return replace(
-        clip,
+        clip if isinstance(clip, HeldOutClip) else _as_held_out(clip),
         splits={**clip.splits, "train": keys},
         steps=(*clip.steps, step),
-        fingerprint=digest(clip.fingerprint, what, chosen),
+        fingerprint=digest(clip.fingerprint, what, list(chosen)),
     )
+
+
+def _as_held_out(clip: Clip) -> HeldOutClip:
+    """A clip of which only the frames of its splits can be read."""
+    own = {f.name: getattr(clip, f.name) for f in fields(HeldOutClip) if f.name != "source"}
+    return HeldOutClip(source=clip, **own)
 
 
 def _spread(cameras: Mapping[str, Camera], names: Sequence[str]) -> list[str]:

@@ -1,0 +1,162 @@
+"""``headbench curve``: quality over training time, cameras, timesteps or tracking error, as conditions of one run."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+from ..condition import Condition, Named
+from ..contracts import Budget, Clip, Progress, no_progress
+from ..errors import InputError
+from ..io.files import check_kind, output_inside
+from ..io.lock import locked
+from ..registry import get, resolve
+from ..runner.captures import open_run_clips, run_configuration
+from ..runner.config import ResolvedMethod, resolve_methods
+from ..runner.run import run_locked
+from ..runner.store import RunFolder
+from ..specs import Findings
+from .curve_settings import CurveSettings
+from .held_out import CAMERA, TIMESTEPS, count_of
+
+log = logging.getLogger(__name__)
+METRICS: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "primitives")
+"""Metrics of a curve, whether the run took them or not, as the canonical profile defines them."""
+
+
+def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Findings:
+    """Plot quality against training time, cameras, timesteps or tracking error, measured on held-out training frames.
+
+    Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. Started again, it keeps what is done; a
+    training that was interrupted begins again, since its time is asked for.
+
+    Raises
+    ------
+    InputError
+        For a folder that is no finished run, a method that the run does not have or that has no budget, a capture that is
+        not the run's or has too few frames to hold some out, and a folder with trainings of other settings.
+    """
+    source = RunFolder(Path(settings.run))
+    manifest = source.read_manifest()
+    manifest.check_done(source.manifest)  # before a folder is made in what is no run
+    if manifest.configuration.clip or manifest.configuration.source:
+        expected = "a run that trained on whole captures"
+        raise InputError(source.manifest, "configuration", expected, "one of a curve or of a sweep")
+    name = "curve" if settings.over == "budget" else f"curve-{settings.over.replace('_', '-')}"
+    out = Path(settings.out) if settings.out else source.root / name
+    check_kind(out, "a run")
+    wanted = _wanted(settings, source)
+    with nullcontext() if settings.out else output_inside(source.root), locked(out):
+        config, opened = open_run_clips(source.root, settings, out=out)
+        held = Named("hold-out", {"camera": settings.camera, "every": settings.every})
+        config = replace(
+            config,
+            clip=held,
+            methods=_asked(config.methods, wanted),
+            settings={name: value for name, value in config.settings.items() if name in _names(wanted)},
+            frames_per_task=settings.frames,
+            metrics=METRICS,
+            metric_profiles=("canonical",),
+            regions=(),
+            source="",
+        )
+        hold_out = resolve(get("conditions", held.name).implementation)
+        clips: list[Clip] = [hold_out(clip, config, **held.parameters) for clip in opened]
+        tasks = tuple(task for task in (CAMERA, TIMESTEPS) if all(task in clip.splits for clip in clips))
+        config = replace(config, tasks=tasks, conditions=tuple(conditions(settings, wanted, clips)))
+        _drop_interrupted(out)
+        run_locked(config, settings.execution, clips=clips, reports=False)
+        found: Findings = resolve(get("reports", "curve").implementation)(out, settings.over)
+        return found
+
+
+def conditions(
+    settings: CurveSettings, methods: Sequence[ResolvedMethod], clips: Sequence[Clip]
+) -> Iterator[Condition]:
+    """What the trainings are given, the whole first: start-up, such as imports, falls where it weighs least.
+
+    Parts that come to the same amount are one, the largest of them.
+    """
+    if settings.over == "tracking_error":
+        for level in settings.tracking_errors:
+            yield Condition(f"tracking-{level:g}", clip=Named("tracking-error", {"level": level}))
+        return
+    texts = [str(part) for part in reversed(settings.parts)]
+    if settings.over == "budget":
+        for text in texts:
+            part = Condition(_named(text), budget=text)
+            larger = [Condition(_named(other), budget=other) for other in texts[: texts.index(text)]]
+            chosen = [
+                m.spec.name
+                for m in methods
+                if all(part.part_of(m.budget) != each.part_of(m.budget) for each in larger)
+            ]
+            if chosen:
+                yield replace(part, methods=() if len(chosen) == len(methods) else tuple(chosen))
+        return
+    counts: set[tuple[int, ...]] = set()
+    what = settings.over.removesuffix("s")
+    for text in texts:
+        wholes = [len({getattr(key, what) for key in clip.splits["train"]}) for clip in clips]
+        count = tuple(count_of(whole, text) for whole in wholes)
+        if count not in counts:
+            counts.add(count)
+            yield Condition(_named(text), clip=Named(settings.over, {"part": text}))
+
+
+def _named(text: str) -> str:
+    return text.replace("/", "-")
+
+
+def _names(methods: Sequence[ResolvedMethod]) -> list[str]:
+    return [method.spec.name for method in methods]
+
+
+def _asked(names: Sequence[str], wanted: Sequence[ResolvedMethod]) -> tuple[str, ...]:
+    """What a configuration calls the wanted methods: a name, or a module and its attribute."""
+    return tuple(name for name in names if get("methods", name).name in _names(wanted))
+
+
+def _wanted(settings: CurveSettings, source: RunFolder) -> list[ResolvedMethod]:
+    """The methods to train, each with a budget."""
+    trained = {record.name for record in source.read_manifest().methods}
+    resolved = [
+        m for m in resolve_methods(run_configuration(source.root, settings)) if m.spec.name in trained
+    ]
+    names = ", ".join(_names(resolved)) or "none that it trained"
+    for name in settings.methods:
+        if name not in _names(resolved):
+            raise InputError(source.manifest, "methods", f"methods of the run: {names}", name)
+    wanted = [
+        m for m in resolved if (m.spec.name in settings.methods if settings.methods else not m.spec.trivial)
+    ]
+    if not wanted:
+        raise InputError(source.manifest, "methods", "a method that is no trivial baseline", names)
+    for method in wanted:
+        if method.budget == Budget():
+            key, expected = f"budget of {method.spec.name}", "iterations or seconds, to train with a part of"
+            remedy = "Name other methods with --methods."
+            raise InputError(source.manifest, key, expected, "none", remedy)
+    programs = [method.spec.name for method in wanted if not method.spec.native]
+    if programs and not settings.trust:
+        expected = "methods that run no program which the run folder names"
+        remedy = "Give --trust to run it, if you trust who made the run; or name other methods."
+        raise InputError(source.manifest, "configuration.settings", expected, ", ".join(programs), remedy)
+    return wanted
+
+
+def _drop_interrupted(out: Path) -> None:
+    """Remove what killed trainings left, so that they begin again and their time is known."""
+    for record in sorted(out.glob("*/*/seed-*/fit.json")):
+        cell = RunFolder(out).cell(record.parents[2].name, record.parents[1].name, 0)
+        cell = replace(cell, folder=record.parent)
+        state = cell.step("fit")
+        if state is not None and state["status"] != "done":
+            if cell.avatar.exists():
+                log.info("%s: its training was interrupted; it begins again", record.parent)
+                shutil.rmtree(cell.avatar)
+            record.unlink()

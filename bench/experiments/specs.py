@@ -1,0 +1,40 @@
+"""Conditions that experiments register; light to import."""
+
+from __future__ import annotations
+
+from ..specs import ConditionSpec
+
+HOLD_OUT = ConditionSpec(
+    name="hold-out",
+    summary="Holds a camera and every n-th timestep out of the training frames: scores no test frame.",
+    kind="clip",
+    implementation="headbench.bench.experiments.held_out:hold_out",
+)
+
+CAMERAS = ConditionSpec(
+    name="cameras",
+    summary="Trains with a part of the training cameras.",
+    kind="clip",
+    implementation="headbench.bench.experiments.held_out:fewer_cameras",
+)
+
+TIMESTEPS = ConditionSpec(
+    name="timesteps",
+    summary="Trains with a part of the training timesteps.",
+    kind="clip",
+    implementation="headbench.bench.experiments.held_out:fewer_timesteps",
+)
+
+TRACKING_ERROR = ConditionSpec(
+    name="tracking-error",
+    summary="Trains with another level of tracking error, of synthetic captures.",
+    kind="clip",
+    implementation="headbench.bench.experiments.tracking:with_tracking_error",
+)
+
+VARIANT = ConditionSpec(
+    name="variant",
+    summary="Derives a smaller or faster avatar without training, see `MethodSpec.variants`.",
+    kind="derive",
+    implementation="headbench.bench.experiments.sweep:variant",
+)

@@ -1,0 +1,89 @@
+"""``headbench sweep``: smaller and faster avatars derived without training, as conditions of a run with a source."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+from ..condition import PLAIN, Condition, Named
+from ..contracts import Avatar, Clip, Progress, no_progress
+from ..errors import InputError
+from ..io.files import check_kind, check_name, output_inside
+from ..io.lock import locked
+from ..registry import get, resolve
+from ..runner.config import default_names
+from ..runner.run import run_locked, trained
+from ..runner.store import RunFolder
+from ..specs import Findings, MethodSpec
+from .sweep_settings import SweepSettings
+
+
+def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Findings:
+    """Derive smaller and faster variants of a run's avatars without training; quality against size and frame time.
+
+    The trained avatars are measured again beside their variants, so that frame times were taken in one go. Writes
+    ``points.csv`` and ``pareto.png`` beside the rows. Started again, it keeps what is measured and adds variants.
+
+    Raises
+    ------
+    InputError
+        For a folder that is no finished run, a method that derives nothing, a variant that none of them has.
+    """
+    source = RunFolder(Path(settings.run))
+    source.read_manifest()  # before a folder is made in what is no run
+    out = Path(settings.out) if settings.out else source.root / "sweep"
+    check_kind(out, "a run")
+    with nullcontext() if settings.out else output_inside(source.root), locked(out):
+        config, jobs = trained(source.root, settings.methods, settings, out)
+        able = [job for job in jobs if job.method.spec.variants]
+        unable = sorted({job.method.spec.name for job in jobs} - {job.method.spec.name for job in able})
+        if not able or (settings.methods and unable):
+            found = ", ".join(unable) or "none"
+            raise InputError(settings.run, "methods", "methods that derive variants", found)
+        methods: dict[str, dict[str, None]] = {}
+        for job in able:
+            derive = resolve(job.method.spec.variants)
+            for variant in derive(job.cell.avatar, job.form.clip, job.device):
+                name = check_name(variant.name, job.method.spec.variants, "name of a variant")
+                methods.setdefault(name, {})[job.method.spec.name] = None
+        for name in settings.variants:
+            if name not in methods:
+                raise InputError("sweep", "variants", "a variant of these methods", repr(name))
+        conditions = [
+            Condition(name, tuple(names), derive=Named("variant", {"name": name}))
+            for name, names in methods.items()
+            if not settings.variants or name in settings.variants
+        ]
+        names = {job.method.spec.name for job in able}
+        # What avatars cost, whether the run measured it or not.
+        costs = [name for name in default_names("metrics") if get("metrics", name).kind == "avatar"]
+        metrics = dict.fromkeys((*config.metrics, *costs))
+        config = replace(
+            config,
+            methods=tuple(name for name in config.methods if get("methods", name).name in names),
+            settings={name: value for name, value in config.settings.items() if name in names},
+            frames_per_task=config.frames_per_task if settings.frames is None else settings.frames,
+            metrics=tuple(name for name in metrics if get("metrics", name).kind != "training"),
+            conditions=(PLAIN, *conditions),
+            source=settings.run,
+        )
+        clips = list({job.clip.subject: job.clip for job in able}.values())
+        run_locked(config, settings.execution, clips=clips, reports=False)
+        shown: Findings = resolve(get("reports", "pareto").implementation)(
+            (str(out),), out, settings.task, settings.metric, settings.time
+        )
+        return shown
+
+
+def variant(method: MethodSpec, trained: Path, out: Path, clip: Clip, device: str, *, name: str) -> Avatar:
+    """Make the variant of a trained avatar that has a name, see `MethodSpec.variants`; the registered change "variant".
+
+    Raises `InputError` where the avatar has no such variant.
+    """
+    known = []
+    for each in resolve(method.variants)(trained, clip, device):
+        if each.name == name:
+            return each.make(out)  # type: ignore[no-any-return]
+        known.append(each.name)
+    raise InputError(trained, "variant", f"one of {', '.join(known)}", name)

@@ -1,0 +1,203 @@
+"""Runs the cells of a run by an executor, in workers or as jobs, and merges their rows.
+
+Two passes: all cells, many at once; then the speed of their avatars, without neighbours that would disturb it. A cell's
+own files decide; only the process here writes those of the run.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ..condition import Condition, label_of
+from ..contracts import Clip
+from ..errors import InputError, shortened
+from ..executors.outcome import read_outcome
+from ..executors.schedule import DAMAGED, Failures, Schedule
+from ..executors.settings import Execution, is_speed
+from ..executors.task import Task
+from ..io.documents import checked, read_json
+from ..io.files import write_json
+from ..machine import check_device
+from ..progress import RunProgress
+from ..protocol import Protocol
+from ..rows import Rows
+from ..specs import MAX_LABEL, MetricSpec
+from .captures import open_clips
+from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
+from .run import make_jobs, run_cell
+from .steps import Job, failed_rows, log_kept, steps_ahead, stored_rows, trained_files
+from .store import RunFolder
+
+log = logging.getLogger(__name__)
+REPORT_EVERY_S = 10.0
+"""Seconds between records of how far a cell is."""
+
+
+def execute(
+    jobs: Sequence[Job], metrics: Sequence[MetricSpec], folder: RunFolder, execution: Execution
+) -> Rows:
+    """Work on the cells of a run, whose lock is held and whose record is written; return the rows of all.
+
+    A cell that is done is kept. One whose process or job was lost is started again, `Execution.restarts` times at most. One
+    that fails has failed rows. A run that is started again tries failed cells again, unless it had begun to measure speed:
+    it then goes on with that.
+    """
+    captures = {subject: index for index, subject in enumerate(dict.fromkeys(j.clip.subject for j in jobs))}
+    tasks = [cell_task(job, captures[job.clip.subject], folder) for job in jobs]
+    places = {task.place: job for task, job in zip(tasks, jobs)}
+    steady = [metric for metric in metrics if not is_speed(metric)]
+
+    for job in jobs:
+        if job.cell.is_done("fit", job.fit_fingerprint) and not job.cell.damage(trained_files(job)):
+            log_kept(job)
+
+    def left(wanted: Sequence[MetricSpec]) -> list[Task]:
+        return [
+            task
+            for task in tasks
+            if task.place not in failures and stored_rows(places[task.place], wanted, retry=True) is None
+        ]
+
+    failures = _failed_before(folder)
+    schedule = Schedule("cells", lambda task: stored_rows(places[task.place], steady) is not None, execution)
+    failures |= schedule.run_all(left(steady))
+    if len(steady) < len(metrics):
+        write_json(folder.speed_pass, {"failed": failures})
+        whole = replace(
+            schedule,
+            label="speed of cells",
+            is_done=lambda task: stored_rows(places[task.place], metrics) is not None,
+            speed=True,
+        )
+        failures |= whole.run_all([replace(task, speed=True) for task in left(metrics)])
+    return Rows.joined(_merged(job, metrics, failures.get(place)) for place, job in places.items())
+
+
+def _failed_before(folder: RunFolder) -> Failures:
+    """Cells that had failed when the run was ended while it measured speed, and why."""
+    path = folder.speed_pass
+    return checked(read_json(path), dict[str, Failures], path)["failed"] if path.exists() else {}
+
+
+def _merged(job: Job, metrics: Sequence[MetricSpec], failure: str | None) -> Rows:
+    """Rows of a cell that has ended."""
+    rows = stored_rows(job, metrics) if failure is None else None
+    return failed_rows(job, metrics, failure or f"HeadbenchError: {DAMAGED}") if rows is None else rows
+
+
+def machine_of(jobs: Sequence[Job], otherwise: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The machine that ran the cells; ``otherwise`` if none is recorded, all names if there were several."""
+    outcomes = [read_outcome(job.cell.folder) for job in jobs]
+    machines = [outcome["machine"] for outcome in outcomes if outcome is not None and "machine" in outcome]
+    if not machines:
+        return otherwise
+    record = {**machines[0], "processor": _all_of(str(machine.get("processor")) for machine in machines)}
+    devices = [machine["device"] for machine in machines if "device" in machine]
+    if devices:
+        record["device"] = {**devices[0], "name": _all_of(str(device["name"]) for device in devices)}
+    return record
+
+
+def _all_of(names: Iterable[str]) -> str:
+    """The different names as one; of several a warning is logged."""
+    different = sorted(set(names))
+    if len(different) > 1:
+        log.warning(
+            "Cells were executed by %s: their times and speeds are not comparable.", ", ".join(different)
+        )
+    return shortened(" and ".join(different), MAX_LABEL - 10)
+
+
+def cell_task(job: Job, capture: int, folder: RunFolder) -> Task:
+    """The task of a cell of the run in ``folder``; ``capture`` is the index of its subject's among those that the reader finds."""
+    place = job.cell.folder.relative_to(folder.root).as_posix()
+    cell = {"subject": job.clip.subject, "label": job.label, "seed": job.seed, "capture": capture}
+    return replace(Task.of(folder.root, place, f"{__name__}:execute_cell", **cell), device=job.device)
+
+
+def execute_cell(task: Task, report: Callable[[str], None]) -> None:
+    """Run a cell by the record of its run; all but its speed, unless the task is to measure that."""
+    job, metrics = _opened.job(Path(task.root), **task.arguments)
+    last = time.monotonic()
+
+    def show(text: Callable[[], str]) -> None:
+        nonlocal last
+        if time.monotonic() - last > REPORT_EVERY_S:
+            last = time.monotonic()
+            log.info("%s", words := text().partition(": ")[2])
+            report(words)
+
+    job = replace(job, line=RunProgress({job.name: steps_ahead(job, metrics)}, show))
+    run_cell(job, metrics if task.speed else [metric for metric in metrics if not is_speed(metric)])
+
+
+class _Opened:
+    """The record and the capture that were read last: cells of a run and of a subject follow each other."""
+
+    def __init__(self) -> None:
+        self._run: _Run | None = None
+        self._clips: list[Clip] = []
+
+    def job(
+        self, run: Path, subject: str, label: str, seed: int, capture: int
+    ) -> tuple[Job, Sequence[MetricSpec]]:
+        """A cell and the metrics of its run. Raises `InputError` for another capture than the run began with."""
+        if self._run is None or self._run.folder.root != run:
+            self._run = _Run.read(run)
+            self._clips = []
+        config, recorded = self._run.config, self._run.fingerprints
+        if [clip.subject for clip in self._clips] != [subject]:
+            self._clips = []  # the former, before another takes memory
+            self._clips = open_clips(config, only=capture)
+        if {clip.subject: clip.fingerprint for clip in self._clips} != {subject: recorded[subject]}:
+            found = ", ".join(clip.subject for clip in self._clips) or "none"
+            raise InputError(config.data, subject, "the capture that the run began with", found)
+        cells, chosen = [self._run.cells[label]], replace(config, seeds=(seed,))
+        (job,) = make_jobs(chosen, cells, self._clips, self._run.protocols, self._run.folder)
+        return job, self._run.metrics
+
+
+_opened = _Opened()
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A run as its record has it."""
+
+    folder: RunFolder
+    config: RunConfig
+    fingerprints: Mapping[str, str]
+    cells: Mapping[str, tuple[ResolvedMethod, Condition]]
+    metrics: Sequence[MetricSpec]
+    protocols: Mapping[str, Protocol]
+
+    @classmethod
+    def read(cls, root: Path) -> _Run:
+        folder = RunFolder(root)
+        manifest = folder.read_manifest()
+        config = replace(manifest.configuration, out=str(root))
+        check_device(config.device)
+        recorded = manifest.protocols.items()
+        protocols = {task: record.protocol(folder.manifest) for task, record in recorded}
+        cells = {
+            label_of(m.spec.name, condition.name): (m, condition) for m, condition in resolve_cells(config)
+        }
+        began_with = {method.label: method.code for method in manifest.methods}
+        for label, (method, _) in cells.items():
+            code = method.identity().get("code")  # of a plug-in outside the package
+            if code not in (None, began_with.get(label)):
+                expected = f"{began_with.get(label)}, the digest of the plug-in's code when the run began"
+                raise InputError(folder.manifest, f"methods, code of {label}", expected, code)
+        return cls(
+            folder,
+            config,
+            {clip.subject: clip.fingerprint for clip in manifest.clips},
+            cells,
+            resolve_metrics(config),
+            protocols,
+        )
