@@ -27,11 +27,11 @@ from ..registry import discover, get, resolve
 from ..rows import Rows
 from ..runner.captures import capture_configuration, open_clips, open_run_clips
 from ..runner.config import ResolvedMethod, RunConfig, RunOptions, default_names, resolve_metrics
-from ..runner.run import describe, make_jobs, write_reports
+from ..runner.run import run_locked
 from ..runner.steps import DIGESTS, Job, measure, render
 from ..runner.store import Cell, RunFolder
 from ..runner.stored import avatar_digest, open_avatar
-from ..specs import Findings, MethodSpec
+from ..specs import Findings, MethodSpec, MetricSpec
 from .background import check_background
 from .command import EvaluateSettings
 from .naming import Render, check_truth, composited, named_renders
@@ -79,8 +79,8 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
         stored.check_subject(clips[0])
         avatar, of = stored.load(config.device), stored.method
         method = images_method(config.methods[0], avatar_digest(source)[:12])
-        method = replace(method, spec=replace(method.spec, resolution=of.spec.resolution))
-        adapted_for = [replace(of, spec=replace(of.spec, name=method.spec.name))]
+        needs = {name: getattr(of.spec, name) for name in ("head_models", "monocular", "resolution")}
+        method = replace(method, spec=replace(method.spec, **needs))
     else:
         images = find_images(source, clips, protocols, settings.names, config)
         if not settings.any_background:
@@ -96,36 +96,25 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
             for (task, key), render in sorted(images.items())
         ]
         method = images_method(config.methods[0], digest(digests)[:12])
-        adapted_for = [method]
     folder = RunFolder(Path(config.out))
     check_kind(folder.root, "a run")
     check_output_folder(folder.root)
+
+    def score(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
+        if settings.avatar:
+            render(job, avatar)
+        else:
+            _copy(images, job)
+            job.cell.finish(DIGESTS, job.fit_fingerprint, files=job.cell.digests(job.frame_paths))
+        return measure(job, avatar, metrics)
+
     with locked(folder.root):
-        manifest = describe(config, [(method, PLAIN)], metrics, clips, protocols)
-        folder.check_kept(manifest)
-        jobs = [
-            replace(job, method=method)
-            for job in make_jobs(config, [(m, PLAIN) for m in adapted_for], clips, protocols, folder)
-        ]
-        manifest.write(folder.manifest)
-        parts = []
-        for index, job in enumerate(jobs):
-            job.check()
-            if settings.avatar:
-                render(job, avatar)
-            else:
-                _copy(images, job)
-                job.cell.finish(DIGESTS, job.fit_fingerprint, files=job.cell.digests(job.frame_paths))
-            parts.append(measure(job, avatar, metrics))
-            progress(index + 1, len(jobs), job.name)
-        rows = Rows.joined(parts)
-        folder.write_rows(rows)
-        replace(manifest, status="done").write(folder.manifest)
-        write_reports(folder.root)
+        cells = [(method, PLAIN)]
+        rows = run_locked(config, cells=cells, metrics=metrics, clips=clips, each=score, unchecked=True)
     together = [*([Path(settings.like)] if settings.like else []), folder.root]
     text = resolve(get("reports", "table-text").implementation)(together, "md")
     data = {"out": folder.root, "method": method.spec.name, "version": method.spec.version, "rows": len(rows)}
-    return Findings(f"{text}\n{folder.root}", data)
+    return Findings(f"{text}\n{folder.root}", data, not rows.failed)
 
 
 def _open(settings: EvaluateSettings, heads: Mapping[str, str]) -> tuple[RunConfig, list[Clip]]:

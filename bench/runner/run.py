@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
@@ -36,6 +36,7 @@ from .steps import Job, derive, failed_rows, fit, measure, reason_of, render, st
 from .store import RunFolder
 
 log = logging.getLogger(__name__)
+RunCell = Callable[[Job, Sequence[MetricSpec]], Rows]
 
 
 def run(
@@ -82,17 +83,29 @@ def run_locked(
     *,
     unchecked: bool = False,
     clips: Sequence[Clip] | None = None,
+    cells: Sequence[tuple[ResolvedMethod, Condition]] | None = None,
+    metrics: Sequence[MetricSpec] | None = None,
+    each: RunCell | None = None,
     reports: bool = True,
     **record: Any,
 ) -> Rows:
-    """Run the cells of a configuration as `run` does, into a folder whose lock is held."""
+    """Run the cells of a configuration as `run` does, into a folder whose lock is held.
+
+    Parameters
+    ----------
+    cells, metrics : sequence, optional
+        What the configuration resolves to, where it does not name them; then ``each`` is to be given.
+    each : callable, optional
+        Does the work of a cell in this process, in place of `run_cell`.
+    """
     start = time.perf_counter()
     folder = RunFolder(Path(config.out))
     config = grown(config, folder)
-    cells, metrics = resolve_cells(config), resolve_metrics(config)
+    cells = resolve_cells(config) if cells is None else cells
+    metrics = resolve_metrics(config) if metrics is None else metrics
     execution = execution or Execution()
     check_executor(execution, config.device)
-    rows = _run(config, cells, metrics, folder, execution, clips, unchecked, record)
+    rows = _run(config, cells, metrics, folder, execution, clips, each or run_cell, unchecked, record)
     if reports:
         write_reports(folder.root)  # with the captures gone from memory
     log.info("finished in %s: %s", duration(time.perf_counter() - start), folder.root)
@@ -106,6 +119,7 @@ def _run(
     folder: RunFolder,
     execution: Execution,
     clips: Sequence[Clip] | None,
+    each: RunCell,
     unchecked: bool,
     record: Mapping[str, Any],
 ) -> Rows:
@@ -140,7 +154,7 @@ def _run(
     for protocol in protocols.values():
         log.info("%s, protocol %s: %d frames", protocol.task, protocol.hash, len(protocol.keys))
     if execution.executor == "inline":
-        rows = run_jobs(jobs, metrics)
+        rows = run_jobs(jobs, metrics, each)
     else:
         from .tasks import execute, machine_of
 
@@ -204,6 +218,8 @@ def check_settings(cells: Iterable[tuple[ResolvedMethod, Condition]]) -> None:
     Raises `InputError` for settings that a method refuses, and whatever importing or creating it raises.
     """
     for method, _ in cells:
+        if not method.spec.implementation:
+            continue  # images of a folder
         made = method.create()
         if isinstance(made, CheckedMethod):
             made.check(None, method.budget)
@@ -322,10 +338,10 @@ def _copy_kept(source: Path, folder: Path) -> None:
                 shutil.copyfile(path, temporary)
 
 
-def run_jobs(jobs: Sequence[Job], metrics: Sequence[MetricSpec]) -> Rows:
-    """Fit, render and measure cell by cell, under one line of progress; a cell that fails has failed rows."""
+def run_jobs(jobs: Sequence[Job], metrics: Sequence[MetricSpec], each: RunCell) -> Rows:
+    """Do the work of each cell, under one line of progress; a cell that fails has failed rows."""
     with run_progress({job.name: steps_ahead(job, metrics) for job in jobs}) as line:
-        return Rows.joined([_run_inline(replace(job, line=line), metrics) for job in jobs])
+        return Rows.joined([_run_inline(replace(job, line=line), metrics, each) for job in jobs])
 
 
 def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
@@ -335,11 +351,11 @@ def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
     return measure(job, avatar, metrics)
 
 
-def _run_inline(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
+def _run_inline(job: Job, metrics: Sequence[MetricSpec], each: RunCell) -> Rows:
     log.info("%s", job.name)
     outcome_path(job.cell.folder).unlink(missing_ok=True)  # of a process or a job that worked on it earlier
     try:
-        return run_cell(job, metrics)
+        return each(job, metrics)
     except HeadbenchError as error:
         log.error("%s failed: %s", job.name, error)
         return failed_rows(job, metrics, reason_of(error))

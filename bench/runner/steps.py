@@ -142,7 +142,7 @@ class Job:
 
     def check_method(self) -> None:
         """Let a method that can tell refuse what it could not train or render; not where all is done already."""
-        method = self.create()
+        method = self.create() if self.method.spec.implementation else None
         if isinstance(method, CheckedMethod) and not self.cell.is_done("measure", self.fit_fingerprint):
             method.check(TrainingView(self.form.clip), self.method.budget)
 
