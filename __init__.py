@@ -53,6 +53,7 @@ if _TYPE_CHECKING:
     from .bench.runner.stored import load_avatar
     from .bench.specs import (
         BenchmarkSpec,
+        CommandSpec,
         DatasetSpec,
         Findings,
         MethodSpec,
@@ -61,7 +62,6 @@ if _TYPE_CHECKING:
         ProfileSpec,
         ReportSpec,
         ResolutionRule,
-        writes,
     )
     from .datasets.head.loaders import load_head
     from .datasets.steps.exclude import exclude_given
@@ -79,6 +79,7 @@ __all__ = [
     "Camera",
     "CheckedMethod",
     "Clip",
+    "CommandSpec",
     "DatasetSpec",
     "DependentOptions",
     "Findings",
@@ -128,7 +129,6 @@ __all__ = [
     "resolve_method",
     "run",
     "train",
-    "writes",
 ]
 
 _HOMES = {
@@ -143,7 +143,7 @@ _HOMES = {
     "bench.runner.stored": ("load_avatar",),
     "bench.rows": ("ALL",),
     "bench.specs": tuple(name for name in __all__ if name.endswith("Spec"))
-    + ("Findings", "Need", "ResolutionRule", "writes"),
+    + ("Findings", "Need", "ResolutionRule"),
     "datasets.head.loaders": ("load_head",),
     "datasets.steps.exclude": ("exclude_given",),
     "reports.runs": ("RunData",),

@@ -22,7 +22,7 @@ from ..manifest import PROTOCOLS, Manifest, protocol_path
 from ..runner.steps import DIGESTS
 from ..runner.store import STAGES, RunFolder
 from ..specs import Findings
-from .command import BundleSettings, check_shown
+from .settings import BundleSettings, check_shown
 
 INDEX = "bundle.json"
 MAX_FILES = 200_000

@@ -3,98 +3,13 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
-from typing import Literal
-
-import tyro
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.io.files import check_kind, output_inside
 from ...bench.io.lock import locked
-from ...bench.options import DependentOptions
-from ...bench.runner.config import RunOptions
 from ...bench.specs import Findings
-
-MOST_TRACKING_ERROR = 4.0
-"""What `headbench synth` takes at most."""
-FRACTIONS = ("1/16", "1/8", "1/4", "1/2", "1")
-LEVELS = (0.0, 1.0, 2.0)
-
-
-@dataclass(frozen=True)
-class CurveSettings(RunOptions):
-    """Quality against training time, cameras, timesteps or tracking error: trains each method with parts of them.
-
-    Each part or level is a whole training of its own. Quality is measured on training frames that are held out of every training,
-    the same for all parts, never on test frames."""
-
-    run: tyro.conf.Positional[str]
-    """Folder of a finished run."""
-
-    out: str | None = None
-    """Folder to write, a run folder itself; default: `curve` in the folder of the run, or `curve-cameras` and so on."""
-
-    methods: tuple[str, ...] = ()
-    """Methods to train; default: all but the trivial baselines."""
-
-    over: Literal["budget", "cameras", "timesteps", "tracking_error"] = "budget"
-    """What to take parts of; or the error of tracking, of a synthetic capture, whose pictures stay."""
-
-    fractions: tuple[str, ...] = ()
-    """Parts of the method's budget, or of the training cameras or timesteps, above 0 and at most 1; default: 1/16 1/8 1/4 1/2
-    1. Not with `--over tracking_error`."""
-
-    levels: tuple[float, ...] = ()
-    """Levels for `--over tracking_error`, as for `headbench synth`; default: 0 1 2. Not with another `--over`."""
-
-    camera: str = ""
-    """Training camera to hold out; default: the one nearest to the mean position of the training cameras."""
-
-    every: int = 8
-    """Hold out one of so many training timesteps."""
-
-    frames: int = 100
-    """Score at most so many frames of each subject in the held-out camera, and as many of the held-out timesteps."""
-
-    dependent = (
-        DependentOptions(("levels",), "over", ("tracking_error",)),
-        DependentOptions(("fractions",), "over", ("budget", "cameras", "timesteps")),
-    )
-
-    def __post_init__(self) -> None:
-        if len(set(self.parts)) != len(self.parts):
-            raise ValueError(f"fractions: each once; found {' '.join(self.fractions)}")
-        if len(set(self.levels)) != len(self.levels):
-            raise ValueError(f"levels: each once; found {' '.join(map(str, self.levels))}")
-        if not all(0 <= level <= MOST_TRACKING_ERROR for level in self.levels):
-            expected = f"from 0 to {MOST_TRACKING_ERROR:g}"
-            raise ValueError(f"levels: {expected}; found {' '.join(map(str, self.levels))}")
-        if self.every < 2:
-            raise ValueError(f"every is {self.every}; at least 2")
-        if self.frames < 1:
-            raise ValueError(f"frames is {self.frames}; at least 1")
-
-    @property
-    def parts(self) -> tuple[Fraction, ...]:
-        """The fractions as numbers, rising. Raises `ValueError` for what is no number above 0 and at most 1."""
-        return tuple(sorted(map(_part, self.fractions or FRACTIONS)))
-
-    @property
-    def tracking_errors(self) -> tuple[float, ...]:
-        """The levels, rising."""
-        return tuple(sorted(self.levels or LEVELS))
-
-
-def _part(text: str) -> Fraction:
-    try:
-        part = Fraction(text)
-    except (ValueError, ZeroDivisionError):
-        part = Fraction(0)
-    if not 0 < part <= 1:
-        raise ValueError(f"fractions: {text!r} is no number above 0 and at most 1, such as 1/4 or 0.25")
-    return part
+from .settings import CurveSettings
 
 
 def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Findings:

@@ -28,10 +28,10 @@ from ...bench.runner.stored import VARIANT_MARK
 from ...bench.specs import Findings, MetricSpec
 from ..aggregate import subject_means
 from ..writers import csv_text
-from .command import CurveSettings
 from .held_out import CAMERA, TIMESTEPS, HeldOutClip, hold_out, reduced
 from .plot import CurvePanel, write_plot
 from .points import HELD_OUT, MEASURED, CurvePoint, column, mean, mean_point, points_text
+from .settings import CurveSettings
 from .tracking import clips_by_level, tracking_error
 
 log = logging.getLogger(__name__)

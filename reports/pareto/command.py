@@ -4,84 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import tyro
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.io.files import check_kind, check_output_folder, output_inside, write_text
 from ...bench.io.lock import locked
-from ...bench.runner.config import RunOptions
-from ...bench.specs import Findings, writes
+from ...bench.specs import Findings
+from .settings import ParetoSettings, SweepSettings
 
 if TYPE_CHECKING:
     from .points import Point
 
 
-@dataclass(frozen=True)
-class ParetoSettings:
-    """Quality against size and frame time, over finished runs of the same frames; CSV, and a plot with the front."""
-
-    runs: tyro.conf.Positional[tuple[str, ...]]
-    """Folders of finished runs: every method in each is a point, such as the settings of a sweep."""
-
-    out: str
-    """Folder to write: points.csv and pareto.png."""
-
-    task: str = "novel_view"
-    """Task whose frames give the quality."""
-
-    metric: str = ""
-    """Metric of quality; default: the first of frames that the runs have."""
-
-    time: str = ""
-    """Metric of frame time, in ms: latency_p50 (default, or what frames per second give), processor_time, ..."""
-
-    def __post_init__(self) -> None:
-        if not self.runs:
-            raise ValueError("runs: at least one folder")
-
-
-@dataclass(frozen=True)
-class SweepSettings(RunOptions):
-    """Quality against size and frame time of what can be derived from a run's avatars without training."""
-
-    run: tyro.conf.Positional[str]
-    """Folder of a finished run."""
-
-    out: str | None = None
-    """Folder to write, a run folder itself; default: `sweep` in the folder of the run. A sweep in it is continued: variants may
-    be added, but none left out."""
-
-    methods: tuple[str, ...] = ()
-    """Methods to derive from; default: all that know how."""
-
-    variants: tuple[str, ...] = ()
-    """Variants to derive, by name; default: all. The trained avatar itself is always measured."""
-
-    frames: int | None = None
-    """Score at most so many frames per subject and task, evenly spaced; default: those of the run."""
-
-    task: str = "novel_view"
-    """Task whose frames give the quality in the plot."""
-
-    metric: str = ""
-    """Metric of quality in the plot; default: the first of frames that the run has."""
-
-    time: str = ""
-    """Metric of frame time in the plot, in ms: latency_p50 (default), processor_time on a machine with other work."""
-
-    def __post_init__(self) -> None:
-        if self.frames is not None and self.frames < 1:
-            raise ValueError(f"frames is {self.frames}; at least 1")
-
-
 COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
 
 
-@writes("out")
 def pareto(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
     """Plot quality against size and frame time of finished runs, with the Pareto front, and write CSV.
 

@@ -19,7 +19,7 @@ from ...bench.runner.steps import Job, measure, render
 from ...bench.runner.store import RunFolder
 from ...bench.runner.stored import shown_by, write_avatar_record
 from ...bench.specs import MetricSpec
-from .command import SweepSettings
+from .settings import SweepSettings
 
 
 def sweep(settings: SweepSettings, out: Path, progress: Progress) -> Rows:

@@ -6,7 +6,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from ...bench.contracts import Progress
+from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.executors.settings import check_executor
 from ...bench.io.files import write_text
@@ -27,14 +27,14 @@ from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import table_of
 from ..writers import to_markdown
 from .ablations import ablation_table
-from .command import ABLATIONS, SEED, SuiteSettings
+from .settings import ABLATIONS, SEED, SuiteSettings
 
 OURS = "ours"
 REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
 """Parts of the frame that have tables of their own."""
 
 
-def run_suite(settings: SuiteSettings, progress: Progress) -> Findings:
+def run_suite(settings: SuiteSettings, progress: Progress = no_progress) -> Findings:
     """Make the captures, run the comparison and, if asked for, the ablations; write ``results.md`` into ``out``.
 
     Raises `InputError` for methods, presets and sizes that do not fit, before the first capture is made.

@@ -18,9 +18,10 @@ from headbench.bench.runner import run as runner
 from headbench.bench.runner.store import RunFolder
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.reports.curve import curve as module
-from headbench.reports.curve.command import CurveSettings, curve_run
+from headbench.reports.curve.command import curve_run
 from headbench.reports.curve.held_out import hold_out
 from headbench.reports.curve.points import MEASURED, half_width
+from headbench.reports.curve.settings import CurveSettings
 
 from ...datasets.flat_renderer import flat_pictures
 from ...datasets.tiny_capture import write_tiny_capture

@@ -9,7 +9,7 @@ from headbench.bench.io.documents import read_json
 from headbench.bench.runner import run as runner
 from headbench.bench.runner.store import RunFolder
 from headbench.reports.pareto import sweep as module
-from headbench.reports.pareto.command import SweepSettings
+from headbench.reports.pareto.settings import SweepSettings
 from headbench.reports.pareto.sweep import sweep
 
 from ...small_run import run_on

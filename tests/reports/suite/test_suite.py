@@ -8,7 +8,7 @@ from headbench.bench import cli
 from headbench.bench.registry import get
 from headbench.bench.runner.config import resolve_method
 from headbench.reports.suite import suite as module
-from headbench.reports.suite.command import ABLATIONS
+from headbench.reports.suite.settings import ABLATIONS
 
 SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16x16")
 

@@ -1,4 +1,4 @@
-"""``headbench suite``."""
+"""Settings of the suite, and its ablations."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.executors.command import ExecutionOptions
+from ...bench.executors.options import ExecutionOptions
 from ...bench.runner.config import parse_size
-from ...bench.specs import Findings, writes
 
 SEED = 26_000
 """Of the suite's captures. Settings of methods are chosen on captures of seeds below 10,000 (`README.md`)."""
@@ -86,11 +84,3 @@ class SuiteSettings(ExecutionOptions):
     def chosen(self) -> tuple[str, ...]:
         """Names of the ablations asked for, in the order of `ABLATIONS`."""
         return tuple(name for name in ABLATIONS if name in self.ablations or ALL in self.ablations)
-
-
-@writes("out")
-def suite(settings: SuiteSettings, progress: Progress = no_progress) -> Findings:
-    """Run the benchmark suite: ten synthetic subjects, all methods, tables by region and part."""
-    from .suite import run_suite
-
-    return run_suite(settings, progress)

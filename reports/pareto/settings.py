@@ -1,0 +1,67 @@
+"""Settings of the Pareto plot and of sweeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import tyro
+
+from ...bench.runner.config import RunOptions
+
+
+@dataclass(frozen=True)
+class ParetoSettings:
+    """Quality against size and frame time, over finished runs of the same frames; CSV, and a plot with the front."""
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of finished runs: every method in each is a point, such as the settings of a sweep."""
+
+    out: str
+    """Folder to write: points.csv and pareto.png."""
+
+    task: str = "novel_view"
+    """Task whose frames give the quality."""
+
+    metric: str = ""
+    """Metric of quality; default: the first of frames that the runs have."""
+
+    time: str = ""
+    """Metric of frame time, in ms: latency_p50 (default, or what frames per second give), processor_time, ..."""
+
+    def __post_init__(self) -> None:
+        if not self.runs:
+            raise ValueError("runs: at least one folder")
+
+
+@dataclass(frozen=True)
+class SweepSettings(RunOptions):
+    """Quality against size and frame time of what can be derived from a run's avatars without training."""
+
+    run: tyro.conf.Positional[str]
+    """Folder of a finished run."""
+
+    out: str | None = None
+    """Folder to write, a run folder itself; default: `sweep` in the folder of the run. A sweep in it is continued: variants may
+    be added, but none left out."""
+
+    methods: tuple[str, ...] = ()
+    """Methods to derive from; default: all that know how."""
+
+    variants: tuple[str, ...] = ()
+    """Variants to derive, by name; default: all. The trained avatar itself is always measured."""
+
+    frames: int | None = None
+    """Score at most so many frames per subject and task, evenly spaced; default: those of the run."""
+
+    task: str = "novel_view"
+    """Task whose frames give the quality in the plot."""
+
+    metric: str = ""
+    """Metric of quality in the plot; default: the first of frames that the run has."""
+
+    time: str = ""
+    """Metric of frame time in the plot, in ms: latency_p50 (default), processor_time on a machine with other work."""
+
+    def __post_init__(self) -> None:
+        if self.frames is not None and self.frames < 1:
+            raise ValueError(f"frames is {self.frames}; at least 1")
