@@ -54,6 +54,7 @@ if _TYPE_CHECKING:
     from .bench.runner.stored import load_avatar
     from .bench.specs import (
         BenchmarkSpec,
+        CommandSpec,
         ConditionSpec,
         DatasetSpec,
         Findings,
@@ -63,7 +64,6 @@ if _TYPE_CHECKING:
         ProfileSpec,
         ReportSpec,
         ResolutionRule,
-        writes,
     )
     from .datasets.head.loaders import load_head
     from .datasets.steps.exclude import exclude_given
@@ -82,6 +82,7 @@ __all__ = [
     "Camera",
     "CheckedMethod",
     "Clip",
+    "CommandSpec",
     "Condition",
     "ConditionSpec",
     "DatasetSpec",
@@ -134,7 +135,6 @@ __all__ = [
     "resolve_method",
     "run",
     "train",
-    "writes",
 ]
 
 _HOMES = {
@@ -150,7 +150,7 @@ _HOMES = {
     "bench.runner.stored": ("load_avatar",),
     "bench.rows": ("ALL",),
     "bench.specs": tuple(name for name in __all__ if name.endswith("Spec"))
-    + ("Findings", "Need", "ResolutionRule", "writes"),
+    + ("Findings", "Need", "ResolutionRule"),
     "datasets.head.loaders": ("load_head",),
     "datasets.steps.exclude": ("exclude_given",),
     "reports.runs": ("RunData",),

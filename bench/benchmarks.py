@@ -1,11 +1,19 @@
-"""What the benchmarks of ``headbench bench`` and ``headbench stress`` share: runs that take turns, and tables of rows."""
+"""``headbench bench`` and ``headbench stress``, and what their benchmarks share: runs that take turns, tables of rows."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
+import tyro
+
+from .contracts import Progress
+from .errors import InputError
+from .io.files import check_writable, write_json
+from .registry import get, resolve
 from .specs import Findings
 
 Key = TypeVar("Key", bound=Hashable)
@@ -65,3 +73,48 @@ def _cell(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
     return str(value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StressSettings:
+    """Exit code 1 where a case does not behave as expected."""
+
+    part: tyro.conf.Positional[str]
+    """What to measure: splats, or what `headbench list benchmarks` shows."""
+    quick: bool = False
+    """Less where there is much: fewer sizes, runs, cases."""
+    out: str | None = None
+    """Also write the results to this JSON file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchSettings(StressSettings):
+    """What is compared is timed in turns, and each table says whether times are processor times or by the clock, and of
+    how many threads; compare ratios, not milliseconds, between machines.
+    """
+
+    tradeoffs: bool = False
+    """Instead of speed alone, what settings that give up accuracy for speed buy."""
+
+
+def bench(settings: BenchSettings, progress: Progress) -> Findings:
+    """Benchmark a part of headbench itself on this machine."""
+    return _measure(settings, "tradeoffs" if settings.tradeoffs else "speed", progress)
+
+
+def stress(settings: StressSettings, progress: Progress) -> Findings:
+    """Test a part of headbench at numerical extremes and print the result of each case."""
+    return _measure(settings, "stress", progress)
+
+
+def _measure(settings: StressSettings, kind: str, progress: Progress) -> Findings:
+    function = getattr(get("benchmarks", settings.part), kind)
+    if not function:
+        found = f"{settings.part}, which has none"
+        raise InputError("command line", "part", f"a benchmark with {kind}", found)
+    if settings.out is not None:
+        check_writable(Path(settings.out), "--out")
+    findings: Findings = resolve(function)(settings.quick, progress)
+    if settings.out is not None:
+        write_json(Path(settings.out), findings.data)
+    return findings

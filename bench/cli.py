@@ -69,12 +69,6 @@ def _call(words: list[str]) -> int:
         return ExitCode.OK
     if not words or words[0] == "help":
         words = [*words[1:], "--help"]
-    from .commands import call  # with the parser, which takes longer to import than the version to print
+    from .commands import call  # which reads the specs of all commands
 
     return call(words)
-
-
-if __name__ == "__main__":
-    from .start import main as start
-
-    sys.exit(start())

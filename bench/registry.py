@@ -40,11 +40,6 @@ SPEC_TYPES: dict[str, type] = {
     "benchmarks": BenchmarkSpec,
     "commands": CommandSpec,
 }
-BUILT_IN = {
-    **{name: name for name in ("demo", "run", "table", "synth", "bench", "stress")},
-    "list": "list_installed",
-}
-"""The commands of this package's module `builtin`, and their functions."""
 log = logging.getLogger(__name__)
 _OWN = "headbench"
 
@@ -66,10 +61,7 @@ def discover(group: Group) -> dict[str, Plugin]:
     the other's first word the later is broken.
     """
     found: dict[str, Plugin] = {}
-    entries: list[EntryPoint] = [*entry_points(group=f"headbench.{group}")]
-    if group == "commands":
-        entries += [EntryPoint(name, f"{_OWN}.bench.builtin:{f}", "") for name, f in BUILT_IN.items()]
-    for entry in sorted(entries, key=lambda e: _origin(e) != _OWN):
+    for entry in sorted(entry_points(group=f"headbench.{group}"), key=lambda e: _origin(e) != _OWN):
         plugin, known = _load(entry, group), found.get(entry.name)
         if known is None:
             found[entry.name] = plugin
@@ -125,8 +117,6 @@ def unknown(file: str, key: str, name: str, known: Any, remedy: str = "") -> Inp
 
 
 def _origin(entry: EntryPoint) -> str:
-    if entry.value.startswith(f"{_OWN}.bench.builtin:"):
-        return _OWN
     return _name_and_version(entry.dist)[0] if entry.dist is not None else "unknown"
 
 
@@ -147,8 +137,6 @@ def _load(entry: EntryPoint, group: str) -> Plugin:
 
 
 def _checked(spec: Any, group: str, name: str) -> Any:
-    if group == "commands":
-        return CommandSpec.of(name, spec)
     if not isinstance(spec, SPEC_TYPES[group]):
         raise InputError(
             f"registry of {group}", name, f"a {SPEC_TYPES[group].__name__}", f"a {type(spec).__name__}"

@@ -6,10 +6,9 @@ resolved when it is used. The behaviours behind the names are in `contracts`.
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, is_dataclass, replace
-from typing import Any, Literal, NamedTuple, get_type_hints
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, NamedTuple
 
 MAX_LABEL = 120
 LABEL = f"at most {MAX_LABEL} printable characters"
@@ -330,60 +329,31 @@ class BenchmarkSpec:
     stress: str = ""
 
 
-CommandFunction = Callable[..., Findings]
-
-
 @dataclass(frozen=True)
 class CommandSpec:
-    """A command of the command line, as its entry point gives it: a function ``(settings, progress) -> Findings``.
-
-    The module that defines the function must be light to import: every start of the command line loads it.
+    """A command of the command line. Listing it imports neither its settings nor its function.
 
     Attributes
     ----------
-    name : the entry point's; may have two words ("prepare nersemble").
-    summary : the first line of the function's docstring.
-    function : called with the settings and a `Progress`. The exit code is 0, or 1 where the findings did not pass,
-        unless they give one.
-    settings : annotation of the function's first parameter: a frozen dataclass whose attributes, described in
-        docstrings, become the options.
-    writes, kinds : the setting with the folder that the command writes, and the kinds of folder that it may continue in,
-        see `writes`; "" for none.
+    name : the words that call it: one, or two of which the first names a group of commands ("prepare nersemble").
+    group : heading of ``headbench --help`` that it stands under: one of `COMMAND_GROUPS`, or another, shown after them.
+    summary : one sentence.
+    settings : "package.module:Class" of a frozen dataclass. Its attributes become the options, the strings below them the
+        help. Help of the command loads this module.
+    function : "package.module:function" of ``(settings, progress: Progress) -> Findings``. The exit code is 0, or 1 where
+        the findings did not pass, unless they give one.
+    writes : the setting with the folder that the command writes: no other process works in it meanwhile; "" for none.
+    kinds : the kinds of folder that the command may continue in, see `bench.io.files.check_kind`.
     """
 
     name: str
+    group: str
     summary: str
-    function: CommandFunction
-    settings: type
+    settings: str
+    function: str
     writes: str = ""
     kinds: tuple[str, ...] = ()
 
-    @classmethod
-    def of(cls, name: str, function: Any) -> CommandSpec:
-        """Describe a function. Raises `TypeError` for what is no command."""
-        parameters = list(inspect.signature(function).parameters)
-        settings = get_type_hints(function).get(parameters[0]) if parameters else None
-        if not isinstance(settings, type) or not is_dataclass(settings):
-            raise TypeError(f"{function!r}: the first parameter of a command is annotated with a dataclass")
-        try:
-            inspect.signature(function).bind(settings, None)
-        except TypeError as error:
-            raise TypeError(
-                f"{function!r}: a command is called with settings and a Progress: {error}"
-            ) from error
-        summary = (function.__doc__ or "").strip().partition("\n")[0]
-        setting, kinds = getattr(function, "writes", ("", ()))
-        return cls(name, summary, function, settings, setting, kinds)
 
-
-def writes(setting: str, *kinds: str) -> Callable[[CommandFunction], CommandFunction]:
-    """Declare the setting that names the folder a command writes: no other process works in it meanwhile.
-
-    A folder that holds another kind of thing than ``kinds`` is refused, see `bench.io.files.check_kind`.
-    """
-
-    def declare(function: CommandFunction) -> CommandFunction:
-        function.__dict__["writes"] = setting, kinds
-        return function
-
-    return declare
+COMMAND_GROUPS = ("compare", "inspect", "data", "export", "validate")
+"""Headings of ``headbench --help``, in this order."""

@@ -1,6 +1,6 @@
 """Captures that headbench reads or makes, and benchmarks. Light to import: implementations are named, not loaded."""
 
-from ..bench.specs import BenchmarkSpec, DatasetSpec
+from ..bench.specs import BenchmarkSpec, CommandSpec, DatasetSpec
 
 ERRORS = "headbench.datasets.lint.before_run:errors"
 
@@ -50,4 +50,110 @@ REFIT = BenchmarkSpec(
     name="refit",
     summary="the refit to another head model: residuals, timesteps a second",
     speed="headbench.datasets.benchmarks.refit:speed",
+)
+
+SYNTH = CommandSpec(
+    name="synth",
+    group="data",
+    summary="Render a synthetic multi-view capture in the GaussianAvatars/VHAP layout.",
+    settings="headbench.datasets.synthetic.command:SynthSettings",
+    function="headbench.datasets.synthetic.command:synth",
+)
+
+PREPARE_NERSEMBLE = CommandSpec(
+    name="prepare nersemble",
+    group="data",
+    summary="Convert raw NeRSemble recordings to captures; an interrupted conversion is continued.",
+    settings="headbench.datasets.nersemble.settings:PrepareSettings",
+    function="headbench.datasets.nersemble.command:prepare_nersemble",
+)
+
+RECORD_NERSEMBLE = CommandSpec(
+    name="record nersemble",
+    group="export",
+    summary="Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to test `prepare`.",
+    settings="headbench.datasets.nersemble.settings:RecordSettings",
+    function="headbench.datasets.nersemble.command:record_nersemble",
+    writes="out",
+    kinds=("a recording",),
+)
+
+LINT = CommandSpec(
+    name="lint",
+    group="data",
+    summary="Check a capture for faults that make a comparison unfair or wrong; --list explains the codes.",
+    settings="headbench.datasets.lint.settings:LintSettings",
+    function="headbench.datasets.lint.command:lint",
+)
+
+TONGUE = CommandSpec(
+    name="tongue",
+    group="data",
+    summary="Find the frames that show the tongue, for review on a contact sheet and with overrides.",
+    settings="headbench.datasets.steps.tongue.command:TongueSettings",
+    function="headbench.datasets.steps.tongue.command:tongue",
+    writes="out",
+)
+
+REFIT_COMMAND = CommandSpec(
+    name="refit",
+    group="data",
+    summary="Refit the tracking of a capture to another head model, with residuals in millimetres and a heat map.",
+    settings="headbench.datasets.head.refit.settings:RefitCommandSettings",
+    function="headbench.datasets.head.refit.command:refit_capture",
+    writes="out",
+    kinds=("captures",),
+)
+
+INSPECT = CommandSpec(
+    name="inspect",
+    group="inspect",
+    summary="Plot the contents of a capture: camera rig, splits, tracked mesh over images, motion by sequence.",
+    settings="headbench.datasets.inspect.command:InspectSettings",
+    function="headbench.datasets.inspect.command:inspect",
+    writes="out",
+)
+
+STEPS = CommandSpec(
+    name="steps",
+    group="inspect",
+    summary="Plot the jaw bases and expression clusters computed from a capture's training frames.",
+    settings="headbench.datasets.steps.pictures.command:StepsSettings",
+    function="headbench.datasets.steps.pictures.command:steps",
+    writes="out",
+)
+
+EXPORT_COLMAP = CommandSpec(
+    name="export colmap",
+    group="export",
+    summary="Write frames of a capture as a COLMAP dataset: images, masks and a sparse model.",
+    settings="headbench.datasets.colmap.command:ExportColmapSettings",
+    function="headbench.datasets.colmap.command:export_colmap",
+    writes="out",
+    kinds=("a COLMAP dataset",),
+)
+
+SUBMISSION_RENDER = CommandSpec(
+    name="submission render",
+    group="export",
+    summary="Render the test frames of a NeRSemble benchmark participant: four sequences, four cameras.",
+    settings="headbench.datasets.nersemble.benchmark.settings:SubmissionRenderSettings",
+    function="headbench.datasets.nersemble.benchmark.render:render_participant",
+    writes="out",
+)
+
+SUBMISSION_WRITE = CommandSpec(
+    name="submission write",
+    group="export",
+    summary="Write a submission to the NeRSemble benchmark and report the loss of its codec; exit code 3 without ffmpeg.",
+    settings="headbench.datasets.nersemble.benchmark.settings:SubmissionWriteSettings",
+    function="headbench.datasets.nersemble.benchmark.command:submission_write",
+)
+
+SUBMISSION_CHECK = CommandSpec(
+    name="submission check",
+    group="export",
+    summary="Check a submission to the NeRSemble benchmark as its server does and decode every frame.",
+    settings="headbench.datasets.nersemble.benchmark.settings:SubmissionCheckSettings",
+    function="headbench.datasets.nersemble.benchmark.command:submission_check",
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..bench.specs import BenchmarkSpec, ReportSpec
+from ..bench.specs import BenchmarkSpec, CommandSpec, ReportSpec
 
 TABLE = ReportSpec(
     name="table",
@@ -29,21 +29,21 @@ PAGE = ReportSpec(
     implementation="headbench.reports.page.report:write_page",
 )
 
-CURVE = ReportSpec(
+CURVE_REPORT = ReportSpec(
     name="curve",
     summary="Quality over what trainings were given, as a table, CSV and a plot.",
     implementation="headbench.reports.curve.curve:curve_report",
     writes=False,
 )
 
-PARETO = ReportSpec(
+PARETO_REPORT = ReportSpec(
     name="pareto",
     summary="Quality over size and frame time with the Pareto front, as a table, CSV and a plot.",
     implementation="headbench.reports.pareto.command:pareto",
     writes=False,
 )
 
-SUITE = ReportSpec(
+SUITE_REPORT = ReportSpec(
     name="suite",
     summary="Results of the suite by region and sequence, with differences from a method and ablations.",
     implementation="headbench.reports.suite.suite:suite_report",
@@ -60,4 +60,79 @@ VIEWER = BenchmarkSpec(
     name="viewer",
     summary="the viewer in a browser: updates a second while a slider moves, milliseconds by step",
     speed="headbench.reports.view.benchmark:speed",
+)
+
+TABLE_COMMAND = CommandSpec(
+    name="table",
+    group="compare",
+    summary="Print a table of finished runs on the same frames, or write it to a file.",
+    settings="headbench.reports.table_command:TableSettings",
+    function="headbench.reports.table_command:print_table",
+)
+
+COMPARE = CommandSpec(
+    name="compare",
+    group="compare",
+    summary="Test paired differences between methods of finished runs: interval, exact test over subjects, Holm's correction.",
+    settings="headbench.reports.statistics.command:CompareSettings",
+    function="headbench.reports.statistics.command:compare_runs",
+)
+
+EXTREMES = CommandSpec(
+    name="extremes",
+    group="compare",
+    summary="Render a run's avatars in views and expressions beyond those of training; check stability limits.",
+    settings="headbench.reports.robustness.settings:ExtremesSettings",
+    function="headbench.reports.robustness.command:extremes_run",
+)
+
+REENACT = CommandSpec(
+    name="reenact",
+    group="compare",
+    summary="Drive a run's avatars with another subject's expressions; check stability limits.",
+    settings="headbench.reports.robustness.settings:ReenactSettings",
+    function="headbench.reports.robustness.command:reenact_run",
+)
+
+REPORT_COMMAND = CommandSpec(
+    name="report",
+    group="inspect",
+    summary="Write a report of finished runs as one HTML file or a folder; it opens without a network.",
+    settings="headbench.reports.page.settings:PageSettings",
+    function="headbench.reports.page.report:write_report",
+)
+
+PARETO = CommandSpec(
+    name="pareto",
+    group="inspect",
+    summary="Plot quality against size and frame time of finished runs, with the Pareto front, and write CSV.",
+    settings="headbench.reports.pareto.settings:ParetoSettings",
+    function="headbench.reports.pareto.command:pareto_runs",
+    writes="out",
+)
+
+LEADERBOARD_BUILD = CommandSpec(
+    name="leaderboard build",
+    group="inspect",
+    summary="Build a leaderboard page in Markdown and HTML from the result bundles in a folder.",
+    settings="headbench.reports.leaderboard.command:LeaderboardSettings",
+    function="headbench.reports.leaderboard.command:leaderboard_build",
+    writes="out",
+)
+
+RENDER = CommandSpec(
+    name="render",
+    group="inspect",
+    summary="Render a stored avatar: frames of a task, or an orbit; as images and video.",
+    settings="headbench.reports.render.settings:RenderSettings",
+    function="headbench.reports.render.render:render_avatar",
+    writes="out",
+)
+
+VIEW = CommandSpec(
+    name="view",
+    group="inspect",
+    summary="View avatars in a browser, side by side, with sliders and recorded sequences.",
+    settings="headbench.reports.view.settings:ViewSettings",
+    function="headbench.reports.view.server:view_avatars",
 )

@@ -20,8 +20,11 @@ NOWHERE = {"torchvision", "pickle5", "chumpy"}
 SOURCES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 
 
-def imports(path: Path, tree: ast.AST) -> list[str]:
-    """Absolute dotted names of everything a source imports, ``headbench.`` in front for our own."""
+def imports(path: Path, tree: ast.AST, *, members: bool = False) -> list[str]:
+    """Absolute dotted names of everything a source imports, ``headbench.`` in front for our own.
+
+    With ``members`` also the names after ``from ... import``, which may be modules.
+    """
     package = ["headbench", *path.relative_to(ROOT).parent.parts]
     names: list[str] = []
     for node in ast.walk(tree):
@@ -30,7 +33,8 @@ def imports(path: Path, tree: ast.AST) -> list[str]:
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else []
             stem = ".".join([*base, *([node.module] if node.module else [])])
-            names += [stem] if node.module else [f"{stem}.{alias.name}" for alias in node.names]
+            names += [stem] if node.module else []
+            names += [f"{stem}.{alias.name}" for alias in node.names] if members or not node.module else []
     return names
 
 
@@ -47,6 +51,62 @@ def violations(path: Path, source: str) -> list[str]:
         elif parts[0] in FORBIDDEN_PACKAGES.get(package, set()) | NOWHERE | set(PACKAGES):
             found.append(f"{package} imports {name}")
     return found
+
+
+MODULES = {".".join(("headbench", *path.relative_to(ROOT).with_suffix("").parts)): path for path in SOURCES}
+UNTIL_THE_ENGINE = (
+    {"bench.executors.cell", "bench.executors.run", "bench.runner.run"},
+    {"bench.executors.task", "bench.executors.worker"},
+)
+"""Circles that go with the runner."""
+
+
+def circles(sources: dict[str, str]) -> list[set[str]]:
+    """Groups of modules that import each other, directly or through others; imports in functions and for types count."""
+    known = {name.removeprefix("headbench."): source for name, source in sources.items()}
+    edges: dict[str, set[str]] = {}
+    for name, source in known.items():
+        path = ROOT / (name.replace(".", "/") + ".py")
+        wanted = (one.removeprefix("headbench.") for one in imports(path, ast.parse(source), members=True))
+        edges[name] = {one for one in wanted if one in known and one != name}
+    reached = {name: set(edges[name]) for name in edges}
+    changed = True
+    while changed:
+        changed = False
+        for name, found in reached.items():
+            more = found.union(*(reached[other] for other in found))
+            changed |= len(more) > len(found)
+            reached[name] = more
+    groups: list[set[str]] = []
+    for name, found in reached.items():
+        if name in found and not any(name in group for group in groups):
+            groups.append({other for other in found if name in reached[other]})
+    return groups
+
+
+def test_modules_do_not_import_each_other_in_circles():
+    sources = {name: path.read_text() for name, path in MODULES.items()}
+    assert [group for group in circles(sources) if group not in UNTIL_THE_ENGINE] == []
+
+
+@pytest.mark.parametrize(
+    "back",
+    [
+        "from .command import Settings",
+        "def f():\n    from . import command",
+        "if TYPE_CHECKING:\n    from ..x.command import Settings",
+        "from .between import g",
+    ],
+)
+def test_a_circle_is_found(back):
+    sources = {
+        "bench.x.command": "from .work import f",
+        "bench.x.work": back,
+        "bench.y": "from .x import work",
+    }
+    sources["bench.x.between"] = "from .command import Settings"
+    found = {"bench.x.command", "bench.x.work"} | ({"bench.x.between"} if "between" in back else set())
+    assert circles({f"headbench.{name}": source for name, source in sources.items()}) == [found]
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))

@@ -126,7 +126,7 @@ def test_the_result_is_there_for_machines(demo):
 
 @pytest.mark.slow
 def test_killed_at_random_moments_it_ends_with_the_same_numbers(run, tmp_path):
-    command = [sys.executable, "-m", "headbench.bench.cli", "demo", "--out", str(tmp_path / "demo"), *TINY]
+    command = [sys.executable, "-m", "headbench.bench.start", "demo", "--out", str(tmp_path / "demo"), *TINY]
     draw = random.Random(time.time_ns())  # the moment must not matter
     for _ in range(4):
         process = subprocess.Popen(

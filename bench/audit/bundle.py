@@ -23,7 +23,7 @@ from ..rows import Rows
 from ..runner.steps import DIGESTS
 from ..runner.store import STAGES, RunFolder
 from ..specs import Findings
-from .command import BundleSettings, check_shown
+from .settings import BundleSettings, check_shown
 
 INDEX = "bundle.json"
 MAX_FILES = 200_000

@@ -33,8 +33,8 @@ from ..runner.store import Cell, RunFolder
 from ..runner.stored import avatar_digest, open_avatar
 from ..specs import Findings, MethodSpec, MetricSpec
 from .background import check_background
-from .command import EvaluateSettings
 from .naming import Render, check_truth, composited, named_renders
+from .settings import EvaluateSettings
 
 
 class NoAvatar:

@@ -7,7 +7,7 @@ import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from ..contracts import Clip, FrameKey
+from ..contracts import Clip, FrameKey, Progress, no_progress
 from ..errors import InputError
 from ..io.files import check_output_folder, write_text
 from ..protocol import make_protocols
@@ -16,8 +16,8 @@ from ..runner.captures import capture_configuration, found_captures, open_clips,
 from ..runner.config import RunConfig
 from ..runner.store import RunFolder
 from ..specs import DatasetSpec, Findings
-from .command import FramesSettings
 from .naming import MAP_COLUMNS, image_name
+from .settings import FramesSettings
 
 FRAMES_FILE, MAP_FILE = "frames.csv", "MAP.csv"
 COLUMNS = (
@@ -28,7 +28,7 @@ COLUMNS = (
 )
 
 
-def write_frames(settings: FramesSettings) -> Findings:
+def write_frames(settings: FramesSettings, progress: Progress = no_progress) -> Findings:
     """Write `FRAMES_FILE` and `MAP_FILE` for the protocols of a run, or for those that a run on a capture would have.
 
     Raises `InputError` for what is neither a run nor a capture, options that only a capture takes, and a `MAP_FILE`

@@ -27,8 +27,8 @@ from ..runner.steps import DIGESTS, Job, measure, recorded_frames
 from ..runner.store import Cell, RunFolder
 from ..specs import Findings, MetricSpec
 from .bundle import read_bundle
-from .command import VerifySettings
 from .evaluate import NoAvatar, images_method
+from .settings import VerifySettings
 
 KEY = ["method", "condition", "seed", "task", *FRAME, "region", "metric"]
 SHOWN = 20

@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from ..executors.command import ExecutionOptions
+from ..executors.options import ExecutionOptions
 from ..options import DependentOptions
 from ..runner.config import RunOptions
 

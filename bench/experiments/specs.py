@@ -1,8 +1,33 @@
-"""Conditions that experiments register; light to import."""
+"""The experiments and the conditions that they register; light to import."""
 
 from __future__ import annotations
 
-from ..specs import ConditionSpec
+from ..specs import CommandSpec, ConditionSpec
+
+SUITE = CommandSpec(
+    name="suite",
+    group="compare",
+    summary="Run the benchmark suite: ten synthetic subjects, all methods, tables by region and part.",
+    settings="headbench.bench.experiments.suite_settings:SuiteSettings",
+    function="headbench.bench.experiments.suite:suite",
+    writes="out",
+)
+
+SWEEP = CommandSpec(
+    name="sweep",
+    group="compare",
+    summary="Derive smaller and faster variants of a run's avatars without training; quality against size and frame time.",
+    settings="headbench.bench.experiments.sweep_settings:SweepSettings",
+    function="headbench.bench.experiments.sweep:sweep_run",
+)
+
+CURVE = CommandSpec(
+    name="curve",
+    group="compare",
+    summary="Plot quality against training time, cameras, timesteps or tracking error, measured on held-out training frames.",
+    settings="headbench.bench.experiments.curve_settings:CurveSettings",
+    function="headbench.bench.experiments.curve:curve_run",
+)
 
 HOLD_OUT = ConditionSpec(
     name="hold-out",

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import tyro
 
-from ..executors.command import ExecutionOptions
+from ..executors.options import ExecutionOptions
 from ..runner.config import RunOptions
 
 

@@ -18,7 +18,7 @@ from ..rows import ALL, FRAME
 from ..runner.scoring import FULL
 from ..runner.store import RunFolder
 from ..specs import MAX_DIGITS, MetricSpec
-from .command import Captures
+from .settings import Captures
 
 AVATAR = "avatar"
 

@@ -16,8 +16,8 @@ from ...bench.specs import Findings
 from ..clip import CaptureClip, FrameFiles
 from ..head.arrays import HeadArrays
 from ..head.procedural.model import procedural_head
-from ..head.refit.command import RefitSettings
 from ..head.refit.refit import refit
+from ..head.refit.settings import RefitSettings
 from ..images import ImageStore
 from .head import FLAME_SIZES, sized_head
 

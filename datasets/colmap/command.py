@@ -13,7 +13,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import write_json
 from ...bench.io.lock import LOCK_FILE
 from ...bench.options import DependentOptions
-from ...bench.specs import Findings, writes
+from ...bench.specs import Findings
 from ..options import CaptureOptions
 
 
@@ -50,7 +50,6 @@ MARKER = "headbench-export.json"
 """File that a folder written by `export_colmap` is recognised by: another may be somebody's own model and images."""
 
 
-@writes("out", "a COLMAP dataset")
 def export_colmap(settings: ExportColmapSettings, progress: Progress) -> Findings:
     """Write frames of a capture as a COLMAP dataset: images, masks and a sparse model.
 

@@ -13,7 +13,7 @@ import tyro
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import write_json
-from ...bench.specs import Findings, writes
+from ...bench.specs import Findings
 from ..options import CaptureOptions
 
 if TYPE_CHECKING:
@@ -41,7 +41,6 @@ class InspectSettings(CaptureOptions):
 PICTURE, NUMBERS = "inspection.png", "inspection.json"
 
 
-@writes("out")
 def inspect(settings: InspectSettings, progress: Progress = no_progress) -> Findings:
     """Plot the contents of a capture: camera rig, splits, tracked mesh over images, motion by sequence.
 

@@ -13,10 +13,10 @@ from ..ga import layout
 from ..ga.tracking import Tracking
 from ..ga.transforms import FrameEntry
 from .catalogue import RULES
-from .command import LintSettings
 from .evidence import Evidence
 from .mesh import Parameters, TrackedSubject
 from .rules import apply
+from .settings import LintSettings
 from .views import Pixels, look, pick_views
 
 if TYPE_CHECKING:

@@ -30,9 +30,9 @@ from ..ga.validate import sequence_names
 from ..ga.writer import pose_to_parameters
 from ..head.arrays import HeadArrays
 from .camera_table import CameraFacts, measure_cameras
-from .command import LintSettings
 from .expression_fit import ExpressionFit, weigh_expression
 from .mesh import Parameters, TrackedSubject, not_finite, read_parameters
+from .settings import LintSettings
 from .views import Pixels, Thumbnail, ViewFacts, look, make_thumbnails, pick_views, pixels_of_files
 
 THOROUGH_TIMESTEPS = 32

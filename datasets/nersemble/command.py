@@ -2,111 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
-
-import tyro
+from typing import TYPE_CHECKING
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind
-from ...bench.options import DependentOptions
-from ...bench.specs import Findings, writes
+from ...bench.specs import Findings
 from ..ga.layout import HEAD_FILE
 from ..head.arrays import save_head
-from ..options import CaptureOptions
 from .names import SUBJECT_NAMES, chosen_subjects
+from .settings import PrepareSettings, RecordSettings
 
 if TYPE_CHECKING:
     from .plan import PreparationPlan
     from .prepare import SubjectResult
-
-
-@dataclass(frozen=True)
-class PrepareSettings:
-    """What to prepare, from where, and how."""
-
-    root: str = ""
-    """Folder with raw recordings: the one that holds the participants' folders."""
-    out: str = "nersemble-captures"
-    """Folder for the captures."""
-    subjects: str = "paper"
-    """Ids separated by commas, "paper" (the nine of the comparison) or "ablation" (306)."""
-    sequences: str = "paper"
-    """Names or unique prefixes separated by commas; "paper" (the ten of UNION10, and FREE); "all" (but the tongue
-    and GLASSES)."""
-    split: Literal["free", "union10"] = "free"
-    """"free" holds out FREE for self-reenactment; "union10" holds out one of the ten sequences by VHAP's seeded
-    rule. The frontal camera is held out for novel views either way."""
-    tracking: str = ""
-    """Folder with VHAP's results. Without it images and cameras are written; call again once there is one."""
-    head: str = ""
-    """Head model the tracking belongs to (flame2023.pkl, or npz): checked against it, never copied if FLAME's."""
-    head_model: str = ""
-    """Version of the head model the tracking belongs to; default: that of --head, or flame2023 without --head."""
-    cameras: str = ""
-    """Serials separated by commas; default: all the calibration has."""
-    downscale: int = 4
-    """Width and height are divided by this, averaging areas; 4 makes 550x802 of 2200x3208."""
-    source: Literal["auto", "video", "images"] = "auto"
-    """What to take where a sequence has both; "auto" takes images where they come with masks."""
-    every: int = 0
-    """Frame stride; 0 stands for 3 with the 73-per-second videos and 1 with VHAP's images."""
-    colour: Literal["auto", "none"] = "auto"
-    """"auto" corrects colours where the recording has a calibration for that; "none" never."""
-    edges: Literal["unblend", "plain"] = "unblend"
-    """Soft edges with masks: "unblend" takes the light of the BACKGROUND still out, where there are stills; "plain"
-    multiplies by the mask, as VHAP does, and leaves fringes."""
-    cut: bool = False
-    """Keep the frames that all cameras have where they differ, instead of an error; tracking of all frames is cut
-    with them."""
-    workers: int = 0
-    """Number of cameras processed at a time; 0 stands for one per processor core."""
-    check: bool = False
-    """Only look whether everything needed is there."""
-    union_root: str = ""
-    """Instead of preparing, check captures exported elsewhere: a folder of UNION folders, such as GaussianAvatars'
-    download. Of the other options only --subjects and --rejoin go with it."""
-    rejoin: bool = False
-    """With --union-root, also write unions of the paper's split (FREE held out) beside them; copies nothing."""
-
-    dependent = (
-        DependentOptions(
-            (
-                *(
-                    "out",
-                    "sequences",
-                    "split",
-                    "tracking",
-                    "head",
-                    "head_model",
-                    "cameras",
-                    "downscale",
-                    "source",
-                ),
-                *("every", "colour", "edges", "cut", "workers", "check"),
-            ),
-            "union_root",
-            False,
-        ),
-        DependentOptions(("rejoin",), "union_root"),
-    )
-
-
-@dataclass(frozen=True)
-class RecordSettings(CaptureOptions):
-    """What to write as a raw recording."""
-
-    capture: tyro.conf.Positional[str]
-    """Synthetic capture: a UNION folder, as `headbench synth` writes them."""
-    out: str
-    """Folder to write: recording/ is for --root of `headbench prepare nersemble`, tracking/ for --tracking,
-    head_model.npz for --head."""
-    release: Literal["v2", "v1", "paper2023"] = "v2"
-    """Whose folders: of the second release, of the first, or of the 2023 paper."""
-    frames: Literal["images", "video"] = "images"
-    """"images" with masks, as VHAP's preprocessing leaves them, or "video" without."""
 
 
 def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progress) -> Findings:
@@ -191,7 +101,6 @@ def _done(results: list[SubjectResult], plans: list[PreparationPlan], settings: 
     return Findings("\n".join(lines), data, passed)
 
 
-@writes("out", "a recording")
 def record_nersemble(settings: RecordSettings, progress: Progress = no_progress) -> Findings:
     """Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to test `prepare`.
 

@@ -15,7 +15,6 @@ from ..ga import layout
 from ..head.arrays import HeadArrays
 from ..head.loaders import load_head
 from ..head.procedural.model import VERSIONS
-from .command import PrepareSettings
 from .names import (
     PAPER_SEQUENCES,
     SEQUENCES,
@@ -27,6 +26,7 @@ from .names import (
 from .pixels import Correction
 from .recording import Participant, participant, read_calibration
 from .sequence import RecordedSequence, read_sequence
+from .settings import PrepareSettings
 from .tracking import TrackedSequence, find_tracked, read_tracked
 
 CY: layout.CyConvention = "bottom"

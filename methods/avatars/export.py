@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ...bench.contracts import HeadAsset, HeadPose, Progress, SplatAvatar
+from ...bench.contracts import HeadAsset, HeadPose, Progress, SplatAvatar, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_writable
 from ...bench.runner.stored import StoredAvatar, open_avatar
@@ -16,9 +16,9 @@ from ..ops.harmonics import harmonic_colors
 from ..shared.avatar_files import read_shared_head
 from ..shared.rendering import view_of
 from ..splats import rasterize
-from .command import AvatarOptions, ExportOptions
 from .formats import FORMATS, StoredSplats
 from .harmonics import DEGREE, harmonics_of
+from .settings import AvatarOptions, ExportGlbSettings, ExportOptions, ExportPlySettings, ExportSogSettings
 from .views import FIELD_OF_VIEW, direction_of, look
 from .web.bake import Source
 
@@ -39,6 +39,21 @@ def open_splats(settings: AvatarOptions) -> tuple[StoredAvatar, SplatAvatar]:
         remedy = "`headbench view` and `headbench render` show it."
         raise InputError(stored.folder, "", "an avatar of splats", found, remedy)
     return stored, avatar
+
+
+def export_ply(settings: ExportPlySettings, progress: Progress = no_progress) -> Findings:
+    """Write an avatar in one pose as a 3D Gaussian splatting PLY; see `export_pose`."""
+    return export_pose(settings, "ply", progress)
+
+
+def export_glb(settings: ExportGlbSettings, progress: Progress = no_progress) -> Findings:
+    """Write an avatar in one pose as binary glTF with splats; see `export_pose`."""
+    return export_pose(settings, "glb", progress)
+
+
+def export_sog(settings: ExportSogSettings, progress: Progress = no_progress) -> Findings:
+    """Write an avatar in one pose as SOG; see `export_pose`."""
+    return export_pose(settings, "sog", progress)
 
 
 def export_pose(settings: ExportOptions, name: str, progress: Progress) -> Findings:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ...bench.configuration import build, parse_assignments
-from ...bench.contracts import Budget, Progress
+from ...bench.contracts import Budget, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_name, digest_file, user_files
 from ...bench.io.lock import LOCK_FILE
@@ -32,7 +32,7 @@ from ..shared.avatar_files import (
     save_shared_head,
     write_subject,
 )
-from .command import ImportGASettings
+from .settings import ImportGASettings
 
 FLAME_PARAM_FILE = "flame_param.npz"
 
@@ -47,7 +47,7 @@ class HeadSettings:
     teeth: TeethPolicy = "auto"
 
 
-def import_avatar(settings: ImportGASettings, progress: Progress) -> Findings:
+def import_avatar(settings: ImportGASettings, progress: Progress = no_progress) -> Findings:
     """Import a GaussianAvatars PLY, with its flame_param.npz or its capture, as an avatar of the method ga.
 
     Raises `InputError` for a file that does not fit, and for a folder that holds something already.

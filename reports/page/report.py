@@ -29,9 +29,9 @@ from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import COMPARISON, TITLES, layouts, table_of
 from ..tables import AVATAR_TITLE, Table
 from ..writers import render_page
-from .command import MAX_MB, MAX_SPLIT_MB, PageSettings
 from .frames import Pictures, ShownFrame, choose_pictures, frame_values, worst_frames
 from .record import failed_cells, name_of, record_of
+from .settings import MAX_MB, MAX_SPLIT_MB, PageSettings
 from .split import (
     ENTRY_BYTES,
     FILE_BYTES,

@@ -3,48 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import tyro
-
 from ...bench.contracts import Progress, no_progress
 from ...bench.io.files import check_output_folder, write_text
-from ...bench.specs import Findings, writes
+from ...bench.specs import Findings
+from .settings import ParetoSettings
 
 if TYPE_CHECKING:
     from .points import Point
 
 
-@dataclass(frozen=True)
-class ParetoSettings:
-    """Quality against size and frame time, over finished runs of the same frames; CSV, and a plot with the front."""
-
-    runs: tyro.conf.Positional[tuple[str, ...]]
-    """Folders of finished runs: every method in each is a point, such as the settings of a sweep."""
-
-    out: str
-    """Folder to write: points.csv and pareto.png."""
-
-    task: str = "novel_view"
-    """Task whose frames give the quality."""
-
-    metric: str = ""
-    """Metric of quality; default: the first of frames that the runs have."""
-
-    time: str = ""
-    """Metric of frame time, in ms: latency_p50 (default, or what frames per second give), processor_time, ..."""
-
-    def __post_init__(self) -> None:
-        if not self.runs:
-            raise ValueError("runs: at least one folder")
-
-
 COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
 
 
-@writes("out")
 def pareto_runs(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
     """Plot quality against size and frame time of finished runs, with the Pareto front, and write CSV."""
     return pareto(settings.runs, Path(settings.out), settings.task, settings.metric, settings.time)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, HeadPose, Progress
+from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import grouped_writes
 from ...bench.io.images import quantise, read_png, write_png
@@ -23,7 +23,7 @@ from ...bench.runner.stored import open_avatar
 from ...bench.specs import Findings
 from ..robustness.extremes import head_center
 from ..robustness.viewpoints import turntable
-from .command import RenderSettings
+from .settings import RenderSettings
 
 ORBIT = "orbit"
 
@@ -39,7 +39,7 @@ class Shot(NamedTuple):
     captured: Callable[[], ByteArray] | None = None
 
 
-def render_avatar(settings: RenderSettings, progress: Progress) -> Findings:
+def render_avatar(settings: RenderSettings, progress: Progress = no_progress) -> Findings:
     """Render a stored avatar; see the settings.
 
     Raises `InputError` for what is no avatar, a capture that the method cannot take, and for cameras and timesteps

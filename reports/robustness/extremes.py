@@ -15,7 +15,7 @@ from ...bench.executors.task import Task
 from ...bench.io.files import digest
 from ...bench.runner.run import load, trained
 from ...bench.runner.steps import Job, trained_files
-from .command import ExtremesSettings
+from .settings import ExtremesSettings
 from .stability import (
     EXPRESSION_LIMITS,
     VIEW_LIMITS,

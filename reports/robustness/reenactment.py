@@ -20,9 +20,9 @@ from ...bench.runner.run import load, make_jobs
 from ...bench.runner.steps import Job
 from ...bench.runner.store import RunFolder
 from ..runs import evenly_spaced
-from .command import ReenactSettings
 from .extremes import training_poses
 from .identity import RecordedAppearance, identity, mean_known, of_recording
+from .settings import ReenactSettings
 from .stability import (
     JudgedFrame,
     Limits,

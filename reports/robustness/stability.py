@@ -28,7 +28,7 @@ from ...bench.contracts import (
     Splats,
 )
 from ...bench.errors import UnavailableError
-from ...bench.executors.command import ExecutionOptions
+from ...bench.executors.options import ExecutionOptions
 from ...bench.io.files import write_json
 from ...bench.io.images import quantise, write_png
 from ...bench.io.provenance import RENDER

@@ -15,7 +15,7 @@ from ...bench.executors.schedule import Schedule
 from ...bench.executors.task import TASK_LOG, Task
 from ...bench.io.documents import checked, read_json
 from ...bench.io.files import write_json
-from .command import ExtremesSettings
+from .settings import ExtremesSettings
 from .stability import JudgedFrame, LimitCheck, RobustnessCase, cell_folder
 
 FILE = "frames.json"

@@ -19,10 +19,10 @@ from ...bench.io.images import encode_image
 from ...bench.registry import resolve
 from ...bench.runner.adaptation import AdaptedClip
 from ...bench.specs import Findings
-from .command import ViewSettings
 from .drawing import draw, splats_of
 from .scene import Scene, ShownAvatar
 from .server import serving
+from .settings import ViewSettings
 from .state import FreeView, Sliders, State
 
 UNTRAINED = "headbench.methods.benchmarks.untrained:untrained"

@@ -21,7 +21,7 @@ from ...bench.runner.store import RunFolder
 from ...bench.runner.stored import avatar_folder, open_avatar
 from ..robustness.extremes import head_center, training_poses
 from ..robustness.reenactment import RigidMean, check_heads, retarget
-from .command import ViewSettings
+from .settings import ViewSettings
 
 log = logging.getLogger(__name__)
 NEUTRAL = "neutral"

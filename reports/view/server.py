@@ -16,17 +16,17 @@ from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
-from ...bench.contracts import Progress
+from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError, UnavailableError, install_extra
 from ...bench.specs import Findings
-from .command import ViewSettings
 from .scene import Scene, open_scene
 from .session import Session
+from .settings import ViewSettings
 
 log = logging.getLogger(__name__)
 
 
-def view_avatars(settings: ViewSettings, progress: Progress) -> Findings:
+def view_avatars(settings: ViewSettings, progress: Progress = no_progress) -> Findings:
     """Serve until interrupted, or for the seconds asked for."""
     viser()
     check_port(settings.host, settings.port)

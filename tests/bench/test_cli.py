@@ -12,12 +12,13 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from headbench.bench import builtin, cli
+from headbench.bench import cli, comparison
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.registry import Plugin
 from headbench.bench.runner import captures
 from headbench.bench.runner.config import DemoConfig, parse_size
 from headbench.bench.specs import Findings
+from headbench.datasets.synthetic import capture
 
 GALLERY = Path(__file__).parents[2] / "reports" / "gallery"
 
@@ -91,7 +92,7 @@ def test_what_no_encoding_holds_is_escaped(monkeypatch, tmp_path):
     ],
 )
 def test_bad_input_is_refused_before_work(capsys, tmp_path, monkeypatch, words, found):
-    monkeypatch.setattr(builtin, "_synthesise", lambda arguments: pytest.fail("a capture was made"))
+    monkeypatch.setattr(capture, "synthesize", lambda **arguments: pytest.fail("a capture was made"))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "run.yaml").write_text("data: a\nout: b\nmetods: [ga]\n")
     assert cli.main(words.split(" ")) == 2
@@ -139,7 +140,7 @@ def test_a_capture_is_made_in_an_empty_folder_by_one_process(monkeypatch, tmp_pa
         seen.append((list(out.iterdir()), {path.name for path in tmp_path.iterdir()}, dynamics))
         (out / "image.png").touch()
 
-    monkeypatch.setattr(builtin, "resolve", lambda reference: make)
+    monkeypatch.setattr(capture, "synthesize", make)
     assert cli.main(["synth", "--out", str(tmp_path / "capture"), "--dynamics", "2"]) == 0
     assert seen == [([], {"capture", ".capture.lock"}, 2.0)]
     assert [path.name for path in tmp_path.iterdir()] == ["capture"]
@@ -162,7 +163,7 @@ def test_smoke_shrinks_the_capture():
 
 
 def test_json_gives_the_numbers_of_the_table():
-    means = builtin.means(GALLERY)
+    means = comparison.means(GALLERY)
     found = {(m["task"], m["method"], m["metric"]): (m["value"], m["status"]) for m in means}
     rows = pd.read_parquet(GALLERY / "rows.parquet")
     own = rows[(rows["task"] == "novel_view") & (rows["method"] == "ga") & (rows["metric"] == "psnr")]
@@ -280,7 +281,7 @@ def test_a_path_that_cannot_be_used_is_code_2(arguments, tmp_path, monkeypatch, 
 )
 def test_output_that_goes_nowhere(command, code):
     """A full disk is an error of its own; a reader that has gone changes no verdict."""
-    line = command.replace("headbench", shlex.join([sys.executable, "-m", "headbench.bench.cli"]), 1)
+    line = command.replace("headbench", shlex.join([sys.executable, "-m", "headbench.bench.start"]), 1)
     done = subprocess.run(["bash", "-c", line], stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == code, done.stderr
     assert done.stderr == ("headbench: standard output: No space left on device. " + MAKE_ROOM) * (code == 2)
@@ -289,7 +290,7 @@ def test_output_that_goes_nowhere(command, code):
 def test_seeds_are_a_list_and_presets_are_those_of_the_methods(monkeypatch, tmp_path):
     seen = []
     monkeypatch.setattr(
-        builtin,
+        comparison,
         "_run",
         lambda config, execution, unchecked: seen.append((config.seeds, config.preset)) or Findings("", {}),
     )
@@ -303,7 +304,9 @@ def test_a_run_takes_the_reader_that_finds_its_capture(monkeypatch, tmp_path, to
     plugins = {name: Plugin(name, "", replace(toy.READER, name=name)) for name in ("toy", "other")}
     monkeypatch.setattr(captures, "discover", lambda group: {"toy": plugins["toy"]})
     monkeypatch.setattr(
-        builtin, "_run", lambda config, execution, unchecked: seen.append(config.reader) or Findings("", {})
+        comparison,
+        "_run",
+        lambda config, execution, unchecked: seen.append(config.reader) or Findings("", {}),
     )
     (tmp_path / "data").mkdir()
     words = ["run", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")]
@@ -334,7 +337,7 @@ def test_a_run_takes_its_executor_from_options_and_settings(
 ):
     seen = []
     monkeypatch.setattr(
-        builtin, "_run", lambda config, execution, unchecked: seen.append(execution) or Findings("", {})
+        comparison, "_run", lambda config, execution, unchecked: seen.append(execution) or Findings("", {})
     )
     assert cli.main(["run", "--data", "d", "--out", str(tmp_path / "o"), *words]) == 0
     assert [(e.executor, e.workers, e.slurm.partition) for e in seen] == [(executor, workers, partition)]
@@ -353,7 +356,7 @@ def test_a_run_takes_its_executor_from_options_and_settings(
 )
 @pytest.mark.parametrize("command", ["run --data d", "synth"])
 def test_settings_of_executors_are_checked(command, words, message, tmp_path, capsys, monkeypatch):
-    for work in ("_run", "_synthesise"):
-        monkeypatch.setattr(builtin, work, lambda *arguments: pytest.fail("went on"))
+    monkeypatch.setattr(comparison, "_run", lambda *arguments: pytest.fail("went on"))
+    monkeypatch.setattr(capture, "synthesize", lambda **arguments: pytest.fail("went on"))
     assert cli.main([*command.split(), "--out", str(tmp_path / "o"), *words.split()]) == 2
     assert message in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.metadata
+import inspect
 import json
 import re
 import subprocess
@@ -10,7 +11,7 @@ from typing import get_type_hints
 
 import pytest
 
-from headbench.bench import cli, commands, registry
+from headbench.bench import cli, commands, parsing, registry, specs
 from headbench.bench.io.files import KINDS
 from headbench.bench.io.lock import locked
 from headbench.bench.runner.config import AvatarFolder
@@ -18,7 +19,7 @@ from headbench.bench.runner.config import AvatarFolder
 TOY = '''
 from dataclasses import dataclass
 import tyro
-from headbench import Findings, InputError, writes
+from headbench import CommandSpec, Findings, InputError
 
 @dataclass(frozen=True)
 class Settings:
@@ -36,24 +37,23 @@ class Lists:
     levels: tuple[float, ...] = (1.0,)
     """How much."""
 
-def count(settings: Lists, progress):
-    """Count them."""
+def count(settings, progress):
     return Findings("", {"lists": [settings.paths, settings.names, settings.levels]})
 
-@writes("path")
-def make(settings: Settings, progress):
-    """Make it."""
-    return look(settings, progress)
-
-def look_alone(settings: Settings):
-    return look(settings, None)
-
-def look(settings: Settings, progress):
-    """Look at it."""
+def look(settings, progress):
     if settings.limit < 0:
         raise InputError("command line", "limit", "at least 0", str(settings.limit))
     code = 3 if settings.limit == 3 else None
     return Findings(f"looked at {settings.path}", {"limit": settings.limit}, settings.limit < 1, code)
+
+def spec(settings="toy_command:Settings", function="toy_command:look", **more):
+    return CommandSpec("toy", "toys", "Look at it.", settings, function, **more)
+
+LOOK = spec()
+COUNT = spec("toy_command:Lists", "toy_command:count")
+MAKE = spec(writes="path")
+NO_SETTINGS, NO_DATACLASS = spec("toy_command:not_there"), spec("toy_command:look")
+NO_FUNCTION = spec(function="toy_command:not_there")
 '''
 
 
@@ -62,8 +62,9 @@ def offer(monkeypatch, tmp_path):
     (tmp_path / "toy_command.py").write_text(TOY)
     monkeypatch.syspath_prepend(tmp_path)
 
-    def offer(*names, function="toy_command:look"):
-        entries = [EntryPoint(name, function, "headbench.commands") for name in names]
+    def offer(*names, spec="toy_command:LOOK"):
+        own = [EntryPoint("list", "headbench.bench.builtin:LIST", "headbench.commands")]
+        entries = [*own, *(EntryPoint(name, spec, "headbench.commands") for name in names)]
         monkeypatch.setattr(registry, "entry_points", lambda group: entries)
 
     return offer
@@ -86,14 +87,14 @@ def test_settings_are_options_and_findings_are_printed(offer, capsys):
     ],
 )
 def test_lists_have_commas_or_spaces(offer, capsys, words, lists):
-    offer("count", function="toy_command:count")
+    offer("count", spec="toy_command:COUNT")
     assert cli.main(["count", *words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"lists": lists}
 
 
 @pytest.mark.parametrize("words", [["--levels"], ["--levels", ","], ["--names", "--levels", "1"]])
 def test_a_list_without_values_is_refused(offer, capsys, words):
-    offer("count", function="toy_command:count")
+    offer("count", spec="toy_command:COUNT")
     with pytest.raises(SystemExit) as ended:
         cli.main(["count", "a", *words])
     assert ended.value.code == 2
@@ -101,11 +102,11 @@ def test_a_list_without_values_is_refused(offer, capsys, words):
 
 
 def test_commands_that_take_an_avatar_describe_it_alike():
-    specs = {name: plugin.spec for name, plugin in registry.discover("commands").items()}
+    settings = {n: registry.resolve(p.spec.settings) for n, p in registry.discover("commands").items()}
     found = {
-        name: get_type_hints(spec.settings, include_extras=True)["avatar"]
-        for name, spec in specs.items()
-        if get_type_hints(spec.settings).get("avatar") is str
+        name: get_type_hints(own, include_extras=True)["avatar"]
+        for name, own in settings.items()
+        if get_type_hints(own).get("avatar") is str
     }
     assert {"compact", "export html", "export ply", "render", "submission render"} <= found.keys()
     assert set(found.values()) == {AvatarFolder}
@@ -117,24 +118,15 @@ def test_findings_decide_the_exit_code(offer, capsys):
     assert "at least 0" in capsys.readouterr().err
 
 
-def test_a_function_not_taking_settings_and_progress_is_broken(offer, capsys):
-    offer("look", function="toy_command:look_alone")
-    assert cli.main(["look", "here"]) == 2
-    assert "called with settings and a Progress: too many positional arguments" in capsys.readouterr().err
-
-
 def test_two_words_share_the_first(offer, capsys):
     offer("make big", "make small")
     assert cli.main(["make", "small", "here"]) == 0
     assert capsys.readouterr().out == "looked at here\n"
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["make"])
-    assert stop.value.code == 2
-    assert "{big, small}" in capsys.readouterr().err
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["--help"])
-    assert stop.value.code == 0
-    assert "big, small" in capsys.readouterr().out
+    assert cli.main(["make"]) == 2
+    assert "one of big, small, found nothing" in capsys.readouterr().err
+    for words in (["--help"], ["make", "--help"]):
+        assert cli.main(words) == 0
+        assert re.search(r"(?m)^Toys\n  make big +Look at it.\n  make small +Look", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(
@@ -166,11 +158,17 @@ def test_words_of_other_toolkits_lead_to_commands_that_exist():
     assert not set(commands.COMMAND_ALIASES) & names
 
 
-def test_help_starts_with_demo_and_run(capsys):
-    with pytest.raises(SystemExit):
-        cli.main(["--help"])
+def test_help_lists_commands_in_groups(capsys):
+    assert cli.main(["--help"]) == 0
     text = capsys.readouterr().out
-    assert text.index("• demo") < text.index("• run ") < text.index("• table") < text.index("• bench")
+    assert (
+        text.index("\n  demo ")
+        < text.index("\n  run ")
+        < text.index("\n  table ")
+        < text.index("\n  bundle ")
+    )
+    headings = [group.capitalize() for group in specs.COMMAND_GROUPS]
+    assert re.findall(r"(?m)^([A-Z]\w+)$", text) == headings
     assert "--version" in text
 
 
@@ -208,24 +206,36 @@ def test_a_command_that_is_the_first_word_of_another_is_broken(offer, capsys, na
 
 
 @pytest.mark.parametrize(
-    ("function", "why"),
+    ("spec", "why", "listed"),
     [
-        ("not_there:look", "not_there"),
-        ("toy_command:not_there", "not_there"),
-        ("toy_command:Findings", "dataclass"),
+        ("not_there:LOOK", "not_there", "broken: "),
+        ("toy_command:not_there", "not_there", "broken: "),
+        ("toy_command:Findings", "a CommandSpec", "broken: "),
+        ("toy_command:NO_SETTINGS", "not_there", "Look"),
+        ("toy_command:NO_DATACLASS", "a dataclass", "Look"),
+        ("toy_command:NO_FUNCTION", "not_there", "Look"),
     ],
 )
 @pytest.mark.parametrize("name", ["look", "look twice"])
-def test_a_broken_command_is_listed_and_raises_only_when_called(offer, capsys, function, why, name):
-    offer(name, function=function)
+def test_a_broken_command_is_listed_and_raises_only_when_called(offer, capsys, spec, why, listed, name):
+    offer(name, spec=spec)
     assert cli.main(["list", "commands"]) == 0
-    assert re.search(rf"(?m)^{name} +broken: ", capsys.readouterr().out)
-    assert cli.main(name.split()) == 2
+    assert re.search(rf"(?m)^{name} +{listed}", capsys.readouterr().out)
+    assert cli.main([*name.split(), "here"]) == 2
     assert why in capsys.readouterr().err
 
 
+def test_every_command_has_its_settings_and_its_function():
+    for plugin in registry.discover("commands").values():
+        settings = registry.resolve(plugin.spec.settings)
+        parameters = [*inspect.signature(registry.resolve(plugin.spec.function)).parameters.values()]
+        assert [parameter.name for parameter in parameters] == ["settings", "progress"], plugin.name
+        assert parameters[0].annotation in (settings.__name__, settings.__base__.__name__), plugin.name
+        assert plugin.spec.name == plugin.name
+
+
 def test_a_folder_that_is_written_is_locked(offer, capsys, tmp_path):
-    offer("make", function="toy_command:make")
+    offer("make", spec="toy_command:MAKE")
     with locked(tmp_path):
         assert cli.main(["make", str(tmp_path)]) == 2
     assert "no other process works in" in capsys.readouterr().err
@@ -248,7 +258,7 @@ def test_every_command_with_a_folder_to_write_locks_it():
     }  # --out is one
     for plugin in registry.discover("commands").values():
         spec = plugin.spec
-        names = {field.name for field in dataclasses.fields(spec.settings)}
+        names = {field.name for field in dataclasses.fields(registry.resolve(spec.settings))}
         assert ("out" in names) == (spec.writes == "out" or spec.name in own | files), spec.name
 
 
@@ -290,7 +300,7 @@ def test_a_folder_of_another_kind_is_refused_untouched(capsys, tmp_path, mark):
 )
 def test_a_tilde_on_the_command_line_is_the_home_folder(monkeypatch, word, expected):
     monkeypatch.setenv("HOME", "/h")
-    assert commands.with_home(word) == expected
+    assert parsing.with_home(word) == expected
 
 
 def test_a_tilde_in_a_configuration_is_the_home_folder(monkeypatch, capsys, tmp_path):

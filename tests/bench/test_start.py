@@ -10,7 +10,7 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from headbench.bench.builtin import ListSettings
+from headbench.bench.listing import ListSettings
 
 CONSOLE_SCRIPT = "import sys\nfrom headbench.bench.start import main\nsys.exit(main())\n"
 LINES = {
@@ -101,7 +101,7 @@ def start(tmp_path):
 
 @pytest.mark.parametrize("module", ["csv", "numpy.linalg", "yaml", "tyro._docstrings"])
 def test_ctrl_c_while_modules_are_imported_is_a_line(start, module):
-    process = start("list", "methods", flags=("-X", "importtime"))
+    process = start("run", "--help", flags=("-X", "importtime"))
     imported = re.compile(rf"\| +{re.escape(module)}$")
     while not imported.search(process.stderr.readline().rstrip()):
         assert process.poll() is None
@@ -174,7 +174,16 @@ def test_workers_end_with_the_process_that_started_them(start, tmp_path, number)
 
 
 LISTS = [f"list {what}" for what in get_args(get_type_hints(ListSettings)["what"])]
-COMMAND_LINE = {"numpy", "tyro", "yaml", "headbench.bench.commands"}
+COMMAND_LINE = {"headbench.bench.commands"}
+PARSER = {
+    "numpy",
+    "tyro",
+    "yaml",
+    "headbench.bench.parsing",
+    "headbench.bench.comparison",
+    "headbench.reports.page.settings",
+}
+"""What a call of one command needs, and settings of two."""
 USED_BY_COMMANDS = {
     *(
         "cv2",
@@ -194,8 +203,9 @@ USED_BY_COMMANDS = {
 @pytest.mark.parametrize(
     ("lines", "unused"),
     [
-        (["--version"], USED_BY_COMMANDS | COMMAND_LINE),
-        (["--help", "demo --help", "prepare nersemble --help", "runn", *LISTS], USED_BY_COMMANDS),
+        (["--version"], USED_BY_COMMANDS | COMMAND_LINE | PARSER),
+        (["--help", "prepare --help"], USED_BY_COMMANDS | PARSER),
+        (["demo --help", "prepare nersemble --help", "runn", *LISTS], USED_BY_COMMANDS),
     ],
 )
 def test_what_calls_no_command_imports_nothing_heavy(lines, unused):

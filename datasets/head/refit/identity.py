@@ -13,8 +13,8 @@ from ....bench.contracts import FloatArray, HeadAsset, IntArray
 from ....bench.errors import InputError
 from ..arrays import faces_in_region, region
 from ..geometry import rigid_alignment, vertex_normals
-from .command import RefitSettings
 from .problem import solve_bounded
+from .settings import RefitSettings
 
 FACE = "face"
 EYEBALLS = ("left_eyeball", "right_eyeball")

@@ -28,7 +28,7 @@ from ....bench.contracts import FloatArray, HeadAsset, IntArray
 from ....bench.errors import InputError
 from ..arrays import JOINT_NAMES
 from ..rotations import matrices_and_derivatives
-from .command import RefitSettings
+from .settings import RefitSettings
 
 ROOT, NECK, JAW, LEFT_EYE, RIGHT_EYE = range(len(JOINT_NAMES))
 SEARCHED = (JAW, LEFT_EYE, RIGHT_EYE)

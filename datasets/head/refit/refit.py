@@ -20,9 +20,9 @@ from ...clip import CaptureClip
 from ..arrays import HeadArrays
 from ..subject import PosedSubject
 from ..teeth import with_teeth
-from .command import RefitSettings
 from .identity import EYEBALLS, FACE, Matching, match, same_topology
 from .problem import FitProblem, angle_bounds, solve_frame
+from .settings import RefitSettings
 
 BLOCK = 64
 """Timesteps that are fitted, and kept on disk, together; the first of each starts from the source's angles."""

@@ -1,76 +1,15 @@
-"""``headbench submission render``, ``submission write`` and ``submission check``."""
+"""``headbench submission write`` and ``submission check``."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
-
-import tyro
 
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import ExitCode, UnavailableError
-from ....bench.runner.config import AvatarFolder
-from ....bench.specs import Findings, writes
+from ....bench.specs import Findings
+from .settings import SubmissionCheckSettings, SubmissionWriteSettings
 
 SHOWN = 20
-
-
-@dataclass(frozen=True)
-class SubmissionRenderSettings:
-    """Render the test frames of a participant of the NeRSemble benchmark's monocular track from a stored avatar, which was
-    trained on the participant's training sequences."""
-
-    avatar: AvatarFolder
-
-    data: str
-    """The benchmark's folder, as nersemble-benchmark-download leaves it: it holds mono_flame_avatar/."""
-
-    participant: str
-    """Whom the avatar shows: 393, 404, 461, 477 or 486."""
-
-    out: str
-    """Folder to write: OUT/PARTICIPANT/SEQUENCE_TIMESTEP_SERIAL.png."""
-
-    head: str | None = None
-    """FLAME 2023 (flame2023.pkl); default: the head model that lies beside the avatar."""
-
-    method: str = ""
-    """Method of the avatar as package.module:SPEC, where it is not registered."""
-
-    device: str = "cpu"
-    """Where to render."""
-
-
-@writes("out")
-def submission_render(settings: SubmissionRenderSettings, progress: Progress = no_progress) -> Findings:
-    """Render the test frames of a NeRSemble benchmark participant: four sequences, four cameras.
-
-    Poses and cameras come from the benchmark's tracking (version 2) and calibration; there is no ground truth of them.
-    """
-    from .render import render_participant
-
-    return render_participant(settings, progress)
-
-
-@dataclass(frozen=True)
-class SubmissionWriteSettings:
-    """Encode rendered frames and write the zip that the NeRSemble benchmark takes."""
-
-    frames: tyro.conf.Positional[str]
-    """Folder with PARTICIPANT/SEQUENCE_TIMESTEP_SERIAL.png, or a run whose subjects are the participants."""
-
-    zip: tyro.conf.Positional[str]
-    """File to write."""
-
-    track: Literal["nvs", "mono_flame_avatar"]
-    """Task of the benchmark."""
-
-    method: str = ""
-    """Method of a run with several."""
-
-    data: str | None = None
-    """The benchmark's folder: its tracking tells how many frames a sequence has. Without it, published totals are held to."""
 
 
 def submission_write(settings: SubmissionWriteSettings, progress: Progress = no_progress) -> Findings:
@@ -109,23 +48,6 @@ def submission_write(settings: SubmissionWriteSettings, progress: Progress = no_
     ]
     data_out = {"out": out, "videos": videos, "cost_db": {str(psnr): cost for psnr, cost in costs.items()}}
     return Findings("\n".join(lines), data_out)
-
-
-@dataclass(frozen=True)
-class SubmissionCheckSettings:
-    """Say what the NeRSemble benchmark's server would refuse of a submission.
-
-    Exit code 0: nothing; 1: something; 2: it is no zip that can be looked at.
-    """
-
-    zip: tyro.conf.Positional[str]
-    """The submission."""
-
-    track: Literal["", "nvs", "mono_flame_avatar"] = ""
-    """Task of the benchmark; default: the one that the zip has most files of."""
-
-    data: str | None = None
-    """The benchmark's folder: its tracking tells how many frames a sequence has. Without it, published totals are held to."""
 
 
 def submission_check(settings: SubmissionCheckSettings, progress: Progress = no_progress) -> Findings:

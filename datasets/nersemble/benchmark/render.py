@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from ....bench.contracts import Progress
+from ....bench.contracts import Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.files import grouped_writes
 from ....bench.io.images import quantise, write_png
@@ -14,8 +14,8 @@ from ....bench.specs import Findings
 from ...head.arrays import HeadArrays, read_head
 from ...head.loaders import load_head
 from ...head.teeth import with_teeth_where_possible
-from .command import SubmissionRenderSettings
 from .data import read_sequence
+from .settings import SubmissionRenderSettings
 from .tracks import MONO
 
 log = logging.getLogger(__name__)
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 WHITE = (1.0, 1.0, 1.0)
 
 
-def render_participant(settings: SubmissionRenderSettings, progress: Progress) -> Findings:
+def render_participant(settings: SubmissionRenderSettings, progress: Progress = no_progress) -> Findings:
     """Render every frame of a participant's test sequences from all cameras of the track.
 
     Raises `InputError` for an unknown participant, an avatar that cannot be read, and tracking or cameras that are missing or

@@ -12,7 +12,7 @@ import tyro
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.files import write_json
-from ....bench.specs import Findings, writes
+from ....bench.specs import Findings
 from ...options import CaptureOptions
 
 
@@ -42,7 +42,6 @@ class StepsSettings(CaptureOptions):
 JAW_PICTURE, CLUSTER_PICTURE, NUMBERS = "jaw_bases.png", "expression_clusters.png", "steps.json"
 
 
-@writes("out")
 def steps(settings: StepsSettings, progress: Progress = no_progress) -> Findings:
     """Plot the jaw bases and expression clusters computed from a capture's training frames.
 

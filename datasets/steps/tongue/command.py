@@ -10,7 +10,7 @@ import tyro
 
 from ....bench.contracts import Progress
 from ....bench.errors import InputError
-from ....bench.specs import Findings, writes
+from ....bench.specs import Findings
 from ...options import CaptureOptions
 
 if TYPE_CHECKING:
@@ -44,7 +44,6 @@ class TongueSettings(CaptureOptions):
 DECISIONS_FILE = "tongue.yaml"
 
 
-@writes("out")
 def tongue(settings: TongueSettings, progress: Progress) -> Findings:
     """Find the frames that show the tongue, for review on a contact sheet and with overrides.
 

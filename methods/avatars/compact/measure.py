@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ....bench.contracts import ByteArray, Clip, HeadAsset, Progress
+from ....bench.contracts import ByteArray, Clip, HeadAsset, Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.images import quantise
 from ....bench.runner.stored import avatar_digest, open_avatar, write_avatar_record
@@ -21,16 +21,16 @@ from ...shared.avatar_files import read_shared_head, save_shared_head
 from ...shared.losses import picture_ssim, psnr, squared_error
 from ...shared.schedule import evenly
 from ...shared.subject_mesh import SubjectMesh
-from .command import CompactSettings
 from .container import Content, write_content
 from .file import COMPACT_FILE, decode, encode, exact_sizes, part_sizes
 from .precision import EXACT, Precision
+from .settings import CompactSettings
 from .simplify import simplify, training_poses
 
 SIMPLIFIED, WHOLE = "left out", "all"
 
 
-def compact_avatar(settings: CompactSettings, progress: Progress) -> Findings:
+def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) -> Findings:
     """Store an avatar of ours, and measure it and its quality; see the settings.
 
     Raises `InputError` for a folder without the exact file of an avatar of ours, and for the capture of another

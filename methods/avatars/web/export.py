@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ....bench.contracts import Camera, FloatArray, HeadPose, Progress
+from ....bench.contracts import Camera, FloatArray, HeadPose, Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.files import check_writable, write_text
 from ....bench.io.provenance import RENDER, note, source_type, tool
@@ -24,9 +24,9 @@ from ...splats import rasterize
 from ..export import neutral_pose, open_splats
 from ..views import direction_of, look
 from .bake import Source, bake
-from .command import ExportHtmlSettings
 from .model import JOINTS, Moved, Slider, WebAvatar
 from .payload import decode, encode, quaternions
+from .settings import ExportHtmlSettings
 
 DIRECTIONS = 96
 """Viewing directions, even over the sphere, at which colours are looked at."""
@@ -45,7 +45,7 @@ DISTANCE_BY_HEIGHT = 2.6
 """Distance of the camera by the extent of the splats."""
 
 
-def export_page(settings: ExportHtmlSettings, progress: Progress) -> Findings:
+def export_page(settings: ExportHtmlSettings, progress: Progress = no_progress) -> Findings:
     """Bake, write, read back and compare; see the settings."""
     out = Path(settings.out)
     check_writable(out, "--out")

@@ -13,7 +13,7 @@ from typing import Any
 from scipy.stats import t as student_t
 
 from ....bench.configuration import build
-from ....bench.contracts import Progress
+from ....bench.contracts import Progress, no_progress
 from ....bench.io.documents import read_json
 from ....bench.io.files import write_json, write_text
 from ....bench.io.lock import locked
@@ -28,7 +28,7 @@ from ....bench.runner.stored import TRAINING_FILE
 from ....bench.specs import Findings
 from ...shared.config import PAPER_ITERATIONS, SplatTraining
 from ...shared.schedule import DensifySchedule, Timeline
-from .command import ParitySettings
+from .settings import ParitySettings
 
 OFFICIAL = {"ga": "ga-official", "gbs": "gbs-official", "ours": "tga-official"}
 METRICS = {"psnr": "dB", "ssim": ""}
@@ -76,7 +76,7 @@ class Difference:
     half_width: float | None
 
 
-def compare(settings: ParitySettings, progress: Progress) -> Findings:
+def compare(settings: ParitySettings, progress: Progress = no_progress) -> Findings:
     """Train and score both, and write the table of their differences; see the command."""
     out = Path(settings.out)
     config = run_config(settings, out)

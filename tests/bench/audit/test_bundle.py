@@ -8,7 +8,7 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.audit.bundle import INDEX, read_bundle
-from headbench.bench.audit.command import BundleSettings
+from headbench.bench.audit.settings import BundleSettings
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.runner.store import RunFolder

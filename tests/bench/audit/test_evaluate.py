@@ -11,8 +11,9 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
-from headbench.bench.audit.command import EvaluateSettings, evaluate
+from headbench.bench.audit.evaluate import evaluate_folder
 from headbench.bench.audit.naming import Render, check_truth, composited
+from headbench.bench.audit.settings import EvaluateSettings
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_png, write_png
@@ -37,7 +38,7 @@ def images(renders, tmp_path):
 
 
 def scored(folder, run, out, label="theirs"):
-    evaluate(EvaluateSettings(str(folder), out=str(out), like=str(run), label=label, trust=True))
+    evaluate_folder(EvaluateSettings(str(folder), out=str(out), like=str(run), label=label, trust=True))
     rows = pd.read_parquet(RunFolder(out).rows)
     return rows[rows["metric"] == "psnr"].reset_index(drop=True)
 
@@ -59,7 +60,7 @@ def test_every_layout_gives_the_same_rows(run, renders, images, tmp_path, layout
 
 
 def test_the_table_shown_holds_the_run_and_the_images(run, images, tmp_path):
-    findings = evaluate(
+    findings = evaluate_folder(
         EvaluateSettings(str(images), out=str(tmp_path / "out"), like=str(run), label="theirs", trust=True)
     )
     lines = [line for line in findings.text.splitlines() if line.startswith(("| toy", "| theirs"))]
@@ -98,7 +99,7 @@ def test_changed_images_are_scored_again_in_the_same_folder(run, images, tmp_pat
 
 def test_less_than_was_scored_is_refused(images, tmp_path):
     def score(*metrics):
-        evaluate(
+        evaluate_folder(
             EvaluateSettings(
                 str(images),
                 out=str(tmp_path / "out"),
@@ -189,7 +190,7 @@ def model(toy, images, tmp_path):
 
 
 def test_renders_numbered_by_gaussianavatars_get_their_keys(run, images, model, tmp_path):
-    evaluate(options(model, run, tmp_path / "out", names="ga-official"))
+    evaluate_folder(options(model, run, tmp_path / "out", names="ga-official"))
     for path in (tmp_path / "out").glob("subject1/theirs/seed-0/renders/*/*.png"):
         np.testing.assert_array_equal(read_png(path), read_png(images / path.name))
     assert scored(images, run, tmp_path / "named").equals(
@@ -231,7 +232,7 @@ def another_order(model):
 def test_official_renders_that_do_not_fit_are_refused(run, model, tmp_path, damage, names, match):
     damage(model)
     with pytest.raises(InputError, match=match):
-        evaluate(options(model, run, tmp_path / "out", names=names))
+        evaluate_folder(options(model, run, tmp_path / "out", names=names))
     assert not (tmp_path / "out").exists()
 
 
@@ -245,7 +246,7 @@ def test_a_list_in_csv_names_images(run, images, tmp_path):
         path.rename(images / f"{number}.png")
         lines.append(f"{number}.png,{sequence},{int(timestep)},{camera}\n")
     (tmp_path / "map.csv").write_text("".join(lines))
-    evaluate(options(images, run, tmp_path / "out", names=str(tmp_path / "map.csv")))
+    evaluate_folder(options(images, run, tmp_path / "out", names=str(tmp_path / "map.csv")))
     assert cli.main(["verify", str(tmp_path / "out"), "--trust"]) == 0
 
 
@@ -266,7 +267,7 @@ def test_a_list_in_csv_names_images(run, images, tmp_path):
 def test_lists_in_csv_that_do_not_fit_are_refused(run, images, tmp_path, text, match):
     (tmp_path / "map.csv").write_text(text)
     with pytest.raises(InputError, match=match):
-        evaluate(options(images, run, tmp_path / "out", names=str(tmp_path / "map.csv")))
+        evaluate_folder(options(images, run, tmp_path / "out", names=str(tmp_path / "map.csv")))
     assert not (tmp_path / "out").exists()
 
 
@@ -315,13 +316,13 @@ AVATAR = {"avatar": True, "method": "toy_plugin:METHOD"}
 
 def test_a_stored_avatar_scores_as_in_its_run(run, cell, images, tmp_path):
     """Its frames and, of what is measured of it as a whole, what the run asks for."""
-    findings = evaluate(options(cell.folder, run, tmp_path / "out", **AVATAR))
+    findings = evaluate_folder(options(cell.folder, run, tmp_path / "out", **AVATAR))
     rows = pd.read_parquet(RunFolder(tmp_path / "out").rows)
     own = pd.read_parquet(RunFolder(run).rows)
     same = [column for column in COLUMNS if column not in ("method", "version")]
     assert rows[same].equals(own[same])
     assert "theirs" in findings.text
-    evaluate(options(cell.avatar, run, tmp_path / "out", **AVATAR))  # kept, as a run keeps it
+    evaluate_folder(options(cell.avatar, run, tmp_path / "out", **AVATAR))  # kept, as a run keeps it
     assert cli.main(["verify", str(tmp_path / "out"), "--trust"]) == 0
 
 
@@ -333,7 +334,7 @@ def test_an_avatar_of_another_subject_is_refused(run, cell, toy, tmp_path, monke
     (stored / "avatar.json").write_text(json.dumps(record))
     monkeypatch.setattr(toy.ToyClip, "head", SimpleNamespace(version="toy"))
     with pytest.raises(InputError, match="found one of subject7"):
-        evaluate(options(stored, run, tmp_path / "out", **AVATAR))
+        evaluate_folder(options(stored, run, tmp_path / "out", **AVATAR))
     assert not (tmp_path / "out").exists()
 
 
@@ -352,5 +353,5 @@ def test_what_is_no_avatar_of_a_known_method_is_refused(run, cell, tmp_path, fol
     (tmp_path / "empty").mkdir()
     place = cell.folder if folder == "seed-0" else tmp_path / folder
     with pytest.raises(InputError, match=match):
-        evaluate(options(place, run, tmp_path / "out", **others))
+        evaluate_folder(options(place, run, tmp_path / "out", **others))
     assert not (tmp_path / "out").exists()

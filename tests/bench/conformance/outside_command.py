@@ -5,7 +5,7 @@ from pathlib import Path
 
 import tyro
 
-from headbench import ALL, Findings, InputError, Progress, RunData
+from headbench import ALL, CommandSpec, Findings, InputError, Progress, RunData
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,15 @@ class WorstSettings:
 
     count: int = 3
     """Frames to list of each method and task."""
+
+
+WORST = CommandSpec(
+    name="worst",
+    group="inspect",
+    summary="List the worst frames of each method of a finished run.",
+    settings="outside_command:WorstSettings",
+    function="outside_command:worst",
+)
 
 
 def worst(settings: WorstSettings, progress: Progress) -> Findings:

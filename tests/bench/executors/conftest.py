@@ -54,7 +54,7 @@ def command(tmp_path):
         write_json(file, asdict(config))
         folders = (Path(__file__).parent, Path(__file__).parents[1])
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))}
-        words = [sys.executable, "-m", "headbench.bench.cli", "run", "--config", str(file), *options]
+        words = [sys.executable, "-m", "headbench.bench.start", "run", "--config", str(file), *options]
         process = subprocess.Popen(
             words, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )

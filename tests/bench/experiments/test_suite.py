@@ -6,7 +6,7 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.experiments import suite as module
-from headbench.bench.experiments.suite import ABLATIONS
+from headbench.bench.experiments.suite_settings import ABLATIONS
 from headbench.bench.registry import get
 from headbench.bench.runner.config import resolve_method
 

@@ -12,7 +12,8 @@ from headbench.bench.runner.captures import open_clips
 from headbench.bench.runner.config import RunConfig
 from headbench.datasets.ga import content_digests
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.lint.command import LintSettings, lint
+from headbench.datasets.lint.command import lint
+from headbench.datasets.lint.settings import LintSettings
 
 from ..tiny_capture import FRONTAL, SERIALS
 

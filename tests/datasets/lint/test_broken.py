@@ -10,7 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
-from headbench.datasets.lint.command import LintSettings, lint
+from headbench.datasets.lint.command import lint
+from headbench.datasets.lint.settings import LintSettings
 
 from .good_capture import GoodCapture
 

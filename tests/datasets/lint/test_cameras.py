@@ -11,7 +11,8 @@ import pytest
 
 from headbench.bench.contracts import Camera
 from headbench.datasets.ga.writer import SequencePlan
-from headbench.datasets.lint.command import LintSettings, lint_capture
+from headbench.datasets.lint.command import lint_capture
+from headbench.datasets.lint.settings import LintSettings
 from headbench.datasets.synthetic.capture import synthesize
 
 from ..head.toy import toy_head

@@ -14,7 +14,8 @@ from headbench.datasets.ga.layout import Declaration
 from headbench.datasets.head.arrays import read_head, save_head
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.lint.catalogue import RULES
-from headbench.datasets.lint.command import LintSettings, lint
+from headbench.datasets.lint.command import lint
+from headbench.datasets.lint.settings import LintSettings
 from headbench.datasets.synthetic.capture import synthesize
 
 

@@ -14,8 +14,9 @@ from headbench.datasets.ga.writer import SequencePlan
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.images import write_image
 from headbench.datasets.lint.catalogue import GROUPS, RULES
-from headbench.datasets.lint.command import LintSettings, lint_capture
+from headbench.datasets.lint.command import lint_capture
 from headbench.datasets.lint.rules import apply
+from headbench.datasets.lint.settings import LintSettings
 
 from ..head.toy import toy_head
 from .faults import FAULTS

@@ -9,8 +9,8 @@ import numpy as np
 
 from headbench.bench.contracts import Camera
 from headbench.datasets.head.arrays import HeadArrays, save_head
-from headbench.datasets.nersemble.command import PrepareSettings
 from headbench.datasets.nersemble.re_record import RecordingWriter, Release, write_tracked
+from headbench.datasets.nersemble.settings import PrepareSettings
 
 from ..head.toy import toy_head
 from ..tiny_capture import rig

@@ -10,13 +10,9 @@ from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.subject import PosedSubject
-from headbench.datasets.nersemble.command import (
-    PrepareSettings,
-    RecordSettings,
-    prepare_nersemble,
-    record_nersemble,
-)
+from headbench.datasets.nersemble.command import prepare_nersemble, record_nersemble
 from headbench.datasets.nersemble.re_record import re_record
+from headbench.datasets.nersemble.settings import PrepareSettings, RecordSettings
 
 from ..tiny_capture import make_plan, rig, write_tiny_capture
 

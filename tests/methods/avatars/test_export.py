@@ -15,11 +15,12 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.datasets.ga import reader
 from headbench.datasets.ga.reader import read_capture
-from headbench.methods.avatars.command import ExportPlySettings, export_ply
-from headbench.methods.avatars.export import neutral_pose
+from headbench.methods.avatars.export import export_ply, neutral_pose
 from headbench.methods.avatars.harmonics import HIDDEN, fit_harmonics, sphere
+from headbench.methods.avatars.settings import ExportPlySettings
 from headbench.methods.avatars.views import visibility
-from headbench.methods.avatars.web.command import ExportHtmlSettings, export_html
+from headbench.methods.avatars.web.export import export_page
+from headbench.methods.avatars.web.settings import ExportHtmlSettings
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
 from headbench.methods.gbs.config import GBSConfig
@@ -149,7 +150,7 @@ def test_an_avatar_without_splats_is_refused(clip, tmp_path):
     options = {"device": "cpu", "seed": 0, "progress": no_progress}
     NearestCamera().fit(clip, tmp_path, Budget(iterations=1), **options)
     recorded(tmp_path, "nearest-camera", clip)
-    for command, settings in ((export_ply, ExportPlySettings), (export_html, ExportHtmlSettings)):
+    for command, settings in ((export_ply, ExportPlySettings), (export_page, ExportHtmlSettings)):
         with pytest.raises(
             InputError, match="an avatar of splats, found one of nearest-camera.*headbench view"
         ):
@@ -164,7 +165,7 @@ def test_a_shape_of_another_head_model_is_refused(clip, tmp_path):
     with pytest.raises(
         InputError, match=r"avatar\.json, shape: expected at most \d+ coefficients.*found 5000"
     ):
-        export_html(ExportHtmlSettings(str(folder), out=str(tmp_path / "x")))
+        export_page(ExportHtmlSettings(str(folder), out=str(tmp_path / "x")))
 
 
 def test_colours_that_are_harmonics_are_found_exactly():

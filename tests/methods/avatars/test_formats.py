@@ -14,17 +14,11 @@ from scipy.spatial import cKDTree
 
 from headbench.bench.errors import UnavailableError
 from headbench.bench.runner.stored import avatar_folder, load_avatar
-from headbench.methods.avatars.command import (
-    ExportGlbSettings,
-    ExportPlySettings,
-    ExportSogSettings,
-    export_glb,
-    export_ply,
-    export_sog,
-)
-from headbench.methods.avatars.export import neutral_pose
+from headbench.methods.avatars.export import export_glb, export_ply, export_sog, neutral_pose
 from headbench.methods.avatars.formats import FORMATS
-from headbench.methods.avatars.web.command import ExportHtmlSettings, export_html
+from headbench.methods.avatars.settings import ExportGlbSettings, ExportPlySettings, ExportSogSettings
+from headbench.methods.avatars.web.export import export_page
+from headbench.methods.avatars.web.settings import ExportHtmlSettings
 from headbench.methods.shared.avatar_files import read_shared_head
 
 from ...small_run import small_run
@@ -175,4 +169,4 @@ def test_without_the_library_the_error_says_what_to_install(run, tmp_path, monke
 
 def test_a_page_holds_what_a_network_draws_as_its_splats_are(run, tmp_path):
     settings = ExportHtmlSettings(str(folder_of(run, "gha")), str(tmp_path / "x.html"), expressions=1)
-    assert export_html(settings).data["psnr"]["rest"] > 25
+    assert export_page(settings).data["psnr"]["rest"] > 25

@@ -11,7 +11,8 @@ from headbench.bench.errors import InputError
 from headbench.bench.runner.stored import load_avatar
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
-from headbench.methods.avatars.command import ImportGASettings, import_ga
+from headbench.methods.avatars.import_ga import import_avatar
+from headbench.methods.avatars.settings import ImportGASettings
 from headbench.methods.ga.method import GA
 from headbench.methods.shared.subject_mesh import SubjectMesh
 
@@ -78,7 +79,7 @@ def test_a_file_made_by_hand_becomes_an_avatar(capture, tmp_path, rest, binding)
 
 
 def imported(capture, out, ply):
-    return import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(out)))
+    return import_avatar(ImportGASettings(str(ply), capture=str(capture), out=str(out)))
 
 
 @pytest.mark.parametrize(
@@ -129,7 +130,7 @@ def flame_param(capture, path, change=None):
 
 def with_beside(tmp_path, **settings):
     ply = ga_file(tmp_path / "point_cloud.ply", ROWS)
-    findings = import_ga(ImportGASettings(str(ply), out=str(tmp_path / "out"), **settings))
+    findings = import_avatar(ImportGASettings(str(ply), out=str(tmp_path / "out"), **settings))
     return GA().load(tmp_path / "out", device="cpu"), findings
 
 
@@ -153,8 +154,8 @@ def plain_import(capture, tmp_path, of_refined=False):
     ply = ga_file(tmp_path / "point_cloud.ply", ROWS)
     out = tmp_path / "plain"
     if of_refined:
-        import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(out)))
-    import_ga(ImportGASettings(str(ply), capture=str(capture), out=str(out), flame_param="none"))
+        import_avatar(ImportGASettings(str(ply), capture=str(capture), out=str(out)))
+    import_avatar(ImportGASettings(str(ply), capture=str(capture), out=str(out), flame_param="none"))
     return out
 
 

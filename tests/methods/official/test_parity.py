@@ -15,8 +15,8 @@ from headbench.bench.rows import Row, Rows
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.official.config import GHAOfficialConfig
 from headbench.methods.official.gha.method import GHAOfficial
-from headbench.methods.official.parity.command import ParitySettings
 from headbench.methods.official.parity.parity import as_theirs, differences_of, run_config
+from headbench.methods.official.parity.settings import ParitySettings
 from headbench.methods.shared.config import PAPER_ITERATIONS, SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, ShuffledEpochs, Timeline
 

@@ -8,7 +8,8 @@ import pytest
 from headbench.bench.contracts import FrameKey
 from headbench.bench.runner.store import RunFolder
 from headbench.reports.page import split
-from headbench.reports.page.command import PageSettings, report
+from headbench.reports.page.report import write_report
+from headbench.reports.page.settings import PageSettings
 
 from .test_page import HOSTILE
 
@@ -20,7 +21,7 @@ def opened(new_tab, tmp_path):
 
     def start(run, width=1200, scheme="light", split=False):
         out = tmp_path / "page.html"
-        report(PageSettings((str(run),), str(out), split=split, trust=True))
+        write_report(PageSettings((str(run),), str(out), split=split, trust=True))
         out = out / "index.html" if split else out
         tab = new_tab(width, 800, color_scheme=scheme)
         tab.on("console", lambda message: faults.append(message.text))

@@ -12,9 +12,9 @@ from headbench.bench.errors import InputError
 from headbench.bench.rows import ALL, Rows
 from headbench.bench.runner.config import RunOptions
 from headbench.reports.page import frames, split
-from headbench.reports.page.command import PageSettings, report
 from headbench.reports.page.frames import ShownFrame, choose_pictures, spread
-from headbench.reports.page.report import write_page
+from headbench.reports.page.report import write_page, write_report
+from headbench.reports.page.settings import PageSettings
 from headbench.reports.runs import RunData, RunSet
 from headbench.reports.table_report import layouts, table_text
 
@@ -61,7 +61,7 @@ def page(toy_run, tmp_path):
     def make(runs=(toy_run,), **changes):
         out = tmp_path / "page.html"
         settings = {"runs": tuple(map(str, runs)), "out": str(out), "trust": True, **changes}
-        found = report(PageSettings(**settings))
+        found = write_report(PageSettings(**settings))
         assert found.data["bytes"] == out.stat().st_size
         return Page(out)
 
@@ -284,7 +284,7 @@ def test_pictures_apart_are_those_of_one_file(page, toy_run, tmp_path, monkeypat
     (folder / "pictures").mkdir(parents=True)
     (folder / "pictures" / "of-an-earlier-page.js").write_text("")
     for _ in range(2):
-        found = report(PageSettings((str(toy_run),), str(folder), split=True, trust=True))
+        found = write_report(PageSettings((str(toy_run),), str(folder), split=True, trust=True))
     assert found.data["bytes"] == sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     apart = Page(folder / "index.html")
     assert apart.images == []
@@ -304,7 +304,7 @@ def test_a_folder_with_other_files_is_not_written_to(toy_run, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("")
     with pytest.raises(InputError, match=r"earlier report alone, found thesis\.tex"):
-        report(PageSettings((str(toy_run),), str(tmp_path / "mine"), split=True, trust=True))
+        write_report(PageSettings((str(toy_run),), str(tmp_path / "mine"), split=True, trust=True))
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.tex"]
 
 

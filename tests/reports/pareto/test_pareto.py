@@ -21,9 +21,10 @@ from headbench.bench.io.files import plain
 from headbench.bench.rows import Row, Rows
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
-from headbench.reports.pareto.command import COSTS, ParetoSettings, pareto_runs
+from headbench.reports.pareto.command import COSTS, pareto_runs
 from headbench.reports.pareto.plot import label_points, write_plot
 from headbench.reports.pareto.points import Point, pareto_front
+from headbench.reports.pareto.settings import ParetoSettings
 
 METRICS = [
     MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr"),

@@ -14,8 +14,9 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_png
 from headbench.bench.io.lock import LOCK_FILE, locked
 from headbench.bench.runner import run as runner
-from headbench.reports.robustness.command import ExtremesSettings, extremes_run
+from headbench.reports.robustness.command import extremes_run
 from headbench.reports.robustness.extremes import ExpressionComponents, extremes, typical_pose
+from headbench.reports.robustness.settings import ExtremesSettings
 from headbench.reports.robustness.sheets import BROKEN, EXTRAPOLATED
 from headbench.reports.robustness.stability import RECORD_FILE, ROWS_FILE, SHEET_FILE
 

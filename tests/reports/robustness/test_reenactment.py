@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_png
-from headbench.reports.robustness.command import ReenactSettings, reenact_run
+from headbench.reports.robustness.command import reenact_run
 from headbench.reports.robustness.reenactment import RigidMean, check_heads, retarget
+from headbench.reports.robustness.settings import ReenactSettings
 from headbench.reports.robustness.stability import RECORD_FILE, ROWS_FILE, SHEET_FILE
 
 

@@ -14,7 +14,8 @@ from headbench.bench.io.files import digest_file
 from headbench.bench.io.images import read_png
 from headbench.bench.runner.store import RunFolder
 from headbench.reports.render import render as module
-from headbench.reports.render.command import RenderSettings, render
+from headbench.reports.render.render import render_avatar
+from headbench.reports.render.settings import RenderSettings
 
 
 @pytest.fixture
@@ -36,7 +37,7 @@ def settings(cell, tmp_path):
 
 @pytest.mark.parametrize("split", ["novel_view", "self_reenactment"])
 def test_frames_are_those_of_the_run(settings, cell, tmp_path, split):
-    found = render(replace(settings, frames=split)).data["frames"]
+    found = render_avatar(replace(settings, frames=split)).data["frames"]
     theirs = sorted((cell.folder / "renders" / split).iterdir())
     assert [path.name for path in found] == [path.name for path in theirs]
     assert all(np.array_equal(read_png(a), read_png(b)) for a, b in zip(found, theirs))
@@ -45,7 +46,7 @@ def test_frames_are_those_of_the_run(settings, cell, tmp_path, split):
 @pytest.mark.parametrize("beside", [False, True])
 def test_cameras_and_timesteps_choose_what_videos_hold(settings, beside):
     chosen = replace(settings, cameras=("1", "3"), timesteps=(4, 5), video=True, fps=10.0, beside=beside)
-    findings = render(chosen)
+    findings = render_avatar(chosen)
     assert len(findings.data["frames"]) == 4
     assert [path.name for path in findings.data["videos"]] == [
         "self_reenactment_FREE_1.webm",
@@ -65,7 +66,9 @@ def test_cameras_and_timesteps_choose_what_videos_hold(settings, beside):
 
 
 def test_an_orbit_looks_at_the_head_from_all_sides(settings):
-    frames = render(replace(settings, frames="orbit", views=5, beyond=100.0, timesteps=(0, 5), video=True))
+    frames = render_avatar(
+        replace(settings, frames="orbit", views=5, beyond=100.0, timesteps=(0, 5), video=True)
+    )
     for path in frames.data["frames"]:
         rows, columns = np.nonzero(read_png(path)[..., 0] < 200)
         assert abs(rows.mean() - 14.5) < 1  # the ball is where the cameras look, and its picture where K says
@@ -76,13 +79,13 @@ def test_an_orbit_looks_at_the_head_from_all_sides(settings):
 def test_a_capture_is_refitted_to_the_head_model_of_the_avatar(settings, cell, monkeypatch):
     asked = []
     monkeypatch.setattr(module, "plan", lambda clip, needs, heads: asked.append(heads))
-    render(settings)
+    render_avatar(settings)
     head = cell.avatar / "head_model.npz"
     head.touch()
     record = json.loads((cell.avatar / "avatar.json").read_text())
     record |= {"head_model": "flame2020", "head_digest": digest_file(head)}
     (cell.avatar / "avatar.json").write_text(json.dumps(record))
-    render(settings)
+    render_avatar(settings)
     assert asked == [{}, {"flame2020": str(cell.avatar / "head_model.npz")}]
 
 
@@ -100,7 +103,7 @@ def test_a_capture_is_refitted_to_the_head_model_of_the_avatar(settings, cell, m
 def test_what_cannot_be_rendered_is_refused_before_work(settings, tmp_path, monkeypatch, change, match):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=match):
-        render(replace(settings, **change))
+        render_avatar(replace(settings, **change))
     assert not (tmp_path / "out").exists()
 
 
@@ -113,5 +116,5 @@ def test_settings_without_meaning_are_refused(settings, change):
 def test_a_video_without_its_writer_is_refused_before_work(settings, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(UnavailableError, match="PyAV"):
-        render(replace(settings, video=True))
+        render_avatar(replace(settings, video=True))
     assert not Path(settings.out).exists()

@@ -1,7 +1,7 @@
 import pytest
 
-from headbench.reports.view.command import ViewSettings
 from headbench.reports.view.scene import open_scene
+from headbench.reports.view.settings import ViewSettings
 
 from ...small_run import small_run
 

@@ -10,7 +10,6 @@ import pytest
 
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.io.images import read_png
-from headbench.reports.view.command import ViewSettings, view
 from headbench.reports.view.drawing import (
     CAPTURED,
     LABEL_PX,
@@ -22,6 +21,8 @@ from headbench.reports.view.drawing import (
     splats_of,
 )
 from headbench.reports.view.scene import open_scene
+from headbench.reports.view.server import view_avatars
+from headbench.reports.view.settings import ViewSettings
 from headbench.reports.view.state import FreeView, Sliders, State
 
 
@@ -180,18 +181,18 @@ def test_a_port_that_is_taken_is_refused_at_once(run):
     pytest.importorskip("viser")
     taken = socket.create_server(("127.0.0.1", 0))
     with taken, pytest.raises(InputError, match="--port.*free.*in use"):
-        view(ViewSettings((str(run.root),), port=taken.getsockname()[1]))
+        view_avatars(ViewSettings((str(run.root),), port=taken.getsockname()[1]))
 
 
 def test_without_viser_the_error_says_what_to_install(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(UnavailableError, match=r"pip install -e '.\[view\]'"):
-        view(ViewSettings((str(run.root),)))
+        view_avatars(ViewSettings((str(run.root),)))
 
 
 def test_the_viewer_ends_after_the_seconds_asked_for(run, capsys, caplog):
     pytest.importorskip("viser")
-    findings = view(ViewSettings((str(run.root),), port=0, seconds=0.0))
+    findings = view_avatars(ViewSettings((str(run.root),), port=0, seconds=0.0))
     assert findings.data["address"].startswith("http://127.0.0.1:")
     assert capsys.readouterr().out == ""
     assert "Everybody" not in caplog.text
@@ -199,5 +200,5 @@ def test_the_viewer_ends_after_the_seconds_asked_for(run, capsys, caplog):
 
 def test_other_addresses_are_warned_of(run, caplog):
     pytest.importorskip("viser")
-    view(ViewSettings((str(run.root),), host="0.0.0.0", port=0, seconds=0.0))
+    view_avatars(ViewSettings((str(run.root),), host="0.0.0.0", port=0, seconds=0.0))
     assert "Everybody who reaches 0.0.0.0" in caplog.text

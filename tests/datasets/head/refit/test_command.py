@@ -15,8 +15,9 @@ from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.refit import refit as block
-from headbench.datasets.head.refit.command import RefitCommandSettings, refit_capture, target_head
+from headbench.datasets.head.refit.command import refit_capture, target_head
 from headbench.datasets.head.refit.rewrite import capture_plan, link_or_copy, write_capture
+from headbench.datasets.head.refit.settings import RefitCommandSettings
 from headbench.datasets.steps.masks import set_background
 
 from ...tiny_capture import make_plan, write_tiny_capture

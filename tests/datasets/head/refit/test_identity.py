@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.procedural.model import procedural_head
-from headbench.datasets.head.refit.command import RefitSettings
 from headbench.datasets.head.refit.identity import (
     closest_points,
     fit_shape,
@@ -17,6 +16,7 @@ from headbench.datasets.head.refit.identity import (
     rigid_alignment,
     same_topology,
 )
+from headbench.datasets.head.refit.settings import RefitSettings
 
 from ..toy import toy_head
 from .heads import subdivided

@@ -10,8 +10,8 @@ from headbench.bench.errors import InputError
 from headbench.datasets.benchmarks.refit import EXACT_MEAN_MM, EXACT_P95_MM, performance
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.head.refit import refit as block
-from headbench.datasets.head.refit.command import RefitSettings
 from headbench.datasets.head.refit.refit import BLOCK, refit
+from headbench.datasets.head.refit.settings import RefitSettings
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.head.teeth import with_teeth
 

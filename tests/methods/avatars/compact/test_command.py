@@ -8,7 +8,8 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.runner.stored import load_avatar
 from headbench.datasets.ga.reader import read_capture
-from headbench.methods.avatars.compact.command import CompactSettings, compact
+from headbench.methods.avatars.compact.measure import compact_avatar
+from headbench.methods.avatars.compact.settings import CompactSettings
 from headbench.methods.ours.method import Ours
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.trivial.method import NearestCamera
@@ -33,7 +34,7 @@ def trained(tmp_path_factory):
 def test_parts_and_their_costs_are_told(trained, tmp_path):
     capture, avatar = trained
     settings = CompactSettings(str(avatar), out=str(tmp_path), compare=str(capture), frames=3)
-    findings = compact(settings)
+    findings = compact_avatar(settings)
     data, quality = findings.data, findings.data["quality"]
     assert data["frames"] == 3
     assert data["whole"]["compact_bytes"] == (tmp_path / "compact.safetensors").stat().st_size
@@ -53,7 +54,7 @@ def test_parts_and_their_costs_are_told(trained, tmp_path):
 @pytest.mark.parametrize("cell", [False, True])
 def test_without_a_capture_only_sizes_are_told(trained, tmp_path, cell):
     avatar = trained[1].parent if cell else trained[1]  # the folder that has it as "avatar" is one of a cell
-    findings = compact(CompactSettings(str(avatar), out=str(tmp_path)))
+    findings = compact_avatar(CompactSettings(str(avatar), out=str(tmp_path)))
     assert "quality" not in findings.data
     assert findings.data["splats_kept"] == findings.data["splats"]
     assert "dB" not in findings.text
@@ -61,7 +62,7 @@ def test_without_a_capture_only_sizes_are_told(trained, tmp_path, cell):
 
 def test_enlarged_pictures_have_no_truth(trained, tmp_path):
     settings = CompactSettings(str(trained[1]), out=str(tmp_path), compare=str(trained[0]), frames=1, scale=2)
-    findings = compact(settings)
+    findings = compact_avatar(settings)
     assert findings.data["exact"]["psnr"] is None
     assert findings.data["quality"]["all"]["psnr_exact"] > 20
 
@@ -69,14 +70,14 @@ def test_enlarged_pictures_have_no_truth(trained, tmp_path):
 def test_what_does_not_belong_together_is_refused(trained, tmp_path):
     (tmp_path / "a.txt").touch()
     with pytest.raises(InputError, match=r"avatar\.json"):
-        compact(CompactSettings(str(tmp_path), out=str(tmp_path / "out")))
+        compact_avatar(CompactSettings(str(tmp_path), out=str(tmp_path / "out")))
     clip = read_capture(trained[0])
     options = {"device": "cpu", "seed": 0, "progress": no_progress}
     NearestCamera().fit(clip, tmp_path / "nearest", Budget(iterations=1), **options)
     recorded(tmp_path / "nearest", "nearest-camera", clip)
     with pytest.raises(InputError, match="exact file.*found an avatar of nearest-camera"):
-        compact(CompactSettings(str(tmp_path / "nearest"), out=str(tmp_path / "out")))
+        compact_avatar(CompactSettings(str(tmp_path / "nearest"), out=str(tmp_path / "out")))
     other = write_tiny_capture(tmp_path / "other", make_plan(subject="902")).union
     with pytest.raises(InputError, match="902"):
-        compact(CompactSettings(str(trained[1]), out=str(tmp_path / "out"), compare=str(other)))
+        compact_avatar(CompactSettings(str(trained[1]), out=str(tmp_path / "out"), compare=str(other)))
     assert not (tmp_path / "out").exists()

@@ -5,8 +5,8 @@ import pytest
 from headbench.bench.contracts import no_progress
 from headbench.methods.avatars.web import export
 from headbench.methods.avatars.web.bake import Source
-from headbench.methods.avatars.web.command import ExportHtmlSettings
 from headbench.methods.avatars.web.model import WebAvatar
+from headbench.methods.avatars.web.settings import ExportHtmlSettings
 
 from ....small_run import small_run
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from headbench.methods.avatars.web.command import ExportHtmlSettings
 from headbench.methods.avatars.web.payload import decode, encode
+from headbench.methods.avatars.web.settings import ExportHtmlSettings
 
 CENTER = np.array([0.0, 0.0, 1.0])
 

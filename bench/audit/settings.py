@@ -1,4 +1,4 @@
-"""``headbench verify``, ``headbench bundle``, ``headbench evaluate`` and ``headbench frames``."""
+"""Settings of the commands verify, bundle, evaluate and frames."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 
 import tyro
 
-from ..contracts import Progress, TaskName, no_progress
+from ..contracts import TaskName
 from ..errors import InputError
 from ..options import DependentOptions
 from ..runner.config import RunOptions
-from ..specs import LABEL, Findings, is_label, writes
+from ..specs import LABEL, is_label
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,6 @@ class VerifySettings(RunOptions):
 
     run: tyro.conf.Positional[str]
     """Folder of a finished run or of `headbench evaluate`, or a file of `headbench bundle`."""
-
-
-def verify(settings: VerifySettings, progress: Progress = no_progress) -> Findings:
-    """Recompute a run's digests and metrics from its frames: exit code 1 if anything differs, 3 if it is not a run."""
-    from .verify import verify_run
-
-    return verify_run(settings, progress)
 
 
 @dataclass(frozen=True)
@@ -78,13 +71,6 @@ def check_shown(submission: Any, source: str) -> None:
     link = submission.link
     if link and not re.fullmatch(r"https?://[^\s\"'<>()\[\]]+", link):
         raise InputError(source, "link", "an address that begins with https:// or http://", repr(link))
-
-
-def bundle(settings: BundleSettings, progress: Progress = no_progress) -> Findings:
-    """Write the results of a finished run to one file, for a leaderboard and for `headbench verify`."""
-    from .bundle import write_bundle
-
-    return write_bundle(settings, progress)
 
 
 @dataclass(frozen=True)
@@ -160,13 +146,6 @@ class EvaluateSettings:
             raise ValueError("say what to score against: --clip CAPTURE, or --like RUN")
 
 
-def evaluate(settings: EvaluateSettings, progress: Progress = no_progress) -> Findings:
-    """Score a folder of images or a stored avatar, so that a method can be compared without a plug-in."""
-    from .evaluate import evaluate_folder
-
-    return evaluate_folder(settings, progress)
-
-
 @dataclass(frozen=True)
 class FramesSettings(RunOptions):
     """List the frames that `headbench evaluate` scores, for renders that are made outside of headbench.
@@ -192,11 +171,3 @@ class FramesSettings(RunOptions):
 
     reader: str = ""
     """Which dataset reader opens the capture; default: the one that finds it."""
-
-
-@writes("out")
-def frames(settings: FramesSettings, progress: Progress = no_progress) -> Findings:
-    """List the frames that `evaluate` needs as CSV: file names, cameras and pose files."""
-    from .frames import write_frames
-
-    return write_frames(settings)

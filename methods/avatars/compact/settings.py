@@ -1,13 +1,11 @@
-"""``headbench compact``."""
+"""Settings of the compact format of avatars."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ....bench.contracts import Progress, no_progress
 from ....bench.options import DependentOptions
 from ....bench.runner.config import AvatarFolder
-from ....bench.specs import Findings, writes
 from ....datasets.options import CaptureOptions
 from .precision import Precision
 
@@ -40,14 +38,3 @@ class CompactSettings(CaptureOptions):
     def __post_init__(self) -> None:
         if self.frames < 1 or self.scale < 1:
             raise ValueError(f"frames and scale must be at least 1, found {self.frames} and {self.scale}")
-
-
-@writes("out", "an avatar")
-def compact(settings: CompactSettings, progress: Progress = no_progress) -> Findings:
-    """Compress an avatar of the method ours to about a fifteenth of its size; with a capture, measure the loss of quality.
-
-    With a capture, each part's cost in quality is measured alone.
-    """
-    from .measure import compact_avatar
-
-    return compact_avatar(settings, progress)

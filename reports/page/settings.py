@@ -1,4 +1,4 @@
-"""``headbench report``."""
+"""Settings of the report."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ from dataclasses import dataclass
 
 import tyro
 
-from ...bench.contracts import Progress, no_progress
 from ...bench.runner.config import RunOptions
-from ...bench.specs import Findings
 
 MAX_MB, MAX_SPLIT_MB = 20.0, 500.0
 
@@ -39,14 +37,3 @@ class PageSettings(RunOptions):
             raise ValueError("runs: at least one folder")
         if self.max_mb is not None and not 0.1 <= self.max_mb <= (most := 4000 if self.split else 1000):
             raise ValueError(f"max-mb is {self.max_mb}; from 0.1 to {most}")
-
-
-def report(settings: PageSettings, progress: Progress = no_progress) -> Findings:
-    """Write a report of finished runs as one HTML file or a folder; it opens without a network.
-
-    Raises `InputError` for folders that are no finished runs or do not compare, a file that cannot be written, and
-    bytes that do not suffice.
-    """
-    from .report import write_report
-
-    return write_report(settings, progress)

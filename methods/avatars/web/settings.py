@@ -1,13 +1,11 @@
-"""``headbench export html``."""
+"""Settings of the export of avatars as web pages."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ....bench.contracts import Progress, no_progress
 from ....bench.options import DependentOptions
-from ....bench.specs import Findings
-from ..command import AvatarOptions
+from ..settings import AvatarOptions
 
 
 @dataclass(frozen=True)
@@ -36,13 +34,3 @@ class ExportHtmlSettings(AvatarOptions):
             raise ValueError(f"degree is {self.degree}; from 0 to 3")
         if self.expressions < 0:
             raise ValueError(f"expressions is {self.expressions}; at least 0")
-
-
-def export_html(settings: ExportHtmlSettings, progress: Progress = no_progress) -> Findings:
-    """Export an avatar as one HTML file with sliders for expressions and joints.
-
-    Raises `InputError` for a folder that holds no avatar of splats, and for a file that cannot be written.
-    """
-    from .export import export_page
-
-    return export_page(settings, progress)

@@ -1,4 +1,4 @@
-"""``headbench view``."""
+"""Settings of the viewer."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ from dataclasses import dataclass
 
 import tyro
 
-from ...bench.contracts import Progress, no_progress
 from ...bench.runner.config import RunOptions
-from ...bench.specs import Findings
 
 
 @dataclass(frozen=True)
@@ -57,14 +55,3 @@ class ViewSettings(RunOptions):
             raise ValueError(f"expressions is {self.expressions}; at least 0")
         if self.seconds is not None and self.seconds < 0:
             raise ValueError(f"seconds is {self.seconds}; at least 0")
-
-
-def view(settings: ViewSettings, progress: Progress = no_progress) -> Findings:
-    """View avatars in a browser, side by side, with sliders and recorded sequences.
-
-    Raises `InputError` for folders without avatars, captures that are not there and a port that is taken, `UnavailableError`
-    without viser.
-    """
-    from .server import view_avatars
-
-    return view_avatars(settings, progress)

@@ -1,14 +1,12 @@
-"""``headbench render``."""
+"""Settings of the command that renders avatars."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
 
-from ...bench.contracts import Progress, no_progress
 from ...bench.options import DependentOptions
 from ...bench.runner.config import AvatarFolder
-from ...bench.specs import Findings, writes
 
 
 @dataclass(frozen=True)
@@ -70,15 +68,3 @@ class RenderSettings:
             raise ValueError("views is at least 1, beyond from 0 to less than 180 degrees")
         if not 0.0 < self.fps <= 1000.0:
             raise ValueError(f"fps is {self.fps}; above 0, at most 1000")
-
-
-@writes("out")
-def render(settings: RenderSettings, progress: Progress = no_progress) -> Findings:
-    """Render a stored avatar: frames of a task, or an orbit; as images and video.
-
-    Images are 8-bit PNG of the capture's size on its background, an orbit's of the size that the method works at. Videos are
-    WebM (VP9), which browsers play.
-    """
-    from .render import render_avatar
-
-    return render_avatar(settings, progress)

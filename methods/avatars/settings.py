@@ -1,4 +1,4 @@
-"""``headbench export ply|glb|sog`` and ``headbench import ga``."""
+"""Settings of the exports and imports of avatars."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 import tyro
 
-from ...bench.contracts import Progress, no_progress
 from ...bench.options import DependentOptions
 from ...bench.runner.config import AvatarFolder
-from ...bench.specs import Findings, writes
 from ...datasets.options import CaptureOptions
 
 
@@ -87,46 +85,3 @@ class ImportGASettings(CaptureOptions):
         DependentOptions(("reader", "cy"), "capture"),
         DependentOptions(("subject",), "capture", False),
     )
-
-
-def export_ply(settings: ExportPlySettings, progress: Progress = no_progress) -> Findings:
-    """Write an avatar in one pose as a 3D Gaussian splatting PLY that common viewers open.
-
-    The findings state bytes, how well harmonics represent its colours, and the PSNR of what is read back.
-    """
-    return _export(settings, "ply", progress)
-
-
-def export_glb(settings: ExportGlbSettings, progress: Progress = no_progress) -> Findings:
-    """Write an avatar in one pose as binary glTF with splats.
-
-    The findings are those of `export ply`.
-    """
-    return _export(settings, "glb", progress)
-
-
-def export_sog(settings: ExportSogSettings, progress: Progress = no_progress) -> Findings:
-    """Write an avatar in one pose as SOG, a compact format of web viewers.
-
-    The findings are those of `export ply`.
-    """
-    return _export(settings, "sog", progress)
-
-
-def _export(settings: ExportOptions, name: str, progress: Progress) -> Findings:
-    from .export import export_pose
-
-    return export_pose(settings, name, progress)
-
-
-@writes("out", "an avatar")
-def import_ga(settings: ImportGASettings, progress: Progress = no_progress) -> Findings:
-    """Import a GaussianAvatars PLY, with its flame_param.npz or its capture, as an avatar of the method ga.
-
-    Harmonics of a lower degree are filled up with zeros, and whatever other columns there are is left out. Shape and
-    static offset come from flame_param.npz, else from the capture. With both, training timesteps are shown in the pose that
-    the official training refined, as official renders of them are; held-out timesteps follow the capture.
-    """
-    from .import_ga import import_avatar
-
-    return import_avatar(settings, progress)

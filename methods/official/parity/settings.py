@@ -1,4 +1,4 @@
-"""``headbench parity``."""
+"""Settings of the comparison with an official repository."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ from typing import Literal
 
 import tyro
 
-from ....bench.contracts import Progress, no_progress
 from ....bench.options import DependentOptions
 from ....bench.runner.config import parse_size
-from ....bench.specs import Findings, writes
 
 
 @dataclass(frozen=True)
@@ -80,11 +78,3 @@ class ParitySettings:
         parse_size(self.size)
         if self.iterations < 1 or self.orders < 1 or self.samples < 10 or not self.tolerance > 0:
             raise ValueError("iterations and orders must be at least 1, samples 10, the tolerance above 0")
-
-
-@writes("out", "captures")
-def parity(settings: ParitySettings, progress: Progress = no_progress) -> Findings:
-    """Train a method and its authors' code on one capture with equal settings and compare the results."""
-    from .parity import compare
-
-    return compare(settings, progress)

@@ -1,0 +1,205 @@
+"""``headbench run`` and ``headbench demo``: settings, and the comparison that both start."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from .configuration import build, merge, parse_assignments, with_homes
+from .contracts import Progress
+from .errors import HeadbenchError, InputError
+from .executors.options import chosen_execution
+from .executors.settings import Execution, ExecutorName
+from .io.documents import read_yaml
+from .io.files import (
+    check_kind,
+    check_output_folder,
+    removed_if_empty,
+)
+from .io.lock import locked
+from .machine import check_device
+from .progress import log_to_file
+from .registry import get, resolve
+from .runner.config import (
+    DemoConfig,
+    RunConfig,
+    build_run_config,
+    demo_run_config,
+    resolve_methods,
+    resolve_metrics,
+)
+from .specs import Findings
+
+Preset = Literal["smoke", "demo", "fast", "paper"]
+
+
+Assignments = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")]
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """Needs no data, no accelerator and no network. Everything is written to OUT: the capture, the avatars, the renders,
+    tables (Markdown, CSV, LaTeX) and contact_sheet.png. Started again after a kill it continues.
+    """
+
+    out: str = "demo-output"
+    """Folder for everything the demo makes."""
+    preset: Preset = "demo"
+    """How much effort: smoke takes seconds and proves nothing about quality; demo takes minutes."""
+    seed: int = 0
+    """Seeds the training."""
+    set: Assignments = ()
+    """Change a setting of the run, as for `headbench run`; repeatable. `capture.size=96x136`, `capture.subject_seed=3`
+    and the like change the capture."""
+
+
+def demo(settings: DemoSettings, progress: Progress) -> Findings:
+    """Run a complete comparison on a synthetic capture: render it, train, measure, print the table."""
+    values = parse_assignments(settings.set)
+    capture = {"preset": settings.preset, "seed": settings.seed, "out": settings.out}
+    given = merge({"capture": capture}, {"capture": values.pop("capture", {})})
+    config = build(DemoConfig, given["capture"], "--set", "capture.")
+    device = str(values.get("device", RunConfig.device))
+    comparison = build_run_config(merge(demo_run_config(config, device), values), "--set")
+    # Errors before the capture is made, which takes minutes.
+    resolve_methods(comparison)
+    resolve_metrics(comparison)
+    check_device(comparison.device)
+    out = Path(settings.out)
+    check_kind(out, "a run")
+    check_output_folder(out)
+    with _log_file(out):
+        start = time.perf_counter()
+        with locked(out):
+            make = resolve(get("datasets", "synthetic").implementation)
+            make(**config.capture_arguments(), progress=progress)
+        return _run(comparison, capture_seconds=round(time.perf_counter() - start, 3))
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Settings come from --config, then from the options here, then from --set. A run that was killed continues
+    when started again. Exit code 0: all done; 1: some method failed (the table shows which and why); 2: bad input,
+    found before any training.
+    """
+
+    data: str | None = None
+    """Capture, such as one in the GaussianAvatars/VHAP layout: a UNION folder, a sequence folder, or a folder of them."""
+    out: str | None = None
+    """Folder for everything the run makes. A run in it is continued: methods, seeds and metrics may be added, but none left
+    out; captures, frames, tasks and regions have to be the same."""
+    methods: str | None = None
+    """Names, separated by commas; see `headbench list methods`. Default: all that compare fairly here:
+    mean-image,nearest-camera,ga,ours."""
+    preset: str | None = None
+    """How much training: smoke (seconds), demo (minutes), fast, paper (the published schedule), or another that each
+    method of the run has; see `headbench list presets`. Default: fast."""
+    config: str | None = None
+    """YAML file with any settings of a run."""
+    head: str | None = None
+    """Head model for captures that bring none: FLAME pickle or npz."""
+    seeds: str | None = None
+    """Seeds of the training, separated by commas: an avatar is trained for each. Default: 0."""
+    executor: ExecutorName | None = None
+    """Where cells (a subject, a method, a seed) run: inline, one after another; processes, several at once on this machine;
+    slurm, a job for each. Default: inline."""
+    workers: int | None = None
+    """How many processes, with `--executor processes`. Default: one for each core."""
+    unchecked: bool = False
+    """Train although `headbench lint` names an error of a capture that makes its results meaningless."""
+    set: Assignments = ()
+    """Any setting, for example `frames_per_task=50`, `settings.ga.budget.iterations=5000`, `execution.slurm.hours=8`;
+    repeatable."""
+
+
+def run(settings: RunSettings, progress: Progress) -> Findings:
+    """Train methods on a capture, render, measure, and write tables and pictures."""
+    values: dict[str, Any] = read_yaml(Path(settings.config)) if settings.config else {}
+    values = with_homes(values, settings.config or "")
+    given = {name: getattr(settings, name) for name in ("data", "out", "methods", "preset", "seeds")}
+    values = merge(values, {key: value for key, value in given.items() if value is not None})
+    if settings.head is not None:
+        values = merge(values, {"reader_settings": {"head": settings.head}})
+    source = settings.config or "command line"
+    for key in ("data", "out"):
+        if key not in values:
+            raise InputError(source, key, f"--{key} or the key {key} in --config", "neither")
+    assigned = parse_assignments(settings.set)
+    values = merge(values, assigned)
+    if "reader" not in values and isinstance(values["data"], str):
+        from .runner.captures import reader_of  # which takes long to import
+
+        values["reader"] = reader_of(values["data"])
+    execution = chosen_execution(
+        values.pop("execution", {}),
+        assigned.get("execution", {}),
+        settings.executor,
+        settings.workers,
+        source,
+    )
+    config = build_run_config(values, source)
+    check_kind(Path(config.out), "a run")  # before the log is written there
+    with _log_file(Path(config.out)):
+        return _run(config, execution, unchecked=settings.unchecked)
+
+
+def _run(config: RunConfig, execution: Execution | None = None, **record: Any) -> Findings:
+    from .runner.run import run as run_comparison
+
+    rows = run_comparison(config, execution, **record)
+    text = f"{_table([config.out])}\n\nPictures, tables and everything else: {config.out}"
+    return Findings(
+        text, {"out": config.out, "failed": rows.failed, "means": means(config.out)}, not rows.failed
+    )
+
+
+def _table(runs: Sequence[str], **options: Any) -> str:
+    text: str = resolve(get("reports", "table-text").implementation)(list(map(Path, runs)), **options)
+    return text
+
+
+def means(run_folder: str) -> list[dict[str, Any]]:
+    """Numbers of the comparison table, so that a machine reads what a person does; None where there is none."""
+    table = json.loads(_table([run_folder], format="json"))
+    return [
+        {
+            **{name: column[name] for name in ("task", "metric")},
+            "method": row["method"],
+            **{name: cell[name] for name in ("value", "status")},
+        }
+        for _, rows in table["groups"]
+        for row in rows
+        for column, cell in zip(table["columns"], row["cells"])
+    ]
+
+
+@contextmanager
+def _log_file(out: Path) -> Iterator[None]:
+    """Log to a run's file; not where the folder cannot be made, which the run then reports properly.
+
+    A run that is refused before it has written anything else leaves neither the file nor a new folder.
+    """
+    log = out / "run.log"
+    is_new = is_writable = False
+    with ExitStack() as stack:
+        with suppress(OSError, ValueError):
+            stack.enter_context(removed_if_empty(out))
+            out.mkdir(parents=True, exist_ok=True)
+            is_new, is_writable = not log.exists(), os.access(out, os.W_OK)
+        if is_writable:
+            stack.enter_context(log_to_file(log))
+        try:
+            yield
+        except HeadbenchError:
+            with suppress(OSError):
+                if is_new and [*out.iterdir()] == [log]:
+                    log.unlink()
+            raise

@@ -1,0 +1,80 @@
+"""Options of commands whose work an executor can do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Annotated, Any
+
+import tyro
+
+from ..configuration import build, merge, parse_assignments
+from ..options import DependentOptions, check_dependent
+from ..registry import unknown
+from .settings import Execution, ExecutorName
+
+DEPENDENT = (
+    DependentOptions(("workers", "threads"), "executor", ("processes",)),
+    DependentOptions(("restarts",), "executor", ("processes", "slurm")),
+    DependentOptions(("poll_s", "slurm"), "executor", ("slurm",)),
+)
+"""Settings of `Execution` that only some executors have."""
+
+
+def chosen_execution(
+    settings: Mapping[str, Any],
+    assigned: Mapping[str, Any],
+    executor: ExecutorName | None,
+    workers: int | None,
+    source: str,
+) -> Execution:
+    """Settings of an executor, with those of ``--set`` and the options ``--executor`` and ``--workers`` laid over them.
+
+    Parameters
+    ----------
+    settings : all of ``execution``, those in ``assigned`` included.
+    assigned : what ``--set`` gives of ``execution``.
+    executor, workers : None where not given.
+    source : file or option that the settings came from, for the error.
+
+    Raises `InputError` for invalid settings, and for given ones that have no effect with the executor.
+    """
+    options = {"executor": executor, "workers": workers}
+    options = {key: value for key, value in options.items() if value is not None}
+    values = merge(settings, options) if isinstance(settings, Mapping) else settings  # which `build` refuses
+    execution = build(Execution, values, source, "execution.")
+    given = {key: f"--set execution.{key}" for key in assigned} | {key: f"--{key}" for key in options}
+    check_dependent(DEPENDENT, given, execution)
+    return execution
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExecutionOptions:
+    """How the work of a command is done."""
+
+    executor: ExecutorName = "inline"
+    """Where it is done, as for `headbench run`."""
+
+    workers: int | None = None
+    """How many processes, as for `headbench run`; with `--executor processes` alone."""
+
+    set: Annotated[
+        tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="execution.KEY=VALUE")
+    ] = ()
+    """A setting of the executor, for example `execution.slurm.partition=gpu`; repeatable."""
+
+    @property
+    def execution(self) -> Execution:
+        """How it is done. Raises `InputError` for settings that are none."""
+        given = parse_assignments(self.set)
+        if stray := sorted(given.keys() - {"execution"}):
+            raise unknown("command line", "--set", stray[0], ["execution"])
+        executor = None if self.executor == "inline" else self.executor
+        settings = given.get("execution", {})
+        return chosen_execution(settings, settings, executor, self.workers, "command line")
+
+    @property
+    def others(self) -> dict[str, Any]:
+        """The settings that decide what comes out: all but these."""
+        own = {field.name for field in fields(ExecutionOptions)}
+        return {name: value for name, value in asdict(self).items() if name not in own}

@@ -1,0 +1,46 @@
+"""``headbench list``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import tyro
+
+from .contracts import Progress
+from .registry import Group, discover
+from .specs import Findings
+
+
+@dataclass(frozen=True)
+class ListSettings:
+    """--json prints all fields."""
+
+    what: tyro.conf.Positional[
+        Literal["methods", "presets", "metrics", "profiles", "datasets", "reports", "benchmarks", "commands"]
+    ]
+    """What to list; datasets are readers, and what makes captures."""
+
+
+def list_installed(settings: ListSettings, progress: Progress) -> Findings:
+    """List what is installed: methods, presets, metrics, their profiles, readers, reports, benchmarks, commands."""
+    group: Group = "methods" if settings.what == "presets" else settings.what
+    entries = []
+    for name, plugin in discover(group).items():
+        known = {} if plugin.spec is None else asdict(plugin.spec)
+        entries.append({"origin": plugin.origin, "error": plugin.error, **known, "name": name})
+    if settings.what == "presets":
+        entries = [
+            {
+                "name": f"{entry['name']} {preset}",
+                "summary": ", ".join(f"{key}={value}" for key, value in values.items()),
+                "settings": values,
+                "error": "",
+            }
+            for entry in entries
+            for preset, values in entry.get("presets", {}).items()
+        ]
+    width = max((len(entry["name"]) for entry in entries), default=0)
+    shown = [f"broken: {entry['error']}" if entry["error"] else entry["summary"] for entry in entries]
+    lines = [f"{entry['name']:<{width}}  {text}" for entry, text in zip(entries, shown)]
+    return Findings("\n".join(lines), entries)

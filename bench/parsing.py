@@ -1,0 +1,164 @@
+"""Reads the options of a command from the words of a command line, as the command's settings declare them, and calls it."""
+
+# Without `from __future__ import annotations`: the parser reads annotations that are made when a command is called.
+
+import json as json_module
+import re
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import is_dataclass, replace
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Union, get_args
+
+import tyro
+
+from .errors import ExitCode, HeadbenchError
+from .io.files import check_kind, expand_home, plain
+from .io.lock import locked
+from .options import check_dependent, given_options
+from .progress import log_to_terminal, progress
+from .registry import Plugin, get, resolve
+from .specs import CommandSpec
+from .streams import show
+
+Command = Callable[..., int]
+
+
+def call_command(name: str, plugins: Mapping[str, Plugin], words: Sequence[str]) -> int:
+    """Call a command with the words behind its name, or print its help; returns the exit code.
+
+    Raises `HeadbenchError` for a command that cannot be loaded.
+    """
+    words = [with_home(word) for word in words]
+    return _parse(_command(name, plugins[name], words), f"headbench {name}", words)
+
+
+def print_completion(plugins: Mapping[str, Plugin], words: Sequence[str]) -> int:
+    """Print, or write, the completion of a shell for all commands, as the parser's own options ask."""
+    return _parse(_all_commands(plugins), "headbench", words)
+
+
+def with_home(word: str) -> str:
+    """A word of the command line with the home folder for ``~``, which shells leave as it is behind ``=`` and in quotes."""
+    match = re.fullmatch(r"((?:[^=]*=)*?)(~.*)", word)
+    if match is None:
+        return word
+    option = match[1].startswith("--") and match[1].count("=") == 1
+    if match[2] == "~" and match[1] and not option:  # null in YAML
+        return word
+    return match[1] + expand_home(match[2], "command line")
+
+
+def _parse(command: Command, program: str, words: Sequence[str]) -> int:
+    """Call a command with the options that the words give."""
+    config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
+    code: int = tyro.cli(command, prog=program, args=words, config=config, registry=_values())
+    return code
+
+
+def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
+    """The command as a function of its settings, which the parser reads. ``words`` say what options are given."""
+    try:
+        spec: CommandSpec = get("commands", name)
+        settings_class = resolve(spec.settings)
+        if not isinstance(settings_class, type) or not is_dataclass(settings_class):
+            raise HeadbenchError(f"{spec.settings}: expected a dataclass with the settings")
+    except HeadbenchError as error:
+        raise HeadbenchError(f"command {name!r} of {plugin.origin} is broken: {error}") from error
+    settings_type: Any = Annotated[settings_class, tyro.conf.OmitArgPrefixes]
+
+    def command(settings: settings_type, json: bool = False) -> int:
+        dependent = getattr(settings_class, "dependent", ())
+        check_dependent(dependent, given_options(words, settings_class), settings)
+        folder = getattr(settings, spec.writes) if spec.writes else None
+        if folder:
+            check_kind(Path(folder), *spec.kinds)
+        lock = locked(Path(folder)) if folder else nullcontext()
+        with log_to_terminal(), lock, progress(name) as report:
+            findings = resolve(spec.function)(settings, report)
+        show(json_module.dumps(findings.data, indent=1, default=plain) if json else findings.text)
+        if findings.code is not None:
+            return findings.code
+        return ExitCode.OK if findings.passed else ExitCode.NEGATIVE
+
+    command.__doc__ = f"{spec.summary}\n\nArgs:\n    json: Print the result as JSON."
+    return command
+
+
+def _all_commands(plugins: Mapping[str, Plugin]) -> Command:
+    """All commands as one, whose first and second word choose: what completion needs. Broken ones are left out."""
+    found: dict[str, Any] = {}
+    for name, plugin in sorted(plugins.items()):
+        first, _, second = name.partition(" ")
+        with suppress(HeadbenchError):
+            command = _command(name, plugin, ())
+            if second:
+                found.setdefault(first, {})[second] = command
+            else:
+                found[first] = command
+    return _nested({n: _nested(c) if isinstance(c, dict) else c for n, c in found.items()})
+
+
+def _nested(group: Mapping[str, Command]) -> Command:
+    # Not tyro's own function for subcommands: it looks for help in typing's sources, which takes as long as the rest.
+    choices = [Annotated[Any, tyro.conf.subcommand(name=n, constructor=c)] for n, c in group.items()]
+    choice: Any = Union[(*choices, Annotated[None, tyro.conf.Suppress])]
+
+    def chosen(command: choice) -> int:
+        return command
+
+    return chosen
+
+
+def _parts(words: Sequence[str], kind: Callable[[str], Any]) -> tuple[Any, ...]:
+    """The values of a list, separated by commas, too. Raises `ValueError` for none: the option would be ignored."""
+    parts = tuple(kind(part) for word in words for part in word.split(",") if part)
+    if not parts:
+        raise ValueError("expected at least one value, found none")
+    return parts
+
+
+def _values() -> tyro.constructors.ConstructorRegistry:
+    """How two kinds of options are read and shown.
+
+    Those that may be left out (``str | None``) as their values are; lists (``tuple[str, ...]``) also with commas.
+    """
+    registry = tyro.constructors.ConstructorRegistry()
+
+    @registry.primitive_rule
+    def optional(
+        info: tyro.constructors.PrimitiveTypeInfo,
+    ) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+        kinds = get_args(info.type)
+        if info.type_origin not in (Union, UnionType) or len(kinds) != 2 or NoneType not in kinds:
+            return None
+        (kind,) = set(kinds) - {NoneType}
+        value = registry.get_primitive_spec(tyro.constructors.PrimitiveTypeInfo.make(kind, info.markers))
+        if isinstance(value, tyro.constructors.UnsupportedTypeAnnotationError):
+            return None
+        return replace(
+            value,
+            str_from_instance=lambda found: ["none"] if found is None else value.str_from_instance(found),
+        )
+
+    @registry.primitive_rule
+    def listed(
+        info: tyro.constructors.PrimitiveTypeInfo,
+    ) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+        kinds = get_args(info.type)
+        named = {
+            tyro.conf.Positional,
+            tyro.conf.UseAppendAction,
+        } & info.markers  # folders; each option one value
+        if info.type_origin is not tuple or named or kinds not in [(kind, ...) for kind in (str, int, float)]:
+            return None
+        return tyro.constructors.PrimitiveConstructorSpec(
+            nargs="*",
+            metavar=f"{kinds[0].__name__.upper()} [{kinds[0].__name__.upper()} ...]",
+            instance_from_str=lambda words: _parts(words, kinds[0]),
+            is_instance=lambda found: isinstance(found, tuple),
+            str_from_instance=lambda found: [str(value) for value in found],
+        )
+
+    return registry

@@ -1,0 +1,87 @@
+"""Settings of the refit of tracking to another head model."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Literal
+
+import tyro
+
+from ....bench.errors import InputError
+from ...options import CaptureOptions
+
+Algorithm = Literal["slsqp", "lbfgs", "mma"]
+
+
+@dataclass(frozen=True)
+class RefitSettings:
+    """How tracking is re-fitted to another head model.
+
+    The defaults follow published practice for monocular methods: vertex distances over the facial region decide,
+    identity comes from the neutral head, neither static offset nor neck rotation is kept.
+    """
+
+    static_offset: Literal["zero", "residual"] = "zero"
+    """What the target's identity cannot express of the neutral head: dropped, or kept as a static offset
+    (one topology only)."""
+
+    neck: Literal["fold", "keep"] = "fold"
+    """The neck's rotation: folded into the head's, as monocular trackers have it, or kept."""
+
+    eyeballs: float = 1.0
+    """Weight of an eyeball's vertex against one of the face; 0 leaves the eyes where they were."""
+
+    lips: float = 1.0
+    """Weight of a lip vertex against other vertices of the face."""
+
+    eye_region: float = 1.0
+    """Weight of a vertex around the eyes against other vertices of the face."""
+
+    prior_mm: float = 0.005
+    """A coefficient of one standard deviation costs as much as this root mean square distance, millimetres."""
+
+    coefficient_bound: float = 6.0
+    """Largest magnitude of identity and expression coefficients, standard deviations."""
+
+    eyelid_bound: float = 2.0
+    """Largest magnitude of an eyelid coefficient; 1 closes the eye."""
+
+    jaw_bound: float = 0.9
+    """Largest magnitude of each component of the jaw's axis-angle, radians."""
+
+    eye_bound: float = 1.0
+    """Largest magnitude of each component of an eye's axis-angle, radians."""
+
+    algorithm: Algorithm = "slsqp"
+    """Which of nlopt's algorithms finds the angles."""
+
+    tolerance: float = 1e-5
+    """An angle is found when a step changes it by less than this, radians."""
+
+    evaluations: int = 200
+    """Maximum number of evaluations per frame."""
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if not isinstance(value, (int, float)):
+                continue
+            lowest = 0.0 if name in ("eyeballs", "lips", "eye_region") else 1e-12
+            if not lowest <= value < float("inf"):
+                raise InputError("refit settings", name, f"a number of at least {lowest:g}", str(value))
+
+
+@dataclass(frozen=True)
+class RefitCommandSettings(CaptureOptions):
+    """What ``headbench refit`` takes."""
+
+    capture: Annotated[str, tyro.conf.Positional]
+    """Capture, in a layout that a reader knows."""
+
+    target: str
+    """Head model to refit to: 2020 or 2023 (the embedded procedural heads), or the file of a head model."""
+
+    out: str
+    """Folder for the refitted capture, refit.json and heat_map.png."""
+
+    settings: RefitSettings = field(default_factory=RefitSettings)
+    """How to fit."""

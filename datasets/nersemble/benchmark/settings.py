@@ -1,0 +1,73 @@
+"""Settings of the commands on submissions to the NeRSemble benchmark."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import tyro
+
+from ....bench.runner.config import AvatarFolder
+
+
+@dataclass(frozen=True)
+class SubmissionRenderSettings:
+    """Render the test frames of a participant of the NeRSemble benchmark's monocular track from a stored avatar, which was
+    trained on the participant's training sequences."""
+
+    avatar: AvatarFolder
+
+    data: str
+    """The benchmark's folder, as nersemble-benchmark-download leaves it: it holds mono_flame_avatar/."""
+
+    participant: str
+    """Whom the avatar shows: 393, 404, 461, 477 or 486."""
+
+    out: str
+    """Folder to write: OUT/PARTICIPANT/SEQUENCE_TIMESTEP_SERIAL.png."""
+
+    head: str | None = None
+    """FLAME 2023 (flame2023.pkl); default: the head model that lies beside the avatar."""
+
+    method: str = ""
+    """Method of the avatar as package.module:SPEC, where it is not registered."""
+
+    device: str = "cpu"
+    """Where to render."""
+
+
+@dataclass(frozen=True)
+class SubmissionWriteSettings:
+    """Encode rendered frames and write the zip that the NeRSemble benchmark takes."""
+
+    frames: tyro.conf.Positional[str]
+    """Folder with PARTICIPANT/SEQUENCE_TIMESTEP_SERIAL.png, or a run whose subjects are the participants."""
+
+    zip: tyro.conf.Positional[str]
+    """File to write."""
+
+    track: Literal["nvs", "mono_flame_avatar"]
+    """Task of the benchmark."""
+
+    method: str = ""
+    """Method of a run with several."""
+
+    data: str | None = None
+    """The benchmark's folder: its tracking tells how many frames a sequence has. Without it, published totals are held to."""
+
+
+@dataclass(frozen=True)
+class SubmissionCheckSettings:
+    """Say what the NeRSemble benchmark's server would refuse of a submission.
+
+    Exit code 0: nothing; 1: something; 2: it is no zip that can be looked at.
+    """
+
+    zip: tyro.conf.Positional[str]
+    """The submission."""
+
+    track: Literal["", "nvs", "mono_flame_avatar"] = ""
+    """Task of the benchmark; default: the one that the zip has most files of."""
+
+    data: str | None = None
+    """The benchmark's folder: its tracking tells how many frames a sequence has. Without it, published totals are held to."""

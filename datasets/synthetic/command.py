@@ -1,0 +1,68 @@
+"""``headbench synth``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from ...bench.contracts import Progress
+from ...bench.executors.options import ExecutionOptions
+from ...bench.executors.settings import check_executor
+from ...bench.io.files import (
+    check_kind,
+    check_output_folder,
+)
+from ...bench.io.lock import locked
+from ...bench.runner.config import (
+    parse_size,
+)
+from ...bench.specs import Findings
+
+
+@dataclass(frozen=True)
+class SynthSettings(ExecutionOptions):
+    """Ray-traced heads of people of all ages, lit by eight large panels, on NeRSemble's camera rig, with sequences named as
+    there. Skin folds and blushes with expressions, with hysteresis and delay. The same settings give the same bytes on
+    every processor; frames that exist are kept. Needs the compiled kernel.
+    """
+
+    out: str
+    """Folder to write."""
+    subjects: int = 1
+    """How many heads; each differs in shape, skin, hair."""
+    cameras: int = 16
+    """2 to 16 views; the frontal one is always there and is held out as the novel view."""
+    timesteps: int = 60
+    """Frames per camera, shared out over the sequences; FREE is held out for self-reenactment."""
+    size: str = "275x401"
+    """Width x height of the images in pixels, for example 550x802 (NeRSemble at a quarter)."""
+    head: str = "procedural"
+    """`procedural`, or the path of a head model (ICT-FaceKit npz)."""
+    seed: int = 0
+    """Decides subjects and performances."""
+    tracking_noise: float = 0.0
+    """Noise on the tracked parameters, as a fraction of their standard deviation."""
+    performance: Literal["full", "parts", "expressions", "still"] = "full"
+    """`parts` plays every sequence and holds out three parts of FREE, each scored as a sequence: seen, recombined and
+    beyond the range of training. `expressions` leaves out jaw and tongue, `still` moves only head, neck and eyes."""
+    dynamics: float = 1.0
+    """Scales what expressions do to skin beyond moving it (wrinkles, blush), 0 to 3."""
+    tracking_error: float = 0.0
+    """Level of the errors that trackers make: shrunk and mixed expressions, drift; 1 is 0.5 to 1 mm on the face, 2 to 3 mm
+    on lips and lids. 0 to 4."""
+
+
+def synth(settings: SynthSettings, progress: Progress) -> Findings:
+    """Render a synthetic multi-view capture in the GaussianAvatars/VHAP layout."""
+    out, execution = Path(settings.out), settings.execution
+    check_executor(execution, "cpu")
+    check_kind(out, "a synthetic capture", "captures")
+    check_output_folder(out)
+    with locked(out, beside=True):  # a capture is made in an empty folder
+        size = parse_size(settings.size)
+        from .capture import synthesize  # which takes long to import
+
+        values = {**settings.others, "out": out, "size": size}
+        synthesize(**values, execution=execution, progress=progress)
+    return Findings(settings.out, {"out": out})

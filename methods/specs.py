@@ -1,0 +1,65 @@
+"""The commands of `methods`; light to import."""
+
+from ..bench.specs import CommandSpec
+
+PARITY = CommandSpec(
+    name="parity",
+    group="compare",
+    summary="Train a method and its authors' code on one capture with equal settings and compare the results.",
+    settings="headbench.methods.official.parity.settings:ParitySettings",
+    function="headbench.methods.official.parity.parity:compare",
+    writes="out",
+    kinds=("captures",),
+)
+
+COMPACT = CommandSpec(
+    name="compact",
+    group="export",
+    summary="Compress an avatar of the method ours to about a fifteenth of its size; with a capture, measure the loss of quality.",
+    settings="headbench.methods.avatars.compact.settings:CompactSettings",
+    function="headbench.methods.avatars.compact.measure:compact_avatar",
+    writes="out",
+    kinds=("an avatar",),
+)
+
+EXPORT_HTML = CommandSpec(
+    name="export html",
+    group="export",
+    summary="Export an avatar as one HTML file with sliders for expressions and joints.",
+    settings="headbench.methods.avatars.web.settings:ExportHtmlSettings",
+    function="headbench.methods.avatars.web.export:export_page",
+)
+
+EXPORT_PLY = CommandSpec(
+    name="export ply",
+    group="export",
+    summary="Write an avatar in one pose as a 3D Gaussian splatting PLY that common viewers open.",
+    settings="headbench.methods.avatars.settings:ExportPlySettings",
+    function="headbench.methods.avatars.export:export_ply",
+)
+
+EXPORT_GLB = CommandSpec(
+    name="export glb",
+    group="export",
+    summary="Write an avatar in one pose as binary glTF with splats.",
+    settings="headbench.methods.avatars.settings:ExportGlbSettings",
+    function="headbench.methods.avatars.export:export_glb",
+)
+
+EXPORT_SOG = CommandSpec(
+    name="export sog",
+    group="export",
+    summary="Write an avatar in one pose as SOG, a compact format of web viewers.",
+    settings="headbench.methods.avatars.settings:ExportSogSettings",
+    function="headbench.methods.avatars.export:export_sog",
+)
+
+IMPORT_GA = CommandSpec(
+    name="import ga",
+    group="export",
+    summary="Import a GaussianAvatars PLY, with its flame_param.npz or its capture, as an avatar of the method ga.",
+    settings="headbench.methods.avatars.settings:ImportGASettings",
+    function="headbench.methods.avatars.import_ga:import_avatar",
+    writes="out",
+    kinds=("an avatar",),
+)

@@ -1,0 +1,67 @@
+"""``headbench table``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from ..bench.contracts import Progress
+from ..bench.errors import InputError
+from ..bench.io.files import (
+    check_writable,
+    write_text,
+)
+from ..bench.specs import Findings
+
+
+@dataclass(frozen=True)
+class TableSettings:
+    """Runs are merged into one table: seeds of the same settings are averaged, other settings get rows of their own."""
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of the runs."""
+    format: Literal["md", "csv", "latex", "html", "json"] | None = None
+    """Markdown, CSV, LaTeX (booktabs), a page of HTML, or JSON. Default: by the suffix of --out, md without it."""
+    layout: str = "comparison"
+    """Which table: comparison, speed (latency, throughput, stages), cost (storage, training), or the paper's: paper-1
+    (all methods), paper-3 (INSTA and ours), paper-4 (what an expression may change: a run each)."""
+    published: bool = False
+    """Add columns with the figures that papers printed, where a layout has some."""
+    region: str = "full"
+    """Region of the frames to show instead of the whole, such as face."""
+    sequences: tuple[str, ...] = ()
+    """Only frames of these sequences; default: all."""
+    columns: tuple[str, ...] = ()
+    """Only these metrics and tasks of the layout, by name and in this order, such as `psnr novel_view`; default: all."""
+    digits: tuple[str, ...] = ()
+    """Decimals shown, of all metrics or of one: `3`, `psnr=1 lpips=4`. Default: the layout's."""
+    out: str | None = None
+    """File to write the table to, instead of printing it."""
+
+
+SUFFIXES = {".md": "md", ".txt": "md", ".tex": "latex", ".html": "html", ".csv": "csv", ".json": "json"}
+"""Formats of tables by the suffix of a file."""
+
+
+def print_table(settings: TableSettings, progress: Progress) -> Findings:
+    """Print a table of finished runs on the same frames, or write it to a file."""
+    from .table_report import table_text
+
+    options = asdict(settings)
+    out = options.pop("out")
+    if out is not None:
+        check_writable(Path(out), "--out")
+        if settings.format is None and Path(out).suffix.lower() not in SUFFIXES:
+            expected = f"a suffix that names a format ({', '.join(SUFFIXES)}), or --format"
+            raise InputError("command line", "--out", expected, out)
+    options["format"] = settings.format or (SUFFIXES[Path(out).suffix.lower()] if out else "md")
+    runs = [Path(run) for run in options.pop("runs")]
+    text = table_text(runs, **options)
+    data = {"format": options["format"], "table": text}
+    if out is None:
+        return Findings(text, data)
+    write_text(Path(out), text)
+    return Findings(out, {**data, "out": out})
