@@ -22,7 +22,7 @@ from ..registry import get, resolve
 from ..rows import ALL, FRAME, Rows
 from ..runner.captures import Plugins, open_run_clips, synthesis_arguments
 from ..runner.config import resolve_cells, resolve_metrics
-from ..runner.run import load, make_jobs
+from ..runner.jobs import load, make_jobs
 from ..runner.steps import DIGESTS, Job, measure, recorded_frames
 from ..runner.store import Cell, RunFolder
 from ..specs import Findings, MetricSpec

@@ -13,7 +13,8 @@ from ..io.files import check_kind, check_name, output_inside
 from ..io.lock import locked
 from ..registry import get, resolve
 from ..runner.config import default_names
-from ..runner.run import run_locked, trained
+from ..runner.jobs import trained
+from ..runner.run import run_locked
 from ..runner.store import RunFolder
 from ..specs import Findings, MethodSpec
 from .sweep_settings import SweepSettings

@@ -21,7 +21,8 @@ from ..rows import ALL, Rows
 from ..specs import Findings, MetricSpec
 from .captures import open_run_clips
 from .config import RunOptions, resolve_cells, resolve_metrics
-from .run import load, make_jobs, write_reports
+from .jobs import load, make_jobs
+from .run import write_reports
 from .steps import Job, measure, reason_of
 from .store import RunFolder
 

@@ -29,7 +29,7 @@ from ..rows import Rows
 from ..specs import MAX_LABEL, MetricSpec
 from .captures import open_clips
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
-from .run import make_jobs, run_cell
+from .jobs import make_jobs, run_cell
 from .steps import Job, failed_rows, log_kept, steps_ahead, stored_rows, trained_files
 from .store import RunFolder
 

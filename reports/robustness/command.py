@@ -28,7 +28,7 @@ def run_robustness_test(
     progress: Progress,
 ) -> Findings:
     """Judge the avatars of a run and write the contact sheet."""
-    from ...bench.runner.run import trained
+    from ...bench.runner.jobs import trained
     from ...bench.runner.store import RunFolder
     from .stability import SHEET_FILE, table
 

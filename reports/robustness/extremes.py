@@ -13,7 +13,7 @@ import numpy as np
 from ...bench.contracts import Clip, FloatArray, FrameKey, HeadPose, Progress
 from ...bench.executors.task import Task
 from ...bench.io.files import digest
-from ...bench.runner.run import load, trained
+from ...bench.runner.jobs import load, trained
 from ...bench.runner.steps import Job, trained_files
 from .settings import ExtremesSettings
 from .stability import (

@@ -16,7 +16,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import digest
 from ...bench.io.images import write_png
 from ...bench.runner.captures import open_clips, run_configuration
-from ...bench.runner.run import load, make_jobs
+from ...bench.runner.jobs import load, make_jobs
 from ...bench.runner.steps import Job
 from ...bench.runner.store import RunFolder
 from ..runs import evenly_spaced

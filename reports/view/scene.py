@@ -16,7 +16,7 @@ from ...bench.errors import HeadbenchError, InputError
 from ...bench.runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
 from ...bench.runner.captures import open_clips, open_run_clips, reader_of, run_configuration
 from ...bench.runner.config import ResolvedMethod, RunConfig, resolve_methods
-from ...bench.runner.run import load, make_jobs
+from ...bench.runner.jobs import load, make_jobs
 from ...bench.runner.store import RunFolder
 from ...bench.runner.stored import avatar_folder, open_avatar
 from ..robustness.extremes import head_center, training_poses

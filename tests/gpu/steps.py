@@ -20,7 +20,7 @@ from headbench.bench.machine import use_device
 from headbench.bench.registry import discover
 from headbench.bench.rows import ALL, Rows
 from headbench.bench.runner.config import RunOptions
-from headbench.bench.runner.run import load, trained
+from headbench.bench.runner.jobs import load, trained
 from headbench.bench.runner.steps import Job
 from headbench.methods.benchmarks.scenes import SplatScene, head_shell, relative_error
 from headbench.methods.shared.loop import CHECKPOINT, synchroniser

@@ -15,7 +15,7 @@ import numpy as np
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.runner.config import RunOptions
-from headbench.bench.runner.run import trained
+from headbench.bench.runner.jobs import trained
 
 from ..small_run import small_run
 from . import pretended

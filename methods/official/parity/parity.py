@@ -12,6 +12,7 @@ from typing import Any
 
 from scipy.stats import t as student_t
 
+from ....bench.condition import PLAIN
 from ....bench.configuration import build
 from ....bench.contracts import Progress, no_progress
 from ....bench.io.documents import read_json
@@ -81,8 +82,7 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Findi
     out = Path(settings.out)
     config = run_config(settings, out)
     methods = resolve_methods(config)
-    for method in methods:
-        check_settings(method)
+    check_settings((method, PLAIN) for method in methods)
     native, official = (method.spec.name for method in methods)
     with log_to_file(out / "parity.log"):
         if settings.data is None:

@@ -17,7 +17,7 @@ from headbench.bench.runner import run as runner
 from headbench.bench.runner.adaptation import MethodNeeds, plan
 from headbench.bench.runner.captures import open_clips
 from headbench.bench.runner.config import RunConfig, RunOptions
-from headbench.bench.runner.run import trained
+from headbench.bench.runner.jobs import trained
 from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import ResolutionRule
 

@@ -1,0 +1,171 @@
+"""The cells of a run with all they need: made here for runs, workers, and everything that looks at a run's avatars."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from ..condition import Condition, label_of
+from ..contracts import Avatar, Clip
+from ..errors import InputError
+from ..io.files import atomic_path, digest, output_inside
+from ..protocol import Protocol
+from ..rows import Rows
+from ..specs import MetricSpec
+from . import adaptation
+from .adaptation import AdaptedClip, MethodNeeds
+from .captures import changed, open_run_clips, run_configuration
+from .config import ResolvedMethod, RunConfig, RunOptions, resolve_cells
+from .scoring import check_regions
+from .steps import Job, derive, fit, measure, render
+from .store import RunFolder
+
+
+def make_jobs(
+    config: RunConfig,
+    cells: Sequence[tuple[ResolvedMethod, Condition]],
+    clips: Sequence[Clip],
+    protocols: Mapping[str, Protocol],
+    folder: RunFolder,
+    out: Path | None = None,
+) -> list[Job]:
+    """Make the cells of a run, each clip in the form that its method and condition need.
+
+    Parameters
+    ----------
+    cells : sequence of (ResolvedMethod, Condition)
+        See `resolve_cells`.
+    folder : RunFolder
+        Run folder of the cells.
+    out : Path, optional
+        Where to keep what took long in adapting clips, its lock is held; what ``folder`` kept is copied there first, since
+        nothing is written in a run by what looks at it. Default: ``folder`` itself.
+
+    Raises
+    ------
+    InputError
+        For a region that a clip does not know, and for a form that a clip cannot be brought into.
+    """
+    regions = {clip.subject: check_regions(clip, config.regions) if protocols else () for clip in clips}
+    forms = _Forms(config, folder, RunFolder(out or folder.root))
+    forms.plan([(clip, method, condition) for clip in clips for method, condition in cells])
+    source = RunFolder(Path(config.source)) if config.source else None
+    return [
+        Job(
+            clip,
+            method,
+            seed,
+            config.device,
+            folder.cell(clip.subject, label_of(method.spec.name, condition.name), seed),
+            protocols,
+            forms.of(clip, method, condition),
+            regions[clip.subject],
+            condition,
+            None if source is None else source.cell(clip.subject, method.spec.name, seed),
+        )
+        for clip in clips
+        for method, condition in cells
+        for seed in config.seeds
+    ]
+
+
+class _Forms:
+    """Clips in the forms that methods and conditions need, each made once."""
+
+    def __init__(self, config: RunConfig, run: RunFolder, out: RunFolder):
+        self._config, self._run, self._out = config, run, out
+        self._changed: dict[str, Clip] = {}
+        self._made: dict[tuple[str, MethodNeeds], AdaptedClip] = {}
+
+    def plan(self, cells: Sequence[tuple[Clip, ResolvedMethod, Condition]]) -> None:
+        """Check that every form can be had, then make them."""
+        planned = {}
+        for clip, method, condition in cells:
+            changed, needs = self._clip(clip, condition), MethodNeeds.of(method.spec)
+            if (changed.fingerprint, needs) not in planned:
+                step = adaptation.plan(changed, needs, self._config.heads)
+                planned[changed.fingerprint, needs] = (changed, step)
+        with output_inside(self._out.root):
+            if self._out.root != self._run.root:
+                for subject in {changed.subject for changed, step in planned.values() if step is not None}:
+                    _copy_kept(self._run.adapted / subject, self._out.adapted / subject)
+            for (fingerprint, needs), (changed, step) in planned.items():
+                if step is not None:
+                    folder, label = self._out.adapted / changed.subject, f"adapting {changed.subject}"
+                    self._made[fingerprint, needs] = adaptation.carry_out(step, needs, folder, label)
+
+    def of(self, clip: Clip, method: ResolvedMethod, condition: Condition) -> AdaptedClip | None:
+        """The form of a clip; None where it is the clip itself."""
+        changed = self._clip(clip, condition)
+        made = self._made.get((changed.fingerprint, MethodNeeds.of(method.spec)))
+        return made or (None if changed is clip else AdaptedClip(changed))
+
+    def _clip(self, clip: Clip, condition: Condition) -> Clip:
+        key = digest(clip.fingerprint, asdict(condition.clip))
+        if key not in self._changed:
+            self._changed[key] = changed(clip, condition.clip, self._config)
+        return self._changed[key]
+
+
+def _copy_kept(source: Path, folder: Path) -> None:
+    """Copy the files that are not in ``folder`` yet; never what a link leads to, for the run may come from anybody."""
+    if source.is_symlink() or source.parent.is_symlink():
+        return
+    for path in sorted(source.rglob("*")):
+        target = folder / path.relative_to(source)
+        if path.is_file() and not path.is_symlink() and not target.exists():
+            with atomic_path(target) as temporary:
+                shutil.copyfile(path, temporary)
+
+
+def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
+    """Train or derive the avatar of a cell, render its frames and measure them; each stage continues where it was."""
+    avatar = fit(job) if job.source is None else derive(job)
+    render(job, avatar)
+    return measure(job, avatar, metrics)
+
+
+def trained(
+    run: Path, methods: Sequence[str], options: RunOptions, out: Path, only: int | None = None
+) -> tuple[RunConfig, list[Job]]:
+    """Return the settings of a run and its cells whose avatar is trained; `load` reads one.
+
+    Parameters
+    ----------
+    run : folder of the run.
+    methods : names of those wanted; empty: all but the trivial baselines, which nothing can drive to extremes.
+    options : where the run's files are now.
+    out : folder to keep clips in that methods need in another form; its lock is held. It becomes ``out`` of the settings.
+    only : see `open_clips`.
+
+    Raises
+    ------
+    InputError
+        For a method that the run does not have, a capture that is not the one trained on, an avatar that is not
+        there or whose training did not end, and a run without any avatar to look at.
+    """
+    folder = RunFolder(run)
+    resolved = [cell for cell in resolve_cells(run_configuration(run, options)) if not cell[1].name]
+    names = [method.spec.name for method, _ in resolved]
+    for name in methods:
+        if name not in names:
+            raise InputError(folder.manifest, "methods", ", ".join(names), name)
+    wanted = [(m, c) for m, c in resolved if (m.spec.name in methods if methods else not m.spec.trivial)]
+    if not wanted:
+        raise InputError(folder.manifest, "methods", "a method that is no trivial baseline", ", ".join(names))
+    config, clips = open_run_clips(run, options, out=out, only=only)
+    jobs = make_jobs(config, wanted, clips, {}, folder, out)
+    for job in jobs:
+        state = job.cell.step("fit")
+        if state is None or state.get("status") != "done":
+            found = "none" if state is None else "one whose training did not end"
+            raise InputError(job.cell.folder, "fit.json", "a trained avatar", found, "Start the run again.")
+    return config, jobs
+
+
+def load(job: Job) -> Avatar:
+    """Read the avatar of a cell, which was trained for it or for its source."""
+    avatar: Avatar = job.create().load((job.source or job.cell).avatar, device=job.device)
+    return avatar
