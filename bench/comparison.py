@@ -26,6 +26,7 @@ from .io.files import (
 )
 from .io.lock import locked
 from .machine import check_device
+from .options import DependentOptions
 from .progress import log_to_file
 from .registry import get, resolve
 from .runner.config import (
@@ -94,8 +95,8 @@ class RunSettings:
     data: str | None = None
     """Capture, such as one in the GaussianAvatars/VHAP layout: a UNION folder, a sequence folder, or a folder of them."""
     out: str | None = None
-    """Folder for everything the run makes. A run in it is continued: methods, seeds and metrics may be added, but none left
-    out; captures, frames, tasks and regions have to be the same."""
+    """Folder for everything the run makes. A run in it is continued and grows: methods, seeds, metrics, conditions, tasks and
+    frames are added to those that it has, and every method is trained with every seed. What it has keeps its settings."""
     methods: str | None = None
     """Names, separated by commas; see `headbench list methods`. Default: all that compare fairly here:
     mean-image,nearest-camera,ga,ours."""
@@ -115,9 +116,15 @@ class RunSettings:
     """How many processes, with `--executor processes`. Default: one for each core."""
     unchecked: bool = False
     """Train although `headbench lint` names an error of a capture that makes its results meaningless."""
+    dry_run: bool = False
+    """Check everything and list the cells with the time, disk and memory that each will probably take; train nothing."""
+    estimates: str | None = None
+    """With --dry-run: folder of an earlier run on a machine like this one, to estimate from; that of --out is always used."""
     set: Assignments = ()
     """Any setting, for example `frames_per_task=50`, `settings.ga.budget.iterations=5000`, `execution.slurm.hours=8`;
     repeatable."""
+
+    dependent = (DependentOptions(("estimates",), "dry_run"),)
 
 
 def run(settings: RunSettings, progress: Progress) -> Findings:
@@ -147,6 +154,12 @@ def run(settings: RunSettings, progress: Progress) -> Findings:
     )
     config = build_run_config(values, source)
     check_kind(Path(config.out), "a run")  # before the log is written there
+    if settings.dry_run:
+        from .runner.forecast import forecast
+        from .runner.run import planned_jobs
+
+        known = [Path(config.out), *([Path(settings.estimates)] if settings.estimates else [])]
+        return forecast(planned_jobs(config), known)
     with _log_file(Path(config.out)):
         return _run(config, execution, unchecked=settings.unchecked)
 

@@ -9,22 +9,35 @@ import tyro
 
 from ..contracts import Progress
 from ..runner.config import RunOptions
+from ..runner.disk import Deletable
 from ..specs import Findings
 
 
 @dataclass(frozen=True)
 class StatusSettings:
-    """Shows the progress of a run, or afterwards, and changes nothing. Exit code 1: a cell failed."""
+    """Shows the progress of a run, or afterwards, and what it takes on disk. Exit code 1: a cell failed."""
 
     run: tyro.conf.Positional[str]
     """Folder of the run."""
 
+    clean: tuple[Deletable, ...] = ()
+    """Delete what can be made again: renders (the next start renders them again), checkpoints of trainings that did not end,
+    damaged avatars that were set aside, logs of processes and jobs."""
+
 
 def status(settings: StatusSettings, progress: Progress) -> Findings:
     """Show which cells of a run are waiting, running, done or failed, and the time left."""
+    from ..runner.disk import clean, shown, usage
     from .status import run_status
 
-    return run_status(Path(settings.run))
+    run = Path(settings.run)
+    freed = clean(run, settings.clean) if settings.clean else 0
+    found = run_status(run)
+    sizes = usage(run)
+    parts = ", ".join(f"{kind} {shown(size)}" for kind, size in sizes.items() if size)
+    text = f"{found.text}\ndisk: {shown(sum(sizes.values()))}: {parts}"
+    text += f"\ndeleted: {shown(freed)} of {', '.join(settings.clean)}" if settings.clean else ""
+    return found._replace(text=text, data={**found.data, "disk": sizes, "deleted": freed})
 
 
 @dataclass(frozen=True)

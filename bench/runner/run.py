@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -125,18 +126,7 @@ def _run(
 ) -> Rows:
     start = time.perf_counter()
     clips = open_clips(config) if clips is None else clips
-    for method, condition in cells:
-        places = product([clip.subject for clip in clips], config.seeds)
-        label = label_of(method.spec.name, condition.name)
-        if not all(folder.cell(subject, label, seed).ended("measure") for subject, seed in places):
-            check_settings([(method, condition)])
-    protocols = make_protocols(config.tasks, clips, config.frames_per_task)
-    planned = describe(config, cells, metrics, clips, protocols)
-    folder.check_kept(planned)
-    jobs = make_jobs(config, cells, clips, protocols, folder)
-    for job in jobs:
-        job.check()
-        job.check_method()
+    planned, protocols, jobs = _planned(config, cells, metrics, folder, clips)
     warn_of_missing_metrics(metrics, clips[0])
     if not unchecked and not config.source:
         for clip in {job.clip.subject: job.clip for job in jobs if not job.cell.ended("fit")}.values():
@@ -166,6 +156,40 @@ def _run(
     return rows
 
 
+def _planned(
+    config: RunConfig,
+    cells: Sequence[tuple[ResolvedMethod, Condition]],
+    metrics: Sequence[MetricSpec],
+    folder: RunFolder,
+    clips: Sequence[Clip],
+    out: Path | None = None,
+) -> tuple[Manifest, dict[str, Protocol], list[Job]]:
+    """The record, the protocols and the cells of a run, all checked; ``out`` as for `make_jobs`."""
+    for method, condition in cells:
+        places = product([clip.subject for clip in clips], config.seeds)
+        label = label_of(method.spec.name, condition.name)
+        if not all(folder.cell(subject, label, seed).ended("measure") for subject, seed in places):
+            check_settings([(method, condition)])
+    protocols = make_protocols(config.tasks, clips, config.frames_per_task)
+    planned = describe(config, cells, metrics, clips, protocols)
+    folder.check_kept(planned)
+    jobs = make_jobs(config, cells, clips, protocols, folder, out)
+    for job in jobs:
+        job.check()
+        job.check_method()
+    return planned, protocols, jobs
+
+
+def planned_jobs(config: RunConfig) -> list[Job]:
+    """The cells that `run` would work on, checked as it checks them; nothing is written into ``config.out``."""
+    folder = RunFolder(Path(config.out))
+    config = grown(config, folder)
+    with TemporaryDirectory() as scratch:
+        clips = open_clips(replace(config, out=scratch))
+        metrics = resolve_metrics(config)
+        return _planned(config, resolve_cells(config), metrics, folder, clips, Path(scratch))[2]
+
+
 def grown(config: RunConfig, folder: RunFolder) -> RunConfig:
     """The configuration together with what the run in the folder has already: methods, seeds, tasks, metrics, conditions.
 
@@ -180,11 +204,17 @@ def grown(config: RunConfig, folder: RunFolder) -> RunConfig:
             raise
         log.warning("%s It is written again.", error)
         return config  # rows that would be lost are an error when they are written
+    before = product(earlier.methods, earlier.seeds)
+    asked = product(config.methods, config.seeds)
+    every = product({*earlier.methods, *config.methods}, {*earlier.seeds, *config.seeds})
+    if more := sorted({*every} - {*before} - {*asked}):
+        text = ", ".join(f"{method} seed {seed}" for method, seed in more)
+        log.warning("A run has every method with every seed; this one gets %s, too.", text)
     for name in ("preset", "device", "divide", "clip", "source"):
-        before, now = getattr(earlier, name), getattr(config, name)
-        if before != now and not (name == "source" and _same_place(before, now)):
+        then, now = getattr(earlier, name), getattr(config, name)
+        if then != now and not (name == "source" and _same_place(then, now)):
             raise InputError(
-                folder.manifest, f"configuration.{name}", f"{before}, as in this run", str(now), DISCARD
+                folder.manifest, f"configuration.{name}", f"{then}, as in this run", str(now), DISCARD
             )
     union: dict[str, Any] = {
         name: tuple(dict.fromkeys((*getattr(earlier, name), *getattr(config, name))))

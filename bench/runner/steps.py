@@ -28,7 +28,7 @@ from ..contracts import (
     Progress,
 )
 from ..errors import HeadbenchError, InputError, UnavailableError, is_damage
-from ..io.files import digest, digest_file, grouped_writes, refuse_links
+from ..io.files import digest, digest_file, grouped_writes, refuse_links, write_text
 from ..io.images import quantise, read_png, write_png
 from ..machine import PeakMemory, ProcessorLoad, machine_name, processor_seconds, use_device
 from ..progress import RunProgress, duration, progress
@@ -41,7 +41,7 @@ from .adaptation import AdaptedClip, TrainingView
 from .config import ResolvedMethod
 from .scoring import FULL, ScoredFrames, make_metric, score_frames
 from .store import Cell, StepState, avatar_files
-from .stored import shown_by, write_avatar_record
+from .stored import shown_by, training_losses, write_avatar_record
 
 log = logging.getLogger(__name__)
 RESULT_FORMAT = 1  # raise when a step changes what it leaves behind
@@ -219,10 +219,27 @@ def fit(job: Job) -> Avatar:
             files=job.cell.digests(avatar_files(job.cell.avatar)),
         )
         log.info("%s: trained in %s", job.name, duration(seconds))
+        write_losses(job)
     else:
         log_kept(job)
     avatar: Avatar = method.load(job.cell.avatar, device=job.device)
     return avatar
+
+
+def write_losses(job: Job) -> None:
+    """Write the losses of a training to ``losses.csv`` and, if it is installed, for TensorBoard into the cell's folder."""
+    losses = training_losses(job.cell.avatar)
+    if not losses:
+        return
+    lines = ["iteration,loss", *(f"{iteration},{loss!r}" for iteration, loss in losses)]
+    write_text(job.cell.folder / "losses.csv", "\n".join(lines) + "\n")
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return
+    with SummaryWriter(str(job.cell.folder / "tensorboard")) as writer:  # type: ignore[no-untyped-call]
+        for iteration, loss in losses:
+            writer.add_scalar("loss", loss, iteration)  # type: ignore[no-untyped-call]
 
 
 def derive(job: Job) -> Avatar:
@@ -515,8 +532,12 @@ def _measure_fingerprint(job: Job, spec: MetricSpec, rendered: Mapping[str, str]
 
 
 def reason_of(error: Exception) -> str:
-    """Why a cell failed, as its rows say it."""
-    return f"{type(error).__name__}: {error}"
+    """Why a cell failed, as its rows say it; "out of memory" has that name, whoever noticed it."""
+    name, text = type(error).__name__, str(error)
+    wanted = ("out of memory", "can't allocate memory", "cannot allocate memory")
+    if isinstance(error, MemoryError) or name == "OutOfMemoryError" or any(w in text.lower() for w in wanted):
+        return f"out of memory: {text or name}"
+    return f"{name}: {text}"
 
 
 def failed_rows(job: Job, metrics: Sequence[MetricSpec], reason: str) -> Rows:

@@ -9,6 +9,7 @@
     <subject>/<method>/seed-<n>/
         fit.json                  what the avatar was made of, how long it took, digests of its files
         avatar/                   what the method wrote
+        losses.csv, tensorboard/  losses of the training, for methods that record them
         renders/<task>/*.png      8-bit frames, named by key
         digests.json              digests of the frames as they were rendered
         rows.parquet              what was measured

@@ -1,0 +1,85 @@
+"""What the files of a run take on disk, and the deletion of what can be made again."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+from ..io.files import output_inside, refuse_links
+from ..io.lock import locked
+from .store import RunFolder
+
+Kind = Literal["avatars", "renders", "checkpoints", "damaged", "logs", "other"]
+Deletable = Literal["renders", "checkpoints", "damaged", "logs"]
+LOSSES: Mapping[str, str] = {
+    "renders": "the next start of the run renders them again; pictures of reports need them",
+    "checkpoints": "trainings that did not end begin again",
+    "damaged": "avatars that were set aside because their files were damaged",
+    "logs": "what processes and jobs printed",
+}
+"""What deleting each kind of file costs."""
+
+
+def usage(run: Path) -> dict[Kind, int]:
+    """Bytes of the files of a run by kind, the kinds in the order of `Kind`."""
+    sizes: dict[Kind, int] = dict.fromkeys(
+        ("avatars", "renders", "checkpoints", "damaged", "logs", "other"), 0
+    )
+    for path, kind in _files(run):
+        sizes[kind] += path.lstat().st_size
+    return sizes
+
+
+def clean(run: Path, kinds: Sequence[Deletable]) -> int:
+    """Delete the files of some kinds from a run, and folders that this leaves empty; return how many bytes they took.
+
+    Raises `InputError` for a folder that is no run, one that another process works in, and links out of it.
+    """
+    RunFolder(run).read_manifest()
+    freed = 0
+    with locked(run), output_inside(run):
+        refuse_links(run)
+        for path, kind in list(_files(run)):
+            if kind in kinds:
+                freed += path.lstat().st_size
+                path.unlink()
+        if "damaged" in kinds:
+            for folder in list(run.glob("*/*/seed-*/avatar-damaged-*")):
+                shutil.rmtree(folder)
+        for folder in sorted((p for p in run.rglob("*") if p.is_dir() and not p.is_symlink()), reverse=True):
+            if (
+                "renders" in kinds
+                and "renders" in folder.relative_to(run).parts
+                and not any(folder.iterdir())
+            ):
+                folder.rmdir()
+    return freed
+
+
+def _files(run: Path) -> Iterator[tuple[Path, Kind]]:
+    for path in sorted(run.rglob("*")):
+        if path.is_file() and not path.is_symlink():
+            yield path, _kind(path.relative_to(run))
+
+
+def _kind(place: Path) -> Kind:
+    # SUBJECT/METHOD/seed-N/..., see `store`.
+    inside = place.parts[3:] if len(place.parts) > 3 and place.parts[2].startswith("seed-") else ()
+    if place.suffix == ".log" or place.parts[0] == "jobs":
+        return "logs"
+    if not inside:
+        return "other"
+    if inside[0] == "renders":
+        return "renders"
+    if inside[0].startswith("avatar-damaged-"):
+        return "damaged"
+    if place.name.startswith("checkpoint"):
+        return "checkpoints"
+    return "avatars" if inside[0] == "avatar" else "other"
+
+
+def shown(size: float) -> str:
+    """A number of bytes for people."""
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
