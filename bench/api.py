@@ -46,15 +46,17 @@ def open_clip(
 
     Parameters
     ----------
-    folder : of the capture, in a layout that a registered reader knows.
-    reader : name of the reader; "" for the one that finds a capture there.
-    head : file of the head model, for captures that bring none.
-    settings : further settings of the reader.
+    folder : Path | str
+        Folder of a capture in a layout that a registered reader knows.
+    reader : str
+        Name of the reader; "" selects the reader that recognises the capture.
+    head : Path | str | None
+        Head model file, for captures that contain none.
 
     Raises
     ------
     InputError
-        Where the folder holds no capture, or several, and whatever the reader finds wrong.
+        The folder holds no capture or several, or the reader finds a fault.
     """
     config = capture_configuration(str(folder), "", reader, None if head is None else str(head))
     clips = open_clips(replace(config, reader_settings={**config.reader_settings, **settings}))
@@ -80,22 +82,30 @@ def train(
 
     Parameters
     ----------
-    method : name of a registered method, or "package.module:SPEC".
-    clip : as `open_clip` gives it, or its folder.
-    out : folder of avatars; what is trained already with the same settings, data and seed is kept.
-    preset : one of the method's.
-    settings : of the method, over the preset; the key "budget" holds iterations and seconds.
+    method : str
+        Name of a registered method, or "package.module:SPEC".
+    clip : Clip | Path | str
+        Clip returned by `open_clip`, or the folder of a capture.
+    out : Path | str
+        Folder for avatars. An avatar trained with the same settings, data and seed is reused.
+    preset : str
+        One of the method's presets.
+    settings : Mapping[str, Any] | None
+        Settings of the method, applied over the preset; the key "budget" holds iterations and
+        seconds.
 
     Returns
     -------
-    The folder of the avatar, ``out``/SUBJECT/METHOD/seed-N/avatar, for `evaluate` and `load_avatar`.
+    Path
+        The folder of the avatar, ``out``/SUBJECT/METHOD/seed-N/avatar, for `evaluate` and
+        `load_avatar`.
 
     Raises
     ------
     InputError
-        For an unknown method, preset or setting, for a device that is not there or that the method does not compute on, for
-        a clip that the method cannot be trained on, and where ``out`` holds an avatar of the same subject, method and seed
-        that was made of something else.
+        Unknown method, preset or setting; a device that is missing or not supported by the method; a
+        clip that the method cannot be trained on; or ``out`` holds a different avatar of the same
+        subject, method and seed.
     """
     check_device(device)
     clip = open_clip(clip) if isinstance(clip, (str, Path)) else clip
@@ -136,23 +146,29 @@ def evaluate(
 
     Parameters
     ----------
-    avatar : folder of a stored avatar, which is given the clip in the form that its method needs; or an `Avatar`, which is
-        given the clip's own cameras and poses.
-    clip : as `open_clip` gives it, or its folder.
-    metrics : names of metrics of frames; none: those that a run takes by default.
-    regions : parts of the frame to score beside the whole; None: the face, where the clip knows it.
-    frames_per_task : maximum number of frames of each task, evenly spaced; None: all.
-    device : where a stored avatar renders.
+    avatar : Path | str | Avatar
+        Folder of a stored avatar, which receives the clip in the form that its method needs; or an
+        `Avatar`, which receives the clip's own cameras and poses.
+    clip : Clip | Path | str
+        Clip returned by `open_clip`, or the folder of a capture.
+    metrics : str | Sequence[str]
+        Names of frame metrics; empty selects the default metrics of a run.
+    regions : str | Sequence[str] | None
+        Image regions to score in addition to the whole frame; None selects the face if the clip has
+        that region.
+    frames_per_task : int | None
+        Maximum number of frames of each task, evenly spaced; None means all.
 
     Returns
     -------
-    One row for each frame, region and metric: task, sequence, timestep, camera, region, metric, value, status ("ok", or
-    "missing" with a reason), reason.
+    pd.DataFrame
+        One row for each frame, region and metric: task, sequence, timestep, camera, region, metric,
+        value, status ("ok", or "missing" with a reason), reason.
 
     Raises
     ------
     InputError
-        For a stored avatar of another subject, and for unknown tasks, metrics and regions.
+        The stored avatar shows another subject, or a task, metric or region is unknown.
     """
     check_device(device)
     clip = open_clip(clip) if isinstance(clip, (str, Path)) else clip
@@ -188,17 +204,21 @@ def run(data: Path | str, out: Path | str, **settings: Any) -> Path:
 
     Parameters
     ----------
-    data, out : capture, and folder for everything that the run makes.
-    settings : further fields of `RunConfig`, such as ``methods=("ga", "ours"), preset="smoke", seeds=(0, 1)``.
+    data, out : Path | str
+        Capture, and output folder of the run.
+    settings : Any
+        Further fields of `RunConfig`, such as ``methods=("ga", "ours"), preset="smoke", seeds=(0,
+        1)``.
 
     Returns
     -------
-    The folder of the run, for `read_runs`.
+    Path
+        The folder of the run, for `read_runs`.
 
     Raises
     ------
     InputError
-        For whatever can be found wrong before the first training.
+        Any fault that can be found before the first training.
     """
     values = {"data": str(data), "out": str(out), **settings}
     if "reader" not in values:

@@ -32,7 +32,7 @@ def take_turns(
 
     Returns
     -------
-    dict
+    dict[Key, list[float]]
         The seconds of ``rounds`` runs of each, by key.
     """
     seconds: dict[Key, list[float]] = {key: [] for key in runs}

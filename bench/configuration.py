@@ -62,12 +62,15 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
 
     Parameters
     ----------
-    source : file or option the values came from, for the error.
-    prefix : dotted path of ``values`` inside it.
+    source : str
+        File or option that the values came from, for the error.
+    prefix : str
+        Dotted path of ``values`` in the source.
 
     Raises
     ------
-    InputError : an unknown key (with the nearest known one), a missing one, or a value of the wrong type.
+    InputError
+        A key is unknown or missing, or a value has the wrong type.
     """
     if not isinstance(values, Mapping):
         raise InputError(source, prefix.rstrip("."), "a group of settings", shown(values))

@@ -51,10 +51,14 @@ class Camera:
 
     Attributes
     ----------
-    id : name within the clip; keys refer to it.
-    width, height : image size, pixels.
-    K : (3, 3) float64, pixels. The principal point is honoured by every renderer.
-    world_to_camera : (4, 4) float64 rigid motion, metres, OpenCV axes.
+    id : str
+        Name within the clip, used by keys.
+    width, height : int
+        Image size, pixels.
+    K : FloatArray
+        (3, 3) float64, pixels. Every renderer uses the principal point.
+    world_to_camera : FloatArray
+        (4, 4) float64 rigid motion, metres, OpenCV axes.
     """
 
     id: str

@@ -55,11 +55,16 @@ class InputError(HeadbenchError):
 
     Parameters
     ----------
-    file : the file (or option, or registry) the fault is in.
-    key : the entry inside it (array name, JSON path, option name), or "" for the file as a whole.
-    expected : what a valid input has there.
-    found : what is there.
-    remedy : what to do about it, if that does not follow from ``expected``.
+    file : str | PathLike[str]
+        The file, option or registry that holds the fault.
+    key : str
+        The entry in it (array name, JSON path, option name), or "" for the whole file.
+    expected : str
+        What a valid input contains.
+    found : str
+        What the input contains.
+    remedy : str
+        How to fix it, if that does not follow from ``expected``.
     """
 
     def __init__(self, file: str | PathLike[str], key: str, expected: str, found: str, remedy: str = ""):

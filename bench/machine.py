@@ -118,10 +118,12 @@ class PeakMemory:
 
     Attributes
     ----------
-    before : bytes resident when it was entered.
-    peak : largest resident bytes until it was left.
-    device_record : of a CUDA device, else empty: ``device_memory_before_bytes`` and ``peak_device_memory_bytes``, what tensors of
-        this process had of it when it was entered and at most until it was left; ``tf32``, whether it was on then.
+    peak : int
+        Largest number of resident bytes in the context.
+    device_record : dict[str, Any]
+        For a CUDA device ``device_memory_before_bytes`` and ``peak_device_memory_bytes``, the memory
+        of this process's tensors on entry and at most; and ``tf32``, whether it was enabled on entry.
+        Empty for other devices.
     """
 
     def __init__(self, device: str = "cpu") -> None:
@@ -188,15 +190,20 @@ class ProcessorLoad:
 
     Parameters
     ----------
-    device : what is computed on, for `machine`.
-    wait : stay in the context until the load can be known, `SHORTEST_LOAD_S`.
+    device : str
+        Device of the computation, for `machine`.
+    wait : bool
+        Stay in the context until the load can be measured, for `SHORTEST_LOAD_S`.
 
     Attributes
     ----------
-    machine : see `machine_name`.
-    threads : of torch and of this package's kernels, 1 where nothing has imported torch.
-    cores : that this process may use.
-    other_cores : mean number of them that others kept busy; None if the context was too short or the system does not tell.
+    machine : str
+        Machine name, see `machine_name`.
+    threads : int
+        Threads of torch and of this package's kernels; 1 if torch is not imported.
+    other_cores : float | None
+        Mean number of these cores that other processes kept busy; None if the context was too short
+        or the system does not report it.
     """
 
     def __init__(self, device: str = "cpu", *, wait: bool = False) -> None:

@@ -137,14 +137,21 @@ class Manifest:
 
     Attributes
     ----------
-    paths : files and folders that the configuration names, by dotted key, relative to the run folder;
-        None in a bundle, which names no folders of the machine that made it.
-    metrics, methods, protocols : in the order of the configuration; protocols by task, in files of their own.
-    machine : processor, cores, memory in bytes, system, versions of packages, accelerators; of a run on a CUDA device that
-        device, CUDA's version and whether TF32 was on, since there is a record of it. See `machine_record`.
-    adapted : clips that were brought into another form for a method.
-    seconds, peak_memory_bytes : of the run's last start; None until it ended.
-    capture_seconds : how long the demo's capture took to make.
+    paths : dict[str, str] | None
+        Files and folders of the configuration by dotted key, relative to the run folder; None in a
+        bundle, which does not name folders of the machine that wrote it.
+    metrics, methods, protocols : tuple[MetricSpec, ...], tuple[MethodRecord, ...], dict[str, ProtocolRecord]
+        In the order of the configuration; protocols by task, in files of their own.
+    machine : dict[str, Any]
+        Processor, cores, memory in bytes, system, package versions and accelerators; for a run on a
+        CUDA device, also the device, CUDA's version and whether TF32 was enabled, except in old
+        records. See `machine_record`.
+    seconds, peak_memory_bytes : float | None, int | None
+        Of the run's last start; None until it ended.
+    adapted : tuple[AdaptedRecord, ...]
+        Clips that were brought into another form for a method.
+    capture_seconds : float | None
+        How long the demo took to make its capture.
     """
 
     configuration: RunConfig

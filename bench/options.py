@@ -19,9 +19,11 @@ class DependentOptions(NamedTuple):
 
     Attributes
     ----------
-    options : names of the attributes.
-    other : name of the attribute that they depend on.
-    values : those of ``other`` with which the options have an effect; True: ``other`` is given, False: it is not.
+    other : str
+        Name of the attribute that they depend on.
+    values : tuple[str, ...] | bool
+        Values of ``other`` with which the options have an effect. True: ``other`` is given; False: it
+        is not.
     """
 
     options: tuple[str, ...]
@@ -40,8 +42,10 @@ def check_dependent(dependent: Iterable[DependentOptions], given: Mapping[str, s
 
     Parameters
     ----------
-    given : names of the attributes that are given, and how the error names each.
-    settings : has the attributes `DependentOptions.other`.
+    given : Mapping[str, str]
+        Names of the given attributes, and how the error names each.
+    settings : Any
+        Settings with the attributes `DependentOptions.other`.
     """
     for options, other, values in dependent:
         value, name = getattr(settings, other), _shown(settings, other)

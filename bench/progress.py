@@ -128,9 +128,11 @@ class RunProgress:
 
     Parameters
     ----------
-    cells : by name, in order: the steps that a cell needs, each with what groups those alike; those of one step and one
-        kind (the method's name, say) take about as long as each other.
-    show : shows a line, if it is time to.
+    cells : Mapping[str, Mapping[str, str]]
+        Steps of each cell, by name and in order, each with its kind (for example the method's name).
+        Steps of one name and kind are assumed to take equally long.
+    show : Show
+        Shows a line if the refresh interval has passed.
     """
 
     def __init__(self, cells: Mapping[str, Mapping[str, str]], show: Show):

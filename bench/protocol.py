@@ -32,16 +32,25 @@ class Protocol:
 
     Attributes
     ----------
-    task : names the split whose frames are scored, or a task without ground truth.
-    keys : the frames, sorted; every method renders exactly these.
-    excluded : frames left out, with the reason.
-    clips : fingerprint of each subject's clip (images, cameras and driving signal).
-    resolution : at which size metrics are taken: WIDTHxHEIGHT of the truth, all that occur.
-    background : colour that renders and truth are composited on.
-    quantisation : how float renders become 8-bit frames.
-    metric_profile : the named set of metric definitions.
-    conditions : what else decides the numbers, by name, where keys do not say it: what is shown and the limits it is
-        held to, for tasks without ground truth.
+    task : TaskName | TaskWithoutTruth
+        The split whose frames are scored, or a task without ground truth.
+    keys : tuple[FrameKey, ...]
+        The scored frames, sorted. Every method renders exactly these.
+    excluded : tuple[tuple[FrameKey, str], ...]
+        Frames that are left out, with the reason.
+    clips : tuple[tuple[str, str], ...]
+        Fingerprint of each subject's clip (images, cameras and driving signal).
+    resolution : str
+        Image sizes of the truth at which metrics are computed, WIDTHxHEIGHT.
+    background : tuple[float, float, float]
+        Colour that renders and truth are composited on.
+    quantisation : str
+        How float renders become 8-bit frames.
+    metric_profile : str
+        The named set of metric definitions.
+    conditions : tuple[tuple[str, str], ...]
+        Further conditions that affect the numbers, by name: for tasks without ground truth, what is
+        rendered and the limits.
     """
 
     task: TaskName | TaskWithoutTruth
@@ -73,11 +82,14 @@ def make_protocol(task: TaskName, clips: Sequence[Clip], max_frames: int | None 
 
     Parameters
     ----------
-    max_frames : score at most so many frames of each clip, evenly spaced over the sorted keys; None: all.
+    max_frames : int | None
+        Maximum number of scored frames of each clip, evenly spaced over the sorted keys; None means
+        all.
 
     Raises
     ------
-    InputError : a clip without frames for the task, or one whose task frames are also training frames.
+    InputError
+        A clip has no frames for the task, or a frame is also used for training.
     """
     keys: list[FrameKey] = []
     sizes: set[tuple[int, int]] = set()

@@ -326,11 +326,13 @@ class Rows:
 
         Parameters
         ----------
-        planned : values that the new rows will have in columns of `Row`, by column.
+        planned : Iterable[str | int]
+            Values of the new rows in columns of `Row`, by column.
 
         Raises
         ------
-        InputError : these rows have other values in one of the columns.
+        InputError
+            These rows have other values in one of the columns.
         """
         for column, values in planned.items():
             named = list(map(str, values))

@@ -31,10 +31,14 @@ class Need(NamedTuple):
 
     Attributes
     ----------
-    what : its name: a kernel, a package, weights, a checkout, a GPU.
-    found : what there is, such as a version; "" where it is missing.
-    remedy : how to get it, if it is missing, and what happens meanwhile.
-    required : nothing works without it; else it works more slowly, or in part.
+    what : str
+        Name of a kernel, package, file of weights, checkout or GPU.
+    found : str
+        What was found, such as a version; "" if it is missing.
+    remedy : str
+        How to install it if it is missing, and what happens without it.
+    required : bool
+        Whether nothing works without it. Otherwise some features are slower or missing.
     """
 
     what: str
@@ -53,12 +57,17 @@ class ResolutionRule:
 
     Attributes
     ----------
-    square : "pad" to the longer side with background, "crop" to the shorter one, or "" for neither; centred.
-        What a crop cuts off is scored as background.
-    divide : reduce by this factor: block means where it divides both sides, else antialiased bicubic.
-    multiply : enlarge by this factor, bicubic.
-    size : (width, height) to resize to at the end, antialiased, in place of ``multiply``.
-    speed_size : (width, height) at which frames per second are measured; None: the size rendered at.
+    square : Literal['', 'pad', 'crop']
+        "pad" to the longer side with background, "crop" to the shorter one, or "" for neither;
+        centred. Pixels that a crop removes are scored as background.
+    divide : int
+        Factor of reduction: block means if it divides both sides, else antialiased bicubic.
+    multiply : int
+        Factor of enlargement, bicubic.
+    size : tuple[int, int] | None
+        (width, height) to resize to at the end, antialiased, instead of ``multiply``.
+    speed_size : tuple[int, int] | None
+        (width, height) at which frames per second are measured; None means the rendered size.
     """
 
     square: Literal["", "pad", "crop"] = ""
@@ -89,31 +98,50 @@ class MethodSpec:
 
     Attributes
     ----------
-    name : as typed on the command line and shown in tables.
-    summary : one sentence.
-    implementation : "package.module:Class"; the class takes the resolved configuration.
-    config : "package.module:Class" of the frozen dataclass with its settings, or "" for a method without any.
-    presets : settings by preset name. The key "budget" holds `Budget` fields; the rest are config fields.
-    head_models : versions the method accepts; empty means any.
-    monocular : needs the views as one video, one frame at a timestep, the head's rigid motion in the cameras.
-    resolution : the image size it works at.
-    preset_resolutions : the same by preset name, for presets that work at another size; see `at_preset`.
-    native : runs on our own implementation; False for an adapter to an official repository.
-    version : of what the method makes. Raise it with each change of the code that changes results: a finished avatar is
-        kept as long as version, settings and data are the same. For methods of this package a change of the code is a
-        warning then; for plug-ins outside it, the run is refused.
-    source : the paper.
-    trivial : a trivial baseline, which every real method should beat; shown in tables, never ranked.
-    default : a run that names no methods takes it.
-    demo : ``headbench demo`` takes it.
-    variants : "package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]``: what can be derived
-        from a trained avatar without training (``headbench sweep``); "" for nothing.
-    devices : kinds of devices that it computes on, such as "cpu"; empty means any. A run on another refuses it.
-    renders : "package.module:function" of ``(folder, clip, listing) -> {FrameKey: Render}``, see `bench.audit.naming`: which
-        image that the method's own program left in a folder shows which frame (``headbench evaluate --names``); ``listing``
-        is the capture's, see `DatasetSpec`. "" where no program numbers its renders.
-    needs : "package.module:function" of ``(config, device) -> Iterable[Need]``: what a machine has to have, each looked
-        for without long work, network or changes of the disk; "" for nothing but what headbench is installed with.
+    name : str
+        Name on the command line and in tables.
+    implementation : str
+        "package.module:Class"; the class takes the resolved configuration.
+    config : str
+        "package.module:Class" of the frozen dataclass with its settings, or "" for a method without
+        settings.
+    presets : Mapping[str, Mapping[str, Any]]
+        Settings by preset name. The key "budget" holds `Budget` fields; the rest are config fields.
+    head_models : tuple[str, ...]
+        Versions that the method accepts; empty means any.
+    monocular : bool
+        Whether the method needs the views as one video, one frame per timestep, with the rigid head
+        motion in the cameras.
+    resolution : ResolutionRule
+        The image size that the method works at.
+    preset_resolutions : Mapping[str, ResolutionRule]
+        Resolution rules of presets that work at another size; see `at_preset`.
+    native : bool
+        Whether it is an implementation of this package; False for an adapter to an official
+        repository.
+    version : str
+        Version of the results. Raise it with each change of the code that changes results: a finished
+        avatar is kept as long as version, settings and data are the same. After a change of the code,
+        methods of this package give a warning; a run with an external plug-in is refused.
+    trivial : bool
+        Whether it is a trivial baseline that every method should beat; shown in tables, never ranked.
+    default : bool
+        Whether a run that names no methods includes it.
+    variants : str
+        "package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]`` for
+        ``headbench sweep``: variants of a trained avatar that need no training; "" for none.
+    devices : tuple[str, ...]
+        Supported kinds of devices, such as "cpu"; empty means any. A run on another device is
+        refused.
+    renders : str
+        "package.module:function" of ``(folder, clip, listing) -> {FrameKey: Render}`` that maps
+        images written by the method's own program to frames (``headbench evaluate --names``), see
+        `bench.audit.naming`; ``listing`` is the capture's, see `DatasetSpec`. "" if no program
+        numbers its renders.
+    needs : str
+        "package.module:function" of ``(config, device) -> Iterable[Need]``: requirements of the
+        machine. The check takes little time, uses no network and writes nothing. "" if headbench's
+        own dependencies suffice.
     """
 
     name: str
@@ -163,18 +191,26 @@ class MetricSpec:
 
     Attributes
     ----------
-    implementation : "package.module:function" of what ``kind`` says; a class there is made without arguments.
-    kind : "frame", a `Metric`; "regional", a `RegionalMetric`; "temporal", a `TemporalMetric`; "avatar", an
-        `AvatarMetric`; "training", a `TrainingMetric`.
-    detail : which of the measurement's details is the value, in ``unit``; "" for its value. Metrics of an avatar that
-        name the same implementation are measured once, together.
-    tables : names of the tables that show it.
-    machine_bound : the number says as much of the machine as of the avatar (speed, memory): it compares on one
-        machine alone, and measuring it again gives another.
-    profile : the set of definitions it belongs to, see `ProfileSpec`. Other profiles than the canonical one stand in
-        the metric's name, too, behind an "@": a row names its profile, ``ssim@3dgs`` is never taken for ``ssim``.
-    default : a run that names no metrics takes it. Not recorded in runs.
-    needs : as of a method, called with None for the config. Not recorded in runs.
+    implementation : str
+        "package.module:function" for the given ``kind``; a class is instantiated without arguments.
+    kind : MetricKind
+        "frame", a `Metric`; "regional", a `RegionalMetric`; "temporal", a `TemporalMetric`; "avatar",
+        an `AvatarMetric`; "training", a `TrainingMetric`.
+    detail : str
+        Key of the measurement's details that holds the value, in ``unit``; "" for the main value.
+        Metrics of an avatar with the same implementation are measured once, together.
+    tables : tuple[str, ...]
+        Names of the tables that show it.
+    machine_bound : bool
+        Whether the value depends on the machine and its load (speed, memory). It is compared on one
+        machine only, and another measurement gives another value.
+    profile : str
+        The set of definitions it belongs to, see `ProfileSpec`. Profiles other than the canonical one
+        are appended to the metric's name after an "@", for example ``ssim@3dgs``.
+    default : bool
+        Whether a run that names no metrics includes it. Not recorded in runs.
+    needs : str
+        As for a method, called with None for the config. Not recorded in runs.
     """
 
     name: str
@@ -210,11 +246,13 @@ class ProfileSpec:
 
     Attributes
     ----------
-    name : as settings and metric names have it.
-    summary : one sentence.
-    source : which code, at which version, prints these numbers.
-    metrics : of this profile by `MetricSpec.profile`, each named ``<metric>@<profile>`` and in a table of the
-        profile's own, ``tables=(profile,)``; but for the canonical profile, whose names are bare.
+    name : str
+        Name in settings and metric names.
+    source : str
+        The code and version that computes these numbers.
+    metrics : tuple[MetricSpec, ...]
+        Metrics with this `MetricSpec.profile`, each named ``<metric>@<profile>`` and shown in the
+        profile's own table, ``tables=(profile,)``. Names of the canonical profile have no suffix.
     """
 
     name: str
@@ -335,15 +373,22 @@ class CommandSpec:
 
     Attributes
     ----------
-    name : the words that call it: one, or two of which the first names a group of commands ("prepare nersemble").
-    group : heading of ``headbench --help`` that it stands under: one of `COMMAND_GROUPS`, or another, shown after them.
-    summary : one sentence.
-    settings : "package.module:Class" of a frozen dataclass. Its attributes become the options, the strings below them the
+    name : str
+        The words that call it: one, or two of which the first names a group of commands ("prepare nersemble").
+    group : str
+        Heading of ``headbench --help`` that lists it: one of `COMMAND_GROUPS`, or another, shown after them.
+    summary : str
+        One sentence.
+    settings : str
+        "package.module:Class" of a frozen dataclass. Its attributes become the options, the strings below them the
         help. Help of the command loads this module.
-    function : "package.module:function" of ``(settings, progress: Progress) -> Findings``. The exit code is 0, or 1 where
+    function : str
+        "package.module:function" of ``(settings, progress: Progress) -> Findings``. The exit code is 0, or 1 where
         the findings did not pass, unless they give one.
-    writes : the setting with the folder that the command writes: no other process works in it meanwhile; "" for none.
-    kinds : the kinds of folder that the command may continue in, see `bench.io.files.check_kind`.
+    writes : str
+        The setting with the folder that the command writes: no other process works in it meanwhile; "" for none.
+    kinds : tuple of str
+        The kinds of folder that the command may continue in, see `bench.io.files.check_kind`.
     """
 
     name: str

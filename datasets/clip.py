@@ -60,13 +60,20 @@ class CaptureClip:
 
     Attributes
     ----------
-    files : of every frame, those of excluded frames included. Where there are pixel steps, what methods see
-        differs from what the files hold.
-    source_fingerprint : digest of the content of all files behind the clip; does not depend on their place.
-    store : decodes images and bounds the memory they take; shared by clips derived from one another.
-    pixel_steps : applied in order when a frame is read, with one rounding to 8 bits at the end.
-    read_background : what straight-alpha files are composited on before the pixel steps; None: `background`.
-    source : the clip that gives the pixels of frames without files, see `as_capture`.
+    files : Mapping[FrameKey, FrameFiles]
+        Files of every frame, including excluded frames. With pixel steps, methods see other pixels
+        than the files hold.
+    source_fingerprint : str
+        Digest of the content of all files of the clip, independent of their location.
+    store : ImageStore
+        Decodes images and bounds their memory; shared by clips derived from one another.
+    pixel_steps : tuple[PixelStep, ...]
+        Steps applied in order when a frame is read, with one rounding to 8 bits at the end.
+    read_background : FloatArray | None
+        Colour that straight-alpha files are composited on before the pixel steps; None means
+        `background`.
+    source : Clip | None
+        The clip that gives the pixels of frames without files, see `as_capture`.
     """
 
     subject: str

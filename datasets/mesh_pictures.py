@@ -58,13 +58,18 @@ def draw_mesh(
 
     Parameters
     ----------
-    vertices : (V, 3) in the world, metres. Triangles with a corner that is not finite are left out.
-    faces : (F, 3), counter-clockwise from outside; the inside is drawn too, darker.
-    colors : (V, 3) display-referred colours in [0, 1]; default: `CLAY`.
-    background : (3,) colour in [0, 1], or an (H, W, 3) image, 8-bit or in [0, 1], to draw upon.
-    opacity : of the mesh over the background.
-    shading : 1 for Lambert shading, 0 for the colours as they are; between, a mixture.
-    supersampling : samples per pixel along each axis.
+    vertices : FloatArray
+        (V, 3) in the world, metres. Triangles with a non-finite corner are left out.
+    faces : IntArray
+        (F, 3), counter-clockwise from outside; the inside is drawn too, darker.
+    colors : FloatArray | None
+        (V, 3) display-referred colours in [0, 1]; default: `CLAY`.
+    background : Sequence[float] | FloatArray | ByteArray
+        (3,) colour in [0, 1], or an (H, W, 3) image, 8-bit or in [0, 1], to draw on.
+    opacity : float
+        Opacity of the mesh over the background.
+    shading : float
+        1 for Lambert shading, 0 for the plain colours, or a mixture.
     """
     fine = camera.resized(supersampling * camera.width, supersampling * camera.height)
     fragments = rasterize_mesh(vertices, faces, fine)
@@ -97,7 +102,7 @@ def rasterize_mesh(vertices: FloatArray, faces: IntArray, camera: Camera) -> Fra
     Raises
     ------
     InputError
-        Where the triangles together cover the picture more than `MAX_LAYERS` times: no head's do.
+        The triangles cover the picture more than `MAX_LAYERS` times in total, which no head does.
     """
     width, height = camera.width, camera.height
     points, usable = _project(vertices, camera)
@@ -141,10 +146,15 @@ def portrait_camera(
 
     Parameters
     ----------
-    vertices : (V, 3) what has to be in the picture, metres; for pictures to be compared, all of their vertices.
-    yaw, pitch : radians; the camera walks to the head's left, and up.
-    fill : part of the picture that the head's projection spans along its longer side.
-    distance : from the middle of the vertices' bounding box, metres.
+    vertices : FloatArray
+        (V, 3) points that must be visible, metres; for pictures that are compared, all of their
+        vertices.
+    yaw, pitch : float
+        Radians; the camera moves to the head's left, and up.
+    fill : float
+        Fraction of the picture that the head's projection spans along its longer side.
+    distance : float
+        Distance from the middle of the vertices' bounding box, metres.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     outward = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])

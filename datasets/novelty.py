@@ -17,9 +17,12 @@ class Novelty(NamedTuple):
 
     Attributes
     ----------
-    outside : share in [0, 1] of the displacement, in the root mean square, that lies outside the span of training.
-    beyond : share in [0, 1] of the expressions that leave the range of training along some direction of its span, by
-        more than a tenth of that range.
+    outside : float
+        Fraction in [0, 1] of the root mean square displacement that lies outside the span of
+        training.
+    beyond : float
+        Fraction in [0, 1] of the expressions that leave the range of training along some direction of
+        its span by more than a tenth of that range.
     """
 
     outside: float

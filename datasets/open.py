@@ -23,7 +23,7 @@ def find_reader(path: str | PathLike[str], name: str = "") -> DatasetSpec:
     Raises
     ------
     InputError
-        Where no reader finds a capture, or several do.
+        No reader recognises the path as a capture, or several do.
     """
     if name:
         spec: DatasetSpec = get("datasets", name)
@@ -55,14 +55,17 @@ def open_clips(
 
     Parameters
     ----------
-    reader : see `find_reader`.
-    wishes : settings for readers that have them, such as ``leaks``; others do without.
-    settings : of the reader.
+    reader : str
+        See `find_reader`.
+    wishes : Mapping[str, Any] | None
+        Settings such as ``leaks`` that are passed to readers that have them and ignored otherwise.
+    settings : Mapping[str, Any] | None
+        Settings of the reader.
 
     Raises
     ------
     InputError
-        As `find_reader` does, for a setting that the reader does not have, and whatever it finds wrong.
+        As for `find_reader`; or the reader lacks a setting or finds a fault.
     """
     spec = find_reader(path, reader)
     known = inspect.signature(resolve(spec.implementation)).parameters

@@ -73,7 +73,8 @@ class Flip:
 
     Attributes
     ----------
-    pixels_per_degree : of visual angle.
+    pixels_per_degree : float
+        Pixels per degree of visual angle.
     """
 
     pixels_per_degree: float = PIXELS_PER_DEGREE

@@ -53,20 +53,29 @@ class Lpips:
 
     Parameters
     ----------
-    net : "alex" (customary for reporting), "squeeze" or "vgg".
-    weights : file with the backbone, or folder to look in; see the module for the default.
-    device : where the network runs; always in float32.
-    scaled : bring images to [-1, 1], as the constants expect; False feeds [0, 1].
-    cache_mb : bound of the features of ground-truth images that are kept for the next method, in 10^6 bytes.
+    net : str
+        "alex" (customary for reporting), "squeeze" or "vgg".
+    weights : Path | None
+        File of the backbone, or folder to look in; see the module for the default.
+    device : str
+        Device of the network, which always computes in float32.
+    scaled : bool
+        Whether to scale images to [-1, 1], as the constants expect; False feeds [0, 1].
+    cache_mb : float
+        Maximum memory for features of ground-truth images that are kept for the next method, in 10^6
+        bytes.
 
     Attributes
     ----------
-    fingerprint : hex digest of all weights in use, the same for a full file and one of features alone.
+    fingerprint : str
+        Hex digest of all weights in use, the same for a full file and one of features alone.
 
     Raises
     ------
-    UnavailableError : no weights; says how to get them.
-    InputError : weights that are not those of the network.
+    UnavailableError
+        Weights are missing; the message says how to get them.
+    InputError
+        The weights are not those of the network.
     """
 
     def __init__(
@@ -271,8 +280,11 @@ def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
 
     Raises
     ------
-    InputError : ``path`` or the environment variable names something that is not there.
-    UnavailableError : not in the folder named, or not found anywhere and not to be fetched; names the remedy.
+    InputError
+        ``path`` or the environment variable names a missing file.
+    UnavailableError
+        The file is missing in the named folder, or was not found and cannot be downloaded; the
+        message names the remedy.
     """
     if found := present_backbone(spec, path):
         return found

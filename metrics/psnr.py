@@ -36,9 +36,11 @@ class Psnr:
 
     Attributes
     ----------
-    per_channel : mean of the PSNRs of red, green and blue, as the training code of GaussianAvatars prints; never
-        below that of all samples together (Jensen).
-    floor : added to the mean squared error of images in [0, 1], as piq does.
+    per_channel : bool
+        Mean of the PSNRs of red, green and blue, as the training code of GaussianAvatars prints;
+        never below that of all samples together (Jensen).
+    floor : float
+        Added to the mean squared error of images in [0, 1], as in piq.
     """
 
     per_channel: bool = False

@@ -130,9 +130,11 @@ class SpeedProtocol:
 
     Attributes
     ----------
-    warm_up : at least so many frames, then until the median of the last ``window`` lies within ``steady`` (relative)
-        of the median of the ``window`` before.
-    depth : frames under way in the throughput loop.
+    warm_up : int
+        Minimum number of warm-up frames. Warm-up ends when the median of the last ``window`` frames
+        lies within ``steady`` (relative) of the median of the ``window`` before.
+    depth : int
+        Number of frames in flight in the throughput loop.
     """
 
     warm_up: int = 30

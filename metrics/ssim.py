@@ -41,12 +41,17 @@ class SsimForm:
 
     Attributes
     ----------
-    window : "gaussian", 11 x 11 of standard deviation 1.5, weights summing to one; or "uniform", 7 x 7.
-    border : "valid" counts only windows that lie wholly inside the image; "reflect" mirrors the image about its
-        outermost pixels, "zero" surrounds it with black, and both count a window for every pixel.
-    sample_covariance : variances and covariance of a sample, n / (n - 1) times those of the window.
-    downsample : first average blocks of ``round(min(H, W) / 256)`` pixels a side (Wang's own suggestion for large
-        images), where that is more than one.
+    window : Literal['gaussian', 'uniform']
+        "gaussian", 11 x 11 with standard deviation 1.5 and weights that sum to one; or "uniform", 7 x
+        7.
+    border : Border
+        "valid" uses only windows that lie wholly inside the image; "reflect" mirrors the image about
+        its outermost pixels, "zero" surrounds it with black, and both use a window for every pixel.
+    sample_covariance : bool
+        Whether to use the sample variances and covariance, n / (n - 1) times those of the window.
+    downsample : bool
+        Whether to average blocks of ``round(min(H, W) / 256)`` pixels a side first (Wang's suggestion
+        for large images), if that is more than one.
     """
 
     window: Literal["gaussian", "uniform"] = "gaussian"

@@ -233,6 +233,42 @@ def test_packages_of_few_uses_are_imported_in_functions():
     assert found == []
 
 
+NOT_CONVERTED = ("bench/runner/", "bench/executors/", "bench/audit/", "reports/")
+"""Folders whose docstrings still have the form ``name : description``."""
+ENTRIES = re.compile(r"^( *)(?:Parameters|Attributes)\n\1-+\n((?:\1 *(?!\"\"\")\S.*\n)+)", re.MULTILINE)
+
+
+def malformed_entries(source: str) -> list[str]:
+    """Entries of Parameters and Attributes other than ``name : type``, then an indented description."""
+    found = []
+    for indent, section in ENTRIES.findall(source):
+        entry = re.compile(rf"{indent}\*{{0,2}}[\w.]+(, \*{{0,2}}[\w.]+)* : .*[^.,;:\n]\n{indent}    \S")
+        starts = re.finditer(rf"^{indent}\S.*$", section, re.MULTILINE)
+        found += [start[0].strip() for start in starts if not entry.match(section, start.start())]
+    return found
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_entries_of_docstrings_name_types(package):
+    paths = {path.relative_to(ROOT).as_posix(): path for path in SOURCES}
+    wanted = [name for name in paths if name.startswith(package) and not name.startswith(NOT_CONVERTED)]
+    assert [(name, line) for name in wanted for line in malformed_entries(paths[name].read_text())] == []
+
+
+@pytest.mark.parametrize(
+    ("entry", "malformed"),
+    [
+        ("width, height : int\n        Size, pixels.", False),
+        ("width : size in pixels.", True),
+        ("width : size in pixels,\n        and more.", True),
+        ("width\n        Size in pixels.", True),
+    ],
+)
+def test_malformed_entries_are_found(entry, malformed):
+    source = f'    """Draw.\n\n    Parameters\n    ----------\n    {entry}\n    """\n'
+    assert bool(malformed_entries(source)) is malformed
+
+
 def test_names_of_tests_have_at_most_60_characters():
     sources = {path: path.read_text() for path in sorted((ROOT / "tests").rglob("*.py"))}
     names = [

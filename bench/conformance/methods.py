@@ -61,9 +61,12 @@ def check_method(method: ResolvedMethod, clip: Clip, out: Path, *, device: str =
 
     Parameters
     ----------
-    method : with a small budget; the kit fits it once and continues it once.
-    clip : a capture with all three splits.
-    out : empty folder to train into.
+    method : ResolvedMethod
+        Method with a small budget; the kit fits it once and resumes it once.
+    clip : Clip
+        Capture with all three splits.
+    out : Path
+        Empty output folder.
     """
     calls: list[tuple[int, int]] = []
 

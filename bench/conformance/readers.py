@@ -39,8 +39,9 @@ def check_reader(spec: DatasetSpec, path: Path, settings: Mapping[str, Any] | No
 
     Parameters
     ----------
-    path : a capture in the reader's layout, or what its ``find`` takes. Small ones are copied once.
-    settings : keyword arguments of the reader.
+    path : Path
+        Capture in the reader's layout, or a path that its ``find`` accepts. Small captures are copied
+        once.
     """
     if not spec.reads:
         raise InputError("check-plugin", spec.name, "a reader", "one that makes captures")

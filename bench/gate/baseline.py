@@ -80,7 +80,9 @@ def read_results(root: Path) -> Results:
 
     Raises
     ------
-    InputError : no finished run, rows that cannot be read, rows of other protocols than the manifest's.
+    InputError
+        The run is not finished, its rows cannot be read, or they belong to other protocols than the
+        manifest's.
     """
     folder = RunFolder(root)
     manifest = folder.read_manifest()

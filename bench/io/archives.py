@@ -22,9 +22,12 @@ def open_archive(
 
     Parameters
     ----------
-    expected : what the file should be, named in errors.
-    members : most that it may have, each of another name, stored or deflated.
-    spare_bytes, per_byte : all members together unpack to at most ``spare_bytes + per_byte * size of the file``.
+    expected : str
+        Kind of file, named in errors.
+    members : int
+        Maximum number of members. Names must be unique, and members stored or deflated.
+    spare_bytes, per_byte : int
+        All members together unpack to at most ``spare_bytes + per_byte * size of the file``.
     """
     with reading(path, expected), open_regular(path, expected) as stream, zipfile.ZipFile(stream) as archive:
         entries = archive.infolist()

@@ -38,11 +38,17 @@ class Member:
 
     Attributes
     ----------
-    kinds : letters of numpy's kinds of types; "U" is text.
-    shape : of each axis its size, a name for one size wherever it stands, or None for any; None for any shape.
-    most : largest magnitude. Floating-point numbers have to be finite without it, too.
-    dtype : the very type, "" for any of ``kinds``.
-    optional : the file may lack it.
+    kinds : str
+        Letters of NumPy type kinds; "U" is text.
+    shape : tuple[int | str | None, ...] | None
+        For each axis its size, a name for a size that is shared, or None for any size; None allows
+        any shape.
+    most : float | None
+        Largest magnitude. Floating-point numbers must be finite in any case.
+    dtype : str
+        Required type; "" allows any type of ``kinds``.
+    optional : bool
+        Whether the file may lack the member.
     """
 
     kinds: str = "f"

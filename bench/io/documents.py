@@ -92,13 +92,19 @@ def checked(value: Any, kind: type[T], source: Source, prefix: str = "", *, fore
 
     Parameters
     ----------
-    kind : a dataclass, or what annotations can name. Numbers are no text, text is no number, 1.0 is no integer.
-    source : where the value comes from, for the error; ``prefix`` is its dotted key there.
-    foreign : another program's format, whose further entries mean nothing to us; they are refused otherwise.
+    kind : type[T]
+        A dataclass or another annotation. Types are not converted: numbers, text and integers are
+        distinct.
+    source : Source
+        File or option of the value, for the error; ``prefix`` is its dotted key there.
+    foreign : bool
+        Whether this is another program's format, whose unknown entries are ignored. They are refused
+        otherwise.
 
     Raises
     ------
-    InputError : an entry is missing, unknown, or of the wrong type or range.
+    InputError
+        An entry is missing, unknown, or of the wrong type or range.
     """
     from pydantic import ValidationError
 

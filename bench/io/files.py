@@ -52,8 +52,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     Raises
     ------
-    InputError : the folder lies outside the one that `output_inside` was given, by a link.
-    OSError : the system cannot write; ``filename`` is ``path``.
+    InputError
+        A link puts the folder outside of the one given to `output_inside`.
+    OSError
+        The file cannot be written; ``filename`` is ``path``.
     """
     _check_target(path)
     check_inside(path.parent)
@@ -442,9 +444,12 @@ def reading(path: str | os.PathLike[str], expected: str, key: str = "", remedy: 
 
     Parameters
     ----------
-    path : the file that is read; ``key`` is the entry in it.
-    expected : what is being read, such as "a NumPy archive".
-    remedy : what to do about a file that cannot be read.
+    path : str | os.PathLike[str]
+        The file that is read; ``key`` is the entry in it.
+    expected : str
+        Kind of file, such as "a NumPy archive".
+    remedy : str
+        What to do about a file that cannot be read.
     """
     try:
         yield

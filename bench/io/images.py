@@ -95,16 +95,19 @@ def read_pixels(path: Path, size: tuple[int, int] | None = None) -> ByteArray:
 
     Parameters
     ----------
-    size : (width, height) it has to have.
+    size : tuple[int, int] | None
+        Required (width, height).
 
     Returns
     -------
-    8-bit (H, W) grey, (H, W, 3) BGR, or (H, W, 4) BGR with straight alpha where the file has transparency.
+    ByteArray
+        8-bit (H, W) grey, (H, W, 3) BGR, or (H, W, 4) BGR with straight alpha if the file has
+        transparency.
 
     Raises
     ------
     InputError
-        Where `probe_image` does, for another size, and for damage that keeps it from being decoded.
+        `probe_image` refuses the file, it has another size, or it is too damaged to be decoded.
     """
     with open_regular(path, "an image file") as stream:
         info, end = _probe(path, stream)

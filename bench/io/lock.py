@@ -38,8 +38,9 @@ def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
 
     Raises
     ------
-    InputError : another process works in the folder; says which, where and since when. The folder cannot be made,
-        or its lock file is a link.
+    InputError
+        Another process works in the folder (the message gives process, host and time), the folder
+        cannot be created, or its lock file is a link.
     """
     path = folder.resolve().parent / f".{folder.resolve().name}.lock" if beside else folder / LOCK_FILE
     check_inside(folder)

@@ -39,13 +39,14 @@ def read_pickle(path: str | PathLike[str]) -> dict[str, Any]:
 
     Returns
     -------
-    The dictionary: arrays (also 0-d, for numpy scalars), strings, numbers, plain containers.
+    dict[str, Any]
+        The dictionary: arrays (also 0-d, for numpy scalars), strings, numbers, plain containers.
 
     Raises
     ------
     InputError
-        Where the file is missing, is no pickle of such a dictionary, is cut off, or names any global other
-        than those that numpy, scipy.sparse and chumpy need for arrays. Nothing of it is run then.
+        The file is missing, truncated, or not a pickle of such a dictionary, or it names a global
+        that NumPy, scipy.sparse and chumpy arrays do not need. Nothing in the file is executed.
     """
     path = Path(path)
     stream = read_bytes(path, EXPECTED, MAX_BYTES)

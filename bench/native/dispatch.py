@@ -56,8 +56,8 @@ class Operation(Generic[P, Result]):
 
     Attributes
     ----------
-    definition : the decorated function.
-    kernel_form : the compiled form; None where there is none.
+    kernel_form : Callable | None
+        The compiled form, if there is one.
     """
 
     def __init__(self, definition: Callable[P, Result]) -> None:

@@ -19,9 +19,12 @@ class Kernel:
 
     Parameters
     ----------
-    module : absolute name of the module, built by ``bench/native/kernel.cmake``.
-    label : what messages call it.
-    substitute : what is used where it is missing; "" for nothing, so that what needs the module is refused.
+    module : str
+        Absolute name of the module, built by ``bench/native/kernel.cmake``.
+    label : str
+        Name of the kernel in messages.
+    substitute : str
+        What is used without the kernel; "" if nothing replaces it and its users raise an error.
     """
 
     def __init__(self, module: str, label: str, substitute: str = "") -> None:

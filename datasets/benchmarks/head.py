@@ -38,8 +38,10 @@ def sized_head(version: str, shape_size: int, expression_size: int) -> HeadArray
 
     Parameters
     ----------
-    version : of the procedural head, "2020" or "2023"; seeds the bases too.
-    shape_size, expression_size : how many directions.
+    version : str
+        Version of the procedural head, "2020" or "2023"; seeds the bases too.
+    shape_size, expression_size : int
+        Number of directions.
     """
     head = procedural_head(version)
     rng = np.random.default_rng([int(version[-4:]), shape_size, expression_size])

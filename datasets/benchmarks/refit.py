@@ -78,7 +78,8 @@ def performance(head: HeadArrays, timesteps: int, *, seed: int = 0, strength: fl
 
     Parameters
     ----------
-    strength : of the expression; its coefficients' standard deviation.
+    strength : float
+        Standard deviation of the expression coefficients.
     """
     rng = np.random.default_rng(seed)
     size = head.expression_basis.shape[2]

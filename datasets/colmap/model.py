@@ -291,7 +291,7 @@ def read_model(path: str | PathLike[str]) -> ColmapModel:
     Raises
     ------
     InputError
-        Where there is no model, a file is cut short or damaged, or an image's camera is missing.
+        There is no model, a file is truncated or damaged, or an image's camera is missing.
     """
     files = find_model(path)
     if files is None:

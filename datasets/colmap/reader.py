@@ -58,13 +58,15 @@ def model_cameras(
 
     Parameters
     ----------
-    distortion : `Camera` has none. "refuse" raises where a camera of the model has some; "left to the images" gives
-        the cameras of the undistorted images, which `undistort_clip` makes with `model_lenses`.
+    distortion : Literal['refuse', 'left to the images']
+        How to treat distortion, which `Camera` lacks. "refuse" raises if a camera of the model is
+        distorted; "left to the images" gives the cameras of the undistorted images, which
+        `undistort_clip` makes with `model_lenses`.
 
     Raises
     ------
     InputError
-        Where a lens distorts or is not known, or two images have one name.
+        A lens is distorted or unknown, or two images have the same name.
     """
     lenses = {number: _lens(model, number) for number in model.cameras}
     found: dict[str, Camera] = {}
@@ -134,17 +136,23 @@ def read_dataset(
 
     Parameters
     ----------
-    head, masks, regions, eyelids : head model or its file, and what belongs to it; see `find_head`.
-    subject : subject id; "" takes that of the images' names, else the folder's name.
-    background : what the images are composited on, (r, g, b) in [0, 1]; None takes the declared one, else white.
-    held_out_sequences, held_out_cameras : splits as of the reader ``ga``. Without them every frame is for training.
-    exclude, cache_mb, remembered : as of the reader ``ga``.
+    head, masks, regions, eyelids : str | Path | None
+        Head model or its file, and the files that belong to it; see `find_head`.
+    subject : str
+        Subject id; "" takes it from the image names, else from the folder's name.
+    background : Sequence[float] | None
+        Colour that images are composited on, (r, g, b) in [0, 1]; None takes the declared one, else
+        white.
+    held_out_sequences, held_out_cameras : Sequence[str]
+        Splits as for the reader ``ga``. Without them every frame is for training.
+    exclude, cache_mb, remembered : Mapping[int, str] | str | Path | None, float, bool
+        As for the reader ``ga``.
 
     Raises
     ------
     InputError
-        Without tracking, for images whose names give no timestep and camera, for a camera that moves, and for
-        whatever is wrong with a file.
+        There is no tracking, an image name gives no timestep and camera, a camera moves, or a file is
+        invalid.
     """
     root = Path(os.path.abspath(path))
     model = read_model(root)

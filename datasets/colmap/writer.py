@@ -77,15 +77,18 @@ def export_model(
 
     Parameters
     ----------
-    keys : frames to write, at least one; their cameras become the model's.
-    naming : of images, see `image_name`. "flat" is for readers that look for all images in one folder (3D Gaussian
-        splatting and what derives from it); masks are then written under the image's own name, too.
+    keys : Sequence[FrameKey]
+        Frames to write, at least one; their cameras become the model's.
+    naming : Naming
+        Naming of images, see `image_name`. "flat" is for readers that expect all images in one folder
+        (3D Gaussian splatting and its derivatives); masks are then also written under the image's own
+        name.
 
     Raises
     ------
     InputError
-        Where there is no frame, a camera has skew, which COLMAP's pinhole cannot express, or a flat name could be
-        read as that of another frame.
+        There is no frame, a camera has skew, which COLMAP's pinhole cannot express, or a flat name is
+        ambiguous.
     """
     if not keys:
         raise InputError("frames to export", "", "at least one", "none")

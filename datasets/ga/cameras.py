@@ -32,9 +32,12 @@ class CaptureCameras:
 
     Attributes
     ----------
-    views : representative frame entry by camera id, in the first sequence's world.
-    sizes : (width, height) by camera id.
-    shifts : (3,) metres to add to positions of a sequence, by sequence folder; zero for the first.
+    views : Mapping[str, FrameEntry]
+        Representative frame entry by camera id, in the first sequence's world.
+    sizes : Mapping[str, tuple[int, int]]
+        (width, height) by camera id.
+    shifts : Mapping[str, FloatArray]
+        (3,) metres to add to positions of a sequence, by sequence folder; zero for the first.
     """
 
     views: Mapping[str, FrameEntry]

@@ -48,9 +48,10 @@ def content_digests(
 
     Parameters
     ----------
-    remembered_for : the capture that the files belong to: what is remembered of it is taken for files whose `Stamp`
-        is the same, and what is read is remembered. Nothing is kept in that folder, which may come from a stranger,
-        but in ``digests`` of `cache_folder`. None reads every byte.
+    remembered_for : Path | None
+        The capture that the files belong to. Digests of files with an unchanged `Stamp` are taken
+        from the user's cache (``digests`` of `cache_folder`, never the capture itself), and new
+        digests are stored there. None reads every byte.
     """
     paths = sorted(set(files))
     place = _place(remembered_for) if remembered_for else None

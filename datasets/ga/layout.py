@@ -138,14 +138,18 @@ class Declaration:
 
     Attributes
     ----------
-    subject : subject id.
-    head_model : version of the head model the parameters belong to.
-    head_file : the head model's file, relative to the declaration's folder.
-    background : (r, g, b) in [0, 1] that the images are composited on.
-    cy : convention of the JSONs' principal point.
-    sequences : sequence name by sequence folder name.
-    excluded : reason by timestep index of the folder's JSONs: frames no split may hold.
-    synthetic : how the capture was synthesised; empty for a recording.
+    head_model : str
+        Version of the head model of the parameters.
+    head_file : str
+        Head model file, relative to the declaration's folder.
+    background : tuple[float, float, float]
+        (r, g, b) in [0, 1] that the images are composited on.
+    cy : CyConvention
+        Convention of the JSONs' principal point.
+    excluded : Mapping[int, str]
+        Reason by timestep index of the folder's JSONs, for frames that no split may hold.
+    synthetic : Mapping[str, Any]
+        How the capture was synthesised; empty for a recording.
     """
 
     subject: str

@@ -73,30 +73,44 @@ def read_capture(
 
     Parameters
     ----------
-    head, masks, regions, eyelids : head model or its file, and what belongs to it; see `find_head`.
-    subject : subject id; "" takes it from ``headbench.json`` or the folder's name.
-    cy : convention of the principal point. "auto" takes what ``headbench.json`` declares, else compares the
-        tracked mesh with the masks; where the images do not decide and it matters, that is an `InputError`.
-        "centre" puts the principal point at the image centre, as GaussianAvatars does.
-    teeth : see `read_tracking`.
-    background : (r, g, b) in [0, 1]; None takes the declared one, else white. For images without alpha it is
-        exchanged by their masks, see `set_background`.
-    below_neck : keep what lies below the tracked neck; False turns it into background, see `mask_below_neck`.
-    held_out_sequences, held_out_cameras : make new splits instead of taking the JSONs': all frames of
-        these sequences (full names or unique prefixes) are self-reenactment, these cameras' other frames
-        novel view, the rest training.
-    exclude : frames to leave out, added to what ``headbench.json`` declares: reason by timestep, or a file for
-        `read_reasons`, such as the one that ``headbench tongue`` writes.
-    leaks : "error" refuses splits that share data; "record" notes it in the step record.
-    decode : decode every image when checking; finds damage in the middle of files.
-    cache_mb : bound of the decoded images held in memory, in 10^6 bytes.
-    remembered : take the digests of files that the system has not touched since from the user's cache. ``headbench
-        verify`` has it False.
+    head, masks, regions, eyelids : HeadArrays | str | Path | None
+        Head model or its file, and the files that belong to it; see `find_head`.
+    subject : str
+        Subject id; "" takes it from ``headbench.json`` or the folder's name.
+    cy : layout.CyConvention | Literal['auto']
+        Convention of the principal point. "auto" takes the one that ``headbench.json`` declares, else
+        compares the tracked mesh with the masks; an `InputError` is raised if the images do not
+        decide and it matters. "centre" puts the principal point at the image centre, as
+        GaussianAvatars does.
+    teeth : TeethPolicy
+        See `read_tracking`.
+    background : Sequence[float] | None
+        (r, g, b) in [0, 1]; None takes the declared one, else white. In images without alpha it is
+        replaced by means of their masks, see `set_background`.
+    below_neck : bool
+        Whether to keep pixels below the tracked neck; False turns them into background, see
+        `mask_below_neck`.
+    held_out_sequences, held_out_cameras : Sequence[str]
+        Make new splits instead of using the JSONs': all frames of these sequences (full names or
+        unique prefixes) are self-reenactment, these cameras' other frames novel view, the rest
+        training.
+    exclude : Mapping[int, str] | str | Path | None
+        Frames to leave out in addition to those of ``headbench.json``: reason by timestep, or a file
+        for `read_reasons`, such as the one that ``headbench tongue`` writes.
+    leaks : LeakPolicy
+        "error" refuses splits that share data; "record" notes it in the step record.
+    decode : bool
+        Whether to decode every image when checking; finds damage in the middle of files.
+    cache_mb : float
+        Maximum memory for decoded images, in 10^6 bytes.
+    remembered : bool
+        Whether to reuse cached digests of files that have not changed since. ``headbench verify``
+        sets it to False.
 
     Raises
     ------
     InputError
-        For the first fault found.
+        The first fault found.
     """
     folder = find_capture(path)
     declaration = layout.Declaration.read(folder)

@@ -29,15 +29,17 @@ def find_head(
 
     Parameters
     ----------
-    folder : of the capture.
-    head : the head model or its file; None takes the file that ``headbench.json`` names, else the capture's
-        ``head_model.npz``.
-    files : masks, regions and eyelids of `load_head`, which finds them by itself beside a FLAME pickle.
+    head : HeadArrays | str | Path | None
+        The head model or its file; None takes the file that ``headbench.json`` names, else the
+        capture's ``head_model.npz``.
+    files : str | Path | None
+        Arguments masks, regions and eyelids of `load_head`, which finds them by itself beside a FLAME
+        pickle.
 
     Raises
     ------
     InputError
-        Where there is no such file, or its version is not the one the capture was tracked with.
+        The file does not exist, or its version is not the one that the capture was tracked with.
     """
     if isinstance(head, HeadArrays):
         asset = head
@@ -96,15 +98,17 @@ def read_tracking(
 
     Parameters
     ----------
-    teeth : "auto" appends teeth (see `with_teeth`) to every head that has none, as GaussianAvatars does to FLAME, so
-        that all methods have the same; a head without lips to hang them on stays without, unless it is FLAME's or the
-        static offset has rows for them. "add" always appends them; "keep" takes the head as it is.
+    teeth : TeethPolicy
+        "auto" appends teeth (see `with_teeth`) to every head without them, as GaussianAvatars does to
+        FLAME, so that all methods have the same; a head without lip rings stays without teeth, unless
+        it is FLAME's or the static offset has rows for them. "add" always appends them; "keep" does
+        not change the head.
 
     Raises
     ------
     InputError
-        For a missing or damaged file, a missing array, a wrong shape, numbers that are not finite or beyond
-        `MAX_MAGNITUDE`, and coefficients that make no head by its size.
+        A file or array is missing or damaged, a shape is wrong, numbers are not finite or beyond
+        `MAX_MAGNITUDE`, or the size of the mesh is not that of a head.
     """
     poses: dict[int, HeadPose] = {}
     shape = static = None

@@ -107,8 +107,10 @@ def parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any])
 
     Parameters
     ----------
-    where : JSON path to the frame, for messages.
-    document : the whole document, which may state intrinsics for all frames.
+    where : str
+        JSON path of the frame, for messages.
+    document : Mapping[str, Any]
+        The whole document, which may state intrinsics for all frames.
     """
     if not isinstance(frame, dict):
         raise InputError(path, where, "an object", type(frame).__name__)

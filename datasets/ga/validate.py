@@ -30,11 +30,14 @@ def check_images(
 
     Parameters
     ----------
-    decode : decode every file too, which finds damage in the middle (minutes for a large capture).
+    decode : bool
+        Whether to decode every file too, which finds damage in the middle (minutes for a large
+        capture).
 
     Returns
     -------
-    What the header of each image says, by path; masks are checked and not listed.
+    dict[Path, ImageInfo]
+        Image headers by path; masks are checked but not included.
     """
     infos: dict[Path, ImageInfo] = {}
     for done, entry in enumerate(entries, start=1):
@@ -175,8 +178,8 @@ def split_by_holding_out(
 
     Parameters
     ----------
-    sequences : full names, or prefixes that one sequence alone has.
-    cameras : camera ids.
+    sequences : Sequence[str]
+        Full names or unique prefixes.
     """
     keys = sorted(set(keys))
     available = sorted({key.sequence for key in keys})
@@ -207,12 +210,13 @@ def require_full_grid(clip: CaptureClip, source: str | Path = "") -> None:
 
     Parameters
     ----------
-    source : the capture the clip was read from, for the message.
+    source : str | Path
+        The capture that the clip was read from, for the message.
 
     Raises
     ------
     InputError
-        Naming the first frame that is missing, and how many are.
+        Frames are missing. The message names the first one and their number.
     """
     timesteps = sorted({(key.sequence, key.timestep) for key in clip.files})
     wanted = (

@@ -166,17 +166,28 @@ class CapturePlan:
 
     Attributes
     ----------
-    subject : subject id, without underscores, as folder names are parsed by them.
-    head : head model of all poses; V vertices, S identity coefficients.
-    shape : (S,) identity coefficients.
-    static_offset : (V, 3) metres.
-    cameras : in index order; the index is the position.
-    sequences : in any order; the union numbers training sequences first.
-    test_sequences : names of the sequences held out for self-reenactment.
-    novel_view_cameras : ids of the cameras held out for novel views.
-    background : (r, g, b) in [0, 1] that images are composited on.
-    cy : how the JSONs state the principal point; VHAP's own is "bottom".
-    synthetic : how the capture was synthesised (seed, noise, ...); empty for a recording.
+    subject : str
+        Subject id, without underscores because folder names are parsed by them.
+    head : HeadArrays
+        Head model of all poses; V vertices, S identity coefficients.
+    shape : FloatArray
+        (S,) identity coefficients.
+    static_offset : FloatArray
+        (V, 3) metres.
+    cameras : Sequence[Camera]
+        In index order; the index is the position.
+    sequences : Sequence[SequencePlan]
+        In any order; the union numbers training sequences first.
+    test_sequences : Sequence[str]
+        Names of the sequences held out for self-reenactment.
+    novel_view_cameras : Sequence[str]
+        Ids of the cameras held out for novel views.
+    background : tuple[float, float, float]
+        (r, g, b) in [0, 1] that images are composited on.
+    cy : layout.CyConvention
+        How the JSONs state the principal point; VHAP's own is "bottom".
+    synthetic : Mapping[str, Any]
+        How the capture was synthesised (seed, noise, ...); empty for a recording.
     """
 
     subject: str

@@ -55,18 +55,29 @@ class HeadArrays:
 
     Attributes
     ----------
-    version : names the expression basis; poses name it as ``HeadPose.head_model``.
-    template : (V, 3) mean head.
-    faces : (F, 3) int64 triangles, counter-clockwise seen from outside.
-    shape_basis, expression_basis : (V, 3, S), (V, 3, E) metres per unit coefficient.
-    pose_basis : (V, 3, 9 (J-1)); column 9(j-1)+3r+c belongs to (R_j - I)[r, c].
-    joint_regressor : (J, V) dense; joints come from the shaped mesh.
-    skinning_weights : (V, J), rows sum to 1.
-    parents : (J,), the root has -1 and every joint comes after its parent.
-    eyelid_basis : (V, 3, 2) left and right, added after skinning and turned with root and neck; None where the
+    version : str
+        Name of the expression basis, equal to ``HeadPose.head_model`` of its poses.
+    template : FloatArray
+        (V, 3) mean head.
+    faces : IntArray
+        (F, 3) int64 triangles, counter-clockwise seen from outside.
+    shape_basis, expression_basis : FloatArray
+        (V, 3, S), (V, 3, E) metres per unit coefficient.
+    pose_basis : FloatArray
+        (V, 3, 9 (J-1)); column 9(j-1)+3r+c belongs to (R_j - I)[r, c].
+    joint_regressor : FloatArray
+        (J, V) dense; joints come from the shaped mesh.
+    skinning_weights : FloatArray
+        (V, J), rows sum to 1.
+    parents : IntArray
+        (J,), the root has -1 and every joint comes after its parent.
+    eyelid_basis : FloatArray | None
+        (V, 3, 2) left and right, added after skinning and turned with root and neck; None where the
         model has none.
-    regions : vertex indices by name, unique; sorted except for `RING_REGIONS`.
-    landmarks : vertex index by name; may be empty.
+    regions : Mapping[str, IntArray]
+        Vertex indices by name, unique; sorted except for `RING_REGIONS`.
+    landmarks : Mapping[str, int]
+        Vertex index by name; may be empty.
     """
 
     version: str
@@ -87,14 +98,15 @@ class HeadArrays:
 
         Parameters
         ----------
-        file : where the arrays come from; named in the error.
+        file : str | PathLike[str]
+            Source of the arrays, named in the error.
 
         Raises
         ------
         InputError
-            For wrong types and shapes, numbers that are not finite or beyond `MAX_MAGNITUDE`, face or region
-            indices out of range, a joint tree that is none, skinning weights that do not sum to 1, or a mesh
-            that cannot be a head's by its size.
+            Wrong types or shapes, numbers that are not finite or beyond `MAX_MAGNITUDE`, face or
+            region indices out of range, an invalid joint tree, skinning weights that do not sum
+            to 1, or a mesh whose size is not that of a head.
         """
         arrays = {name: np.asarray(getattr(self, name)) for name in STORED}
         if self.eyelid_basis is not None:
@@ -125,13 +137,15 @@ class HeadArrays:
 
         Parameters
         ----------
-        shape : (S,) identity coefficients; None for the mean head.
-        static_offset : (V, 3) metres, added to the shaped template; None for none.
+        shape : FloatArray | None
+            (S,) identity coefficients; None for the mean head.
+        static_offset : FloatArray | None
+            (V, 3) metres, added to the shaped template.
 
         Raises
         ------
         InputError
-            For a pose of another head model.
+            The pose belongs to another head model.
         """
         from .subject import PosedSubject  # with torch
 
@@ -227,7 +241,7 @@ def read_head(path: Path) -> HeadArrays:
     Raises
     ------
     InputError
-        Where the file is not such an npz, lacks a member or holds arrays that make no head.
+        The file is not such an npz, lacks a member, or its arrays do not form a head.
     """
     content = read_arrays(path, {"format": TEXT})
     if str(content["format"]) != FORMAT:
@@ -295,7 +309,7 @@ def faces_in_region(asset: HeadAsset, name: str) -> IntArray:
     Raises
     ------
     InputError
-        Where the head has no such region.
+        The head has no such region.
     """
     if name not in asset.regions:
         known = ", ".join(sorted(asset.regions)) or "no regions"

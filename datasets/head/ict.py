@@ -67,19 +67,23 @@ def ict_head(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> He
 
     Parameters
     ----------
-    file : named in errors.
-    content : members of the npz: ``v_neutral`` and deltas in centimetres, triangles with materials, names,
+    file : str | PathLike[str]
+        Named in errors.
+    content : Mapping[str, np.ndarray]
+        Members of the npz: ``v_neutral`` and deltas in centimetres, triangles with materials, names,
         landmark vertices.
 
     Returns
     -------
-    A head with one identity direction per mode (metres per standard deviation), one expression direction per
-    shape but those of `DROPPED_SHAPES` (coefficients in [0, 1]), and 68 named landmarks.
+    HeadArrays
+        Head with one identity direction per mode (metres per standard deviation), one expression
+        direction for each shape except `DROPPED_SHAPES` (coefficients in [0, 1]), and 68 named
+        landmarks.
 
     Raises
     ------
     InputError
-        Where a member is missing or does not fit the others, or the mesh has not the kit's parts.
+        A member is missing or inconsistent, or the mesh lacks the kit's parts.
     """
     _check(file, content)
     with reading(file, "the mesh of ICT-FaceKit, whose parts can be told apart"):
@@ -208,8 +212,10 @@ class Profile:
 
     Attributes
     ----------
-    length : from nasion to chin.
-    neck_top, neck_base : heights along the neck where the head begins and the shoulders begin.
+    length : float
+        Distance from nasion to chin.
+    neck_top, neck_base : float
+        Heights along the neck at which the head and the shoulders begin.
     """
 
     length: float
@@ -242,8 +248,10 @@ def mesh_parts(
 
     Parameters
     ----------
-    materials : vertices of each material's triangles.
-    jaw_open : (V, 3) displacement of ``jawOpen``, which tells lower teeth from upper ones.
+    materials : Mapping[str, IntArray]
+        Vertices of each material's triangles.
+    jaw_open : FloatArray
+        (V, 3) displacement of ``jawOpen``, which separates lower teeth from upper teeth.
     """
     for name in _MATERIALS:
         if name not in materials or not len(materials[name]):
@@ -381,7 +389,7 @@ def fit_hinge(points: FloatArray, moved: FloatArray) -> Hinge:
     Raises
     ------
     ValueError
-        Where the points hardly turn, so that the motion has no centre.
+        The points hardly turn, so that the motion has no centre.
     """
     plane, target = points[:, 1:], moved[:, 1:]
     middle, target_middle = plane.mean(0), target.mean(0)

@@ -42,26 +42,31 @@ def load_head(
     eyelids: str | PathLike[str] | None = None,
     version: str | None = None,
 ) -> HeadArrays:
-    """Load a head model; what the file is follows from its content.
+    """Load a head model. The kind of file is recognised by its content.
+
+    Files that belong to a FLAME pickle and are not given are searched for in `PLACES` under their usual names,
+    ``FLAME_masks.pkl``, ``l_eyelid.npy`` and ``r_eyelid.npy``, and ``regions.json`` beside the pickle.
 
     Parameters
     ----------
-    path : FLAME pickle (2020: ``generic_model.pkl``, 2023: ``flame2023.pkl``), npz written by `save_head`,
-        or ICT-FaceKit npz.
-    masks : ``FLAME_masks.pkl``, for a FLAME pickle; the derived regions are added.
-    regions : JSON file ``{name: [vertex, ...]}`` with further regions, such as the lip rings.
-    eyelids : folder of ``l_eyelid.npy`` and ``r_eyelid.npy`` (or one of these), (V, 3) metres by which a closed lid moves, as Metrical
-        Tracker and SMIRK ship them.
-    version : names the expression basis. Needed where the file name of a FLAME pickle does not tell
-        ("flame2020", "flame2023"); must agree with what a npz of ours says.
-
-    For a FLAME pickle, files that are not given are used where they lie in one of `PLACES` under their usual names:
-    ``FLAME_masks.pkl``, ``l_eyelid.npy`` and ``r_eyelid.npy``; and ``regions.json`` beside the pickle.
+    path : str | PathLike[str]
+        FLAME pickle (2020: ``generic_model.pkl``, 2023: ``flame2023.pkl``), npz written by
+        `save_head`, or ICT-FaceKit npz.
+    masks : str | PathLike[str] | None
+        ``FLAME_masks.pkl``, for a FLAME pickle; the derived regions are added.
+    regions : str | PathLike[str] | None
+        JSON file ``{name: [vertex, ...]}`` with further regions, such as the lip rings.
+    eyelids : str | PathLike[str] | None
+        Folder of ``l_eyelid.npy`` and ``r_eyelid.npy`` (or one of these), (V, 3) metres by which a
+        closed lid moves, as Metrical Tracker and SMIRK ship them.
+    version : str | None
+        Name of the expression basis. Required if the file name of a FLAME pickle does not contain it
+        ("flame2020", "flame2023"); must agree with the version in an npz of this package.
 
     Raises
     ------
     InputError
-        Where a file is missing, damaged or of no known kind, or holds arrays that make no head.
+        A file is missing, damaged or of an unknown kind, or its arrays do not form a head.
     """
     path = Path(path)
     with open_regular(path, "a head model file") as stream:
@@ -126,7 +131,8 @@ def flame_version(path: Path) -> str:
     Raises
     ------
     InputError
-        Where the name leaves it open: the two files have the same layout, and confusing them goes unnoticed.
+        The name is ambiguous. The two files have the same layout, so confusing them would go
+        unnoticed.
     """
     stem = path.stem.lower().replace("-", "_")
     folder = re.fullmatch("flame[-_ ]?(2020|2023)", path.parent.name.lower())

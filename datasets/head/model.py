@@ -27,8 +27,10 @@ class HeadModel(torch.nn.Module):
 
     Parameters
     ----------
-    asset : a head in FLAME's layout, e.g. `HeadArrays`.
-    dtype, device : of the buffers; inputs have to match.
+    asset : HeadAsset
+        Head in FLAME's layout, e.g. `HeadArrays`.
+    dtype, device : torch.dtype, torch.device | str
+        Type and device of the buffers; inputs must match.
     """
 
     template: Tensor
@@ -103,21 +105,31 @@ class HeadModel(torch.nn.Module):
 
         Parameters
         ----------
-        shape : (B, S) identity coefficients.
-        expression : (B, E).
-        rotation, neck, jaw : (B, 3); ``rotation`` turns about joint 0, not about the origin.
-        eyes : (B, 6) left, then right.
-        translation : (B, 3).
-        static_offset : (B, V, 3) or (V, 3), added to the shaped template.
-        eyelids : (B, 2) left, right; only for models with eyelid bases. Added after skinning and turned with root
-            and neck, so that a head moves rigidly with its lids; trackers that have them keep both at rest.
-        canonical : (B, V, 3), what `canonical` gave for this identity; replaces ``shape`` and
-            ``static_offset``. Worth it where the identity is fixed: the identity basis is the largest array.
+        shape : Tensor | None
+            (B, S) identity coefficients.
+        expression : Tensor
+            (B, E).
+        rotation, neck, jaw : Tensor
+            (B, 3); ``rotation`` turns about joint 0, not about the origin.
+        eyes : Tensor
+            (B, 6) left, then right.
+        translation : Tensor
+            (B, 3).
+        static_offset : Tensor | None
+            (B, V, 3) or (V, 3), added to the shaped template.
+        eyelids : Tensor | None
+            (B, 2) left, right; only for models with eyelid bases. Added after skinning and turned
+            with root and neck, so that lids move rigidly with the head; trackers that have them
+            keep both at rest.
+        canonical : Tensor | None
+            (B, V, 3) output of `canonical` for this identity; replaces ``shape`` and
+            ``static_offset``. Saves time if the identity is fixed, because the identity basis is
+            the largest array.
 
         Raises
         ------
         ValueError
-            Where sizes do not fit the model, or identity is given both ways or not at all.
+            Sizes do not fit the model, or identity is given twice or not at all.
         """
         neutral = self._neutral(shape, static_offset, canonical)
         expression = _rows(expression, self.expression_size, "expression")
@@ -199,7 +211,7 @@ class HeadModel(torch.nn.Module):
         Raises
         ------
         InputError
-            Where there is no pose, one belongs to another head model, or its sizes do not fit.
+            There is no pose, a pose belongs to another head model, or its sizes do not fit.
         """
         if not poses:
             raise InputError("poses", "", "at least one pose", "none")
@@ -259,13 +271,17 @@ def joint_motions(rotations: Tensor, joints: Tensor, parents: Sequence[int]) -> 
 
     Parameters
     ----------
-    rotations : (B, J, 3, 3) local rotation of each joint relative to its parent.
-    joints : (B, J, 3) rest positions; the root stays where it is.
-    parents : parent of each joint, -1 for the root; parents come first.
+    rotations : Tensor
+        (B, J, 3, 3) local rotation of each joint relative to its parent.
+    joints : Tensor
+        (B, J, 3) rest positions; the root does not move.
+    parents : Sequence[int]
+        Parent of each joint, -1 for the root; parents come first.
 
     Returns
     -------
-    (B, J, 3, 4): R and o of each joint.
+    Tensor
+        (B, J, 3, 4): R and o of each joint.
     """
     turns = [rotations[:, 0]]
     shifts = [joints[:, 0] - (turns[0] @ joints[:, 0, :, None])[..., 0]]

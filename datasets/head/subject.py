@@ -28,10 +28,10 @@ class PosedSubject:
 
     Parameters
     ----------
-    head : the model.
-    shape : (S,) identity coefficients.
-    static_offset : (V, 3) metres.
-    dtype : that everything is computed in.
+    shape : FloatArray
+        (S,) identity coefficients.
+    static_offset : FloatArray
+        (V, 3) metres.
     """
 
     def __init__(

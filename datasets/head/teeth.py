@@ -43,7 +43,7 @@ def with_teeth(arrays: HeadArrays) -> HeadArrays:
     Raises
     ------
     InputError
-        Where the head has teeth already, or no lip rings and none can be found.
+        The head has teeth already, or no lip rings are given or found.
     """
     if "teeth" in arrays.regions:
         found = f"{len(arrays.regions['teeth'])} vertices"
@@ -167,13 +167,16 @@ def lip_rings(asset: HeadAsset, length: int = RING_LENGTH) -> tuple[IntArray, In
 
     Parameters
     ----------
-    asset : its ring regions are returned as they are if it has both; otherwise the rings are found from ``lips``.
-    length : n of rings that are found; fewer if the lips have fewer vertices there.
+    asset : HeadAsset
+        Head whose ring regions are returned unchanged if it has both; otherwise the rings are found
+        from ``lips``.
+    length : int
+        Number of vertices of rings that are found; fewer if the lips have fewer.
 
     Raises
     ------
     InputError
-        Where rings are given but differ in length, or none can be found.
+        The given rings differ in length, or none can be found.
     """
     where = f"head model {asset.version!r}"
     if all(name in asset.regions for name in RING_REGIONS):

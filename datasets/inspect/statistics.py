@@ -34,14 +34,20 @@ class SequenceRow:
 
     Attributes
     ----------
-    held_out : whether its timesteps are tests of self-reenactment.
-    jaw_deg : least, median and largest opening of the jaw, degrees.
-    head_deg : largest turn of the head away from its mean direction, degrees.
-    head_mm : largest distance of the head from its mean place, millimetres.
-    expression_sigma : root mean square over timesteps of the coefficients' length over sqrt(E): 1 where every
-        coefficient scatters by its standard deviation of 1.
-    largest_coefficient : largest absolute coefficient.
-    reach_mm : median and largest displacement of the farthest-moving vertex by expression alone, millimetres.
+    held_out : bool
+        Whether its timesteps test self-reenactment.
+    jaw_deg : tuple[float, float, float]
+        Minimum, median and maximum opening of the jaw, degrees.
+    head_deg : float
+        Largest rotation of the head from its mean direction, degrees.
+    head_mm : float
+        Largest distance of the head from its mean position, millimetres.
+    expression_sigma : float
+        Root mean square over timesteps of the coefficients' length over sqrt(E): 1 if every
+        coefficient has a standard deviation of 1.
+    reach_mm : tuple[float, float]
+        Median and maximum displacement of the farthest-moving vertex by expression alone,
+        millimetres.
     """
 
     sequence: str
@@ -62,12 +68,18 @@ class ExpressionSpace:
 
     Attributes
     ----------
-    timesteps : of the capture, excluded ones left out.
-    held_out : (T,) whether a timestep is tested on.
-    scores_mm : (T, K) root-mean-square displacement of the face's vertices along each component.
-    explained : (K,) share of the training variance.
-    novelty_mm : by held-out timestep, RMS distance of its face to the nearest training face.
-    novelty : of each held-out sequence against training.
+    timesteps : Sequence[int]
+        Timesteps of the capture without excluded ones.
+    held_out : np.ndarray
+        (T,) whether a timestep is held out.
+    scores_mm : FloatArray
+        (T, K) root-mean-square displacement of the face's vertices along each component.
+    explained : FloatArray
+        (K,) share of the training variance.
+    novelty_mm : Mapping[int, float]
+        RMS distance of the face to the nearest training face, by held-out timestep.
+    novelty : Mapping[str, Novelty]
+        Novelty of each held-out sequence against training.
     """
 
     timesteps: Sequence[int]

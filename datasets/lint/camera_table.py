@@ -65,19 +65,33 @@ class CameraFacts:
 
     Attributes
     ----------
-    frames : images measured.
-    level : mean grey level, 0 to 255.
-    contrast : largest `structure` of its images, grey levels: about 0 for images of one colour.
-    motion : largest `structure` of the difference of two of its images, grey levels: about 0 for a frozen picture.
-    match : correlation, -1 to 1, of the face's brightness with the other cameras', at the best offset.
-    offset : (2,) pixels right and down from where the calibration projects the face to where the image shows it.
-    metres_per_pixel, degrees_per_pixel : at the head's distance.
-    height, scale : of the images in pixels; over that of the images measured.
-    lag : frames by which its images are late (positive) or early, whole.
-    unsteady, unsteady_at_lag : median distance in pixels of the offsets over time from their median, without a lag and with it.
-    sharpness : log2 of the contrast of fine details of the face over that in the other cameras.
-    fits : where its own calibration is in doubt, the camera whose calibration matches the images better, "" for none.
-    fits_match : the correlation under that calibration.
+    level : float
+        Mean grey level, 0 to 255.
+    contrast : float
+        Largest `structure` of its images, grey levels: about 0 for images of one colour.
+    motion : float
+        Largest `structure` of the difference of two of its images, grey levels: about 0 for a frozen
+        image.
+    match : float
+        Correlation, -1 to 1, of the face's brightness with the other cameras', at the best offset.
+    offset : tuple[float, float]
+        (2,) pixels right and down from the projected face to the face in the image.
+    metres_per_pixel, degrees_per_pixel : float
+        Pixel size at the head's distance.
+    height, scale : int, float
+        Image height in pixels, and its ratio to the height of the images measured.
+    lag : int
+        Frames by which its images are late (positive) or early, whole.
+    unsteady, unsteady_at_lag : float
+        Median distance in pixels of the offsets over time from their median, without a lag and with
+        it.
+    sharpness : float
+        log2 of the contrast of fine details of the face relative to the other cameras.
+    fits : str
+        If its own calibration is in doubt, the camera whose calibration matches the images better,
+        otherwise "".
+    fits_match : float
+        Correlation under that calibration.
     """
 
     frames: int

@@ -52,22 +52,31 @@ class Evidence:
 
     Attributes
     ----------
-    folder : of the capture.
-    of_layout : whether the files of the GaussianAvatars/VHAP layout were read; else what another reader gives.
-    background : declared, else white.
-    declaration : its ``headbench.json``, None where there is none or it is broken.
-    splits : frames that could be read, by split.
-    unread : slots of frames that a JSON lists and that could not be read.
-    declaration_faults, json_faults, frame_faults, file_faults, head_faults : why things could not be read.
-    headers : of the images and masks that are there, by path.
-    digests : of the content of every image that is there.
-    parameters : by timestep.
-    subject : head and identity that fit the parameters; None where no file does.
-    views : decoded sample frames.
-    thumbnails : of the images searched for near-duplicates.
-    expression_fit : how well expressions explain the images; None where that cannot be told.
-    cameras : measurements of each camera by its id.
-    refusal : why `read_capture` refuses the capture, None where it does not.
+    of_layout : bool
+        Whether the files of the GaussianAvatars/VHAP layout were read. Otherwise the data come from
+        another reader.
+    background : tuple[float, ...]
+        Declared colour, else white.
+    declaration : layout.Declaration | None
+        Its ``headbench.json``; None if it is missing or invalid.
+    splits : Mapping[str, tuple[FrameEntry, ...]]
+        Frames that could be read, by split.
+    unread : frozenset[Slot]
+        Slots of frames that a JSON lists and that could not be read.
+    declaration_faults, json_faults, frame_faults, file_faults, head_faults : Sequence[InputError]
+        Reasons why content could not be read.
+    headers : Mapping[Path, ImageInfo]
+        Headers of the existing images and masks, by path.
+    digests : Mapping[Path, str]
+        Content digest of every existing image.
+    subject : TrackedSubject | None
+        Head and identity that fit the parameters; None if no file fits.
+    thumbnails : Sequence[Thumbnail]
+        Thumbnails of the images searched for near-duplicates.
+    expression_fit : ExpressionFit | None
+        How well expressions explain the images; None if that cannot be measured.
+    refusal : InputError | None
+        Error of `read_capture`; None if it accepts the capture.
     """
 
     folder: Path

@@ -80,8 +80,10 @@ def weigh_expression(
 
     Parameters
     ----------
-    entries : frames whose images are there.
-    views : sample frames; the camera that they show to look most into the face is taken.
+    entries : Sequence[FrameEntry]
+        Frames with existing images.
+    views : Sequence[ViewFacts]
+        Sample frames; the most frontal camera in them is used.
     """
     camera = _facing_camera(views)
     if subject is None or camera is None:

@@ -30,12 +30,18 @@ class Parameters:
 
     Attributes
     ----------
-    arrays : as stored, but for the per-vertex `OFFSETS`; empty where the file does not read.
-    not_finite : names of arrays with NaN or infinite numbers.
-    offset_change_m : largest difference of its static offset from the first file's; 0 where it has none.
-    dynamic_m : largest entry of its dynamic offset; 0 where it has none.
-    pose : None where the head is unknown or the arrays do not fit it.
-    error : why there is no pose.
+    arrays : Mapping[str, np.ndarray]
+        Stored arrays without the per-vertex `OFFSETS`; empty if the file cannot be read.
+    not_finite : tuple[str, ...]
+        Names of arrays with NaN or infinite numbers.
+    offset_change_m : float
+        Largest difference of its static offset from the first file's; 0 without one.
+    dynamic_m : float
+        Largest entry of its dynamic offset; 0 without one.
+    pose : HeadPose | None
+        None if the head is unknown or the arrays do not fit it.
+    error : InputError | None
+        Why there is no pose.
     """
 
     timestep: int
@@ -141,16 +147,26 @@ class MeshFacts:
 
     Attributes
     ----------
-    vertices : (V, 3) in the world of the frame's sequence, metres.
-    camera : as the frame states it, of the image's size.
-    distance : from the camera to the mesh's centre, metres.
-    depth : of that centre along the viewing direction; negative behind the camera.
-    upright : cosine between the image's and the head's upward directions.
-    facing : cosine between the face's direction and that from head to camera.
-    face_outside : share of the face's vertices that fall outside the foreground, None without a mask.
-    overlap : intersection over union of mesh and foreground, None without a mask.
-    size : area of the mesh over that of the foreground, None without a mask.
-    skin : median colour (3,) of the face's visible skin, 8-bit levels; None where little of it shows.
+    vertices : FloatArray
+        (V, 3) in the world of the frame's sequence, metres.
+    camera : Camera
+        Camera of the frame, at the image's size.
+    distance : float
+        Distance from the camera to the mesh's centre, metres.
+    depth : float
+        Depth of that centre along the viewing direction; negative behind the camera.
+    upright : float
+        Cosine of the angle between the upward directions of image and head.
+    facing : float
+        Cosine of the angle between the face's direction and the direction from head to camera.
+    face_outside : float | None
+        Fraction of the face's vertices outside of the foreground; None without a mask.
+    overlap : float | None
+        Intersection over union of mesh and foreground; None without a mask.
+    size : float | None
+        Area of the mesh divided by that of the foreground; None without a mask.
+    skin : FloatArray | None
+        Median colour (3,) of the face's visible skin, 8-bit levels; None if little of it is visible.
     """
 
     vertices: FloatArray

@@ -38,11 +38,17 @@ class Rule:
 
     Attributes
     ----------
-    code : stable name, "HB" and three digits; the first digit is the subject (see `catalogue`).
-    title : the fault in a few words.
-    remedy : what to do about it.
-    check : evidence to hits; no hit where what it needs could not be read.
-    of_layout : looks at files of the GaussianAvatars/VHAP layout; skipped where another reader read the capture.
+    code : str
+        Stable name, "HB" and three digits; the first digit is the subject (see `catalogue`).
+    title : str
+        The fault in a few words.
+    remedy : str
+        How to fix it.
+    check : Callable
+        Function from evidence to hits; no hits if the data that it needs could not be read.
+    of_layout : bool
+        Whether it checks files of the GaussianAvatars/VHAP layout; skipped for captures of other
+        readers.
     """
 
     code: str

@@ -47,14 +47,17 @@ class MaskFacts:
 
     Attributes
     ----------
-    low, high : least and largest value of the mask.
-    coverage : share of the image that it covers.
-    outside : median colour (3,) far from the foreground, 8-bit levels; None where there is nothing outside.
-    outside_off : share of those pixels that are not of the declared background's colour.
-    inside_empty : share of the foreground that is of the background's colour.
-    fringe : median over soft pixels of what the subject adds to the image over what it should add,
-        (I - (1-a) B) / (a F), with F the mean colour of the covered pixels nearby; 1 for a clean straight-alpha
-        composite, a (0.5) for one premultiplied twice. None where too few soft pixels tell.
+    outside : FloatArray | None
+        Median colour (3,) far from the foreground, 8-bit levels; None if there are no such pixels.
+    outside_off : float
+        Fraction of those pixels that differ from the declared background.
+    inside_empty : float
+        Fraction of the foreground that has the background's colour.
+    fringe : float | None
+        Median over soft pixels of (I - (1-a) B) / (a F), the subject's measured contribution to the
+        image over the expected one, with F the mean colour of the covered pixels nearby; 1 for a
+        clean straight-alpha composite, a (0.5) for one premultiplied twice. None with too few soft
+        pixels.
     """
 
     low: int
@@ -72,16 +75,24 @@ class ViewFacts:
 
     Attributes
     ----------
-    low, high : least and largest level of any pixel's channels.
-    subject_low, subject_high : the same over pixels that the subject covers wholly.
-    grey : whether no pixel has any colour.
-    corners : median colour (3,) of the upper corners.
-    corners_off : share of their pixels that are not of the declared background's colour.
-    blank : whether its pixels (where there is a mask, the subject's) have no more contrast than noise has.
-    has_alpha : whether the image has an alpha channel, which then is its mask.
-    mask : None without a mask, or where the mask does not decode or is of another size.
-    mesh : None where the frame has no pose or no head.
-    error : why the image does not decode; all else is then empty.
+    low, high : int
+        Minimum and maximum level of any pixel's channels.
+    subject_low, subject_high : int
+        The same over pixels that the subject covers wholly.
+    corners : FloatArray | None
+        Median colour (3,) of the upper corners.
+    corners_off : float
+        Fraction of their pixels that differ from the declared background.
+    blank : bool
+        Whether its pixels (the subject's if there is a mask) have no more contrast than noise.
+    has_alpha : bool
+        Whether the image has an alpha channel, which then is its mask.
+    mask : MaskFacts | None
+        None without a mask, or if it cannot be decoded or has another size.
+    mesh : MeshFacts | None
+        None if the frame has no pose or no head.
+    error : InputError | None
+        Why the image cannot be decoded; all other fields are then empty.
     """
 
     entry: FrameEntry
@@ -127,9 +138,12 @@ class Pixels:
 
     Attributes
     ----------
-    headers : of the images and masks that are there, by path.
-    image : of a frame, (H, W, 3), on the background.
-    mask : of a frame, (H, W); None where it has none of its image's size.
+    headers : Mapping[Path, ImageInfo]
+        Headers of the existing images and masks, by path.
+    image : Callable
+        Function from a frame to its image (H, W, 3) on the background.
+    mask : Callable
+        Function from a frame to its mask (H, W); None without a mask of the image's size.
     """
 
     headers: Mapping[Path, ImageInfo]
@@ -271,9 +285,13 @@ class Thumbnail:
 
     Attributes
     ----------
-    grey : (SIDE, SIDE) float32 levels.
-    bits : (SIDE * (SIDE - 1),) float32, +1 where brightness grows to the right by more than a level, else -1.
-    shown : (SIDE, SIDE) bool, where it differs from the upper corners.
+    grey : FloatArray
+        (SIDE, SIDE) float32 levels.
+    bits : FloatArray
+        (SIDE * (SIDE - 1),) float32, +1 where brightness increases to the right by more than a level,
+        else -1.
+    shown : np.ndarray
+        (SIDE, SIDE) bool, whether it differs from the upper corners.
     """
 
     split: str

@@ -117,9 +117,12 @@ class MeshFit:
 
         Parameters
         ----------
-        mesh : (V, 3).
-        shaped : (V, 3) head with identity and expression, unposed.
-        known : (9,) jaw and eyes where they are known, so that the eyelids alone are fitted.
+        mesh : FloatArray
+            (V, 3).
+        shaped : FloatArray
+            (V, 3) head with identity and expression, unposed.
+        known : FloatArray | None
+            (9,) jaw and eyes if they are known; only the eyelids are fitted then.
         """
         turns, lids = np.zeros(9) if known is None else known, np.zeros(self._lids.shape[2])
         rows = self._rows

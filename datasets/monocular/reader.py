@@ -73,20 +73,27 @@ def read_video(
 
     Parameters
     ----------
-    head, masks, regions, eyelids : head model that the video was tracked with, FLAME 2020 as a rule, see `find_head`.
-    subject : subject id; "" takes it from ``headbench.json`` or the folder's name.
-    teeth : as of the reader ``ga``.
-    background : (r, g, b) in [0, 1] that straight alpha and masked images are composited on; None takes the declared
-        one, else white.
-    held_out_frames : so many of the last frames are self-reenactment. None takes the split that the folder has, else
-        350, or a quarter of a video with fewer than 700 frames.
-    held_out_sequences : videos, by name, that are self-reenactment, in place of the last frames.
-    exclude, cache_mb, remembered : as of the reader ``ga``.
+    head, masks, regions, eyelids : HeadArrays | str | Path | None
+        Head model that the video was tracked with, usually FLAME 2020; see `find_head`.
+    subject : str
+        Subject id; "" takes it from ``headbench.json`` or the folder's name.
+    teeth : TeethPolicy
+        As for the reader ``ga``.
+    background : Sequence[float] | None
+        (r, g, b) in [0, 1] that straight alpha and masked images are composited on; None takes the
+        declared one, else white.
+    held_out_frames : int | None
+        Number of last frames for self-reenactment. None takes the split of the folder, else 350, or a
+        quarter of a video with fewer than 700 frames.
+    held_out_sequences : Sequence[str]
+        Names of the videos for self-reenactment, instead of the last frames.
+    exclude, cache_mb, remembered : Mapping[int, str] | str | Path | None, float, bool
+        As for the reader ``ga``.
 
     Raises
     ------
     InputError
-        For the first fault found.
+        The first fault found.
     """
     root = Path(os.path.abspath(path))
     declaration = Declaration.read(root)

@@ -30,11 +30,14 @@ class VideoFrame:
 
     Attributes
     ----------
-    where : file and entry, for messages.
-    sequence, number : the video's name, and the frame's number in its file's name.
-    image, mask : files; the mask is the image itself where that has straight alpha.
-    camera : of this frame alone.
-    pose : in the world that ``camera`` maps from; its timestep is not set yet.
+    where : tuple[Path, str]
+        File and entry, for messages.
+    sequence, number : str, int
+        The video's name, and the frame's number in its file name.
+    image, mask : Path
+        Files; the mask is the image itself if that has straight alpha.
+    pose : HeadPose
+        Pose in the world that ``camera`` maps from; its timestep is not set yet.
     """
 
     where: tuple[Path, str]
@@ -57,12 +60,18 @@ class Track:
 
     Attributes
     ----------
-    frames : sorted by `VideoFrame.name`, each once.
-    shape : (S,) identity coefficients of the head model.
-    hard_masks : masks are cut at one half, as the layout's own loader does.
-    held_out : names of the frames that the layout itself holds out; None where it says nothing.
-    files : all that was read, images aside.
-    notes : what the layout leaves open, and how it was settled.
+    frames : Sequence[VideoFrame]
+        Sorted by `VideoFrame.name`, without duplicates.
+    shape : FloatArray
+        (S,) identity coefficients of the head model.
+    hard_masks : bool
+        Whether masks are thresholded at one half, as the layout's own loader does.
+    held_out : frozenset[tuple[str, int]] | None
+        Names of the frames that the layout holds out; None if it does not define a split.
+    files : frozenset[Path]
+        All files that were read, except images.
+    notes : Mapping[str, Any]
+        What the layout leaves open, and the choice that was made.
     """
 
     frames: Sequence[VideoFrame]

@@ -33,10 +33,12 @@ class UnionReport:
 
     Attributes
     ----------
-    fault : the first fault, or "".
-    notes : what is unusual, though readable.
-    free : the sequence folder of FREE beside it, or "".
-    rejoined : the union of the paper's split that was written, or "".
+    notes : tuple[str, ...]
+        Unusual but readable properties.
+    free : str
+        The sequence folder of FREE beside it, or "".
+    rejoined : str
+        The written union with the paper's split, or "".
     """
 
     subject: str

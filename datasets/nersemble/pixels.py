@@ -180,14 +180,19 @@ def prepare_pixels(
 
     Parameters
     ----------
-    bgr : (H, W, 3) as OpenCV decodes.
-    mask : (H, W) foreground coverage, or None: the image then keeps its background.
-    size : (width, height) of the result, at most the frame's.
-    still : (H, W, 3) as OpenCV decodes, the empty set from the same camera.
+    bgr : ByteArray
+        (H, W, 3) in OpenCV's channel order.
+    mask : ByteArray | None
+        (H, W) foreground coverage; with None the image keeps its background.
+    size : tuple[int, int]
+        (width, height) of the result, at most the frame's.
+    still : ByteArray | None
+        (H, W, 3) image of the empty set from the same camera, in OpenCV's channel order.
 
     Returns
     -------
-    (h, w, 3) RGB and the (h, w) mask, or None without a mask.
+    tuple[ByteArray, ByteArray | None]
+        (h, w, 3) RGB and the (h, w) mask, or None without a mask.
     """
     if mask is None:
         rgb = cv2.cvtColor(_shrink(bgr, size), cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)

@@ -45,12 +45,15 @@ class SequenceJob:
 
     Attributes
     ----------
-    recorded : the raw frames.
-    cameras : in index order, of the prepared images, in the aligned world.
-    corrections : colour correction by serial; empty for none.
-    stills : the empty set by serial, where its light is to be taken out of soft edges; empty for nowhere.
-    tracked : parameters, or None where there are none yet.
-    folder : to write.
+    cameras : Sequence[Camera]
+        Cameras of the prepared images in index order, in the aligned world.
+    corrections : Mapping[str, Correction]
+        Colour correction by serial; empty for none.
+    stills : Mapping[str, Path]
+        Images of the empty set by serial, used to remove its light from soft edges; empty to skip
+        this.
+    tracked : TrackedSequence | None
+        Parameters, or None if there are none yet.
     """
 
     recorded: RecordedSequence

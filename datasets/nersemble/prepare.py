@@ -54,10 +54,14 @@ class SubjectResult:
 
     Attributes
     ----------
-    written, kept : images.
-    frames : frames per split of the union; empty where there is none.
-    union : the folder to give to a reader, or None.
-    missing : what keeps the capture from being whole, one sentence each.
+    written, kept : int
+        Number of images.
+    frames : dict[str, int]
+        Frames per split of the union; empty where there is none.
+    union : Path | None
+        The folder to give to a reader, or None.
+    missing : tuple[str, ...]
+        Reasons why the capture is not complete, one sentence each.
     """
 
     subject: str

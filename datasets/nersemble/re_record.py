@@ -47,8 +47,8 @@ def re_record(
     Raises
     ------
     InputError
-        Where a camera has no frame at some timestep, before anything is written; ``source``, the capture the
-        clip was read from, is named.
+        A camera lacks a frame at some timestep, which is checked before writing; the message names
+        ``source``, the capture that the clip was read from.
     """
     require_full_grid(clip, source)
     writer = RecordingWriter(root, clip.subject, [*clip.cameras.values()], release)
@@ -135,9 +135,12 @@ class RecordingWriter:
 
     Parameters
     ----------
-    subject : three-digit id from 900.
-    cameras : in the order of the rig; sizes are those of the recorded images.
-    release : whose folders: "v2", "v1" (parts merged) or "paper2023" (a folder of PNGs per frame).
+    subject : str
+        Three-digit id from 900.
+    cameras : Sequence[Camera]
+        Cameras in the order of the rig, with the sizes of the recorded images.
+    release : Release
+        Layout: "v2", "v1" (parts merged) or "paper2023" (a folder of PNGs per frame).
     """
 
     def __init__(self, root: Path, subject: str, cameras: Sequence[Camera], release: Release = "v2"):

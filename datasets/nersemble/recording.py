@@ -46,11 +46,16 @@ class Participant:
 
     Attributes
     ----------
-    subject : three-digit id.
-    calibration_file : ``camera_params.json``.
-    sequences : folder by full sequence name, ``BACKGROUND`` left out.
-    backgrounds : still of the empty set by serial.
-    listed : sequences that the release's metadata lists; empty where there is none.
+    subject : str
+        Three-digit id.
+    calibration_file : Path
+        ``camera_params.json``.
+    sequences : Mapping[str, Path]
+        Folder by full sequence name, without ``BACKGROUND``.
+    backgrounds : Mapping[str, Path]
+        Still of the empty set by serial.
+    listed : tuple[str, ...]
+        Sequences that the release's metadata lists; empty without metadata.
     """
 
     subject: str
@@ -171,10 +176,14 @@ class Calibration:
 
     Attributes
     ----------
-    file : where they come from, for error messages.
-    world_to_camera : (4, 4) by serial.
-    intrinsics : (3, 3) by serial, pixels of an image of ``size``.
-    size : (width, height) that the intrinsics refer to; None where they refer to the images as they are.
+    file : Path
+        Source of the values, for error messages.
+    world_to_camera : Mapping[str, FloatArray]
+        (4, 4) by serial.
+    intrinsics : Mapping[str, FloatArray]
+        (3, 3) by serial, pixels of an image of ``size``.
+    size : tuple[int, int] | None
+        (width, height) that the intrinsics refer to; None if they refer to the images as they are.
     """
 
     file: Path

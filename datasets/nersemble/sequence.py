@@ -42,12 +42,18 @@ class RecordedView:
 
     Attributes
     ----------
-    serial : of the camera.
-    video : the video, or None where the frames are image files.
-    images : image file by frame number; empty for a video.
-    count : frames there are.
-    size : (width, height).
-    mask_video, masks : foreground coverage in the same form as the frames, where there is any.
+    serial : str
+        Serial number of the camera.
+    video : Path | None
+        The video, or None if the frames are image files.
+    images : Mapping[int, Path]
+        Image file by frame number; empty for a video.
+    count : int
+        Number of frames.
+    size : tuple[int, int]
+        (width, height).
+    mask_video, masks : Path | None, Mapping[int, Path]
+        Foreground coverage in the same form as the frames, if present.
     """
 
     serial: str
@@ -110,17 +116,23 @@ def read_sequence(
 
     Parameters
     ----------
-    wanted : its name or a unique prefix.
-    cameras : serials; empty for all cameras of the calibration.
-    every : keep the frames whose number this divides; None keeps every third of videos and of the 2023 frame
-        folders, which run at 73 per second, and all images that VHAP's preprocessing wrote (25 per second).
-    cut : where cameras differ in their frames, keep those that all have, instead of an error.
+    wanted : str
+        Its name or a unique prefix.
+    cameras : Sequence[str]
+        Serials; empty for all cameras of the calibration.
+    every : int | None
+        Frame stride: keep the frames whose number it divides. None keeps every third frame of videos
+        and of the 2023 frame folders, which have 73 frames per second, and all images of VHAP's
+        preprocessing (25 per second).
+    cut : bool
+        Whether to keep only the frames that all cameras have if they differ, instead of raising an
+        error.
 
     Raises
     ------
     InputError
-        For a camera without frames, frames without a camera, truncated videos, damaged headers, frame counts
-        that differ between cameras, masks that are missing in part or of another size.
+        A camera without frames, frames without a camera, truncated videos, damaged headers, different
+        frame counts, or masks that are incomplete or of another size.
     """
     name = participant.match(wanted)
     folder = participant.sequences[name]

@@ -26,10 +26,13 @@ class TrackedSequence:
 
     Attributes
     ----------
-    file : where they come from.
-    frames : arrays with T rows: those of `POSE_SIZES`, ``expr``, and ``dynamic_offset`` and ``eyelids`` where
-        there are any.
-    constant : ``shape`` (S,) and ``static_offset`` (1, V, 3), zeros where the tracker wrote none.
+    file : Path
+        Source of the values.
+    frames : Mapping[str, FloatArray]
+        Arrays with T rows: those of `POSE_SIZES`, ``expr``, and ``dynamic_offset`` and ``eyelids`` if
+        present.
+    constant : Mapping[str, FloatArray]
+        ``shape`` (S,) and ``static_offset`` (1, V, 3), zeros if the tracker wrote none.
     """
 
     file: Path

@@ -45,12 +45,18 @@ class ExpressionClusters:
 
     Attributes
     ----------
-    timesteps : (T,) sorted training timesteps.
-    labels : (T,) class of each, from 0; every class has a member.
-    medoids : (classes,) timestep of each class that is the nearest to its centre in the spectral embedding.
-    landmarks : timesteps that stood for all; T where all pairs were compared.
-    radius : metres within which every face has a landmark; 0 where all pairs were compared.
-    variant : "official" where the published behaviour was asked for.
+    timesteps : IntArray
+        (T,) sorted training timesteps.
+    labels : IntArray
+        (T,) class of each, from 0; no class is empty.
+    medoids : IntArray
+        (classes,) timestep of each class that is nearest to its centre in the spectral embedding.
+    landmarks : int
+        Number of landmark timesteps; T if all pairs were compared.
+    radius : float
+        Metres within which every face has a landmark; 0 if all pairs were compared.
+    variant : str
+        "official" for the published behaviour.
     """
 
     timesteps: IntArray
@@ -94,14 +100,17 @@ def cluster_expressions(
 
     Parameters
     ----------
-    seed : decides the first landmark, or the random starts of "official"; all pairs without it need none.
-    variant : "official" reproduces the published code: all pairs however many, k-means from ten random starts.
-        It sees training timesteps alone, as the default does.
+    seed : int
+        Seed of the first landmark, or of the random starts of "official"; unused for all pairs
+        otherwise.
+    variant : Literal['paper', 'official']
+        "official" reproduces the published code: all pairs regardless of their number, k-means from
+        ten random starts. Both use training timesteps only.
 
     Raises
     ------
     InputError
-        Where the head has no region "face".
+        The head has no region "face".
     """
     timesteps = np.array(sorted({key.timestep for key in clip.splits["train"]}))
     faces = expression_displacements(clip, timesteps.tolist())
@@ -129,14 +138,18 @@ def cluster_by_distance(
 
     Parameters
     ----------
-    distances : (N, N) symmetric, zero diagonal; or (N, m) of each item to each landmark. Where the landmarks are
-        farthest points, the largest of these is the largest of all, or within the landmarks' radius of it.
-    classes : at most as many; fewer where there are fewer distinct items.
-    landmarks : (m,) which items they are; distinct.
+    distances : FloatArray
+        (N, N) symmetric, zero diagonal; or (N, m) of each item to each landmark. If the landmarks are
+        farthest points, the largest of these is the largest of all, up to the landmarks' radius.
+    classes : int
+        Maximum number of classes; fewer if there are fewer distinct items.
+    landmarks : IntArray | None
+        (m,) distinct indices of the landmarks.
 
     Returns
     -------
-    (N,) labels from 0, without empty classes, and the (N, c) embedding that they part.
+    tuple[IntArray, FloatArray]
+        (N,) labels from 0, without empty classes, and the (N, c) embedding that was clustered.
     """
     count, largest = len(distances), float(distances.max(initial=0.0))
     rows = distances if landmarks is None else distances[landmarks]
@@ -229,9 +242,12 @@ def farthest_meshes(
 
     Parameters
     ----------
-    meshes : (N, 3, F) float32, N at least 1.
-    limit : largest number of landmarks.
-    tolerance : stop where the radius is at most this fraction of the largest distance found.
+    meshes : FloatArray
+        (N, 3, F) float32, N at least 1.
+    limit : int
+        Maximum number of landmarks.
+    tolerance : float
+        Stop when the radius is at most this fraction of the largest distance found.
     """
     count = min(limit, len(meshes))
     columns = np.empty((count, len(meshes)), dtype=np.float32)
@@ -306,8 +322,10 @@ def nystrom_embedding(columns: FloatArray, landmarks: IntArray, classes: int) ->
 
     Parameters
     ----------
-    columns : (N, m) similarity of each item to each landmark.
-    landmarks : (m,) which items these are; m at least ``classes``.
+    columns : FloatArray
+        (N, m) similarity of each item to each landmark.
+    landmarks : IntArray
+        (m,) indices of the landmarks; m at least ``classes``.
     """
     block = columns[landmarks]
     values, vectors = eigh(0.5 * (block + block.T))

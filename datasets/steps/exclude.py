@@ -46,13 +46,15 @@ def exclude_timesteps(
 
     Parameters
     ----------
-    reasons : label by timestep, such as {57: "tongue out"}.
-    source : where the reasons come from; named in the error.
+    reasons : Mapping[int, str]
+        Label by timestep, such as {57: "tongue out"}.
+    source : str | PathLike[str]
+        Source of the reasons, named in the error.
 
     Raises
     ------
     InputError
-        Where a timestep is not in the clip, or no training frame would be left.
+        A timestep is not in the clip, or no training frame would remain.
     """
     unknown = sorted(set(reasons) - set(clip.poses))
     if unknown:
@@ -72,12 +74,15 @@ def exclude_given(clip: Clip, exclude: Mapping[int, str] | str | Path | None) ->
 
     Parameters
     ----------
-    exclude : reason by timestep, or a file for `read_reasons`, such as the one that ``headbench tongue`` writes.
+    exclude : Mapping[int, str] | str | Path | None
+        Reason by timestep, or a file for `read_reasons`, such as the one that ``headbench tongue``
+        writes.
 
     Raises
     ------
     InputError
-        As `exclude_timesteps` and `read_reasons` do, and where the clip's head model is none in FLAME's layout.
+        As for `exclude_timesteps` and `read_reasons`; or the clip's head model does not have FLAME's
+        layout.
     """
     from ..clip import as_capture  # which takes long to import
 
@@ -104,7 +109,7 @@ def read_reasons(path: Path, clip: CaptureClip) -> dict[int, str]:
     Raises
     ------
     InputError
-        Where the file says nothing of the clip's subject, or numbers timesteps as another capture does.
+        The file does not mention the clip's subject, or numbers timesteps differently.
     """
     if path.suffix.lower() == ".json":
         return read_labels(path)
@@ -154,11 +159,16 @@ class Exclusions:
 
     Attributes
     ----------
-    threshold : score from which on a frame is left out.
-    basis : how the threshold was found.
-    cameras : that were looked at.
-    frames : decision by timestep.
-    overrides : people's word by timestep: "keep", or the reason to leave the frame out.
+    threshold : float
+        Minimum score of frames that are left out.
+    basis : str
+        How the threshold was found.
+    cameras : tuple[str, ...]
+        Cameras that were evaluated.
+    frames : Mapping[int, FrameDecision]
+        Decision by timestep.
+    overrides : Mapping[int, str]
+        Manual decision by timestep: "keep", or the reason to leave the frame out.
     """
 
     threshold: float

@@ -33,13 +33,14 @@ def clip_for_method(source: Clip, needs: MethodNeeds, heads: Mapping[str, str]) 
 
     Parameters
     ----------
-    heads : files of head models by version, to refit to. The procedural head's versions need none.
+    heads : Mapping[str, str]
+        Head model files by version, to refit to. The procedural head's versions need none.
 
     Raises
     ------
     InputError
-        Where the method accepts none of the head models at hand, a file holds another version than it is said to,
-        or images are too small for the resolution rule.
+        The method accepts none of the available head models, a file holds another version than
+        stated, or images are too small for the resolution rule.
     """
     clip = as_capture(source)
     target = None

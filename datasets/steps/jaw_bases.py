@@ -46,13 +46,17 @@ def farthest_quaternions(
 
     Parameters
     ----------
-    candidates : (N, 4) unit quaternions, real part first.
-    seed : (4,) the first choice; counts among the ``count``.
-    tolerance : stop where no candidate is farther than this from those chosen.
+    candidates : FloatArray
+        (N, 4) unit quaternions, real part first.
+    seed : Sequence[float]
+        (4,) the first choice, included in ``count``.
+    tolerance : float
+        Stop when no candidate is farther than this from the chosen ones.
 
     Returns
     -------
-    (n, 4), n at most ``count``: fewer where the candidates are not that many distinct ones.
+    FloatArray
+        (n, 4), n at most ``count``: fewer if there are fewer distinct candidates.
     """
     chosen = [np.asarray(seed, dtype=np.float64)]
     nearest = 1 - np.abs(candidates @ chosen[0][:, None])[:, 0]
@@ -72,8 +76,10 @@ def jaw_bases(
 
     Parameters
     ----------
-    variant : "official" reproduces the published code: candidates are the poses of all novel-view frames
-        and of every 16th self-reenactment frame (**a leak of the test signal**), seeded with `HALF_TURN`.
+    variant : Literal['paper', 'official']
+        "official" reproduces the published code: candidates are the poses of all novel-view frames
+        and of every 16th self-reenactment frame (**a leak of the test signal**), seeded with
+        `HALF_TURN`.
     """
     if variant == "official":
         test = sorted(clip.splits["self_reenactment"], key=lambda key: (key.timestep, key.camera))
@@ -92,8 +98,10 @@ def jaw_weights(quaternions: FloatArray, bases: FloatArray) -> FloatArray:
 
     Parameters
     ----------
-    quaternions : (N, 4) unit quaternions, real part first.
-    bases : (n, 4), from `jaw_bases`.
+    quaternions : FloatArray
+        (N, 4) unit quaternions, real part first.
+    bases : FloatArray
+        (n, 4) output of `jaw_bases`.
     """
     likeness = np.abs(quaternions @ bases.T)
     return likeness / likeness.sum(axis=1, keepdims=True)

@@ -91,12 +91,13 @@ def mask_below_neck(clip: CaptureClip, *, softness: float = SOFTNESS) -> Capture
 
     Parameters
     ----------
-    softness : standard deviation of the edge, in image widths.
+    softness : float
+        Standard deviation of the edge, in image widths.
 
     Raises
     ------
     InputError
-        Where the head model has no regions "boundary" or "neck", or softness is not positive.
+        The head model has no regions "boundary" or "neck", or softness is not positive.
     """
     if not softness > 0:
         raise InputError(

@@ -46,8 +46,10 @@ class Alignment:
 
     Attributes
     ----------
-    source : (width, height) of the images as they are.
-    moves : applied in this order.
+    source : Size
+        (width, height) of the original images.
+    moves : tuple[Resize | PixelBox, ...]
+        Operations, applied in this order.
     """
 
     source: Size
@@ -191,7 +193,7 @@ def resize_image(image: FloatArray, width: int, height: int) -> FloatArray:
     Raises
     ------
     InputError
-        For a size without pixels or beyond `MAX_SIDE`, and for images that are not float32.
+        A size has no pixels or exceeds `MAX_SIDE`, or an image is not float32.
     """
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise InputError("resize", "size", f"sides of 1 to {MAX_SIDE} pixels", f"{width}x{height}")

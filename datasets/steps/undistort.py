@@ -36,11 +36,17 @@ class Lens:
 
     Attributes
     ----------
-    model : as COLMAP names it: a pinhole, or one that can be undone.
-    parameters : in COLMAP's order; lengths in pixels.
-    width, height : image size, pixels.
+    model : str
+        COLMAP's name of the model: a pinhole, or a distortion that can be undone.
+    parameters : tuple[float, ...]
+        In COLMAP's order; lengths in pixels.
+    width, height : int
+        Image size, pixels.
 
-    Raises `InputError` for a model that is not known and for parameters that are not its own.
+    Raises
+    ------
+    InputError
+        The model is unknown, or the parameters do not belong to it.
     """
 
     model: str
@@ -135,12 +141,13 @@ def undistort_clip(clip: CaptureClip, lenses: Mapping[str, Lens]) -> CaptureClip
 
     Parameters
     ----------
-    lenses : by camera id; cameras without one have no distortion.
+    lenses : Mapping[str, Lens]
+        Lens by camera id; cameras without one have no distortion.
 
     Raises
     ------
     InputError
-        For lenses of cameras that the clip does not have, or of another image size.
+        A lens belongs to a camera that the clip does not have, or to another image size.
     """
     stray = sorted(set(lenses) - set(clip.cameras))
     if stray:

@@ -88,7 +88,7 @@ def measure(head: HeadAsset, vertices: FloatArray) -> Anatomy:
     Raises
     ------
     InputError
-        Where the head names neither its own landmarks nor iBUG's, or lacks eyeball regions.
+        The head has neither its own landmarks nor iBUG's, or lacks eyeball regions.
     """
     landmarks: Mapping[str, int] = getattr(head, "landmarks", {})
     points = {name: vertices[landmark_index(landmarks, name)] for name in _IBUG}

@@ -73,30 +73,43 @@ def synthesize(
 
     Parameters
     ----------
-    cameras : 2 to 16; the frontal one is always there and held out as the novel view.
-    timesteps : per subject, shared out over the sequences; FREE is held out for self-reenactment, and its
-        frames with the tongue out are labelled as excluded.
-    size : (width, height) of the images, pixels.
-    head : see `plan.load_geometry`.
-    tracking_noise : standard deviation of the error of each stored parameter, as a fraction of that
-        parameter's own standard deviation over the subject's timesteps. Images show the exact poses.
-    samples_per_pixel : rounded up to a count that the sampler takes; by default enough for 40 dB between two
-        renders of a frame.
-    tracking_error : level of the errors that trackers make, see `tracking.with_tracking_error`; 0 to 4.
-    performance : see `performance.Kind`; with less than all of it, captures for which less has to be modelled.
-    dynamics : scales wrinkles and blush, 0 to 3: 0 leaves skin as it is at rest, wherever it moves.
-    pictures : folder of an earlier capture that differs in its tracking alone: its pictures are linked (copied where links
-        cannot be), not rendered.
-    workers : processes that render; by default as many as there are cores, or one where there is little to do.
-    execution : where subjects are rendered, a task each; None for this process, and ``workers``, one subject after another.
+    cameras : int
+        2 to 16; the frontal one is always included and held out as the novel view.
+    timesteps : int
+        Number per subject, distributed over the sequences; FREE is held out for self-reenactment, and
+        its frames with the tongue out are labelled as excluded.
+    size : tuple[int, int]
+        (width, height) of the images, pixels.
+    head : str
+        See `plan.load_geometry`.
+    tracking_noise : float
+        Standard deviation of the error of each stored parameter, as a fraction of that parameter's
+        own standard deviation over the subject's timesteps. Images show the exact poses.
+    samples_per_pixel : int | None
+        Rounded up to a count that the sampler supports; the default gives 40 dB between two renders
+        of a frame.
+    tracking_error : float
+        Level of simulated tracking errors, see `tracking.with_tracking_error`; 0 to 4.
+    performance : Kind
+        See `performance.Kind`; other kinds than the full performance are easier to model.
+    dynamics : float
+        Scale of wrinkles and blush, 0 to 3: with 0 the skin has its colour at rest everywhere.
+    pictures : str | Path | None
+        Folder of an earlier capture that differs only in its tracking. Its pictures are linked, or
+        copied if links are not supported, instead of rendered.
+    workers : int | None
+        Number of rendering processes; by default one per core, or one for little work.
+    execution : Execution | None
+        Executor that renders the subjects, one task each; None renders one after another in this
+        process and its ``workers``.
 
     Raises
     ------
     InputError
-        Before rendering, for settings out of range, a folder that holds a capture of other settings, and ``pictures`` of
-        other settings or not whole.
+        Settings are out of range, the folder holds a capture of other settings, or ``pictures`` have
+        other settings or are incomplete. Raised before rendering.
     UnavailableError
-        Where the compiled kernel is missing.
+        The compiled kernel is missing.
     HeadbenchError
         A task of ``execution`` failed.
     """

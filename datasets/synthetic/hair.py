@@ -258,12 +258,18 @@ def ribbons(
 
     Parameters
     ----------
-    outward : (n, k, 3) or (n, 1, 3) direction that a ribbon's flat side faces.
-    width : (n,) metres, at the root.
-    color : (n, c, 3) linear reflectance across each ribbon, c >= 2 columns.
-    tip_shade : factor on the colour at the tip (above 1 for sun-bleached tips).
-    tip_width : width at the tip as a share of the width at the root.
-    arch : how far the middle stands out from the edges, as a share of the width.
+    outward : FloatArray
+        (n, k, 3) or (n, 1, 3) direction that a ribbon's flat side faces.
+    width : FloatArray
+        (n,) metres, at the root.
+    color : FloatArray
+        (n, c, 3) linear reflectance across each ribbon, c >= 2 columns.
+    tip_shade : float
+        Factor on the colour at the tip (above 1 for sun-bleached tips).
+    tip_width : float
+        Width at the tip relative to the width at the root.
+    arch : float
+        Height of the middle above the edges, relative to the width.
     """
     count, points = paths.shape[:2]
     columns = color.shape[1]

@@ -158,15 +158,15 @@ class PanelTracer:
 
     Parameters
     ----------
-    lights : at most eight.
-    samples : rays a pixel, rounded up to a square number.
-    threads : results do not depend on it.
-    seed : decides which points of the panels each vertex looks at.
+    samples : int
+        Rays per pixel, rounded up to a square number.
+    seed : int
+        Seed of the points on the panels that each vertex samples.
 
     Raises
     ------
     UnavailableError
-        Where the compiled kernel is missing.
+        The compiled kernel is missing.
     """
 
     def __init__(

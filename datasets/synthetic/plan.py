@@ -250,7 +250,7 @@ def load_geometry(name: str) -> Geometry:
     Raises
     ------
     InputError
-        Where the file is no ICT-FaceKit npz: other models' coefficients have no semantic translation here.
+        The file is not an ICT-FaceKit npz. Coefficients of other models have no semantic translation.
     """
     if name in PROCEDURAL:
         return _procedural(name.removeprefix("procedural") or "2023")

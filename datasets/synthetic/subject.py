@@ -203,11 +203,16 @@ class FineMesh:
 
     Attributes
     ----------
-    faces : (F', 3) triangles over the fine points.
-    parents : (N, 3) vertex indices into the tracked mesh.
-    weights : (N, 3) barycentric weights, rows sum to 1.
-    parent_faces : (N,) tracked triangle a point lies on (one of them for points on an edge).
-    coarse_faces : (F, 3) the tracked triangles that were refined.
+    faces : IntArray
+        (F', 3) triangles over the fine points.
+    parents : IntArray
+        (N, 3) vertex indices into the tracked mesh.
+    weights : FloatArray
+        (N, 3) barycentric weights, rows sum to 1.
+    parent_faces : IntArray
+        (N,) tracked triangle a point lies on (one of them for points on an edge).
+    coarse_faces : IntArray
+        (F, 3) the tracked triangles that were refined.
     """
 
     faces: IntArray
@@ -243,9 +248,12 @@ def refine(vertices: FloatArray, faces: IntArray, target: FloatArray, rounds: in
 
     Parameters
     ----------
-    vertices : (V, 3) tracked mesh at rest, metres.
-    faces : (F, 3) triangles to refine; vertices they do not use are left out.
-    target : (V,) longest edge wanted around each vertex, metres.
+    vertices : FloatArray
+        (V, 3) tracked mesh at rest, metres.
+    faces : IntArray
+        (F, 3) triangles to refine; unused vertices are left out.
+    target : FloatArray
+        (V,) longest edge wanted around each vertex, metres.
     """
     used, local = np.unique(faces, return_inverse=True)
     triangles: IntArray = local.reshape(faces.shape).astype(np.int64)

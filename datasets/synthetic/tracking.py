@@ -74,8 +74,10 @@ def with_tracking_error(
 
     Parameters
     ----------
-    sequences, activations, translation : exact poses, the controls that made them, and how.
-    level : 0 returns the poses as they are; 1 displaces the face by 0.5 to 1 mm, lips and lids by about
+    sequences, activations, translation : Mapping[str, Sequence[HeadPose]], Mapping[str, Sequence[Activations]], Translation
+        Exact poses, the controls that made them, and the conversion between them.
+    level : float
+        0 returns the poses unchanged; 1 displaces the face by 0.5 to 1 mm, lips and lids by about
         `DETAIL_MM`, and so on in proportion.
     """
     if level == 0.0:

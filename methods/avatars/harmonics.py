@@ -64,8 +64,10 @@ def turn_harmonics(dc: Tensor, rest: Tensor, rotation: Tensor) -> tuple[Tensor, 
 
     Parameters
     ----------
-    dc, rest : (N, 3) and (N, 3, K - 1) along own directions, K up to 16.
-    rotation : (N, 3, 3) from a splat's own axes to the world's.
+    dc, rest : Tensor
+        (N, 3) and (N, 3, K - 1) in each splat's own axes, K up to 16.
+    rotation : Tensor
+        (N, 3, 3) from a splat's own axes to the world's.
     """
     count = coefficient_count(DEGREE)
     directions = sphere(4 * count).to(dc.dtype)
@@ -86,8 +88,10 @@ def fit_harmonics(radiance: Callable[[Tensor], Tensor], weights: Tensor, directi
 
     Parameters
     ----------
-    radiance : maps one direction (3,) to the colours (N, 3) seen from there.
-    weights : (N, M) of the directions, see `visibility`; at least `HIDDEN` is taken.
+    radiance : Callable
+        Maps one direction (3,) to the colours (N, 3) seen from it.
+    weights : Tensor
+        (N, M) weights of the directions, see `visibility`; at least `HIDDEN` is used.
     """
     # 3DGS looks harmonics up along the way from the camera to the splat.
     basis = sh_basis(-directions, DEGREE)

@@ -13,9 +13,11 @@ class GAConfig:
 
     Attributes
     ----------
-    sh_degree, sh_every, min_sh_every : degree of the spherical harmonics at the end; one degree more each
-        ``sh_every`` iterations (published scale), but at least ``min_sh_every`` of the actual run.
-    refine_tracking : optimise expression, poses and translation of the training timesteps.
+    sh_degree, sh_every, min_sh_every : int
+        Final degree of the spherical harmonics; it is raised by one every ``sh_every`` iterations
+        (published scale), but at least ``min_sh_every`` of the actual run.
+    refine_tracking : bool
+        Whether to optimise expression, poses and translation of the training timesteps.
     """
 
     splats: SplatTraining = field(default_factory=SplatTraining)

@@ -123,9 +123,10 @@ class GAAvatar(StoredSplatAvatar):
 
     Attributes
     ----------
-    mesh, subject : the subject's.
-    splat_tensors, binding : per-splat tensors by name, and the triangle of each.
-    refined : the tracking refined in training, None where it was left alone.
+    splat_tensors, binding : dict[str, Tensor], Tensor
+        Per-splat tensors by name, and the triangle of each splat.
+    refined : RefinedTracking | None
+        The tracking refined in training; None if it was not refined.
     """
 
     def __init__(

@@ -29,10 +29,6 @@ class GBSAvatar(StoredSplatAvatar):
 
     Files: ``avatar.safetensors`` and ``subject.npz`` count as storage; beside them lies the shared head model, with
     teeth. What the mesh says of the splats is computed from these when loaded.
-
-    Attributes
-    ----------
-    stored : what the avatar's file holds.
     """
 
     def __init__(self, folder: Path, rig: Rig, stored: Stored, device: str):
@@ -89,11 +85,14 @@ class Stored(NamedTuple):
 
     Attributes
     ----------
-    neutral : per-splat tensors by name, see `blendshapes.apply_pose`.
-    points : surface point that each splat was put on at the start.
-    expressions : K.
-    entries : rows of the differences; their weights are 1.
-    differences : (M, C) what is added at coefficient 1, in the columns of `blendshapes.difference_widths`.
+    neutral : dict[str, Tensor]
+        Per-splat tensors by name, see `blendshapes.apply_pose`.
+    points : SurfacePoints
+        Surface point of each splat at the start of training.
+    entries : Entries
+        Rows of the differences; their weights are 1.
+    differences : Tensor
+        (M, C) difference at coefficient 1, in the columns of `blendshapes.difference_widths`.
     """
 
     neutral: dict[str, Tensor]

@@ -36,11 +36,14 @@ class Entries(NamedTuple):
 
     Attributes
     ----------
-    starts : (N + 1,) int64, the first row of each splat, and the number of all.
-    owners : (M,) int64, splat of each row, ascending.
-    expressions : (M,) int64.
-    weights : (M,) with which a row counts; 1 where it holds what is added at coefficient 1.
-    rows : (M,) int64, 0 to M - 1.
+    starts : Tensor
+        (N + 1,) int64, the first row of each splat, and the number of rows.
+    owners : Tensor
+        (M,) int64, splat of each row, ascending.
+    weights : Tensor
+        (M,) weights of the rows; 1 if a row holds the difference at coefficient 1.
+    rows : Tensor
+        (M,) int64, 0 to M - 1.
     """
 
     starts: Tensor
@@ -113,9 +116,11 @@ def apply_pose(neutral: Mapping[str, Tensor], differences: Tensor, motions: Poin
 
     Parameters
     ----------
-    neutral : means (N, 3) metres, log_scales (N, 3), quats (N, 4), opacities (N,) logits, sh_dc (N, 3) and sh_rest
-        (N, 3, R).
-    differences : (N, C), learnt and blended, in the columns of `difference_widths`.
+    neutral : Mapping[str, Tensor]
+        Means (N, 3) metres, log_scales (N, 3), quats (N, 4), opacities (N,) logits, sh_dc (N, 3) and
+        sh_rest (N, 3, R).
+    differences : Tensor
+        (N, C), learnt and blended, in the columns of `difference_widths`.
     """
     rest = neutral["sh_rest"]
     by_rest = differences.shape[1] - sum(difference_widths(0).values())
@@ -146,11 +151,18 @@ class PointMotions(NamedTuple):
 
     Attributes
     ----------
-    linear, offset : (N, 9) and (N, 3), blended transforms of the joints with eyelids and translation; x -> A x + b.
-    rotation : (N, 9), the rotation in ``linear``.
-    product : (N, 16), the matrix that multiplies by its quaternion from the left.
-    turn : (N, 4) initial differences of rotation, blended: times the quaternion at the start.
-    shift : (N, 3) initial differences of position, blended, and pose correctives; before the transform, metres.
+    linear, offset : Tensor
+        (N, 9) and (N, 3), blended transforms of the joints with eyelids and translation; x -> A x +
+        b.
+    rotation : Tensor
+        (N, 9), the rotation in ``linear``.
+    product : Tensor
+        (N, 16), the matrix of left multiplication by its quaternion.
+    turn : Tensor
+        (N, 4) blended initial differences of rotation, multiplied by the initial quaternion.
+    shift : Tensor
+        (N, 3) initial differences of position, blended, and pose correctives; before the transform,
+        metres.
     """
 
     linear: Tensor
@@ -171,15 +183,20 @@ class Rig:
 
     Parameters
     ----------
-    head, shape, static_offset : of the subject, as those of `SubjectMesh`.
-    points : on its neutral mesh.
-    expressions : K, leading expressions that splats follow; the joints follow all.
+    head, shape, static_offset : HeadAsset, FloatArray, FloatArray
+        As for `SubjectMesh`.
+    points : SurfacePoints
+        Points on its neutral mesh.
+    expressions : int
+        K, number of leading expressions that splats follow; the joints follow all.
 
     Attributes
     ----------
-    mesh : the subject's.
-    corners, barycentric : (3 P,) int64 vertices and (3, P, 1) weights of the points' corners, all first corners first.
-    turns, turned : (4 F, K) `initial_rotations` of the triangles with points, and (P,) int64 each point's one of them.
+    corners, barycentric : Tensor
+        (3 P,) int64 vertices and (3, P, 1) weights of the points' corners, all first corners first.
+    turns, turned : Tensor
+        (4 F, K) `initial_rotations` of the triangles with points, and (P,) int64 index of each
+        point's triangle in them.
     """
 
     def __init__(
@@ -259,8 +276,10 @@ def deformation_gradients(rest: Tensor, moved: Tensor) -> Tensor:
 
     Parameters
     ----------
-    rest : (F, 3, 3) corners, metres.
-    moved : (..., F, 3, 3) corners.
+    rest : Tensor
+        (F, 3, 3) corners, metres.
+    moved : Tensor
+        (..., F, 3, 3) corners.
     """
     inverse, singular = torch.linalg.inv_ex(_edges(rest))
     maps = _edges(moved) @ inverse
@@ -298,9 +317,12 @@ def initial_rotations(vertices: Tensor, basis: Tensor, faces: Tensor) -> Tensor:
 
     Parameters
     ----------
-    vertices : (V, 3) neutral mesh, metres.
-    basis : (V, 3, K) metres per unit coefficient.
-    faces : (F, 3) int64.
+    vertices : Tensor
+        (V, 3) neutral mesh, metres.
+    basis : Tensor
+        (V, 3, K) metres per unit coefficient.
+    faces : Tensor
+        (F, 3) int64.
     """
     rest = vertices.to(torch.float64)[faces]
     turns = torch.zeros(len(faces), 4, basis.shape[2], dtype=torch.float64, device=vertices.device)
@@ -323,9 +345,12 @@ def consistency_mask(
 
     Parameters
     ----------
-    vertices : (V, 3) neutral mesh.
-    expressions : K, how many of the leading expressions.
-    floor, full : metres.
+    vertices : FloatArray
+        (V, 3) neutral mesh.
+    expressions : int
+        K, number of leading expressions.
+    floor, full : float
+        Displacements where the mask starts and where it is 1, metres.
     """
     # Teeth have no expressions of their own; held in place with the scalp they would seem to have.
     still, neck, teeth = (

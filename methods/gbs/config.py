@@ -38,26 +38,41 @@ class GBSConfig:
 
     Attributes
     ----------
-    samples, teeth_samples : splats at the start, on the head and on each row of teeth; upper limits where
+    samples, teeth_samples : int
+        Initial number of splats on the head and on each row of teeth; upper limits if
         ``sample_spacing`` is set.
-    sample_spacing : pixels between neighbouring splats at the start, as the training cameras see the head on average:
-        more splats than images can tell apart are not required. 0 takes ``samples`` as they are, as published.
-    expressions : leading expression coefficients that have differences; as many as there are, if fewer.
-    sh_degree, sh_every, min_sh_every : degree of the neutral spherical harmonics at the end; one degree more each
-        ``sh_every`` iterations (published scale), but at least ``min_sh_every`` of the actual run.
-    difference_sh_degree : degree up to which the differences change the harmonics.
-    difference_..._lr : learning rates of the differences, for harmonics of all degrees the same.
-    position_settles : iteration (published scale) at which the learning rate of positions has fallen to its final value.
-    teeth_densify_gradient : ``densify_gradient`` of the teeth.
-    mask_floor_mm, mask_full_mm : displacement of the surface by one expression, at coefficient 1, up to which its
-        differences are zero and not stored, and at which they count in full. The published values: a tenth of the
-        largest displacement by FLAME's 50th expression, and the largest by its first.
-    alpha_weight : of the mean squared difference of alpha and mask; needs masks, else it is left out.
-    teeth_weight : of the penalty on teeth that leave the mouth (`points.MouthCylinder`), the mean over each row, added up.
-    correctives_variant : "paper" interpolates the pose correctives of a triangle's corners. "official" adds them up as
-        the authors' program does, which makes them three times too strong.
-    lower_teeth_variant : "paper" lets the lower teeth follow the jaw alone. "official" lets them follow root and neck by
-        5.6 % as the authors' program does.
+    sample_spacing : float
+        Initial distance of neighbouring splats in pixels, on average over the training cameras: more
+        splats than images can resolve are not required. 0 uses ``samples`` unchanged, as published.
+    expressions : int
+        Number of leading expression coefficients with differences; all, if there are fewer.
+    sh_degree, sh_every, min_sh_every : int
+        Final degree of the neutral spherical harmonics; it is raised by one every ``sh_every``
+        iterations (published scale), but at least ``min_sh_every`` of the actual run.
+    difference_sh_degree : int
+        Degree up to which the differences change the harmonics.
+    difference_..._lr : float
+        Learning rates of the differences; the same for harmonics of all degrees.
+    position_settles : int
+        Iteration (published scale) at which the learning rate of positions has reached its final
+        value.
+    teeth_densify_gradient : float
+        ``densify_gradient`` for the teeth.
+    mask_floor_mm, mask_full_mm : float
+        Displacement of the surface by one expression, at coefficient 1, up to which its differences
+        are zero and not stored, and from which they have full weight. The published values are a
+        tenth of the largest displacement by FLAME's 50th expression, and the largest by its first.
+    alpha_weight : float
+        Weight of the mean squared difference of alpha and mask; ignored without masks.
+    teeth_weight : float
+        Weight of the penalty on teeth that leave the mouth (`points.MouthCylinder`), the mean over
+        each row, summed.
+    correctives_variant : Literal['paper', 'official']
+        "paper" interpolates the pose correctives of a triangle's corners. "official" sums them as the
+        authors' program does, which makes them three times too strong.
+    lower_teeth_variant : Literal['paper', 'official']
+        "paper" lets the lower teeth follow only the jaw. "official" also lets them follow root and
+        neck by 5.6 % as the authors' program does.
     """
 
     splats: BlendshapeTraining = field(default_factory=BlendshapeTraining)

@@ -54,9 +54,10 @@ def poisson_disk(
 
     Parameters
     ----------
-    vertices, faces : (V, 3) metres, (F, 3).
-    triangles : which of the faces.
-    seed : of the run.
+    vertices, faces : FloatArray, IntArray
+        (V, 3) metres, (F, 3).
+    triangles : IntArray
+        Indices of the faces to sample.
     """
     corners = np.asarray(vertices, np.float64)[faces[triangles]]
     areas = triangle_areas(vertices, faces[triangles])

@@ -44,8 +44,11 @@ class StartingPoints(NamedTuple):
 
     Attributes
     ----------
-    points, spacing : N points, and the distances between them and their neighbours, metres.
-    part : (N,) what each is put on, in ascending order: 0 for the head, then a number for each row of teeth.
+    points, spacing : SurfacePoints, np.ndarray
+        N points, and the distances to their neighbours, metres.
+    part : np.ndarray
+        (N,) part of each point, in ascending order: 0 for the head, then a number for each row of
+        teeth.
     """
 
     points: SurfacePoints
@@ -60,7 +63,8 @@ class GBSTraining(SplatTrainer):
 
     Attributes
     ----------
-    points, entries : the surface point of each splat at the start, and the differences of the splats.
+    points, entries : SurfacePoints, Entries
+        The surface point of each splat at the start, and the differences of the splats.
     """
 
     def __init__(

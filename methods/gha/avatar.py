@@ -40,7 +40,8 @@ class GHAAvatar:
 
     Parameters
     ----------
-    driver : on the CPU, wherever the tensors are: what it computes is small.
+    driver : Driver
+        On the CPU for any device of the tensors, because it computes little.
     """
 
     def __init__(

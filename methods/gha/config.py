@@ -14,59 +14,91 @@ class GHAConfig:
 
     Attributes
     ----------
-    schedule_length : iterations of the published run, both phases.
-    mesh_fraction : part of the budget that the mesh phase takes.
-    unit : metres of one canonical unit.
-    landmarks : how many points of the tracked face say where expression rules.
-    near_squared, far_squared : squared distances from the nearest landmark up to which expression alone rules, and
-        from which on head pose alone does (0.1 and 0.25 units squared are 3.2 and 5 cm).
-    start : what the signed distance is fitted to before the mesh phase. "sphere" as published; "mesh", the tracked
-        mesh, saves a short run the way from the sphere to a head.
-    start_steps : steps of that fit.
-    grid_vertices : vertices of the tetrahedral grid about the head.
-    subdivide : take the Gaussians from a grid of half the spacing, as published.
-    max_points : thin the points taken from the mesh to this number; None keeps them all.
-    mouth_points : further points, drawn in a box behind the lips.
-    features, channels : features of a point, and channels of what is splatted; the first three are a colour.
-    geometry_hidden, expression_color_hidden, ... : widths of the networks' hidden layers.
-    sr_widths : widths of the super-resolution network's blocks. The first works at the splatted size, each further
-        one at twice the size before: their number decides by how much splats are drawn smaller than the image.
-    residual : let super-resolution add to the splatted colours instead of making colours, as published, of nothing;
-        a short run then starts where splatting alone arrives, and splatting with the colours of the mesh phase.
-    neutral_jaw : radians that the jaw is open in the neutral head (about the first axis). Displacements belong to
-        places, so between lips that touch they cannot part; published landmarks start at any first timestep.
-    motion_steps : steps that fit the deformation by expression to the head model's own (`TrackedMotion`) before the
-        mesh phase; 0 as published.
-    motion_weight : of the same error in both phases, relative to the vertices' motion; 0 as published.
-    appearance_margin : how far beyond its training range, in parts of that range, each driving value is followed by
-        the networks of colour and attributes; None, as published, sets no end. What lies far outside of training
-        otherwise tints a face.
-    zero_initialised : start all controllers without an effect of expression and pose, deformation and attributes with outputs
-        of zero, instead of small random ones: what a short capture never shows then stays without effect.
-    angle_unit : radians of jaw and eye angles that count as 1 in the expression code. Expression coefficients are of
-        the order of 1, and beside them a short run hardly notices a jaw's tenths of a radian.
-    expression_noise : standard deviation of what is added to each driving value that the networks of colour and
-        attributes see in training, drawn anew in every iteration. A few timesteps leave most directions of the code
-        unseen, in which networks then do as they like; noise keeps them from it. 0 as published.
-    displacement_scale, attribute_scale : factors of the networks' outputs.
-    initial_opacity : of all Gaussians.
-    mesh_views, mesh_size : views of a timestep in one iteration of the mesh phase, and the longer side of their images
-        in pixels; smaller images stay as they are.
-    landmark_weight : of the mean squared distance, in square units, between moved and tracked landmarks.
-    landmark_timesteps : timesteps whose landmarks one iteration of the mesh phase looks at; published is the one that
-        its images show, but landmarks cost little, and a short run does not come to each timestep often.
-    mesh_lr, landmark_lr : learning rates of the mesh phase.
-    network_lr, position_lr, feature_lr, rotation_lr, scale_lr, opacity_lr, correction_lr : of the Gaussian phase, the
-        last one for the corrections of the tracked head pose, one for each training timestep.
-    final_rate : part of their learning rate that the Gaussian phase's tensors end with, log-linearly over the last
-        half of the phase; 1 keeps them constant, as published.
-    low_weight, structure_weight : weights of the L1 loss at the splatted size and of 1 - SSIM at the full one.
-        The latter stands for the published 0.1 LPIPS, whose backbone is not ours to ship.
-    low_image_variant : "paper" compares the splatted colours with area means of the image; "official" with every fourth
-        pixel, as the authors' program does.
-    augment : rescale the feature image by 0.8 to 1.25 before super-resolution, and cut out of it or put it at random,
-        as published.
-    checkpoint_every_s : seconds between checkpoints.
+    mesh_fraction : float
+        Fraction of the budget for the mesh phase.
+    unit : float
+        Metres per canonical unit.
+    landmarks : int
+        Number of points of the tracked face that define where expression has an effect.
+    near_squared, far_squared : float
+        Squared distances from the nearest landmark up to which only expression has an effect, and
+        from which only head pose has (0.1 and 0.25 units squared are 3.2 and 5 cm).
+    start : Literal['sphere', 'mesh']
+        Shape that the signed distance is fitted to before the mesh phase: "sphere", as published, or
+        "mesh", the tracked mesh, which saves iterations of a short run.
+    start_steps : int
+        Number of steps of that fit.
+    grid_vertices : int
+        Number of vertices of the tetrahedral grid around the head.
+    subdivide : bool
+        Whether to take the Gaussians from a grid of half the spacing, as published.
+    max_points : int | None
+        Maximum number of points taken from the mesh; None keeps all.
+    mouth_points : int
+        Number of further points, drawn in a box behind the lips.
+    features, channels : int
+        Number of features of a point, and of channels that are splatted; the first three are a
+        colour.
+    geometry_hidden, ..._hidden : tuple[int, ...]
+        Widths of the networks' hidden layers.
+    sr_widths : tuple[int, ...]
+        Widths of the super-resolution network's blocks. The first works at the splatted size, each
+        further one at twice the size of the one before: their number decides how much smaller than
+        the image splats are rendered.
+    residual : bool
+        Whether super-resolution adds to the splatted colours instead of replacing them, as published.
+        A short run then starts from the result of splatting, with the colours of the mesh phase.
+    neutral_jaw : float
+        Opening of the jaw in the neutral head, radians about the first axis. Displacements depend on
+        position, so lips that touch could not part; published landmarks start at an arbitrary first
+        timestep.
+    motion_steps : int
+        Steps that fit the deformation by expression to the head model's own (`TrackedMotion`) before
+        the mesh phase; 0 as published.
+    motion_weight : float
+        Weight of the same error in both phases, relative to the vertices' motion; 0 as published.
+    appearance_margin : float | None
+        How far the networks of colour and attributes follow each driving value beyond its training
+        range, as a fraction of that range; None, as published, sets no limit. Values far outside of
+        training otherwise tint a face.
+    zero_initialised : bool
+        Whether expression and pose initially have no effect, with zero deformation and attribute
+        outputs, instead of small random ones: what a short capture does not show then keeps no
+        effect.
+    angle_unit : float
+        Radians of jaw and eye angles that correspond to 1 in the expression code. Expression
+        coefficients are of the order of 1, and a short run hardly responds to much smaller angles.
+    expression_noise : float
+        Standard deviation of noise on each driving value of the networks of colour and attributes in
+        training, drawn in every iteration. Few timesteps leave most directions of the code unseen;
+        noise regularises the networks there. 0 as published.
+    displacement_scale, attribute_scale : float
+        Factors of the networks' outputs.
+    mesh_views, mesh_size : int
+        Views of a timestep in one iteration of the mesh phase, and the longer side of their images in
+        pixels; smaller images are not resized.
+    landmark_weight : float
+        Weight of the mean squared distance, in square units, between moved and tracked landmarks.
+    landmark_timesteps : int
+        Number of timesteps with landmarks in one iteration of the mesh phase. Published is only the
+        timestep of its images, but landmarks cost little, and a short run sees each timestep rarely.
+    mesh_lr, landmark_lr : float
+        Learning rates of the mesh phase.
+    network_lr, position_lr, feature_lr, rotation_lr, scale_lr, opacity_lr, correction_lr : float
+        Learning rates of the Gaussian phase, the last one for the corrections of the tracked head
+        pose, one for each training timestep.
+    final_rate : float
+        Final learning rate of the Gaussian phase's tensors relative to the initial one, log-linear
+        over the last half of the phase; 1 keeps it constant, as published.
+    low_weight, structure_weight : float
+        Weights of the L1 loss at the splatted size and of 1 - SSIM at full size. The latter replaces
+        the published 0.1 LPIPS, whose backbone cannot be distributed here.
+    low_image_variant : Literal['paper', 'official']
+        "paper" compares the splatted colours with area means of the image; "official" with every
+        fourth pixel, as the authors' program does.
+    augment : bool
+        Whether to rescale the feature image by 0.8 to 1.25 before super-resolution and crop or place
+        it at random, as published.
     """
 
     schedule_length: int = 600_000

@@ -73,10 +73,15 @@ class Driver:
 
     Parameters
     ----------
-    shape, static_offset : (S,) identity and (V, 3) metres.
-    expression_scale : (E,) that the expression code is divided by; None for ones.
-    origin : (3,) of the canonical frame in the unposed head, metres.
-    center : (3,) metres that `HeadMotion.code` has translations relative to, see `scene_center`; None for the world's origin.
+    shape, static_offset : FloatArray
+        (S,) identity and (V, 3) metres.
+    expression_scale : Tensor | None
+        (E,) divisor of the expression code; None for ones.
+    origin : FloatArray
+        (3,) origin of the canonical frame in the unposed head, metres.
+    center : FloatArray | None
+        (3,) metres, the origin of translations in `HeadMotion.code`, see `scene_center`; None for the
+        world's origin.
     """
 
     def __init__(

@@ -180,10 +180,11 @@ class SuperResolution:
 
     Attributes
     ----------
-    channels : of the feature image.
-    widths : channels of the blocks.
-    residual : add to the splatted colours, enlarged bilinearly, as far as something is drawn, instead of making
-        colours; there is no sigmoid then, and the start is nothing to be added.
+    widths : tuple[int, ...]
+        Channels of the blocks.
+    residual : bool
+        Whether to add to the splatted colours, enlarged bilinearly, as far as something is drawn,
+        instead of making colours; there is no sigmoid then, and the initial output is zero.
     """
 
     channels: int
@@ -299,11 +300,16 @@ def posed(
 
     Parameters
     ----------
-    rotation, translation : (3, 3) and (3,) of the canonical frame.
-    turn : (4, 4), what multiplies by the rotation's quaternion.
-    points, moves : (N, 3) canonical points, and displacements before their factor.
-    log_scales, quats, opacities : (N, 3), (N, 4) and (N,) logits, canonical.
-    changes : (N, 8) what networks add to them, before its factor.
+    rotation, translation : Tensor
+        (3, 3) and (3,) of the canonical frame.
+    turn : Tensor
+        (4, 4), matrix of multiplication by the rotation's quaternion.
+    points, moves : Tensor
+        (N, 3) canonical points, and displacements before their factor.
+    log_scales, quats, opacities : Tensor
+        (N, 3), (N, 4) and (N,) logits, canonical.
+    changes : Tensor
+        (N, 8) changes of them by the networks, before their factor.
     """
     unit = config.unit
     scale, quat, faint = (config.attribute_scale * changes).split(list(ATTRIBUTES), dim=1)

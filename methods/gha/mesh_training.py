@@ -46,7 +46,9 @@ class MeshTraining:
 
     Parameters
     ----------
-    fitted : whether the start is still to be fitted to the sphere or the tracked mesh; a resumed run need not.
+    fitted : bool
+        Whether the start must still be fitted to the sphere or the tracked mesh; False for a resumed
+        run.
     """
 
     def __init__(self, scene: TrainingScene, head: MeshHead, *, fitted: bool):

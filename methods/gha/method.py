@@ -44,7 +44,8 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
 
     Parameters
     ----------
-    clock : seconds, from any start; what budgets in seconds are measured by.
+    clock : Callable
+        Clock in seconds with any origin, for budgets in seconds.
     """
 
     name, version = SPEC.name, SPEC.version

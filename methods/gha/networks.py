@@ -36,12 +36,17 @@ class Mlp:
 
     Attributes
     ----------
-    name : prefix of its tensors, ``NAME.weight_K`` (out, in) and ``NAME.bias_K`` (out,).
-    point_inputs, condition_inputs : sizes of the two parts of the input, in this order.
-    hidden, outputs : widths of the layers.
-    deaf : start without an effect of the condition, by weights of zero for it. What training never shows then has
-        none in the end, instead of a random one.
-    zero_initialised : start with outputs of zero, by a last layer of zero.
+    name : str
+        Prefix of its tensors, ``NAME.weight_K`` (out, in) and ``NAME.bias_K`` (out,).
+    point_inputs, condition_inputs : int
+        Sizes of the two parts of the input, in this order.
+    hidden, outputs : tuple[int, ...], int
+        Widths of the layers.
+    deaf : bool
+        Whether the condition's weights are initially zero. Conditions that training never shows then
+        have no effect, instead of a random one.
+    zero_initialised : bool
+        Whether the last layer is initially zero.
     """
 
     name: str

@@ -165,9 +165,11 @@ class Inference:
 
     Parameters
     ----------
-    mouth : (F,) bool, as in `render_rays`.
-    backend : "reference" is `render_rays`; "auto" takes the kernel for parameters in float32 on the CPU. An instruction
-        set of the kernel's ``instruction_sets()`` stands for the kernel in that one.
+    mouth : Tensor
+        (F,) bool, as in `render_rays`.
+    backend : str
+        "reference" is `render_rays`; "auto" uses the kernel for parameters in float32 on the CPU. A
+        value of the kernel's ``instruction_sets()`` selects the kernel with that instruction set.
     """
 
     def __init__(

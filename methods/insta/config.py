@@ -41,45 +41,62 @@ class InstaConfig:
 
     Attributes
     ----------
-    schedule_length : iterations of the published run.
-    levels, level_features, log2_table, base_resolution, finest_resolution : multi-resolution hash encoding
-        (Mueller et al., SIGGRAPH 2022): levels, features each (1, 2, 4 or 8), largest rows per level, samples per
-        side of the unit cube on the first and the last level.
-    hidden, density_layers, color_layers, latent : width and number of hidden layers of the two networks, and what
-        the first hands to the second.
-    conditions : leading expression coefficients that the density network sees where the nearest triangle is of the
-        mouth. Elsewhere it sees ones.
-    density_bias, prior_depth, prior_scale : added to the logarithm of the density per metre is ``density_bias -
-        min(distance / prior_scale, prior_depth)``, with the distance from the mesh in metres. Not published (0 there):
-        a short run has not the time to find the surface, and so starts with a density that is highest at the mesh.
-    step : metres between samples of a ray.
-    shell_outside, shell_inside : metres from the surface within which there may be density, on both of its sides.
-    jaw_opening : radians that the jaw of the canonical mesh is opened, so that lips are apart.
-    warp_variant : "paper" carries points by the mean of the transforms of the nearest triangle and of those across
-        its edges, weighted by exp(-4 d) in metres, each with the root of the ratio of areas as its scale (paper,
-        section 3.2). "official" is the authors' program: means in the face region alone, exp(-d) for the own
-        triangle, and a scale only in the eye region, by the ratio itself.
-    occupancy_resolution, occupancy_every, occupancy_decay, occupancy_threshold : cells along the longest side of the
-        canonical box; iterations between refreshes; how much of an old value stays; optical thickness per ``step``
-        above which a cell is marched through.
-    occupancy_whole : iterations of the actual run in which a refresh visits all cells; then it visits a quarter.
-    samples_per_iteration, first_rays : samples the number of rays is adapted to, and how many rays to begin with.
-    images_per_iteration : training images that share an iteration's rays; the program takes all it has loaded, up to
-        1,700.
-    round_samples, stop_transmittance : samples per ray that are evaluated before rays with less transmittance than
-        this stop.
-    huber : where the colour loss turns from square to linear.
-    mouth_weight, mouth_from : weight of pixels that show lips or teeth, from then on.
-    depth_weight : of the distance between the expected depth and the mesh, metres, outside hair and neck. 0 for none.
-    opacity_weight : of the mean opacity of a ray's samples, summed. Not published (0 there): with it short runs clear
-        the air in front of the surface, which nothing else asks for, and have less to march through.
-    target_variant : "paper" composites the truth over the random background as the prediction is, in sRGB. "official"
-        does it in linear light, which differs where masks are soft.
-    learning_rate, final_rate, betas, weight_decay, ema : Adam; part of the rate that is left at the end, log-linearly
-        over the last half; decay of the networks' weights; of the running mean of parameters that is kept as the
-        avatar.
-    mesh_cache_mb, image_cache_mb : memory for posed meshes and for training images.
-    checkpoint_every_s : seconds between checkpoints.
+    levels, level_features, log2_table, base_resolution, finest_resolution : int
+        Multi-resolution hash encoding (Mueller et al., SIGGRAPH 2022): levels, features each (1, 2, 4
+        or 8), largest rows per level, samples per side of the unit cube on the first and the last
+        level.
+    hidden, density_layers, color_layers, latent : int
+        Width and number of hidden layers of the two networks, and number of outputs that the first
+        passes to the second.
+    conditions : int
+        Number of leading expression coefficients that the density network receives if the nearest
+        triangle belongs to the mouth. Elsewhere it receives ones.
+    density_bias, prior_depth, prior_scale : float
+        The logarithm of the density per metre is offset by ``density_bias - min(distance /
+        prior_scale, prior_depth)``, with the distance from the mesh in metres. Not published (0
+        there): a short run cannot find the surface in its time, and so starts with a density that is
+        highest at the mesh.
+    step : float
+        Metres between samples of a ray.
+    shell_outside, shell_inside : float
+        Maximum distance of density from the surface, metres, on both of its sides.
+    jaw_opening : float
+        Opening of the jaw in the canonical mesh, radians, so that the lips are apart.
+    warp_variant : Literal['paper', 'official']
+        "paper" transforms points by the mean of the transforms of the nearest triangle and of those
+        across its edges, weighted by exp(-4 d) in metres, each with the root of the ratio of areas as
+        its scale (paper, section 3.2). "official" is the authors' program: means only in the face
+        region, exp(-d) for the own triangle, and a scale only in the eye region, by the ratio itself.
+    occupancy_resolution, occupancy_every, occupancy_decay, occupancy_threshold : int, int, float, float
+        Cells along the longest side of the canonical box; iterations between refreshes; decay of an
+        old value; optical thickness per ``step`` above which a cell is marched through.
+    occupancy_whole : int
+        Iterations of the actual run in which a refresh visits all cells; later it visits a quarter.
+    samples_per_iteration, first_rays : int
+        Target number of samples that the number of rays is adapted to, and initial number of rays.
+    images_per_iteration : int
+        Training images that share an iteration's rays; the authors' program uses all that it has
+        loaded, up to 1,700.
+    round_samples, stop_transmittance : int, float
+        Samples per ray that are evaluated before rays with less transmittance than this stop.
+    huber : float
+        Error at which the colour loss changes from quadratic to linear.
+    mouth_weight, mouth_from : float, int
+        Weight of pixels that show lips or teeth, and the iteration from which it is used.
+    depth_weight : float
+        Weight of the distance between the expected depth and the mesh, metres, outside hair and neck;
+        0 for none.
+    opacity_weight : float
+        Weight of the mean opacity of a ray's samples, summed. Not published (0 there): in short runs
+        it clears the space in front of the surface, which no other loss does, and so saves samples.
+    target_variant : Literal['paper', 'official']
+        "paper" composites the truth over the random background as the prediction is, in sRGB.
+        "official" does it in linear light, which differs at soft masks.
+    learning_rate, final_rate, betas, weight_decay, ema : float, float, tuple[float, float], float, float
+        Adam; final rate relative to the initial one, log-linear over the last half; decay of the
+        networks' weights; decay of the running mean of parameters that is kept as the avatar.
+    mesh_cache_mb, image_cache_mb : int
+        Memory for posed meshes and for training images.
     """
 
     schedule_length: int = 20_000

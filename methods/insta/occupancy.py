@@ -70,8 +70,11 @@ class Occupancy:
 
         Parameters
         ----------
-        condition : (K,) coefficients that cells of the mouth are evaluated with.
-        whole : all cells; otherwise a random quarter of all, and of the occupied ones.
+        condition : Tensor
+            (K,) coefficients for the evaluation of cells of the mouth.
+        whole : bool
+            Whether to refresh all cells; otherwise a random quarter of all and of the occupied
+            ones.
         """
         generator = numpy_generator(seed, "occupancy", iteration)
         chosen = np.arange(len(self.candidates))

@@ -126,10 +126,14 @@ def composite(
 
     Parameters
     ----------
-    thickness : (N,) density times the length of each sample; samples ray by ray, in order of distance.
-    values, distances : (N, C) and (N,).
-    rays : (N,) int64, not descending.
-    entering : (R,) transmittance in front of the first of these samples.
+    thickness : Tensor
+        (N,) density times the length of each sample; samples ordered by ray, then by distance.
+    values, distances : Tensor
+        (N, C) and (N,).
+    rays : Tensor
+        (N,) int64, ascending, with repetitions.
+    entering : Tensor
+        (R,) transmittance in front of the first of these samples.
     """
     count = len(entering)
     depth = thickness.double()

@@ -64,12 +64,16 @@ class Repository:
 
     Attributes
     ----------
-    url : where it is.
-    commit : the one that its adapter was written for.
-    scripts : files that tell its checkout from another folder.
-    modules : what has to be importable in its interpreter, where it has one.
-    trial : a statement that has to work there, "" for none, and what to do where it does not.
-    downloads : files that the authors offer apart from it and expect in it, and where each comes from.
+    commit : str
+        The commit that its adapter was written for.
+    scripts : tuple[str, ...]
+        Files that identify its checkout.
+    modules : tuple[str, ...]
+        Modules that its interpreter must be able to import, if it has one.
+    trial : str
+        A statement that its interpreter must execute, or "", and the remedy if it fails.
+    downloads : Mapping[str, str]
+        Files that the authors distribute separately and expect in it, with their sources.
     """
 
     url: str
@@ -87,9 +91,10 @@ class Checkout:
 
     Attributes
     ----------
-    folder : of the checkout, absolute.
-    python : command of the interpreter, or of the program where the code is one.
-    record : commit, files that differ from it, versions; for the avatar's record.
+    python : tuple[str, ...]
+        Command of the interpreter, or of the program if the code is a program.
+    record : dict[str, Any]
+        Commit, modified files and versions, for the avatar's record.
     """
 
     folder: Path

@@ -12,17 +12,24 @@ class OfficialConfig:
 
     Attributes
     ----------
-    checkout : folder of a checkout of the authors' repository. It is read, never written.
-    python : command that starts the interpreter in which their code runs: a path, or words such as ``conda run
-        --no-capture-output -n ga python`` or ``apptainer exec --nv ga.sif python``. A container has to see the checkout
-        and the run folder by the same paths.
-    commit : what is checked out, by the first seven digits or more; "" takes whatever is there.
-    arguments : appended to their training command.
-    device : where their code computes. "cuda" is all that it knows; "cpu-shim" puts our CPU renderer in place of its
-        rasteriser and stand-ins in place of what else needs CUDA (`shim.cpu`), by the interpreter of headbench unless
-        ``python`` names another that has it. Rows are then labelled "(cpu-shim)" and are not the original's.
-    order : in which the training images are taken: as their code draws them, or as the native method does with the same
-        seed, so that both see the same image in each iteration.
+    checkout : str
+        Folder of a checkout of the authors' repository. It is read, never written.
+    python : str
+        Command that starts the interpreter for their code: a path, or words such as ``conda run
+        --no-capture-output -n ga python`` or ``apptainer exec --nv ga.sif python``. A container must
+        see the checkout and the run folder under the same paths.
+    commit : str
+        Expected commit of the checkout, by at least its first seven digits; "" accepts any.
+    arguments : tuple[str, ...]
+        Appended to their training command.
+    device : Literal['cuda', 'cpu-shim']
+        Where their code computes. It supports "cuda" only; "cpu-shim" replaces its rasteriser by the
+        CPU renderer of this package and other CUDA code by stand-ins (`shim.cpu`), with headbench's
+        interpreter unless ``python`` names another one that has it. Rows are then labelled
+        "(cpu-shim)" and are not the original's.
+    order : Literal['published', 'native']
+        Order of the training images: as their code draws them, or as the native method does with the
+        same seed, so that both use the same image in each iteration.
     """
 
     checkout: str = ""
@@ -69,7 +76,8 @@ class GHAOfficialConfig(OfficialConfig):
 
     Attributes
     ----------
-    mesh_fraction : part of the iterations that the mesh head takes; their scripts are stopped by hand.
+    mesh_fraction : float
+        Fraction of the iterations for the mesh head; their scripts are stopped manually.
     """
 
     commit: str = "d006861f117e1a74174c29631383386ad876922c"
@@ -90,9 +98,12 @@ class INSTAOfficialConfig(OfficialConfig):
 
     Attributes
     ----------
-    program : what their build made: a file, in the checkout unless its path is absolute, or words that start it, such
-        as ``apptainer exec --nv insta.sif /path/INSTA/build/rta``.
-    images_on_gpu : training images that lie in the GPU's memory; of more, their code draws others every 1,500 iterations.
+    program : str
+        The built program: a file, in the checkout unless its path is absolute, or words that start
+        it, such as ``apptainer exec --nv insta.sif /path/INSTA/build/rta``.
+    images_on_gpu : int
+        Number of training images in the GPU's memory; if there are more, their code loads others
+        every 1,500 iterations.
     """
 
     commit: str = "9c17968ed719f487025577f0fc477749134639c6"

@@ -69,9 +69,10 @@ class Workplace:
 
     Attributes
     ----------
-    input : the capture in the repository's own form.
-    program : the program's working directory, with the files that it expects there; the checkout stays clean.
-    model : what the program writes.
+    input : Path
+        The capture in the repository's own format.
+    program : Path
+        The program's working directory, with the files that it expects; the checkout is not modified.
     """
 
     root: Path

@@ -84,11 +84,17 @@ def run_program(
 
     Parameters
     ----------
-    on_line : called with every line, and with every state of a line that draws itself anew.
-    variables : of its environment besides `environment`.
-    held : an open file that the program inherits, so that a lock on it lasts as long as the program.
+    on_line : Callable
+        Called with every line, and with every update of a line that the program redraws.
+    variables : Mapping[str, str] | None
+        Environment variables in addition to `environment`.
+    held : IO[str] | None
+        An open file that the program inherits, so that a lock on it lasts as long as the program.
 
-    Raises `ProgramError` where the command cannot be started.
+    Raises
+    ------
+    ProgramError
+        The command cannot be started.
     """
     flush_renames()
     with log.open("ab") as stream:

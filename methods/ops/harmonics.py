@@ -64,7 +64,8 @@ def initial_coefficients(count: int, degree: int, generator: torch.Generator) ->
 
     Returns
     -------
-    ``sh_dc`` (N, 3) and ``sh_rest`` (N, 3, K - 1), K the `coefficient_count` of ``degree``.
+    dict[str, Tensor]
+        ``sh_dc`` (N, 3) and ``sh_rest`` (N, 3, K - 1), K the `coefficient_count` of ``degree``.
     """
     dc = torch.rand(count, 3, generator=generator) / 255
     return {"sh_dc": dc, "sh_rest": torch.zeros(count, 3, coefficient_count(degree) - 1)}
@@ -76,8 +77,10 @@ def harmonic_colors(dc: Tensor, rest: Tensor, vectors: Tensor, degree: int) -> T
 
     Parameters
     ----------
-    dc : (N, 3) coefficient of degree 0.
-    rest : (N, 3, K - 1) coefficients of higher degrees by channel; those above ``degree`` are not used.
+    dc : Tensor
+        (N, 3) coefficient of degree 0.
+    rest : Tensor
+        (N, 3, K - 1) coefficients of higher degrees by channel; those above ``degree`` are not used.
     """
     if degree == 0:
         return torch.relu(0.5 + C0 * dc)

@@ -38,7 +38,7 @@ def call(name: str, *arguments: Any) -> Any:
     Raises
     ------
     ValueError
-        Where an array's type, shape or layout is not what the function expects.
+        An array's type, shape or layout is not what the function expects.
     """
     function = getattr(KERNEL.load(), name)
     return function(arrays(*arguments), instruction_sets()[_backend.get()], threads())

@@ -25,10 +25,14 @@ class Frames(NamedTuple):
 
     Attributes
     ----------
-    rotation : (F, 3, 3); columns are an edge, the normal, and an in-plane axis away from the third vertex.
-    center : (F, 3) centroid, metres.
-    size : (F,) mean of base and height, metres.
-    quaternion : (F, 4) of ``rotation``, real part first.
+    rotation : Tensor
+        (F, 3, 3); columns are an edge, the normal, and an in-plane axis away from the third vertex.
+    center : Tensor
+        (F, 3) centroid, metres.
+    size : Tensor
+        (F,) mean of base and height, metres.
+    quaternion : Tensor
+        (F, 4) quaternion of ``rotation``, real part first.
     """
 
     rotation: Tensor
@@ -46,8 +50,10 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
 
     Parameters
     ----------
-    vertices : (V, 3).
-    faces : (F, 3) int64.
+    vertices : Tensor
+        (V, 3).
+    faces : Tensor
+        (F, 3) int64.
     """
     # Coordinates apart, (3, F) each: several times faster on the CPU than rows of three.
     corners = vertices.t().contiguous().index_select(1, faces.t().reshape(-1)).view(3, 3, -1)

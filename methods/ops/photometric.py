@@ -41,11 +41,12 @@ def blur(planes: Tensor) -> Tensor:
 def mean_ssim(image: Tensor, truth: Tensor) -> Tensor:
     """SSIM as 3DGS trains with: 11 x 11 Gaussian window of sigma 1.5, zero padding, mean over all pixels.
 
+    Wang et al. 2004, eq. 13 with population moments. Not an evaluation metric: the zero padding lowers borders.
+
     Parameters
     ----------
-    image, truth : (3, H, W) in [0, 1].
-
-    Wang et al. 2004, eq. 13 with population moments. Not an evaluation metric: the zero padding lowers borders.
+    image, truth : Tensor
+        (3, H, W) in [0, 1].
     """
     blurred = blur(torch.cat([image, truth, image * image + truth * truth, image * truth]))
     mean_x, mean_y, squares, products = blurred.split(len(image))

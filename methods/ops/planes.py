@@ -22,9 +22,12 @@ def sum_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
 
     Parameters
     ----------
-    table : (T, C).
-    rows : (N, K) int64.
-    weights : (N, K), of the table's dtype.
+    table : Tensor
+        (T, C).
+    rows : Tensor
+        (N, K) int64.
+    weights : Tensor
+        (N, K), of the table's dtype.
     """
     return embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
@@ -97,8 +100,10 @@ class ColorNetwork(NamedTuple):
 
     Attributes
     ----------
-    xy, xz, yz : (R * R, C_k) planes.
-    first, last : (H, C + 27) and (3, H) weights, C the sum of the C_k.
+    xy, xz, yz : Tensor
+        (R * R, C_k) planes.
+    first, last : Tensor
+        (H, C + 27) and (3, H) weights, C the sum of the C_k.
     """
 
     xy: Tensor
@@ -124,8 +129,8 @@ def plane_colors(positions: Tensor, directions: Tensor, box: Bounds, network: Co
 
     Parameters
     ----------
-    positions, directions : (N, 3), and (N, 3) unit vectors to the camera.
-    box : of the planes.
+    positions, directions : Tensor
+        (N, 3), and (N, 3) unit vectors to the camera.
     """
     features = triplane_features(network[:3], box, positions)
     inputs = torch.cat([*features, encode(directions)], dim=1)
@@ -201,7 +206,8 @@ def line_offsets(positions: Tensor, box: Bounds, table: Tensor, layers: OffsetLa
 
     Parameters
     ----------
-    table : (3 L, H) what each sample of the lines adds to the first layer.
+    table : Tensor
+        (3 L, H) contribution of each sample of the lines to the first layer.
     """
     # Computed outside, too: on a GPU the host would wait for the number of those inside.
     position = line_position(box.unit(positions.detach()), len(table) // AXES)
@@ -241,8 +247,10 @@ def shader(from_position: Tensor, of_direction: Tensor, last: Tensor) -> Shader:
 
     Parameters
     ----------
-    from_position : (N, H), what the planes add to the hidden layer.
-    of_direction, last : (27, H) and (3, H) weights of the encoded direction and of the hidden layer.
+    from_position : Tensor
+        (N, H), contribution of the planes to the hidden layer.
+    of_direction, last : Tensor
+        (27, H) and (3, H) weights of the encoded direction and of the hidden layer.
     """
 
     def shade(means: Tensor, center: Tensor, turns: Tensor, binding: Tensor) -> Tensor:

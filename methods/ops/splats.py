@@ -60,11 +60,17 @@ def to_world(
 
     Parameters
     ----------
-    binding : (N,) int64, the triangle of each splat.
-    means : (N, 3) in units of the triangle's size.
-    log_scales : (N, 3) logarithms in the same unit.
-    quats : (N, 4), real part first, of any length.
-    activated : of ``log_scales`` and ``quats``, where these stay for many frames and no gradient is asked for.
+    binding : Tensor
+        (N,) int64, the triangle of each splat.
+    means : Tensor
+        (N, 3) in units of the triangle's size.
+    log_scales : Tensor
+        (N, 3) logarithms in the same unit.
+    quats : Tensor
+        (N, 4), real part first, of any length.
+    activated : Activated | None
+        Activations of ``log_scales`` and ``quats``, if these stay the same for many frames and no
+        gradient is needed.
     """
     linear = (frames.size[:, None, None] * frames.rotation).flatten(1)
     # One gather instead of four, and one scatter for its gradient. The quaternion goes along as the matrix that
@@ -117,8 +123,10 @@ def points_on(means: Tensor, binding: Tensor, linear: Tensor, center: Tensor) ->
 
     Parameters
     ----------
-    binding : (N,) int64, the triangle of each splat.
-    linear, center : (F, 9) size times rotation, and (F, 3), by triangle.
+    binding : Tensor
+        (N,) int64, the triangle of each splat.
+    linear, center : Tensor
+        (F, 9) size times rotation, and (F, 3), by triangle.
     """
     return apply_matrices(linear.index_select(0, binding), means) + center.index_select(0, binding)
 
@@ -152,9 +160,12 @@ def directions_to(
 
     Parameters
     ----------
-    center : (3,) of the camera.
-    turns, binding : (F, 3, 3) rotations by triangle, and (N,) int64, the triangle of each splat.
-    last : (3, 3) applied to all after that; None for no rotation.
+    center : Tensor
+        (3,) position of the camera.
+    turns, binding : Tensor
+        (F, 3, 3) rotations by triangle, and (N,) int64, the triangle of each splat.
+    last : Tensor | None
+        (3, 3) applied to all directions afterwards; None for no rotation.
     """
     directions = normalize(center - means, dim=1)
     rows = turns.reshape(-1, 9).index_select(0, binding)

@@ -218,8 +218,10 @@ def penalty_weights(
 
     Parameters
     ----------
-    unposed, canonical : (V, 3) metres, with and without expression, jaw and eyes.
-    is_face : (F,) triangles of the face region.
+    unposed, canonical : Tensor
+        (V, 3) metres, with and without expression, jaw and eyes.
+    is_face : Tensor
+        (F,) triangles of the face region.
     """
     millimetres = 1000 * centroid_displacements(unposed, canonical, faces)
     still_face = (millimetres < config.penalty.face_mm).to(millimetres.dtype)

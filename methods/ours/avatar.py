@@ -42,11 +42,14 @@ class OursAvatar(StoredSplatAvatar):
 
     Attributes
     ----------
-    subject, field : whom it shows, and what its file holds.
-    mesh : the subject's.
-    neutral : the splats before an expression changes them.
-    line_offsets : what the lines give; None where there are none.
-    colors : what the planes, or spherical harmonics, give to a camera, see `Shader`.
+    subject, field : Subject, Field
+        The subject, and the content of its file.
+    neutral : LocalSplats
+        The splats before an expression changes them.
+    line_offsets : LineOffsets | None
+        Offsets given by the lines; None without lines.
+    colors : Shader
+        View-dependent colour of the planes, or of spherical harmonics, see `Shader`.
     """
 
     def __init__(

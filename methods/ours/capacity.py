@@ -49,11 +49,14 @@ class CapacityPlan:
 
     Attributes
     ----------
-    tolerance : pixels.
-    pixel : metres that a pixel covers on the head, median over training frames.
-    decisions : one for each size that was not kept.
-    lines : whether anything is dynamic.
-    lines_within : corners of the lines' box, metres, where it is not that of ``lines.bounds``.
+    tolerance : float
+        Tolerance in pixels.
+    pixel : float
+        Size of a pixel on the head, metres, median over training frames.
+    decisions : tuple[Decision, ...]
+        One for each size that was changed.
+    lines_within : tuple[tuple[float, ...], tuple[float, ...]] | None
+        Corners of the lines' box, metres, if it differs from that of ``lines.bounds``.
     """
 
     tolerance: float
@@ -95,8 +98,8 @@ def plan_capacity(clip: Clip, mesh: SubjectMesh, config: OursConfig) -> Capacity
 
     Parameters
     ----------
-    mesh : of the clip's subject.
-    config : its sizes are upper limits, those in ``capacity.keep`` are left alone.
+    config : OursConfig
+        Its sizes are upper limits; those in ``capacity.keep`` are not changed.
     """
     planner = _Planner(clip, mesh, config)
     planner.lines()
@@ -256,7 +259,8 @@ def pixel_footprint(clip: Clip, center: FloatArray) -> float:
 
     Parameters
     ----------
-    center : (3,) centre of the canonical head, metres; each pose's translation is added.
+    center : FloatArray
+        (3,) centre of the canonical head, metres; each pose's translation is added.
     """
     sizes = []
     for key in clip.splits["train"]:
@@ -286,14 +290,18 @@ def leading_directions(coefficients: FloatArray, basis: FloatArray, tolerance: f
 
     Parameters
     ----------
-    coefficients : (T, E) of the training timesteps.
-    basis : (V, 3, E) metres per unit.
-    tolerance : metres.
+    coefficients : FloatArray
+        (T, E) coefficients of the training timesteps.
+    basis : FloatArray
+        (V, 3, E) metres per unit.
+    tolerance : float
+        Metres.
 
     Returns
     -------
-    The least K such that leaving out the directions from K on, or from any later one on, displaces no vertex by more
-    than the tolerance in any timestep.
+    int
+        The smallest K such that leaving out the directions from K on, or from any later one on,
+        displaces no vertex by more than the tolerance in any timestep.
     """
     deviation, columns = _deviation(coefficients), _columns(basis)
     needed = 0
@@ -348,8 +356,10 @@ def spanning_jaw_bases(
 
     Returns
     -------
-    Number of bases, at most ``limit``, of the farthest-point order of `jaw_bases`, and metres. None are needed
-    where no training pose moves a vertex by more than the tolerance from the mean jaw rotation.
+    tuple[int, float]
+        Number of bases, at most ``limit``, in the farthest-point order of `jaw_bases`, and metres.
+        None are needed if no training pose moves a vertex by more than the tolerance from the mean
+        jaw rotation.
     """
     candidates = jaw_quaternions(poses)
     mean = candidates.mean(0)

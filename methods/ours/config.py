@@ -27,15 +27,22 @@ class Planes:
 
     Attributes
     ----------
-    resolution, channels : samples per side, and channels of the (x,y), (x,z) and (y,z) planes.
-    bounds_variant : "mesh" fits the planes to the canonical mesh in all directions; "paper" sets x to +-0.25 m, which
-        leaves half the samples in x unused on a head without long hair.
-    lr, network_lr : learning rates of the planes and of the network.
-    move_splats : whether the loss moves splats to where the planes, seen from there, have better colours, as published.
-    direction_smoothing : standard deviation of a view direction, radians: the colour network is given the mean of the
-        encoding over such directions, so that it invents no colours between the training cameras. 0 as published.
-    residual_lr : learning rate of a colour of its own for each splat, added to that of the planes; 0, as published, gives
-        it none.
+    resolution, channels : int, tuple[int, int, int]
+        Samples per side, and channels of the (x,y), (x,z) and (y,z) planes.
+    bounds_variant : Literal['mesh', 'paper']
+        "mesh" fits the planes to the canonical mesh in all directions; "paper" sets x to +-0.25 m,
+        which leaves half the samples in x unused on a head without long hair.
+    lr, network_lr : float
+        Learning rates of the planes and of the network.
+    move_splats : bool
+        Whether the loss moves splats to positions where the planes have better colours, as published.
+    direction_smoothing : float
+        Standard deviation of a view direction, radians: the colour network receives the mean of the
+        encoding over such directions, which keeps colours smooth between the training cameras. 0 as
+        published.
+    residual_lr : float
+        Learning rate of a separate colour of each splat, added to that of the planes; 0, as
+        published, disables it.
     """
 
     resolution: int = 128
@@ -61,17 +68,24 @@ class Lines:
 
     Attributes
     ----------
-    enabled : dynamic appearance on or off.
-    dynamic : what the lines change. The paper's method is opacity alone; position, rotation and scale are its Table 4,
-        colour our addition to that ablation.
-    resolution, channels : samples and channels per line.
-    expressions, jaw_bases : how many leading expression coefficients (as many as there are, if fewer) and jaw bases
-        have lines.
-    jaw_bases_variant : "paper" takes jaw bases from training poses, seeded with the identity. "official" draws them
+    enabled : bool
+        Whether appearance is dynamic.
+    dynamic : tuple[Dynamic, ...]
+        Quantities that the lines change. The paper's method is opacity alone; position, rotation and
+        scale are its Table 4, colour is an addition to that ablation.
+    resolution, channels : int
+        Samples and channels per line.
+    expressions, jaw_bases : int
+        Number of leading expression coefficients (all, if there are fewer) and jaw bases with lines.
+    jaw_bases_variant : Literal['paper', 'official']
+        "paper" takes jaw bases from training poses, seeded with the identity. "official" draws them
         from held-out poses as the authors' program does: a leak, for comparison with it only.
-    bounds : box in which splats have dynamic opacity: the "head" (whole mesh) or the "face" region.
-    start : iteration (published scale) at which lines and penalty start.
-    lr, network_lr : learning rates of the lines and of the network.
+    bounds : Literal['head', 'face']
+        Box in which splats have dynamic opacity: the "head" (whole mesh) or the "face" region.
+    start : int
+        Iteration (published scale) at which lines and penalty start.
+    lr, network_lr : float
+        Learning rates of the lines and of the network.
     """
 
     enabled: bool = True
@@ -101,11 +115,15 @@ class Penalty:
 
     Attributes
     ----------
-    weight : 0 turns it off.
-    softness : offsets under which |offset| is rounded off to a parabola (Huber 1964), so that its gradient does not
-        change sign around 0 and outweigh the image's in the optimiser's second moments; 0 as published.
-    face_mm, other_mm, other_weight : surface displacement under which opacity may not change, in the face region and
-        elsewhere, and the weight elsewhere.
+    weight : float
+        0 turns it off.
+    softness : float
+        Offsets below which |offset| is replaced by a parabola (Huber 1964), so that the sign of its
+        gradient does not jump at 0 and outweigh the image's gradient in the optimiser's second
+        moments; 0 as published.
+    face_mm, other_mm, other_weight : float
+        Surface displacement below which opacity may not change, in the face region and elsewhere, and
+        the weight elsewhere.
     """
 
     weight: float = 1.0
@@ -125,9 +143,10 @@ class OuterLayers:
 
     Attributes
     ----------
-    count : layers; 0 as published.
-    gap : metres between two.
-    opacity : of their splats.
+    count : int
+        Number of layers; 0 as published.
+    gap : float
+        Distance of two layers, metres.
     """
 
     count: int = 0
@@ -145,9 +164,11 @@ class Sampling:
 
     Attributes
     ----------
-    balanced, expression_clusters : each of so many clusters of expressions has an equal share.
-    clusters_variant : "paper" finds the same clusters every time and needs no comparison of all pairs of timesteps;
-        "official" finds them as the authors' program does. Both see training timesteps alone.
+    balanced, expression_clusters : bool, int
+        Whether clusters of expressions have equal shares, and their number.
+    clusters_variant : Literal['paper', 'official']
+        "paper" finds the same clusters every time without a comparison of all pairs of timesteps;
+        "official" finds them as the authors' program does. Both use training timesteps only.
     """
 
     balanced: bool = True
@@ -161,12 +182,16 @@ class PlannedCapacity:
 
     Attributes
     ----------
-    mode : "fixed" takes the configured sizes as they are. "auto" takes them as upper limits and decides from the training
-        data how much of them the scene requires (`capacity.plan_capacity`).
-    tolerance : pixels; motion of the surface below it counts as none.
-    detail : samples of the planes per pixel, along the longest side of their box. 1 keeps PSNR and LPIPS; 0.5 keeps PSNR
-        alone, in half the bytes (README.md).
-    keep : sizes that "auto" leaves as they are.
+    mode : Literal['fixed', 'auto']
+        "fixed" uses the configured sizes. "auto" uses them as upper limits and chooses smaller ones
+        that the training data support (`capacity.plan_capacity`).
+    tolerance : float
+        Pixels; smaller motion of the surface is ignored.
+    detail : float
+        Samples of the planes per pixel, along the longest side of their box. 1 keeps PSNR and LPIPS;
+        0.5 keeps only PSNR, in half the bytes (README.md).
+    keep : tuple[Planned, ...]
+        Sizes that "auto" does not change.
     """
 
     mode: Literal["fixed", "auto"] = "fixed"
@@ -185,15 +210,18 @@ class OursConfig:
 
     Attributes
     ----------
-    hidden : units of the hidden layers of both networks.
-    direction_jitter : standard deviation, radians, of a random rotation of all view directions in each iteration. What
-        a colour does between the training cameras no image shows; of the order of the cameras' spacing, jitter keeps
-        it smooth. 0 as published.
-    color : "planes" reads colour from the tri-plane; "sh" gives every splat spherical harmonics of degree
+    direction_jitter : float
+        Standard deviation, radians, of a random rotation of all view directions in each iteration. No
+        image shows the colours between the training cameras; jitter of the order of the cameras'
+        spacing keeps them smooth. 0 as published.
+    color : Literal['planes', 'sh']
+        "planes" reads colour from the tri-plane; "sh" gives every splat spherical harmonics of degree
         ``sh_degree`` in canonical directions instead (an ablation).
-    sh_degree, sh_every, min_sh_every, sh_dc_lr, sh_rest_lr : as those of `GAConfig`.
-    storage : "exact" keeps the avatar as float32; "compact" writes a quantised file beside it (`compact.file`), which
-        is what is then loaded, rendered, measured and counted.
+    sh_degree, sh_every, min_sh_every, sh_dc_lr, sh_rest_lr : int, int, int, float, float
+        As for `GAConfig`.
+    storage : Literal['exact', 'compact']
+        "exact" keeps the avatar as float32; "compact" also writes a quantised file (`compact.file`),
+        which is then loaded, rendered, measured and counted.
     """
 
     splats: SplatTraining = field(default_factory=SplatTraining)

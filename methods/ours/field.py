@@ -46,11 +46,16 @@ class LocalSplats(NamedTuple):
 
     Attributes
     ----------
-    means : (N, 3) in units of the triangle's size.
-    log_scales : (N, 3) logarithms in the same unit.
-    quats : (N, 4), real part first, of any length.
-    logits : (N,) of the opacities.
-    color_change : (N, 3) added to the colours before they are cut at 0; None where nothing is added.
+    means : Tensor
+        (N, 3) in units of the triangle's size.
+    log_scales : Tensor
+        (N, 3) logarithms in the same unit.
+    quats : Tensor
+        (N, 4), real part first, of any length.
+    logits : Tensor
+        (N,) logits of the opacities.
+    color_change : Tensor | None
+        (N, 3) added to the colours before they are clamped at 0; None for no change.
     """
 
     means: Tensor
@@ -94,8 +99,10 @@ def blend_lines(lines: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
 
     Parameters
     ----------
-    lines : (E + J, 3, L, C).
-    expression, jaw : (E,) coefficients and (J,) weights.
+    lines : Tensor
+        (E + J, 3, L, C).
+    expression, jaw : Tensor
+        (E,) coefficients and (J,) weights.
     """
     flat = lines.flatten(1)
     count = len(expression)
@@ -173,9 +180,12 @@ class CanonicalFrames:
 
     Attributes
     ----------
-    linear : (F, 9) size times rotation.
-    center : (F, 3).
-    rotation : (F, 3, 3).
+    linear : Tensor
+        (F, 9) size times rotation.
+    center : Tensor
+        (F, 3).
+    rotation : Tensor
+        (F, 3, 3).
     """
 
     linear: Tensor

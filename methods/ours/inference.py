@@ -38,8 +38,8 @@ class LineOffsets:
 
     Parameters
     ----------
-    tensors : of a field with lines.
-    positions : (N, 3) canonical positions.
+    positions : Tensor
+        (N, 3) canonical positions.
     """
 
     def __init__(self, tensors: Mapping[str, Tensor], positions: Tensor):

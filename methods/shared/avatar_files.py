@@ -94,7 +94,8 @@ class RefinedTracking:
 
     Parameters
     ----------
-    tracked, refined : by name of `TRACKED`, (T, n) float32, rows in the order of ``timesteps``.
+    tracked, refined : Mapping[str, FloatArray]
+        Arrays of `TRACKED` by name, (T, n) float32, rows in the order of ``timesteps``.
     """
 
     def __init__(

@@ -32,8 +32,11 @@ def save_checkpoint(path: Path, run: str, state: dict[str, Any]) -> None:
 
     Parameters
     ----------
-    run : digest of everything the run was started with; `load_checkpoint` refuses another run's file.
-    state : nested dicts, lists and tuples of tensors, numbers and text.
+    run : str
+        Digest of everything the run was started with; `load_checkpoint` refuses files with another
+        digest.
+    state : dict[str, Any]
+        Nested dicts, lists and tuples of tensors, numbers and text.
     """
     tensors: dict[str, Tensor] = {}
     tree = _packed(state, tensors)

@@ -20,26 +20,43 @@ class DensifiedTraining:
 
     Attributes
     ----------
-    schedule_length : iterations of the published run; every ``..._from``, ``..._every`` below is on its scale.
-    position_lr, position_lr_final : log-linear from one to the other over the run, times the scene extent.
-    final_rate : part of their learning rate that all other tensors end with, log-linearly over the last half of
-        the run; 1 keeps them constant, as published. A short run has not the steps to average Adam's noise away.
-    ssim_weight : the loss is ``(1 - w) L1 + w (1 - SSIM)``.
-    densify_from, densify_every, densify_until : rounds of cloning, splitting and pruning.
-    densify_gradient : mean gradient of the projected mean, in normalised device units, that asks for a round.
-    densify_extent : splats larger than this part of the scene extent are split, smaller ones cloned.
-    split_variant : "paper" scatters the two children of a split over the parent. "official" does as the authors' program,
-        which uses world-space scales in local coordinates and so puts both children almost onto the parent.
-    prune_opacity : splats below it are removed.
-    prune_extent, prune_extent_from : so are splats larger than this part of the extent, from then on.
-    reset_every, reset_at_start, reset_opacity : opacities are cut to ``reset_opacity`` regularly (None: never), and
-        once when densification starts, if the background is white, as published.
-    max_splats : densification stops adding above this number; None for no bound.
-    min_densify_every, min_reset_every : in iterations of the actual run. A gradient mean needs some views, and
-        opacities some steps to recover.
-    min_settle : no densification and no reset in the last so many iterations of the actual run.
-    mesh_cache_mb : memory for the posed meshes of known timesteps.
-    checkpoint_every_s : seconds between checkpoints.
+    schedule_length : int
+        Iterations of the published run; every ``..._from`` and ``..._every`` below is on its scale.
+    position_lr, position_lr_final : float
+        Initial and final rate, log-linear over the run, times the scene extent.
+    final_rate : float
+        Final learning rate of all other tensors relative to the initial one, log-linear over the last
+        half of the run; 1 keeps it constant, as published. A short run lacks the steps to average
+        Adam's noise.
+    ssim_weight : float
+        The loss is ``(1 - w) L1 + w (1 - SSIM)``.
+    densify_from, densify_every, densify_until : int
+        Schedule of cloning, splitting and pruning.
+    densify_gradient : float
+        Mean gradient of the projected mean, in normalised device units, above which a splat is cloned
+        or split.
+    densify_extent : float
+        Splats larger than this fraction of the scene extent are split, smaller ones cloned.
+    split_variant : Literal['paper', 'official']
+        "paper" scatters the two children of a split over the parent. "official" does as the authors'
+        program, which uses world-space scales in local coordinates and so puts both children almost
+        onto the parent.
+    prune_opacity : float
+        Splats with less opacity are removed.
+    prune_extent, prune_extent_from : float, int
+        Splats larger than this fraction of the extent are removed, from this iteration.
+    reset_every, reset_at_start, reset_opacity : int | None, bool, float
+        Opacities are reduced to ``reset_opacity`` regularly (None: never), and once when
+        densification starts, if the background is white, as published.
+    max_splats : int | None
+        Densification stops adding above this number; None for no bound.
+    min_densify_every, min_reset_every : int
+        In iterations of the actual run. A gradient mean needs several views, and opacities several
+        steps to recover.
+    min_settle : int
+        Number of last iterations of the actual run without densification and reset.
+    mesh_cache_mb : int
+        Memory for the posed meshes of known timesteps.
     """
 
     schedule_length: int = 600_000
@@ -97,8 +114,10 @@ class SplatTraining(DensifiedTraining):
 
     Attributes
     ----------
-    position_weight, position_threshold : penalty on local positions longer than the threshold (triangle sizes).
-    scale_weight, scale_threshold : penalty on local scales above the threshold (triangle sizes).
+    position_weight, position_threshold : float
+        Penalty on local positions longer than the threshold (triangle sizes).
+    scale_weight, scale_threshold : float
+        Penalty on local scales above the threshold (triangle sizes).
     """
 
     position_weight: float = 0.01
@@ -113,10 +132,14 @@ class Capacity:
 
     Attributes
     ----------
-    mode : "fixed" takes the configured sizes as they are. "auto" takes them as upper limits: short trainings without the
-        ends of the training sequences try smaller ones (`sizes.choose_sizes`), which takes time beyond the budget.
-    share : of the budget, for each of these trainings; at least 500 iterations of it.
-    tolerance_db, tolerance_ssim : what PSNR and SSIM of the held-out timesteps may lose.
+    mode : Literal['fixed', 'auto']
+        "fixed" uses the configured sizes. "auto" uses them as upper limits: short trainings without
+        the ends of the training sequences try smaller ones (`sizes.choose_sizes`), which takes time
+        beyond the budget.
+    share : float
+        Fraction of the budget for each of these trainings; at least 500 iterations.
+    tolerance_db, tolerance_ssim : float
+        Allowed loss of PSNR and SSIM on the held-out timesteps.
     """
 
     mode: Literal["fixed", "auto"] = "fixed"

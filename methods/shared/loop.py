@@ -61,10 +61,14 @@ class Fit:
 
     Attributes
     ----------
-    out : folder of the avatar, its checkpoint and its record.
-    run : digest of everything that decides how training goes; another run's checkpoint is refused.
-    clock : seconds, from any start; what budgets in seconds are measured by.
-    trials : the sizes that were tried before, for the record.
+    out : Path
+        Folder of the avatar, its checkpoint and its record.
+    run : str
+        Digest of everything that affects training; a checkpoint with another digest is refused.
+    clock : Callable
+        Clock in seconds with any origin, for budgets in seconds.
+    trials : Sequence[Any]
+        The sizes that were tried before, for the record.
     """
 
     clip: Clip
@@ -108,14 +112,17 @@ def train(
 
     Parameters
     ----------
-    published_length : iterations of the published run (`Timeline`).
-    began : what the clock said before the preparation of ``trainable``, whose seconds then count like those of
-        iterations; by default counting begins here.
+    published_length : int
+        Iterations of the published run (`Timeline`).
+    began : float | None
+        Reading of the clock before ``trainable`` was prepared, so that the preparation counts as
+        training time; by default counting begins here.
 
     Raises
     ------
     InputError
-        For a budget without iterations and seconds, and for a checkpoint that is damaged or of another run.
+        The budget has neither iterations nor seconds, or a checkpoint is damaged or belongs to
+        another run.
     """
     budget, clock = fit.budget, fit.clock
     check_budget(budget)
@@ -216,7 +223,8 @@ class TrainingImages:
 
     Parameters
     ----------
-    masks : whether images come with a fourth channel, the foreground's coverage.
+    masks : bool
+        Whether images have a fourth channel, the foreground's coverage.
     """
 
     def __init__(

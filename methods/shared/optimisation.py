@@ -26,9 +26,8 @@ class Optimiser:
 
     Parameters
     ----------
-    parameters : name -> parameter.
-    learning_rates : name -> initial learning rate.
-    betas : decay of the two moments.
+    betas : tuple[float, float]
+        Decay of the two moments.
     """
 
     def __init__(
@@ -128,16 +127,20 @@ class Densifier:
 
     Parameters
     ----------
-    names : the per-splat groups.
-    binding : (N,) int64, triangle of each splat.
-    face_count : number of triangles.
-    extent : size of the scene, metres (`scene_extent`).
-    seed : of the run.
-    thresholds : (F,) gradient that asks for a round, by triangle; None takes ``settings.densify_gradient`` for all.
-    keep_last : whether a triangle keeps its last splat.
-    tables : groups with any number of rows for each splat, all rows of the first splat first; splats on one triangle
-        have equally many. Children inherit them.
-    table_rows : (F,) int64, how many rows a splat on each triangle has in the tables.
+    binding : Tensor
+        (N,) int64, triangle of each splat.
+    extent : float
+        Size of the scene, metres (`scene_extent`).
+    thresholds : Tensor | None
+        (F,) gradient above which splats are cloned or split, by triangle; None uses
+        ``settings.densify_gradient`` for all.
+    keep_last : bool
+        Whether the last splat of a triangle is never removed.
+    tables : tuple[str, ...]
+        Groups with any number of rows for each splat, all rows of the first splat first; splats on
+        one triangle have equally many. Children inherit them.
+    table_rows : Tensor | None
+        (F,) int64, number of rows in the tables for a splat on each triangle.
     """
 
     def __init__(
@@ -177,7 +180,9 @@ class Densifier:
 
         Parameters
         ----------
-        face_sizes : (F,) of the current frame, metres: what turns local scales into world scales.
+        face_sizes : Tensor
+            (F,) triangle sizes of the current frame, metres, which convert local scales into
+            world scales.
         """
         gradient = self._gradient_sum / self._views.clamp_min(1)
         if self._thresholds is None:

@@ -28,9 +28,12 @@ class PosedSplats:
 
     Attributes
     ----------
-    means, quats, scales : (N, 3) metres, (N, 4) unit quaternions wxyz, (N, 3) metres.
-    opacities : (N,).
-    colors : (N, 3) as the camera asked for sees them; None where no camera was given.
+    means, quats, scales : FloatArray
+        (N, 3) metres, (N, 4) unit quaternions wxyz, (N, 3) metres.
+    opacities : FloatArray
+        (N,).
+    colors : FloatArray | None
+        (N, 3) as seen from the requested camera; None without a camera.
     """
 
     means: FloatArray
@@ -195,8 +198,10 @@ class StoredSplatAvatar:
 
     Parameters
     ----------
-    stored : files that count as storage, in the avatar's folder.
-    place : the splats of a pose; calls its second argument with "drive" as soon as the mesh is posed.
+    stored : Sequence[Path]
+        Files in the avatar's folder that count as storage.
+    place : Callable
+        Returns the splats of a pose; calls its second argument with "drive" when the mesh is posed.
     """
 
     def __init__(

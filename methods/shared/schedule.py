@@ -31,8 +31,8 @@ class Timeline:
 
     Parameters
     ----------
-    total : iterations of the actual run.
-    published : iterations of the run the settings were written for.
+    published : int
+        Iterations of the run that the settings were written for.
     """
 
     total: int
@@ -137,7 +137,8 @@ class Weighted:
 
     Parameters
     ----------
-    weights : (n,) not negative, not all zero.
+    weights : Sequence[float] | np.ndarray
+        (n,) non-negative, at least one positive.
     """
 
     def __init__(self, weights: Sequence[float] | np.ndarray, seed: int):

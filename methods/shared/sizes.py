@@ -97,8 +97,10 @@ def choose_sizes(
 
     Parameters
     ----------
-    sizes : one after the other; of each, values are tried until one loses too much.
-    train : trains an avatar with a configuration on a clip into a folder, and continues it after a kill.
+    sizes : Sequence[Size]
+        Chosen one after another; for each, values are tried until one loses too much.
+    train : Callable
+        Trains an avatar with a configuration on a clip into a folder, and resumes it after a kill.
     """
     clip = HeldOut(fit.clip)
     if not clip.held_out or not clip.splits["train"]:

@@ -56,8 +56,10 @@ class SplatTrainer:
 
         Parameters
         ----------
-        splats, shared : per-splat tensors, "means" among them, and all others.
-        binding, face_count, extent, seed, density : as those of `Densifier`.
+        splats, shared : Initial
+            Per-splat tensors, including "means", and all others.
+        binding, face_count, extent, seed, density : Tensor, int, float, int, Any
+            As for `Densifier`.
         """
         initial = {**splats, **shared}
         self.splat_names, self.extent = tuple(splats), extent
@@ -139,7 +141,8 @@ class SplatTrainer:
 
         Parameters
         ----------
-        face_sizes : (F,) metres per unit of the local scales, by triangle.
+        face_sizes : Tensor
+            (F,) metres per unit of the local scales, by triangle.
         """
         offset = opacities.new_zeros(len(opacities), 2).requires_grad_()
         rendering = rasterize(
@@ -192,9 +195,12 @@ class Start(NamedTuple):
 
     Attributes
     ----------
-    binding : (N,) int64, the triangle of each; every triangle once at least.
-    means : (N, 3) in the triangles' frames, units of the triangle's size.
-    opacities : (N,) in (0, 1).
+    binding : Tensor
+        (N,) int64, the triangle of each splat; every triangle occurs at least once.
+    means : Tensor
+        (N, 3) in the triangles' frames, units of the triangle's size.
+    opacities : Tensor
+        (N,) in (0, 1).
     """
 
     binding: Tensor

@@ -23,13 +23,15 @@ class SubjectMesh:
 
     Parameters
     ----------
-    shape : (S,) identity coefficients.
-    static_offset : (V, 3) metres, added to the shaped template.
+    shape : FloatArray
+        (S,) identity coefficients.
+    static_offset : FloatArray
+        (V, 3) metres, added to the shaped template.
 
     Raises
     ------
     InputError
-        Where they make a mesh that is no head's by its size, see `check_size`.
+        The size of the mesh is not that of a head, see `check_size`.
     """
 
     def __init__(self, head: HeadAsset, shape: FloatArray, static_offset: FloatArray, device: str):

@@ -67,7 +67,8 @@ class _ImageAvatar:
 
     Parameters
     ----------
-    arrays : ``head_model`` and ``background``, of the images, among them.
+    arrays : Mapping[str, np.ndarray]
+        Arrays of the images, including ``head_model`` and ``background``.
     """
 
     def __init__(self, arrays: Mapping[str, np.ndarray]):

@@ -196,9 +196,8 @@ def principal_basis(shapes: dict[str, FloatArray], deviation: FloatArray, seed: 
 
     Parameters
     ----------
-    shapes : K displacements (V, 3).
-    deviation : (K,) standard deviation of each activation.
-    seed : draws the correlations.
+    shapes : dict[str, FloatArray]
+        K displacements (V, 3).
 
     Notes
     -----
@@ -281,8 +280,8 @@ def lid_turn(surface: SculptedHead, upper: FloatArray | float, lower: FloatArray
 
     Parameters
     ----------
-    surface : the surface at rest.
-    upper, lower : radians by which each margin turns, positive up; a number, or one for each vertex.
+    upper, lower : FloatArray | float
+        Radians by which each margin turns, positive up; a number, or one for each vertex.
     """
     relative = surface.vertices - EYE_CENTER
     x, y, z = relative.T

@@ -37,13 +37,15 @@ def procedural_head(version: str = "2023") -> HeadArrays:
 
     Parameters
     ----------
-    version : "2023" ("procedural2023") or "2020" ("procedural2020"). Both have one topology and template.
-        The 2020 one leaves the blinks to two eyelid bases, and its shapes and directions differ a little.
+    version : str
+        "2023" ("procedural2023") or "2020" ("procedural2020"). Both have the same topology and
+        template. In 2020 two eyelid bases represent the blinks, and shapes and directions differ a
+        little.
 
     Raises
     ------
     InputError
-        For any other version.
+        The version is unknown.
     """
     name = full_version(version)
     surface = load_sculpture()
@@ -72,8 +74,10 @@ def semantic_to_coefficients(version: str = "2023") -> tuple[FloatArray, FloatAr
 
     Returns
     -------
-    (K, E) expression coefficients of each shape in `SEMANTIC_NAMES` at activation 1, and (K, 2) coefficients
-    of the eyelid bases, or None where the version has none. Coefficients of combinations add up.
+    tuple[FloatArray, FloatArray | None]
+        (K, E) expression coefficients of each shape in `SEMANTIC_NAMES` at activation 1, and (K, 2)
+        coefficients of the eyelid bases, or None if the version has none. Coefficients of
+        combinations are added.
     """
     name = full_version(version)
     shapes = version_shapes(load_sculpture(), name)

@@ -30,11 +30,12 @@ class MouthMesh:
 
     Attributes
     ----------
-    name : "upper_teeth", "lower_teeth", "upper_gums", "lower_gums" or "tongue".
-    vertices : (n, 3) in the neutral shape, metres.
-    faces : (f, 3), counter-clockwise seen from outside.
-    skinning_weights : (n, 5).
-    material : "teeth", "gums" or "tongue".
+    name : str
+        "upper_teeth", "lower_teeth", "upper_gums", "lower_gums" or "tongue".
+    vertices : FloatArray
+        (n, 3) in the neutral shape, metres.
+    faces : IntArray
+        (f, 3), counter-clockwise seen from outside.
     """
 
     name: str
@@ -51,14 +52,15 @@ def render_parts(
 
     Parameters
     ----------
-    head : a version of the procedural head.
-    shape : (S,) identity coefficients; the mean head if None. Parts follow the mouth's wall around them.
-    tongue_out : 0 lies behind the lower teeth, 1 is put out over the lower lip (the jaw should be open).
+    shape : FloatArray | None
+        (S,) identity coefficients; the mean head if None. Parts follow the mouth's wall around them.
+    tongue_out : float
+        0 places the tongue behind the lower teeth, 1 over the lower lip (the jaw should be open).
 
     Raises
     ------
     InputError
-        Where the head is not a procedural one, or ``tongue_out`` is not in [0, 1].
+        The head is not procedural, or ``tongue_out`` is not in [0, 1].
     """
     if "mouth_socket" not in head.regions or not head.version.startswith("procedural"):
         raise InputError(f"head model {head.version!r}", "regions", "a procedural head", "another head")

@@ -44,9 +44,12 @@ class SculptSettings:
 
     Attributes
     ----------
-    out : npz to write: ``vertices`` (V, 3) float32 metres, ``faces`` (F, 3) int32, ``mirror`` (V,) int32.
-    step : voxel of the fine surface, metres.
-    detail : factor on the wanted edge lengths; smaller is finer.
+    out : Path
+        Output npz: ``vertices`` (V, 3) float32 metres, ``faces`` (F, 3) int32, ``mirror`` (V,) int32.
+    step : float
+        Voxel size of the fine surface, metres.
+    detail : float
+        Factor on the wanted edge lengths; smaller is finer.
     """
 
     out: Path
@@ -246,16 +249,20 @@ def coarsen(
 
     Parameters
     ----------
-    vertices, faces : the fine mesh, manifold, with at least about three edges to a wanted edge.
-    size : (V,) wanted edge length, metres.
-    fixed : fine vertices that become coarse vertices as they are.
-    border : (V,) bit set of the border lines each fine vertex lies on (0 inside). A coarse vertex whose
+    vertices, faces : FloatArray, IntArray
+        The fine mesh, manifold, with at least about three edges per wanted edge.
+    size : FloatArray
+        (V,) wanted edge length, metres.
+    fixed : IntArray
+        Fine vertices that become coarse vertices unchanged.
+    border : IntArray
+        (V,) bit set of the border lines through each fine vertex (0 inside). A coarse vertex whose
         cluster touches border lines stays on them, so borders keep their shape.
-    iterations : Lloyd steps.
 
     Returns
     -------
-    (V', 3) vertices, of which the first ``len(fixed)`` are the fixed ones, and (F', 3) triangles.
+    tuple[FloatArray, IntArray]
+        (V', 3) vertices, of which the first ``len(fixed)`` are the fixed ones, and (F', 3) triangles.
     """
     density = vertex_areas(vertices, faces) / size**2
     even = surface_graph(vertices, faces, size, diagonals=True)

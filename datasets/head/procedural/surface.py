@@ -41,10 +41,14 @@ class SculptedHead:
 
     Attributes
     ----------
-    vertices : (V, 3) float64, metres.
-    faces : (F, 3) int64, counter-clockwise seen from outside.
-    mirror : (V,) vertex that is the mirror image of each.
-    skin_count : number of skin vertices; each eyeball has half of the rest.
+    vertices : FloatArray
+        (V, 3) float64, metres.
+    faces : IntArray
+        (F, 3) int64, counter-clockwise seen from outside.
+    mirror : IntArray
+        (V,) index of the mirror image of each vertex.
+    skin_count : int
+        Number of skin vertices; each eyeball has half of the rest.
     """
 
     vertices: FloatArray
@@ -144,7 +148,7 @@ def load_sculpture(path: Path = PACKAGED) -> SculptedHead:
     Raises
     ------
     InputError
-        Where the file is no such npz.
+        The file is not such an npz.
     """
     members = {
         "vertices": Member("f", ("V", 3)),

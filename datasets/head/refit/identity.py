@@ -41,11 +41,16 @@ class Matching:
 
     Attributes
     ----------
-    vertices : (n,) of the target, ascending.
-    weights : (n,) of their squared distances.
-    counterparts : (n, V source) sparse; takes the source's vertices to points on its surface.
-    alignment : (4, 4) rigid motion from the source's model space to the target's.
-    shape : (S,) identity of the target.
+    vertices : IntArray
+        (n,) vertices of the target, ascending.
+    weights : FloatArray
+        (n,) weights of their squared distances.
+    counterparts : csr_array
+        (n, V source) sparse; maps the source's vertices to points on its surface.
+    alignment : FloatArray
+        (4, 4) rigid motion from the source's model space to the target's.
+    shape : FloatArray
+        (S,) identity of the target.
     """
 
     vertices: IntArray
@@ -85,12 +90,13 @@ def match(source: HeadAsset, neutral: FloatArray, target: HeadAsset, settings: R
 
     Parameters
     ----------
-    neutral : (V source, 3) metres.
+    neutral : FloatArray
+        (V source, 3) metres.
 
     Raises
     ------
     InputError
-        Where a head lacks a face region, or too few counterparts are found.
+        A head lacks a face region, or too few counterparts are found.
     """
     vertices, weights = fitted_vertices(target, settings)
     if same_topology(source, target):

@@ -74,16 +74,17 @@ class FitProblem:
 
     Parameters
     ----------
-    head : the model that is fitted.
-    canonical : (V, 3) its neutral head, unposed, metres.
-    vertices : (n,) which vertices have targets.
-    weights : (n,) non-negative, of the squared distances; only their ratios matter.
-    settings : bounds and prior.
+    canonical : FloatArray
+        (V, 3) unposed neutral head, metres.
+    vertices : IntArray
+        (n,) vertices with targets.
+    weights : FloatArray
+        (n,) non-negative weights of the squared distances; only their ratios matter.
 
     Raises
     ------
     InputError
-        Where the joint tree is not FLAME's.
+        The joint tree is not FLAME's.
     """
 
     def __init__(
@@ -130,8 +131,10 @@ class FitProblem:
 
         Parameters
         ----------
-        targets : (T, n, 3) metres, in the frame of the head.
-        necks : (T, 3, 3) rotations of the neck joint; read only where the settings keep them.
+        targets : FloatArray
+            (T, n, 3) metres, in the frame of the head.
+        necks : FloatArray
+            (T, 3, 3) rotations of the neck joint; read only where the settings keep them.
         """
         wanted = _MILLIMETRES * np.asarray(targets, dtype=np.float64)
         weighted = wanted * self._share[:, None]
@@ -297,14 +300,15 @@ def solve_bounded(gram: FloatArray, right: FloatArray, bound: FloatArray) -> Flo
 
     Parameters
     ----------
-    gram : (n, n) symmetric positive definite; only the lower triangle is read.
-    right : (n,).
-    bound : (n,) positive.
+    gram : FloatArray
+        (n, n) symmetric positive definite; only the lower triangle is read.
+    bound : FloatArray
+        (n,) positive.
 
     Raises
     ------
     ValueError
-        Where ``gram`` is not positive definite.
+        ``gram`` is not positive definite.
     """
     x = _solve(gram, right)
     if (np.abs(x) <= bound).all():
@@ -369,8 +373,10 @@ def solve_frame(
 
     Parameters
     ----------
-    start : (9,) angles to start from, such as the previous timestep's.
-    fixed : (9,) values of the angles that move no vertex with a target, and so are not searched.
+    start : FloatArray
+        (9,) initial angles, such as the previous timestep's.
+    fixed : FloatArray
+        (9,) values of the angles that move no vertex with a target, which are not optimised.
     """
     searched, limit = problem.searched, angle_bounds(settings)
     scale = problem.scale[searched]

@@ -54,15 +54,19 @@ def refit(
 
     Parameters
     ----------
-    clip : tracked with any head model.
-    target : head model to fit. Where the clip's has teeth of `with_teeth` and the target none, they are added.
-    folder : where finished blocks of timesteps are kept, so that a second call with the same input continues.
+    clip : CaptureClip
+        Clip tracked with any head model.
+    target : HeadArrays
+        Head model to fit. If the clip's head has teeth of `with_teeth` and the target does not, they
+        are added.
+    folder : Path | None
+        Cache of finished blocks of timesteps; a second call with the same input continues.
 
     Raises
     ------
     InputError
-        Where there is no timestep, the tracking holds numbers that are not finite, or the models do not go
-        together (see `match`).
+        There is no timestep, the tracking is not finite, or the models are incompatible (see
+        `match`).
     """
     settings = settings or RefitSettings()
     timesteps = sorted(clip.poses)
@@ -329,12 +333,17 @@ class RefitReport:
 
     Attributes
     ----------
-    source, target : versions of the head models.
-    frames : one for each timestep, ascending.
-    vertex_mm : (V,) mean residual of each of the target's vertices over the timesteps; NaN where a vertex was
-        not fitted.
-    neutral_mm : mean distance of the neutral heads over the facial region.
-    shape_at_bound : identity coefficients that ended at their bound.
+    source, target : str
+        Versions of the head models.
+    frames : Sequence[FrameResidual]
+        One for each timestep, ascending.
+    vertex_mm : FloatArray
+        (V,) mean residual of the target's vertices over the timesteps; NaN for vertices that were not
+        fitted.
+    neutral_mm : float
+        Mean distance of the neutral heads over the facial region.
+    shape_at_bound : tuple[str, ...]
+        Identity coefficients that ended at their bound.
     """
 
     source: str

@@ -24,8 +24,8 @@ def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress
     Raises
     ------
     InputError
-        Where the layout cannot hold the clip: a camera without a frame at some timestep, splits other than by
-        held-out timesteps and cameras, exclusions other than of whole timesteps.
+        The layout cannot represent the clip: a camera lacks a frame at some timestep, splits are not
+        defined by held-out timesteps and cameras, or exclusions are not of whole timesteps.
     """
     plan, index = capture_plan(clip)
     writer = CaptureWriter(out, plan)

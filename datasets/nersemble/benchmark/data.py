@@ -43,12 +43,13 @@ def read_sequence(
 
     Parameters
     ----------
-    head : FLAME 2023 with or without teeth; coefficients are padded with zeros to its bases.
+    head : HeadArrays
+        FLAME 2023 with or without teeth; coefficients are padded with zeros to its bases.
 
     Raises
     ------
     InputError
-        For a file that is missing, damaged, or fits neither the head model nor the conventions.
+        A file is missing or damaged, or does not fit the head model or the conventions.
     """
     path = tracking_file(data, participant, sequence)
     arrays = read_arrays(path, MEMBERS)

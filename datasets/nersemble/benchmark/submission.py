@@ -48,13 +48,17 @@ def find_frames(
 
     Parameters
     ----------
-    method : of a run with several.
-    data : the benchmark's folder, which tells how many frames a sequence has, where that is not published.
+    method : str
+        Method to use from a run with several.
+    data : Path | None
+        The benchmark's folder, which gives the number of frames of a sequence if that is not
+        published.
 
     Raises
     ------
     InputError
-        For participants, sequences, cameras and frames that are missing, a gap between timesteps, and a wrong size.
+        Participants, sequences, cameras or frames are missing, timesteps have a gap, or a size is
+        wrong.
     """
     found: dict[Video, list[Path]] = {}
     by_participant = {name: _by_camera(folder, name, method) for name in track.sequences}
@@ -224,13 +228,16 @@ def check_submission(
 
     Parameters
     ----------
-    data : the benchmark's folder; without it, frames of the monocular track are held to the published totals alone.
-    name : of the track; "" takes the one that the zip has most files of.
+    data : Path | None
+        The benchmark's folder; without it, frames of the monocular track are only compared with the
+        published totals.
+    name : str
+        Name of the track; "" takes the one with the most files in the zip.
 
     Raises
     ------
     InputError
-        For a file that is no zip, or whose entries are too many or too large to be looked at.
+        The file is not a zip, or its entries are too many or too large.
     """
     issues = Issues()
     bounds = {"members": MOST_ENTRIES, "spare_bytes": 0, "per_byte": MOST_PER_BYTE}

@@ -40,13 +40,16 @@ class BenchmarkTrack:
 
     Attributes
     ----------
-    name : of the folder in the benchmark's data.
-    size : (width, height) in pixels.
-    fps : frames per second of its videos.
-    sequences : to render, by participant, with the number of frames if it is published.
-    serials : cameras to render.
-    train_serial : the camera that there are training videos of; "" where there are several.
-    totals : published number of frames of all sequences of a participant together.
+    name : TrackName
+        Name of the folder in the benchmark's data.
+    size : tuple[int, int]
+        (width, height) in pixels.
+    sequences : Mapping[str, Mapping[str, int | None]]
+        Sequences to render, by participant, with the number of frames if it is published.
+    train_serial : str
+        The camera of the training videos; "" if there are several.
+    totals : Mapping[str, int] | None
+        Published number of frames of all sequences of a participant together.
     """
 
     name: TrackName

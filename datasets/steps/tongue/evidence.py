@@ -51,10 +51,14 @@ class MouthEvidence:
 
     Attributes
     ----------
-    areas : (T,) mm² of the largest covered patch that begins at the mouth; 0 where there is none.
-    patches : (T, H, W) that patch.
-    strength : (T, H, W) float16 standard deviations by which each pixel looks covered; 0 where not seen.
-    seen : (T,) share of the lower lip that some camera saw.
+    areas : FloatArray
+        (T,) mm² of the largest covered patch that begins at the mouth; 0 without one.
+    patches : np.ndarray
+        (T, H, W) pixels of that patch.
+    strength : FloatArray
+        (T, H, W) float16 standard deviations by which each pixel looks covered; 0 if not seen.
+    seen : FloatArray
+        (T,) fraction of the lower lip that some camera saw.
     """
 
     areas: FloatArray
@@ -183,9 +187,12 @@ def decide(
 
     Parameters
     ----------
-    timesteps : sequence by timestep, in the order of the evidence.
-    threshold : mm²; None chooses one.
-    overrides : what people decided, see `Exclusions`.
+    timesteps : Mapping[int, str]
+        Sequence by timestep, in the order of the evidence.
+    threshold : float | None
+        mm²; None chooses one automatically.
+    overrides : Mapping[int, str]
+        Manual decisions, see `Exclusions`.
     """
     basis = "given"
     if threshold is None:

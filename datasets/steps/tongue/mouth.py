@@ -48,13 +48,20 @@ class MouthAtlas:
 
     Attributes
     ----------
-    inside : (H, W) where the map has surface: the face's outside, facing front.
-    corners : (N, 3) vertices of the triangle behind each pixel of ``inside``, in row-major order.
-    weights : (N, 3) barycentric weights on them.
-    lips : (H, W) pixels of the lips.
-    below : (H, W) pixels under the line where the lips meet: lower lip and chin.
-    height : (H, W) millimetres above (below: negative) the line where the lips meet.
-    occluders : (F', 3) triangles near enough to hide the mouth from a camera in front of it.
+    inside : np.ndarray
+        (H, W) whether the map has surface: the face's outside, facing front.
+    corners : IntArray
+        (N, 3) vertices of the triangle behind each pixel of ``inside``, in row-major order.
+    weights : FloatArray
+        (N, 3) barycentric weights on them.
+    lips : np.ndarray
+        (H, W) pixels of the lips.
+    below : np.ndarray
+        (H, W) pixels below the line where the lips meet: lower lip and chin.
+    height : FloatArray
+        (H, W) millimetres above the line where the lips meet, negative below.
+    occluders : IntArray
+        (F', 3) triangles that can hide the mouth from a camera in front of it.
     """
 
     inside: np.ndarray
@@ -182,10 +189,14 @@ class MouthColours:
 
     Attributes
     ----------
-    timesteps : sorted.
-    cameras : ids by position.
-    colours : (T, C, H, W, 3) 8-bit sRGB; 0 where not seen.
-    seen : (T, C, H, W).
+    timesteps : Sequence[int]
+        Sorted timesteps.
+    cameras : Sequence[str]
+        Camera ids by position.
+    colours : ByteArray
+        (T, C, H, W, 3) 8-bit sRGB; 0 if not seen.
+    seen : np.ndarray
+        (T, C, H, W).
     """
 
     timesteps: Sequence[int]

@@ -30,9 +30,9 @@ def encode_field(
 
     Parameters
     ----------
-    tensors : of a field.
-    positions : (N, 3) canonical positions of the splats, as they will be read: samples of the planes that no splat
-        reads are left out, and become 0.
+    positions : Tensor
+        (N, 3) canonical positions of the splats after decoding: samples of the planes that no splat
+        reads are left out and become 0.
     """
     arrays: dict[str, np.ndarray] = {}
     if PLANES[0] in tensors:
@@ -168,9 +168,11 @@ def encode_splats(
 
     Parameters
     ----------
-    tensors : with ``splats`` (N, 12) and, where they hold the colour, the harmonics.
-    turned : an expression adds to the quaternions. Then all four components are kept, of any length; otherwise three
-        are enough, see `smallest_three`.
+    tensors : dict[str, Tensor]
+        ``splats`` (N, 12) and, if they hold the colour, the harmonics.
+    turned : bool
+        Whether an expression adds to the quaternions. Then all four components are kept, of any
+        length; otherwise three are enough, see `smallest_three`.
     """
     columns = splat_columns(tensors["splats"].cpu())
     means, logits, log_scales, quats, triangles = (part.numpy() for part in columns.values())

@@ -168,8 +168,10 @@ class Comparison:
 
     Parameters
     ----------
-    frames : how many, spread evenly over both held-out splits.
-    scale : enlargement of the pictures; above 1 there is no truth.
+    frames : int
+        Number of frames, spread evenly over both held-out splits.
+    scale : int
+        Enlargement of the pictures; above 1 there is no ground truth.
     """
 
     def __init__(self, clip: Clip, exact: OursAvatar, frames: int, scale: int = 1):

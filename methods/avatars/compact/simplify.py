@@ -20,12 +20,13 @@ def simplify(avatar: OursAvatar, poses: Iterable[HeadPose], precision: Precision
 
     Parameters
     ----------
-    poses : of training. A splat whose opacity stays below 1/255 in all of them is left out; the renderer culls such
-        splats, so these poses look the same with and without. Without any pose no splat is left out.
-
-    precision : lines that it rounds to zero are set to zero. If that leaves none, and the lines change opacity alone,
-        every pose changes an opacity by the same number; it is added once and for all, and lines and network are left
-        out.
+    poses : Iterable[HeadPose]
+        Training poses. A splat whose opacity stays below 1/255 in all of them is removed; the
+        renderer culls such splats, so these poses do not change. Without poses no splat is removed.
+    precision : Precision
+        Lines that it rounds to zero are set to zero. If no other lines remain, and the lines change
+        opacity alone, every pose changes an opacity by the same number; it is added once, and lines
+        and network are left out.
     """
     field = avatar.field
     tensors = dict(field.tensors)

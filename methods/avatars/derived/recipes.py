@@ -38,11 +38,12 @@ class Recipe:
 
     Attributes
     ----------
-    splats : fraction of the splats kept, those that contribute most to training views.
-    degree : highest degree of spherical harmonics.
-    planes, lines : samples along a side of a plane, along a line.
-    storage : how its numbers are stored.
-    cutoffs : below what the renderer leaves work out.
+    splats : float
+        Fraction of the splats that are kept: those that contribute most to training views.
+    planes, lines : int | None
+        Samples along a side of a plane, along a line.
+    cutoffs : Cutoffs
+        Thresholds of the renderer.
     """
 
     splats: float = 1.0

@@ -41,9 +41,13 @@ class Source:
 
     Attributes
     ----------
-    rest : the pose at rest: expression, neck, jaw and eyes are 0, rotation and translation those of the head.
-    root : (3,) the root joint without translation, about which ``rest.rotation`` turns, metres.
-    joints : (4, 3) neck, jaw, left and right eye in the head's frame.
+    rest : HeadPose
+        The pose at rest: expression, neck, jaw and eyes are 0, rotation and translation those of the
+        head.
+    root : FloatArray
+        (3,) position of the root joint without translation, the centre of ``rest.rotation``, metres.
+    joints : FloatArray
+        (4, 3) positions of neck, jaw, left and right eye in the head's frame.
     """
 
     avatar: SplatAvatar

@@ -25,10 +25,14 @@ class Slider(NamedTuple):
 
     Attributes
     ----------
-    joints : indices into `JOINTS` of those that it turns; none for an expression.
-    axis : 0, 1 or 2 for x, y, z. number : of the expression.
-    low, high : where the slider ends: coefficients or radians.
-    step : value at which its morph counts fully.
+    joints : tuple[int, ...]
+        Indices into `JOINTS` of the joints that it turns; none for an expression.
+    axis : int
+        0, 1 or 2 for x, y, z.
+    low, high : float
+        Ends of the slider: coefficients or radians.
+    step : float
+        Value at which its morph has full weight.
     """
 
     name: str
@@ -55,14 +59,20 @@ class WebAvatar:
 
     Attributes
     ----------
-    means, rotations, log_scales, logits : (N, 3), (N, 3, 3), (N, 3), (N,) of the face at rest.
-    harmonics : (N, 3, K), in 3DGS' order and signs, along the way from the camera to the splat.
-    turned : whether harmonics turn with the head, or stay with the world.
-    weights : (N, 4) of `JOINTS`; what is missing to 1 stays with the shoulders.
-    joints : (4, 3) where they are.
-    sliders : M of them.
-    d_means, d_turns, d_log_scales, d_logits, d_colors : (M, N, 3), (M, N, 3), (M, N, 3), (M, N), (M, N, 3): what is added
-        at ``step`` before skinning; turns are rotation vectors.
+    means, rotations, log_scales, logits : FloatArray
+        (N, 3), (N, 3, 3), (N, 3), (N,) of the face at rest.
+    harmonics : FloatArray
+        (N, 3, K), in 3DGS' order and signs, as functions of the direction from the camera to the
+        splat.
+    turned : bool
+        Whether harmonics turn with the head; otherwise they are fixed in the world.
+    weights : FloatArray
+        (N, 4) skinning weights of `JOINTS`; the remainder to 1 stays with the shoulders.
+    joints : FloatArray
+        (4, 3) positions.
+    d_means, d_turns, d_log_scales, d_logits, d_colors : FloatArray
+        (M, N, 3), (M, N, 3), (M, N, 3), (M, N), (M, N, 3): what is added at ``step`` before skinning;
+        turns are rotation vectors.
     """
 
     means: FloatArray

@@ -56,7 +56,8 @@ class OfficialHead:
 
     Attributes
     ----------
-    order : (V',) vertex of the clip's head for each of theirs; -1 for one that stands for nothing.
+    order : IntArray
+        (V',) vertex of the clip's head for each of theirs; -1 for a vertex without a counterpart.
     """
 
     head: HeadAsset

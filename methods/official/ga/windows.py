@@ -26,8 +26,11 @@ class Window:
 
     Attributes
     ----------
-    camera : of the box; its principal point is the middle exactly, its focal length one for both axes.
-    left, top : of the box in the image, whole pixels; negative where it begins outside.
+    camera : Camera
+        Camera of the box, with the principal point exactly in the middle and one focal length for
+        both axes.
+    left, top : int
+        Position of the box in the image, whole pixels; negative if it begins outside.
     """
 
     camera: Camera

@@ -39,7 +39,9 @@ class GHATracking:
 
     Attributes
     ----------
-    rows : (L,) vertices that stand for their landmarks and for each hundredth vertex of their face model.
+    rows : np.ndarray
+        (L,) vertices that correspond to their landmarks and to each hundredth vertex of their face
+        model.
     """
 
     driver: Driver

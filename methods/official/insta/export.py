@@ -71,11 +71,16 @@ class VideoMesh:
 
     Attributes
     ----------
-    head, posed : the clip's own, with teeth where it has them.
-    kept : (V',) vertices of theirs.
-    faces : (F', 3) triangles by theirs.
-    masks : files of regions, by name.
-    is_flames : whether vertices are FLAME's, so that triangles and regions are theirs.
+    head, posed : HeadAsset, PosedSubject
+        The clip's own, with teeth if it has them.
+    kept : IntArray
+        (V',) vertices of their mesh.
+    faces : IntArray
+        (F', 3) triangles in their numbering.
+    masks : Mapping[str, bytes]
+        Files of regions, by name.
+    is_flames : bool
+        Whether vertices are FLAME's, so that triangles and regions are the official ones.
     """
 
     head: HeadAsset

@@ -62,10 +62,12 @@ class Difference:
 
     Attributes
     ----------
-    orders : those that both have whole results of.
-    native, official : mean over frames, then sequences, then subjects, for each of them.
-    difference : their mean difference.
-    half_width : of its 95 % interval (Student's t over orders); None with a single order.
+    orders : tuple[int, ...]
+        Orders for which both have complete results.
+    native, official : tuple[float, ...]
+        Mean over frames, then sequences, then subjects, for each order.
+    half_width : float | None
+        Half width of its 95 % interval (Student's t over orders); None with a single order.
     """
 
     task: str

@@ -54,22 +54,30 @@ class GaussianRasterizer(nn.Module):
 
         Parameters
         ----------
-        means3D, scales, rotations : (N, 3), (N, 3), (N, 4) wxyz; metres.
-        means2D : (N, 3) values that nothing depends on; their gradient is that by the projected means in normalised device
-            units, its third column zero.
-        opacities : (N, 1) or (N,) in [0, 1].
-        shs, colors_precomp : (N, K, 3) harmonics of which ``sh_degree`` are used, or (N, 3) colours; one of both.
-        cov3D_precomp : not taken.
-        alpha_point_id : of GaussianBlendshapes' fork; 0 asks for the coverage by all splats besides.
+        means3D, scales, rotations : Tensor | None
+            (N, 3), (N, 3), (N, 4) wxyz; metres.
+        means2D : Tensor
+            (N, 3) values that do not affect the image. Their gradient is the one with respect to
+            the projected means in normalised device units, with a zero third column.
+        opacities : Tensor
+            (N, 1) or (N,) in [0, 1].
+        shs, colors_precomp : Tensor | None
+            (N, K, 3) harmonics of which ``sh_degree`` are used, or (N, 3) colours; exactly one of
+            them.
+        alpha_point_id : int | None
+            Argument of GaussianBlendshapes' fork; 0 also returns the coverage by all splats.
 
         Returns
         -------
-        Image (3, H, W); coverage (H, W) where it is asked for; radii (N,), above 0 for every splat in view, whatever its
-        opacity.
+        tuple[Tensor, ...]
+            Image (3, H, W); coverage (H, W) if requested; radii (N,), positive for every splat in
+            view, whatever its opacity.
 
         Raises
         ------
-        ValueError : both or none of harmonics and colours, covariances, or coverage by some splats.
+        ValueError
+            Both or neither of harmonics and colours are given, covariances are given, or coverage
+            by a part of the splats is requested.
         """
         to = self.raster_settings
         if (shs is None) == (colors_precomp is None):

@@ -91,6 +91,9 @@ def test_losses_are_written_as_csv_and_for_tensorboard(config, toy, monkeypatch)
         write_json(out / "training.json", {"losses": [[1, 0.5], [2, 0.25]]})
 
     class Writer(nullcontext):
+        def __enter__(self):
+            return self
+
         def add_scalar(self, name, value, step):
             written.append((name, value, step))
 
