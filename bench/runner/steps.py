@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -234,12 +235,12 @@ def write_losses(job: Job) -> None:
     lines = ["iteration,loss", *(f"{iteration},{loss!r}" for iteration, loss in losses)]
     write_text(job.cell.folder / "losses.csv", "\n".join(lines) + "\n")
     try:
-        from torch.utils.tensorboard import SummaryWriter
+        tensorboard = import_module("torch.utils.tensorboard")
     except ImportError:
         return
-    with SummaryWriter(str(job.cell.folder / "tensorboard")) as writer:  # type: ignore[no-untyped-call]
+    with tensorboard.SummaryWriter(str(job.cell.folder / "tensorboard")) as writer:
         for iteration, loss in losses:
-            writer.add_scalar("loss", loss, iteration)  # type: ignore[no-untyped-call]
+            writer.add_scalar("loss", loss, iteration)
 
 
 def derive(job: Job) -> Avatar:
