@@ -65,6 +65,7 @@ if _TYPE_CHECKING:
         ReportSpec,
         ResolutionRule,
     )
+    from .datasets.head.arrays import save_head
     from .datasets.head.loaders import load_head
     from .datasets.steps.exclude import exclude_given
     from .reports.runs import RunData
@@ -134,6 +135,7 @@ __all__ = [
     "read_runs",
     "resolve_method",
     "run",
+    "save_head",
     "train",
 ]
 
@@ -151,6 +153,7 @@ _HOMES = {
     "bench.rows": ("ALL",),
     "bench.specs": tuple(name for name in __all__ if name.endswith("Spec"))
     + ("Findings", "Need", "ResolutionRule"),
+    "datasets.head.arrays": ("save_head",),
     "datasets.head.loaders": ("load_head",),
     "datasets.steps.exclude": ("exclude_given",),
     "reports.runs": ("RunData",),

@@ -185,6 +185,8 @@ def _convert(hint: Any, value: Any, source: str, key: str) -> Any:
             raise InputError(source, key, "a group of settings", shown(value))
         return dict(value)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        if isinstance(value, hint):
+            return value
         return build(hint, value, source, f"{key}.")
     return _convert_scalar(hint, value, source, key)
 

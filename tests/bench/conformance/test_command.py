@@ -55,6 +55,30 @@ def test_a_command_written_outside_reads_a_run(outside, run, capsys, monkeypatch
         assert error in capsys.readouterr().err
 
 
+def test_an_experiment_written_outside_runs_its_conditions(
+    outside, npz_capture, tmp_path, monkeypatch, capsys
+):
+    noise = EntryPoint("noise", "outside_experiment:COMMAND", "headbench.commands")
+    found = registry.entry_points
+    monkeypatch.setattr(
+        registry, "entry_points", lambda group: [noise] if group == noise.group else found(group=group)
+    )
+    monkeypatch.setattr("headbench.bench.api.reader_of", lambda data: "outside_reader:SPEC")
+    words = ["noise", "--data", str(npz_capture), "--out", str(tmp_path / "run"), "--methods", "mean-image"]
+    assert cli.main([*words, "--preset", "smoke", "--deviations", "40"]) == 0
+    assert "mean-image+noise-40" in capsys.readouterr().out
+    rows = headbench.RunData.read(tmp_path / "run").rows
+    how = {"metric": "psnr", "task": "self_reenactment", "region": "full", "seeds": headbench.ALL}
+    plain, noisy = (
+        rows.select(method=name, **how)["value"].mean() for name in ("mean-image", "mean-image+noise-40")
+    )
+    assert plain != noisy
+
+
+def test_a_method_written_outside_draws_the_tracked_mesh(outside, capsys):
+    assert cli.main(["check-plugin", "outside_method:SPEC"]) == 0, capsys.readouterr().out
+
+
 @pytest.fixture
 def grey(npz_capture):
     """The words that check the README's method."""
