@@ -107,7 +107,7 @@ class MethodSpec:
     default : a run that names no methods takes it.
     demo : ``headbench demo`` takes it.
     variants : "package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]``: what can be derived
-        from a trained avatar without training (``headbench sweep``); "" for nothing.
+        from a trained avatar without training (``headbench run sweep``); "" for nothing.
     devices : kinds of devices that it computes on, such as "cpu"; empty means any. A run on another refuses it.
     renders : "package.module:function" of ``(folder, clip, listing) -> {FrameKey: Render}``, see `bench.audit.naming`: which
         image that the method's own program left in a folder shows which frame (``headbench evaluate --names``); ``listing``

@@ -86,7 +86,7 @@ def read_capture(
         these sequences (full names or unique prefixes) are self-reenactment, these cameras' other frames
         novel view, the rest training.
     exclude : frames to leave out, added to what ``headbench.json`` declares: reason by timestep, or a file for
-        `read_reasons`, such as the one that ``headbench tongue`` writes.
+        `read_reasons`, such as the one that ``headbench prepare tongue`` writes.
     leaks : "error" refuses splits that share data; "record" notes it in the step record.
     decode : decode every image when checking; finds damage in the middle of files.
     cache_mb : bound of the decoded images held in memory, in 10^6 bytes.

@@ -58,7 +58,7 @@ def rasterize(
         with ``eps2d``, so that the low-pass filter makes small splats faint, not bigger (gsplat's mode "antialiased";
         Yu et al., "Mip-Splatting", CVPR 2024, eq. 9). The cut at ``alpha_min`` applies to the product.
     alpha_min : a splat is left out of pixels where its alpha is below this, and altogether where its opacity is. The
-        default, 1/255, is gsplat's; more is faster and less exact (``headbench bench splats --tradeoffs`` measures it).
+        default, 1/255, is gsplat's; more is faster and less exact (``headbench doctor bench splats --tradeoffs`` measures it).
     transmittance_min : the splat that would bring a pixel's transmittance to this or below is left out, with all behind
         it. The default, 1e-4, is gsplat's; more is faster and less exact. Backend "cuda" has the defaults alone.
     means2d_offset : (N, 2), or (V, N, 2) with several cameras. Pixels, added to the projected means. Zeros that require a gradient collect the

@@ -1,4 +1,4 @@
-"""``headbench curve``."""
+"""``headbench run curve``."""
 
 from __future__ import annotations
 

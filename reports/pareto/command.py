@@ -1,4 +1,4 @@
-"""``headbench pareto`` and ``headbench sweep``."""
+"""``headbench report pareto`` and ``headbench run sweep``."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _text(
 def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Findings:
     """Derive smaller and faster variants of a run's avatars without training; quality against size and frame time.
 
-    Writes ``points.csv`` and ``pareto.png`` as `headbench pareto` does.
+    Writes ``points.csv`` and ``pareto.png`` as `headbench report pareto` does.
     Raises `InputError` for a folder that is no finished run, and for methods and variants that there are not.
     """
     from ...bench.runner.store import RunFolder
