@@ -106,14 +106,14 @@ endef
 
 gate: setup
 	$(gated_demo)
-	$(BIN)/headbench gate $(GATED) --baseline tests/demo_baseline.json --junit build/gate.xml --markdown build/gate.md
+	$(BIN)/headbench compare $(GATED) --baseline tests/demo_baseline.json --junit build/gate.xml --markdown build/gate.md
 
 baseline: setup
 	$(gated_demo)
-	$(BIN)/headbench gate $(GATED) --baseline tests/demo_baseline.json --update --captures remade
+	$(BIN)/headbench compare $(GATED) --baseline tests/demo_baseline.json --update --captures remade
 
 bench: setup
-	$(BIN)/headbench bench splats
+	$(BIN)/headbench doctor bench splats
 
 # The README's table and picture are those of the last demo.
 readme: demo

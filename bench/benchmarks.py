@@ -1,4 +1,4 @@
-"""``headbench bench`` and ``headbench stress``, and what their benchmarks share: runs that take turns, tables of rows."""
+"""``headbench doctor bench`` and ``headbench doctor stress``, and what their benchmarks share: runs that take turns, tables of rows."""
 
 from __future__ import annotations
 

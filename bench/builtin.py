@@ -5,7 +5,7 @@ from .specs import CommandSpec
 DEMO = CommandSpec(
     name="demo",
     group="compare",
-    summary="Run a complete comparison on a synthetic capture: render it, train, measure, print the table.",
+    summary="Compare all methods on a synthetic capture; needs no data, GPU or network.",
     settings="headbench.bench.comparison:DemoSettings",
     function="headbench.bench.comparison:demo",
 )
@@ -21,15 +21,15 @@ RUN = CommandSpec(
 STATUS = CommandSpec(
     name="status",
     group="compare",
-    summary="Show which cells of a run are waiting, running, done or failed, and the time left.",
+    summary="Show which cells of a run are waiting, running, done or failed.",
     settings="headbench.bench.executors.command:StatusSettings",
     function="headbench.bench.executors.command:status",
 )
 
 SPEED = CommandSpec(
-    name="speed",
+    name="run speed",
     group="compare",
-    summary="Measure the speed of a finished run's avatars again, without training, and update its tables and report.",
+    summary="Measure the speed of a finished run's avatars again, without training.",
     settings="headbench.bench.executors.command:SpeedSettings",
     function="headbench.bench.executors.command:speed",
 )
@@ -37,7 +37,7 @@ SPEED = CommandSpec(
 EVALUATE = CommandSpec(
     name="evaluate",
     group="compare",
-    summary="Score a folder of images or a stored avatar, so that a method can be compared without a plug-in.",
+    summary="Score a folder of images or a stored avatar, without a plug-in.",
     settings="headbench.bench.audit.settings:EvaluateSettings",
     function="headbench.bench.audit.evaluate:evaluate_folder",
 )
@@ -45,7 +45,7 @@ EVALUATE = CommandSpec(
 FRAMES = CommandSpec(
     name="frames",
     group="compare",
-    summary="List the frames that `evaluate` needs as CSV: file names, cameras and pose files.",
+    summary="List the frames that `evaluate` scores: file names, cameras, pose files.",
     settings="headbench.bench.audit.settings:FramesSettings",
     function="headbench.bench.audit.frames:write_frames",
     writes="out",
@@ -54,7 +54,7 @@ FRAMES = CommandSpec(
 VERIFY = CommandSpec(
     name="verify",
     group="validate",
-    summary="Recompute a run's digests and metrics from its frames: exit code 1 if anything differs, 3 if it is not a run.",
+    summary="Recompute a run's digests and metrics from its frames and report differences.",
     settings="headbench.bench.audit.settings:VerifySettings",
     function="headbench.bench.audit.verify:verify_run",
 )
@@ -62,23 +62,15 @@ VERIFY = CommandSpec(
 BUNDLE = CommandSpec(
     name="bundle",
     group="export",
-    summary="Write the results of a finished run to one file, for a leaderboard and for `headbench verify`.",
+    summary="Write the results of a finished run to one file, for a leaderboard.",
     settings="headbench.bench.audit.settings:BundleSettings",
     function="headbench.bench.audit.bundle:write_bundle",
 )
 
-GATE = CommandSpec(
-    name="gate",
-    group="validate",
-    summary="Compare a run with a committed baseline: exit code 1 if a number got worse, 3 if one is missing.",
-    settings="headbench.bench.gate.settings:GateSettings",
-    function="headbench.bench.gate.command:gate",
-)
-
 CHECK_PLUGIN = CommandSpec(
-    name="check-plugin",
+    name="doctor check",
     group="validate",
-    summary="Check a method, reader or metric against its contract and list every violation; exit code 1 if there are any.",
+    summary="Check a method, reader or metric against its contract.",
     settings="headbench.bench.conformance.command:CheckPluginSettings",
     function="headbench.bench.conformance.command:check_plugin",
 )
@@ -86,7 +78,7 @@ CHECK_PLUGIN = CommandSpec(
 DOCTOR = CommandSpec(
     name="doctor",
     group="validate",
-    summary="Report for every method, metric and reader what is missing on this machine, and how to install it.",
+    summary="Report what methods, metrics and readers lack here, and how to install it.",
     settings="headbench.bench.doctor:DoctorSettings",
     function="headbench.bench.doctor:doctor",
 )
@@ -94,13 +86,13 @@ DOCTOR = CommandSpec(
 LIST = CommandSpec(
     name="list",
     group="inspect",
-    summary="List what is installed: methods, presets, metrics, their profiles, readers, reports, benchmarks, commands.",
+    summary="List installed methods, presets, metrics, readers, reports and commands.",
     settings="headbench.bench.listing:ListSettings",
     function="headbench.bench.listing:list_installed",
 )
 
 BENCH = CommandSpec(
-    name="bench",
+    name="doctor bench",
     group="validate",
     summary="Benchmark a part of headbench itself on this machine.",
     settings="headbench.bench.benchmarks:BenchSettings",
@@ -108,9 +100,9 @@ BENCH = CommandSpec(
 )
 
 STRESS = CommandSpec(
-    name="stress",
+    name="doctor stress",
     group="validate",
-    summary="Test a part of headbench at numerical extremes and print the result of each case.",
+    summary="Test a part of headbench at numerical extremes.",
     settings="headbench.bench.benchmarks:StressSettings",
     function="headbench.bench.benchmarks:stress",
 )

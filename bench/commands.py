@@ -6,6 +6,7 @@ Light to import: the parser and the settings of a command are loaded when it is 
 from __future__ import annotations
 
 import difflib
+import shlex
 import shutil
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -23,13 +24,35 @@ _ALIASES = {
     "lint": "check validate",
     "prepare nersemble": "preprocess process-data process",
     "run": "benchmark fit train",
-    "sweep": "prune",
+    "run sweep": "prune",
     "synth": "generate synthesize",
     "table": "results show",
     "view": "viewer gui",
 }
 COMMAND_ALIASES = {word: name for name, words in _ALIASES.items() for word in words.split()}
 """Names that other toolkits use for a command, and the command of headbench that does the same."""
+
+MOVED = {
+    "bench": "doctor bench",
+    "check-plugin": "doctor check",
+    "compact": "export compact",
+    "curve": "run curve",
+    "extremes": "run extremes",
+    "gate": "compare",
+    "leaderboard build": "report leaderboard",
+    "parity": "run parity",
+    "pareto": "report pareto",
+    "record nersemble": "export nersemble",
+    "reenact": "run reenact",
+    "refit": "prepare refit",
+    "speed": "run speed",
+    "steps": "inspect steps",
+    "stress": "doctor stress",
+    "suite": "run suite",
+    "sweep": "run sweep",
+    "tongue": "prepare tongue",
+}
+"""Commands of earlier versions, and what does the same now. `InputError` names the new command line."""
 
 ABOUT = (
     "Benchmark of animatable 3D head avatars. Start with `headbench demo`. `headbench COMMAND --help` explains a command, "
@@ -68,16 +91,16 @@ def call(words: Sequence[str]) -> int:
         raise InputError(
             "command line", words[0], f"followed by one of {seconds}", " ".join(words[1:]) or "nothing"
         )
-    raise _unknown(" ".join(words[: 2 if table else 1]), plugins)
+    raise _unknown(words, plugins)
 
 
 def help_page(plugins: Mapping[str, Plugin]) -> str:
-    """List commands in groups: those of `COMMAND_GROUPS` in the order of `FIRST`, then by name."""
+    """List commands in groups: those of `COMMAND_GROUPS` in the order of `FIRST`, then by name; a word stands above its second words."""
     width = max(map(len, plugins)) + 2
     columns = min(shutil.get_terminal_size((100, 24)).columns, 120)
     lines = ["usage: headbench COMMAND [OPTIONS]", "", *textwrap.wrap(ABOUT, columns)]
     groups: dict[str, list[str]] = {group: [] for group in COMMAND_GROUPS}
-    for name, plugin in sorted(plugins.items(), key=lambda item: (*_place(item[0]), item[0])):
+    for name, plugin in sorted(plugins.items(), key=lambda item: (_place(item[0]), item[0])):
         group, summary = ("broken", "It cannot be loaded; calling it shows why.")
         if plugin.spec is not None:
             group, summary = plugin.spec.group, plugin.spec.summary
@@ -89,18 +112,27 @@ def help_page(plugins: Mapping[str, Plugin]) -> str:
     return "\n".join([*lines, "", *textwrap.wrap(EXIT_CODES, columns)])
 
 
-def _place(name: str) -> tuple[int]:
-    return (FIRST.index(name) if name in FIRST else len(FIRST),)
+def _place(name: str) -> int:
+    first = name.partition(" ")[0]
+    return FIRST.index(first) if first in FIRST else len(FIRST)
 
 
-def _unknown(words: str, plugins: Mapping[str, Plugin]) -> InputError:
-    """The error for words that name no command, with the nearest one."""
-    name = COMMAND_ALIASES.get(words.lower().replace("_", "-"), "")
+def _unknown(words: Sequence[str], plugins: Mapping[str, Plugin]) -> InputError:
+    """The error for words that name no command: with the new command line for `MOVED`, else with the nearest command."""
+    for asked in (" ".join(words[:2]), words[0]):
+        if asked in MOVED:
+            line = f"headbench {MOVED[asked]} {shlex.join(words[len(asked.split()) :])}".rstrip()
+            return InputError(
+                "command line", "", "a command of headbench", repr(asked), f"It is now `{line}`."
+            )
+    firsts = {name.partition(" ")[0] for name in plugins}
+    asked = " ".join(words[: 2 if words[0] in firsts else 1])
+    name = COMMAND_ALIASES.get(asked.lower().replace("_", "-"), "")
     if name not in plugins:
-        name = next(iter(difflib.get_close_matches(words, plugins, n=1, cutoff=0.5)), "")
+        name = next(iter(difflib.get_close_matches(asked, plugins, n=1, cutoff=0.5)), "")
     remedy = "`headbench --help` lists them."
     if name:
         spec = plugins[name].spec
         summary = f" ({spec.summary.rstrip('.')})" if spec is not None else ""
         remedy = f"Did you mean `headbench {name}`{summary}? {remedy}"
-    return InputError("command line", "", "a command of headbench", repr(words[:60]), remedy)
+    return InputError("command line", "", "a command of headbench", repr(asked[:60]), remedy)

@@ -17,7 +17,17 @@ class ListSettings:
     """--json prints all fields."""
 
     what: tyro.conf.Positional[
-        Literal["methods", "presets", "metrics", "profiles", "datasets", "reports", "conditions", "benchmarks", "commands"]
+        Literal[
+            "methods",
+            "presets",
+            "metrics",
+            "profiles",
+            "datasets",
+            "reports",
+            "conditions",
+            "benchmarks",
+            "commands",
+        ]
     ]
     """What to list; datasets are readers, and what makes captures."""
 

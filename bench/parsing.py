@@ -2,6 +2,7 @@
 
 # Without `from __future__ import annotations`: the parser reads annotations that are made when a command is called.
 
+import inspect
 import json as json_module
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -88,26 +89,30 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
 
 def _all_commands(plugins: Mapping[str, Plugin]) -> Command:
     """All commands as one, whose first and second word choose: what completion needs. Broken ones are left out."""
-    found: dict[str, Any] = {}
+    found: dict[str, dict[str, Command]] = {}
     for name, plugin in sorted(plugins.items()):
         first, _, second = name.partition(" ")
         with suppress(HeadbenchError):
-            command = _command(name, plugin, ())
-            if second:
-                found.setdefault(first, {})[second] = command
-            else:
-                found[first] = command
-    return _nested({n: _nested(c) if isinstance(c, dict) else c for n, c in found.items()})
+            found.setdefault(first, {})[second] = _command(name, plugin, ())
+    return _nested({first: _nested(seconds) for first, seconds in found.items()})
 
 
 def _nested(group: Mapping[str, Command]) -> Command:
+    """Commands as one whose word chooses; one without a word offers its own options beside the others' words."""
     # Not tyro's own function for subcommands: it looks for help in typing's sources, which takes as long as the rest.
-    choices = [Annotated[Any, tyro.conf.subcommand(name=n, constructor=c)] for n, c in group.items()]
+    own = group.get("")
+    words = {name: command for name, command in group.items() if name}
+    if own is not None and not words:
+        return own
+    choices = [Annotated[Any, tyro.conf.subcommand(name=n, constructor=c)] for n, c in words.items()]
     choice: Any = Union[(*choices, Annotated[None, tyro.conf.Suppress])]
 
     def chosen(command: choice) -> int:
         return command
 
+    if own is not None:
+        chosen.__annotations__ = {"command": choice, "settings": own.__annotations__["settings"]}
+        chosen.__signature__ = inspect.signature(lambda command, settings: None)  # type: ignore[attr-defined]
     return chosen
 
 

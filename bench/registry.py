@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import difflib
 import importlib
-import itertools
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from typing import Any, Literal
@@ -57,8 +56,7 @@ class Plugin:
 def discover(group: Group) -> dict[str, Plugin]:
     """All plug-ins of a group by name. A broken one is listed with its error, never fatal.
 
-    Where two distributions claim a name, headbench's own wins and the clash is logged. Of two commands of which one is
-    the other's first word the later is broken.
+    Where two distributions claim a name, headbench's own wins and the clash is logged.
     """
     found: dict[str, Plugin] = {}
     for entry in sorted(entry_points(group=f"headbench.{group}"), key=lambda e: _origin(e) != _OWN):
@@ -67,14 +65,6 @@ def discover(group: Group) -> dict[str, Plugin]:
             found[entry.name] = plugin
         elif known.origin != plugin.origin:
             log.warning("%s %r of %s is hidden by that of %s", group, entry.name, plugin.origin, known.origin)
-    if group == "commands":
-        for name, plugin in found.items():
-            before = itertools.takewhile(lambda other, name=name: other != name, found)  # type: ignore[misc]
-            first = name.partition(" ")[0]
-            rival = next((n for n in before if n == first or (n.partition(" ")[0] == name)), None)
-            if rival is not None:
-                why = f"{rival!r} of {found[rival].origin} is a command, too"
-                found[name] = replace(plugin, spec=None, error=why)
     return found
 
 

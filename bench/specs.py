@@ -129,7 +129,7 @@ class MethodSpec:
         Whether a run that names no methods includes it.
     variants : str
         "package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]`` for
-        ``headbench sweep``: variants of a trained avatar that need no training; "" for none.
+        ``headbench run sweep``: variants of a trained avatar that need no training; "" for none.
     devices : tuple[str, ...]
         Supported kinds of devices, such as "cpu"; empty means any. A run on another device is
         refused.

@@ -31,7 +31,7 @@ def _in_ascii(error: UnicodeError) -> tuple[str, int]:
 
 
 def show(text: str = "", end: str = "\n") -> None:
-    """Print the result of a command. A reader that has gone (``headbench gate … | head -1``) changes no exit code."""
+    """Print the result of a command. A reader that has gone (``headbench compare … | head -1``) changes no exit code."""
     try:
         print(text, end=end, flush=True)
     except OSError as error:

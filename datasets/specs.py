@@ -63,15 +63,15 @@ SYNTH = CommandSpec(
 PREPARE_NERSEMBLE = CommandSpec(
     name="prepare nersemble",
     group="data",
-    summary="Convert raw NeRSemble recordings to captures; an interrupted conversion is continued.",
+    summary="Convert raw NeRSemble recordings to captures.",
     settings="headbench.datasets.nersemble.settings:PrepareSettings",
     function="headbench.datasets.nersemble.command:prepare_nersemble",
 )
 
 RECORD_NERSEMBLE = CommandSpec(
-    name="record nersemble",
+    name="export nersemble",
     group="export",
-    summary="Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to test `prepare`.",
+    summary="Write a synthetic capture as a raw NeRSemble recording, to test `prepare`.",
     settings="headbench.datasets.nersemble.settings:RecordSettings",
     function="headbench.datasets.nersemble.command:record_nersemble",
     writes="out",
@@ -81,24 +81,24 @@ RECORD_NERSEMBLE = CommandSpec(
 LINT = CommandSpec(
     name="lint",
     group="data",
-    summary="Check a capture for faults that make a comparison unfair or wrong; --list explains the codes.",
+    summary="Check a capture for faults that make a comparison unfair or wrong.",
     settings="headbench.datasets.lint.settings:LintSettings",
     function="headbench.datasets.lint.command:lint",
 )
 
 TONGUE = CommandSpec(
-    name="tongue",
+    name="prepare tongue",
     group="data",
-    summary="Find the frames that show the tongue, for review on a contact sheet and with overrides.",
+    summary="Find the frames that show the tongue, for review on a contact sheet.",
     settings="headbench.datasets.steps.tongue.command:TongueSettings",
     function="headbench.datasets.steps.tongue.command:tongue",
     writes="out",
 )
 
 REFIT_COMMAND = CommandSpec(
-    name="refit",
+    name="prepare refit",
     group="data",
-    summary="Refit the tracking of a capture to another head model, with residuals in millimetres and a heat map.",
+    summary="Refit the tracking of a capture to another head model.",
     settings="headbench.datasets.head.refit.settings:RefitCommandSettings",
     function="headbench.datasets.head.refit.command:refit_capture",
     writes="out",
@@ -108,16 +108,16 @@ REFIT_COMMAND = CommandSpec(
 INSPECT = CommandSpec(
     name="inspect",
     group="inspect",
-    summary="Plot the contents of a capture: camera rig, splits, tracked mesh over images, motion by sequence.",
+    summary="Plot a capture: camera rig, splits, tracked mesh over images, motion.",
     settings="headbench.datasets.inspect.command:InspectSettings",
     function="headbench.datasets.inspect.command:inspect",
     writes="out",
 )
 
 STEPS = CommandSpec(
-    name="steps",
+    name="inspect steps",
     group="inspect",
-    summary="Plot the jaw bases and expression clusters computed from a capture's training frames.",
+    summary="Plot the jaw bases and expression clusters of a capture's training frames.",
     settings="headbench.datasets.steps.pictures.command:StepsSettings",
     function="headbench.datasets.steps.pictures.command:steps",
     writes="out",
@@ -126,7 +126,7 @@ STEPS = CommandSpec(
 EXPORT_COLMAP = CommandSpec(
     name="export colmap",
     group="export",
-    summary="Write frames of a capture as a COLMAP dataset: images, masks and a sparse model.",
+    summary="Write frames of a capture as a COLMAP dataset: images, masks, sparse model.",
     settings="headbench.datasets.colmap.command:ExportColmapSettings",
     function="headbench.datasets.colmap.command:export_colmap",
     writes="out",
@@ -136,7 +136,7 @@ EXPORT_COLMAP = CommandSpec(
 SUBMISSION_RENDER = CommandSpec(
     name="submission render",
     group="export",
-    summary="Render the test frames of a NeRSemble benchmark participant: four sequences, four cameras.",
+    summary="Render the test frames of a NeRSemble benchmark participant.",
     settings="headbench.datasets.nersemble.benchmark.settings:SubmissionRenderSettings",
     function="headbench.datasets.nersemble.benchmark.render:render_participant",
     writes="out",
@@ -145,7 +145,7 @@ SUBMISSION_RENDER = CommandSpec(
 SUBMISSION_WRITE = CommandSpec(
     name="submission write",
     group="export",
-    summary="Write a submission to the NeRSemble benchmark and report the loss of its codec; exit code 3 without ffmpeg.",
+    summary="Write a submission to the NeRSemble benchmark; exit code 3 without ffmpeg.",
     settings="headbench.datasets.nersemble.benchmark.settings:SubmissionWriteSettings",
     function="headbench.datasets.nersemble.benchmark.command:submission_write",
 )
@@ -153,7 +153,7 @@ SUBMISSION_WRITE = CommandSpec(
 SUBMISSION_CHECK = CommandSpec(
     name="submission check",
     group="export",
-    summary="Check a submission to the NeRSemble benchmark as its server does and decode every frame.",
+    summary="Check a submission to the NeRSemble benchmark as its server does.",
     settings="headbench.datasets.nersemble.benchmark.settings:SubmissionCheckSettings",
     function="headbench.datasets.nersemble.benchmark.command:submission_check",
 )

@@ -3,9 +3,9 @@
 from ..bench.specs import CommandSpec
 
 PARITY = CommandSpec(
-    name="parity",
+    name="run parity",
     group="compare",
-    summary="Train a method and its authors' code on one capture with equal settings and compare the results.",
+    summary="Compare a method with its authors' code on one capture at equal settings.",
     settings="headbench.methods.official.parity.settings:ParitySettings",
     function="headbench.methods.official.parity.parity:compare",
     writes="out",
@@ -13,9 +13,9 @@ PARITY = CommandSpec(
 )
 
 COMPACT = CommandSpec(
-    name="compact",
+    name="export compact",
     group="export",
-    summary="Compress an avatar of the method ours to about a fifteenth of its size; with a capture, measure the loss of quality.",
+    summary="Compress an avatar of the method ours to about a fifteenth of its size.",
     settings="headbench.methods.avatars.compact.settings:CompactSettings",
     function="headbench.methods.avatars.compact.measure:compact_avatar",
     writes="out",
@@ -25,7 +25,7 @@ COMPACT = CommandSpec(
 EXPORT_HTML = CommandSpec(
     name="export html",
     group="export",
-    summary="Export an avatar as one HTML file with sliders for expressions and joints.",
+    summary="Write an avatar as one HTML file with sliders for expressions and joints.",
     settings="headbench.methods.avatars.web.settings:ExportHtmlSettings",
     function="headbench.methods.avatars.web.export:export_page",
 )
@@ -33,7 +33,7 @@ EXPORT_HTML = CommandSpec(
 EXPORT_PLY = CommandSpec(
     name="export ply",
     group="export",
-    summary="Write an avatar in one pose as a 3D Gaussian splatting PLY that common viewers open.",
+    summary="Write an avatar in one pose as a 3D Gaussian splatting PLY.",
     settings="headbench.methods.avatars.settings:ExportPlySettings",
     function="headbench.methods.avatars.export:export_ply",
 )
@@ -57,7 +57,7 @@ EXPORT_SOG = CommandSpec(
 IMPORT_GA = CommandSpec(
     name="import ga",
     group="export",
-    summary="Import a GaussianAvatars PLY, with its flame_param.npz or its capture, as an avatar of the method ga.",
+    summary="Import a GaussianAvatars PLY as an avatar of the method ga.",
     settings="headbench.methods.avatars.settings:ImportGASettings",
     function="headbench.methods.avatars.import_ga:import_avatar",
     writes="out",

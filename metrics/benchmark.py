@@ -1,4 +1,4 @@
-"""``headbench bench metrics``: the image metrics beside the usual libraries, whose values are the same."""
+"""``headbench doctor bench metrics``: the image metrics beside the usual libraries, whose values are the same."""
 
 from __future__ import annotations
 

@@ -73,23 +73,23 @@ TABLE_COMMAND = CommandSpec(
 COMPARE = CommandSpec(
     name="compare",
     group="compare",
-    summary="Test paired differences between methods of finished runs: interval, exact test over subjects, Holm's correction.",
+    summary="Test differences between methods, or compare a run with a baseline file (CI).",
     settings="headbench.reports.statistics.command:CompareSettings",
     function="headbench.reports.statistics.command:compare_runs",
 )
 
 EXTREMES = CommandSpec(
-    name="extremes",
+    name="run extremes",
     group="compare",
-    summary="Render a run's avatars in views and expressions beyond those of training; check stability limits.",
+    summary="Render views and expressions beyond training; check stability limits.",
     settings="headbench.reports.robustness.settings:ExtremesSettings",
     function="headbench.reports.robustness.command:extremes_run",
 )
 
 REENACT = CommandSpec(
-    name="reenact",
+    name="run reenact",
     group="compare",
-    summary="Drive a run's avatars with another subject's expressions; check stability limits.",
+    summary="Drive avatars with another subject's expressions; check stability limits.",
     settings="headbench.reports.robustness.settings:ReenactSettings",
     function="headbench.reports.robustness.command:reenact_run",
 )
@@ -97,24 +97,24 @@ REENACT = CommandSpec(
 REPORT_COMMAND = CommandSpec(
     name="report",
     group="inspect",
-    summary="Write a report of finished runs as one HTML file or a folder; it opens without a network.",
+    summary="Write an HTML report of finished runs; it opens without a network.",
     settings="headbench.reports.page.settings:PageSettings",
     function="headbench.reports.page.report:write_report",
 )
 
 PARETO = CommandSpec(
-    name="pareto",
+    name="report pareto",
     group="inspect",
-    summary="Plot quality against size and frame time of finished runs, with the Pareto front, and write CSV.",
+    summary="Plot quality against size and frame time of runs, with the Pareto front.",
     settings="headbench.reports.pareto.settings:ParetoSettings",
     function="headbench.reports.pareto.command:pareto_runs",
     writes="out",
 )
 
 LEADERBOARD_BUILD = CommandSpec(
-    name="leaderboard build",
+    name="report leaderboard",
     group="inspect",
-    summary="Build a leaderboard page in Markdown and HTML from the result bundles in a folder.",
+    summary="Build a leaderboard page from the result bundles in a folder.",
     settings="headbench.reports.leaderboard.command:LeaderboardSettings",
     function="headbench.reports.leaderboard.command:leaderboard_build",
     writes="out",

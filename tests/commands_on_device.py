@@ -17,7 +17,7 @@ from headbench.bench.runner import config
 from .methods import pretended
 from .test_end_to_end import CASES, OTHERS, timed_in_few_frames
 
-COMMANDS = ("sweep", "curve", "extremes", "reenact", "verify", "view")
+COMMANDS = ("run sweep", "run curve", "run extremes", "run reenact", "verify", "view")
 """Those that load the avatars of a run on the run's device."""
 
 

@@ -67,18 +67,18 @@ PREPARE = (
 )
 COMMANDS = (
     f"inspect capture {GIVEN} --out inspected",
-    f"steps capture {GIVEN} --out steps",
+    f"inspect steps capture {GIVEN} --out steps",
     "run --config config.json",
-    f"refit capture {GIVEN} --target flame/generic_model.pkl --out refitted",
-    "refit refitted/UNION3_901 --target flame/flame2023.pkl --out again",
-    "refit refitted/UNION3_901 --target 2023 --out procedural",
+    f"prepare refit capture {GIVEN} --target flame/generic_model.pkl --out refitted",
+    "prepare refit refitted/UNION3_901 --target flame/flame2023.pkl --out again",
+    "prepare refit refitted/UNION3_901 --target 2023 --out procedural",
     f"export colmap capture {GIVEN} --out colmap --names flat --tracking",
-    f"record nersemble capture {GIVEN} --out recording",
+    f"export nersemble capture {GIVEN} --out recording",
     f"{PREPARE} --sequences EMO-1,FREE,SEN-01 --downscale 1 --out prepared",
     "export ply run/901/ga/seed-0/avatar --out ga.ply",
     "render run/901/ours/seed-0/avatar --capture colmap --reader colmap --frames train --out rendered",
     f"import ga run/901/ga/seed-0/avatar/point_cloud.ply --capture capture {GIVEN} --out imported",
-    f"tongue capture {GIVEN} --out tongue",
+    f"prepare tongue capture {GIVEN} --out tongue",
 )
 
 

@@ -87,7 +87,7 @@ class EvaluateSettings:
     """Folder with the images, or with --avatar that of an avatar as `headbench render` takes it."""
 
     out: str
-    """Folder to write: that of a run with one method, which every report, `table`, `compare`, `gate` and `verify` read."""
+    """Folder to write: that of a run with one method, which every report, `table`, `compare` and `verify` read."""
 
     clip: str | None = None
     """Capture to score against (or folder of several); default: that of the run named by --like."""

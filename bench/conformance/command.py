@@ -1,4 +1,4 @@
-"""``headbench check-plugin``."""
+"""``headbench doctor check``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``headbench curve``: quality over training time, cameras, timesteps or tracking error, as conditions of one run."""
+"""``headbench run curve``: quality over training time, cameras, timesteps or tracking error, as conditions of one run."""
 
 from __future__ import annotations
 

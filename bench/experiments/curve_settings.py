@@ -1,4 +1,4 @@
-"""Settings of ``headbench curve``."""
+"""Settings of ``headbench run curve``."""
 
 from __future__ import annotations
 

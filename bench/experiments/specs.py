@@ -5,26 +5,26 @@ from __future__ import annotations
 from ..specs import CommandSpec, ConditionSpec
 
 SUITE = CommandSpec(
-    name="suite",
+    name="run suite",
     group="compare",
-    summary="Run the benchmark suite: ten synthetic subjects, all methods, tables by region and part.",
+    summary="Run the benchmark suite: ten synthetic subjects, all methods; takes hours.",
     settings="headbench.bench.experiments.suite_settings:SuiteSettings",
     function="headbench.bench.experiments.suite:suite",
     writes="out",
 )
 
 SWEEP = CommandSpec(
-    name="sweep",
+    name="run sweep",
     group="compare",
-    summary="Derive smaller and faster variants of a run's avatars without training; quality against size and frame time.",
+    summary="Derive smaller and faster avatars without training, and measure them.",
     settings="headbench.bench.experiments.sweep_settings:SweepSettings",
     function="headbench.bench.experiments.sweep:sweep_run",
 )
 
 CURVE = CommandSpec(
-    name="curve",
+    name="run curve",
     group="compare",
-    summary="Plot quality against training time, cameras, timesteps or tracking error, measured on held-out training frames.",
+    summary="Measure quality against training time, cameras, timesteps or tracking error.",
     settings="headbench.bench.experiments.curve_settings:CurveSettings",
     function="headbench.bench.experiments.curve:curve_run",
 )

@@ -1,4 +1,4 @@
-"""Settings of ``headbench suite``, and its ablations."""
+"""Settings of ``headbench run suite``, and its ablations."""
 
 from __future__ import annotations
 

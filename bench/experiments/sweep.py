@@ -1,4 +1,4 @@
-"""``headbench sweep``: smaller and faster avatars derived without training, as conditions of a run with a source."""
+"""``headbench run sweep``: smaller and faster avatars derived without training, as conditions of a run with a source."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of ``headbench sweep``."""
+"""Settings of ``headbench run sweep``."""
 
 from __future__ import annotations
 

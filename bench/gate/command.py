@@ -1,18 +1,17 @@
-"""``headbench gate``."""
+"""``headbench compare --baseline``."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
 
-from ..contracts import Progress, no_progress
 from ..errors import ExitCode, InputError
 from ..io.files import check_writable, write_text
 from ..specs import Findings
-from .settings import GateSettings
+from .settings import BaselineOptions
 
 
-def gate(settings: GateSettings, progress: Progress = no_progress) -> Findings:
+def compare_with_baseline(run: Path, baseline: Path, settings: BaselineOptions) -> Findings:
     """Compare a run with a committed baseline: exit code 1 if a number got worse, 3 if one is missing.
 
     Results or a baseline that are missing or invalid are a finding too, with exit code 3, so that CI does not
@@ -23,9 +22,9 @@ def gate(settings: GateSettings, progress: Progress = no_progress) -> Findings:
             check_writable(Path(path), option)
             Path(path).unlink(missing_ok=True)  # a report of an earlier run would pass for this one's
     if settings.update:
-        check_writable(Path(settings.baseline), "--baseline")
+        check_writable(baseline, "--baseline")
     try:
-        return _update(settings) if settings.update else _judge(settings)
+        return _update(run, baseline, settings) if settings.update else _judge(run, baseline, settings)
     except InputError as error:
         from .verdicts import failed_junit, failed_markdown
 
@@ -35,14 +34,14 @@ def gate(settings: GateSettings, progress: Progress = no_progress) -> Findings:
         )
 
 
-def _write_reports(settings: GateSettings, junit: str, markdown: str) -> None:
+def _write_reports(settings: BaselineOptions, junit: str, markdown: str) -> None:
     """Write the reports asked for."""
     for path, text in ((settings.junit, junit), (settings.markdown, markdown)):
         if path is not None:
             write_text(Path(path), text)
 
 
-def _judge(settings: GateSettings) -> Findings:
+def _judge(run: Path, baseline_file: Path, settings: BaselineOptions) -> Findings:
     from .baseline import Baseline, read_results
     from .verdicts import (
         environment_changes,
@@ -54,7 +53,7 @@ def _judge(settings: GateSettings) -> Findings:
         unjudged_notes,
     )
 
-    baseline, results = Baseline.read(Path(settings.baseline)), read_results(Path(settings.results))
+    baseline, results = Baseline.read(baseline_file), read_results(run)
     verdicts = judge(results, baseline, speed=settings.judge_speed)
     code = exit_code(verdicts)
     changes = environment_changes(baseline.environment, results.environment)
@@ -75,13 +74,12 @@ def _judge(settings: GateSettings) -> Findings:
     return Findings(to_text(verdicts, code, notes), data, code == 0, code)
 
 
-def _update(settings: GateSettings) -> Findings:
+def _update(run: Path, path: Path, settings: BaselineOptions) -> Findings:
     from .baseline import Baseline, read_results
     from .verdicts import judge
 
-    path = Path(settings.baseline)
     earlier = Baseline.read(path) if path.exists() else None
-    results = read_results(Path(settings.results))
+    results = read_results(run)
     baseline = Baseline.of(results, earlier, settings.captures)
     verdicts = judge(results, earlier) if earlier else []
     gone = sorted(earlier.values.keys() - baseline.values.keys()) if earlier else []

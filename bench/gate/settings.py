@@ -5,44 +5,40 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import tyro
-
 from ..options import DependentOptions
 
 Captures = Literal["same", "remade"]
 
 
-@dataclass(frozen=True)
-class GateSettings:
-    """Hold the results of a run against a baseline file.
+@dataclass(frozen=True, kw_only=True)
+class BaselineOptions:
+    """Comparison of a run with a baseline file."""
 
-    Exit code 0: nothing got worse; 1: something did; 2: wrong usage; 3: results or baseline missing or invalid.
-    """
-
-    results: tyro.conf.Positional[str]
-    """Folder of a finished run, or of `headbench evaluate`."""
-
-    baseline: str
-    """Baseline file (JSON), to be kept under version control."""
+    baseline: str | None = None
+    """Compare one run, or what `headbench evaluate` wrote, with this baseline file (JSON), which is kept under version
+    control. Exit code 0: nothing got worse; 1: something did; 3: results or baseline missing or invalid."""
 
     update: bool = False
-    """Write the results into the baseline instead of judging them; tolerances already in the file are kept."""
+    """With --baseline: write the results into the file instead of judging them; tolerances that it has are kept."""
 
     captures: Captures | None = None
     """With --update: `same` (default) demands the very same captures, by fingerprint, ever after; `remade` is for ones
     synthesised again for every run, whose pictures differ in last bits between processors: all else must be the same."""
 
     judge_speed: bool = False
-    """Also judge metrics that depend on the machine and its load (frames per second, milliseconds, training time, memory),
+    """With --baseline: also judge metrics that depend on the machine and its load (frames per second, milliseconds, training time, memory),
     where the baseline was measured on a machine of the same kind. Without it they are shown and decide nothing."""
 
     junit: str | None = None
-    """Also write a JUnit XML file: one test case for every task, method, subject and metric."""
+    """With --baseline: also write a JUnit XML file: one test case for every task, method, subject and metric."""
 
     markdown: str | None = None
-    """Also write a Markdown summary."""
+    """With --baseline: also write a Markdown summary."""
 
-    dependent = (
-        DependentOptions(("captures",), "update"),
-        DependentOptions(("judge_speed", "junit", "markdown"), "update", False),
-    )
+
+DEPENDENT = (
+    DependentOptions(("update", "captures", "judge_speed", "junit", "markdown"), "baseline"),
+    DependentOptions(("captures",), "update"),
+    DependentOptions(("judge_speed", "junit", "markdown"), "update", False),
+)
+"""Options that have no effect without, or with, another one."""

@@ -205,7 +205,7 @@ def to_markdown(verdicts: Sequence[Verdict], code: int, notes: Sequence[str]) ->
 
 def to_junit(verdicts: Sequence[Verdict], notes: Sequence[str]) -> str:
     """JUnit XML: a suite for each task; regressed is a failure, missing an error, unjudged skipped."""
-    root = ElementTree.Element("testsuites", name="headbench gate")
+    root = ElementTree.Element("testsuites", name="headbench compare")
     for task in dict.fromkeys(verdict.place.task for verdict in verdicts):
         own = [verdict for verdict in verdicts if verdict.place.task == task]
         counts = Counter(verdict.outcome for verdict in own)
@@ -235,7 +235,7 @@ def failed_markdown(message: str) -> str:
 
 def failed_junit(message: str) -> str:
     """The JUnit XML where results or baseline are missing or invalid: one test case, with an error."""
-    root = ElementTree.Element("testsuites", name="headbench gate")
+    root = ElementTree.Element("testsuites", name="headbench compare")
     counts = {"tests": "1", "failures": "0", "errors": "1", "skipped": "0"}
     suite = ElementTree.SubElement(root, "testsuite", {"name": "gate", **counts})
     case = ElementTree.SubElement(suite, "testcase", classname="gate", name="results and baseline")

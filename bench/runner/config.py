@@ -284,7 +284,7 @@ def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
 
 AVATAR_FOLDER = (
     "folder of an avatar: a cell of a run (RUN/SUBJECT/METHOD/seed-0), the folder avatar in it, or what `headbench import ga` "
-    "or `headbench compact` wrote"
+    "or `headbench export compact` wrote"
 )
 AvatarFolder = Annotated[
     tyro.conf.Positional[str], tyro.conf.arg(help=f"{AVATAR_FOLDER[0].upper()}{AVATAR_FOLDER[1:]}.")

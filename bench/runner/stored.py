@@ -175,7 +175,7 @@ def open_avatar(folder: Path, method: str = "") -> StoredAvatar:
     home = avatar_folder(folder)
     path = home / AVATAR_FILE
     if not path.is_file():
-        remedy = "It is written when a training, an import or `headbench compact` ends."
+        remedy = "It is written when a training, an import or `headbench export compact` ends."
         if (folder / "run.json").is_file():
             remedy = "The avatars of a run lie in SUBJECT/METHOD/seed-N/avatar inside its folder."
         raise InputError(
@@ -212,7 +212,7 @@ def _resolved(spec: MethodSpec, record: AvatarRecord, path: Path) -> ResolvedMet
 
 
 def load_avatar(folder: Path | str, *, device: str = "cpu", method: str = "") -> Avatar:
-    """Load an avatar that a run, an import or `headbench compact` stored, whatever its method.
+    """Load an avatar that a run, an import or `headbench export compact` stored, whatever its method.
 
     Parameters
     ----------

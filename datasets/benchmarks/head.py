@@ -1,4 +1,4 @@
-"""The head model: time of its forward pass (``headbench bench head``) and extremes (``headbench stress head``).
+"""The head model: time of its forward pass (``headbench doctor bench head``) and extremes (``headbench doctor stress head``).
 
 Measured on a head with random bases of any size: as large as a licensed model's, licensed by nobody.
 """

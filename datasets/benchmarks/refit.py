@@ -1,4 +1,4 @@
-"""``headbench bench refit``: what remains after a refit to another head model, and how fast it is."""
+"""``headbench doctor bench refit``: what remains after a refit to another head model, and how fast it is."""
 
 from __future__ import annotations
 

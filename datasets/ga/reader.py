@@ -96,7 +96,7 @@ def read_capture(
         training.
     exclude : Mapping[int, str] | str | Path | None
         Frames to leave out in addition to those of ``headbench.json``: reason by timestep, or a file
-        for `read_reasons`, such as the one that ``headbench tongue`` writes.
+        for `read_reasons`, such as the one that ``headbench prepare tongue`` writes.
     leaks : LeakPolicy
         "error" refuses splits that share data; "record" notes it in the step record.
     decode : bool

@@ -1,4 +1,4 @@
-"""``headbench prepare nersemble`` and ``headbench record nersemble``."""
+"""``headbench prepare nersemble`` and ``headbench export nersemble``."""
 
 from __future__ import annotations
 

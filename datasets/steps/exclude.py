@@ -1,6 +1,6 @@
 """Leave labelled frames out of every split: FLAME has no tongue, so frames that show one are not compared.
 
-Labels come as JSON ({"<timestep>": "<reason>"}), or as the YAML that ``headbench tongue`` writes, which says what a
+Labels come as JSON ({"<timestep>": "<reason>"}), or as the YAML that ``headbench prepare tongue`` writes, which says what a
 detector decided, why, and what people decided instead. One file serves several subjects::
 
     format: headbench-exclusions-1
@@ -75,7 +75,7 @@ def exclude_given(clip: Clip, exclude: Mapping[int, str] | str | Path | None) ->
     Parameters
     ----------
     exclude : Mapping[int, str] | str | Path | None
-        Reason by timestep, or a file for `read_reasons`, such as the one that ``headbench tongue``
+        Reason by timestep, or a file for `read_reasons`, such as the one that ``headbench prepare tongue``
         writes.
 
     Raises
@@ -116,7 +116,9 @@ def read_reasons(path: Path, clip: CaptureClip) -> dict[int, str]:
     subjects = read_exclusions(path)
     if clip.subject not in subjects:
         found = ", ".join(subjects) or "no subjects"
-        raise InputError(path, "subjects", clip.subject, found, "Run `headbench tongue` on this capture too.")
+        raise InputError(
+            path, "subjects", clip.subject, found, "Run `headbench prepare tongue` on this capture too."
+        )
     decided = subjects[clip.subject]
     sequences = {key.timestep: key.sequence for key in clip.files}
     for timestep, frame in decided.frames.items():
@@ -136,7 +138,7 @@ KEEP = "keep"
 UNIT = "mm2 of lip and chin that look covered"
 
 _HEADER = """\
-# Frames with the tongue out, found by `headbench tongue`. Leave them out with
+# Frames with the tongue out, found by `headbench prepare tongue`. Leave them out with
 #   headbench run --set reader_settings.exclude=THIS_FILE
 # Correct a decision under `overrides` of its subject, as "timestep: keep" or "timestep: reason to exclude";
 # overrides win, and another run of the detector keeps them.
@@ -225,7 +227,7 @@ class _File:
 def read_exclusions(path: Path) -> dict[str, Exclusions]:
     """Read the file: decisions by subject. Raises `InputError` for anything that is not one."""
     if not path.exists():
-        remedy = "Make one with `headbench tongue`."
+        remedy = "Make one with `headbench prepare tongue`."
         raise InputError(path, "", "a file of exclusions", "no such file", remedy)
     content = checked(read_yaml(path), _File, path)
     return {

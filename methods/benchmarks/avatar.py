@@ -1,4 +1,4 @@
-"""``headbench bench avatar``: frames of an untrained avatar of `ours` beside those of one of `ga` with the same splats."""
+"""``headbench doctor bench avatar``: frames of an untrained avatar of `ours` beside those of one of `ga` with the same splats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``headbench stress splats``: the renderer at numerical extremes, forward and backward, each with a verdict.
+"""``headbench doctor stress splats``: the renderer at numerical extremes, forward and backward, each with a verdict.
 
 Cases are small: their truth is the float64 reference. Bounds are on float32 arithmetic, whatever the instruction set:
 the mean absolute error of the image (colours of order 1), and the relative L2 error of the worst gradient.

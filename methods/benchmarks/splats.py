@@ -1,4 +1,4 @@
-"""``headbench bench splats``: what the renderer's two passes take, and what settings that give up accuracy buy."""
+"""``headbench doctor bench splats``: what the renderer's two passes take, and what settings that give up accuracy buy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``headbench bench training``: an iteration of each method that trains splats, against the rasteriser's two passes.
+"""``headbench doctor bench training``: an iteration of each method that trains splats, against the rasteriser's two passes.
 
 Splats lie at random on the procedural head, as training leaves them, and the images are drawn from an untrained avatar: what an
 iteration costs does not depend on what it learns.

@@ -73,7 +73,7 @@ def rasterize(
         ``alpha_min`` applies to the product.
     alpha_min : float
         Splats are skipped in pixels where their alpha is smaller, and everywhere if their opacity is.
-        The default, 1/255, is gsplat's; larger values are faster and less exact (``headbench bench
+        The default, 1/255, is gsplat's; larger values are faster and less exact (``headbench doctor bench
         splats --tradeoffs`` measures it).
     transmittance_min : float
         The splat that would reduce a pixel's transmittance to this or below is skipped, with all

@@ -1,4 +1,4 @@
-"""``headbench leaderboard build``."""
+"""``headbench report leaderboard``."""
 
 from __future__ import annotations
 

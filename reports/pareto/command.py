@@ -1,4 +1,4 @@
-"""``headbench pareto``."""
+"""``headbench report pareto``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of ``headbench pareto``."""
+"""Settings of ``headbench report pareto``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``headbench extremes`` and ``headbench reenact``."""
+"""``headbench run extremes`` and ``headbench run reenact``."""
 
 from __future__ import annotations
 

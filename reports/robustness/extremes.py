@@ -1,4 +1,4 @@
-"""``headbench extremes``: views between and beyond the training cameras, expressions along principal components."""
+"""``headbench run extremes``: views between and beyond the training cameras, expressions along principal components."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``headbench reenact``: avatars of one subject driven with the held-out performance of another."""
+"""``headbench run reenact``: avatars of one subject driven with the held-out performance of another."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def check_heads(source: HeadAsset, target: HeadAsset, where: str) -> None:
     """Raise `InputError` where the source's coefficients mean nothing to the target's head model."""
     ours, theirs = (f"{h.version}, {h.expression_basis.shape[2]} expressions" for h in (target, source))
     if ours != theirs:
-        remedy = "Re-fit the source to the target's head model first: headbench refit."
+        remedy = "Re-fit the source to the target's head model first: headbench prepare refit."
         raise InputError(where, "head model", ours, theirs, remedy)
 
 

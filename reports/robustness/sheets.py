@@ -21,7 +21,7 @@ EXTREMES_WIDTH, REENACT_WIDTH, REENACT_COLUMNS = 110, 150, 8
 
 
 def write_extremes_sheet(folder: Path, width: int = EXTREMES_WIDTH) -> Path:
-    """Draw the sheet of a folder that ``headbench extremes`` left: a column a view, a row a step; returns the PNG.
+    """Draw the sheet of a folder that ``headbench run extremes`` left: a column a view, a row a step; returns the PNG.
 
     Views beyond the training cameras have an orange frame, frames that break a limit a red one. In every view the
     expression goes along one component, named above its column, from the mean in the first row outwards.
@@ -39,7 +39,7 @@ def write_extremes_sheet(folder: Path, width: int = EXTREMES_WIDTH) -> Path:
 
 
 def write_reenact_sheet(folder: Path, width: int = REENACT_WIDTH, columns: int = REENACT_COLUMNS) -> Path:
-    """Draw the sheet of a folder that ``headbench reenact`` left; returns the PNG.
+    """Draw the sheet of a folder that ``headbench run reenact`` left; returns the PNG.
 
     The source's frame above, the avatars it drives below: up to ``columns`` timesteps of each pair of target and
     source, evenly spaced. A frame that breaks a limit has a red frame.

@@ -1,4 +1,4 @@
-"""``headbench stress statistics``: tests and intervals on paired differences that are drawn from a known population."""
+"""``headbench doctor stress statistics``: tests and intervals on paired differences that are drawn from a known population."""
 
 from __future__ import annotations
 

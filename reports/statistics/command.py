@@ -12,6 +12,8 @@ import tyro
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.gate.settings import DEPENDENT, BaselineOptions
+from ...bench.options import DependentOptions
 from ...bench.protocol import TASK_TITLES
 from ...bench.specs import Findings, MetricSpec
 
@@ -21,8 +23,10 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class CompareSettings:
-    """Paired differences between methods of finished runs: size, interval, exact test, Holm's correction."""
+class CompareSettings(BaselineOptions):
+    """Paired differences between methods of finished runs: size, interval, exact test, Holm's correction. With --baseline:
+    one run against the numbers of a file, for CI.
+    """
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of finished runs on the same frames. Further seeds of a method join it; another setting is another
@@ -49,9 +53,18 @@ class CompareSettings:
     format: Literal["text", "csv"] = "text"
     """How to print; --json gives everything, each subject's difference included."""
 
+    dependent = (
+        *DEPENDENT,
+        DependentOptions(
+            ("against", "metrics", "trivial", "region", "sequences", "level", "format"), "baseline", False
+        ),
+    )
+
     def __post_init__(self) -> None:
         if not self.runs:
             raise ValueError("runs: at least one folder")
+        if self.baseline is not None and len(self.runs) != 1:
+            raise ValueError(f"runs: one folder with --baseline, found {len(self.runs)}")
         if not 0 < self.level < 1:
             raise ValueError(f"level is {self.level}; a number between 0 and 1")
 
@@ -63,12 +76,16 @@ FIELDS = (
 
 
 def compare_runs(settings: CompareSettings, progress: Progress = no_progress) -> Findings:
-    """Test paired differences between methods of finished runs: interval, exact test over subjects, Holm's correction.
+    """Test paired differences between methods of finished runs, or compare one run with a baseline file.
 
     Raises `InputError` for runs, methods and metrics that do not fit.
     """
     from ..runs import Part, RunSet
 
+    if settings.baseline is not None:
+        from ...bench.gate.command import compare_with_baseline
+
+        return compare_with_baseline(Path(settings.runs[0]), Path(settings.baseline), settings)
     part = Part(settings.region, settings.sequences)
     return compare_methods(RunSet.read([Path(folder) for folder in settings.runs], part), settings, progress)
 

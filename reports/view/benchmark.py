@@ -1,4 +1,4 @@
-"""``headbench bench viewer``: how often a browser sees something new while a slider moves, and what each step takes."""
+"""``headbench doctor bench viewer``: how often a browser sees something new while a slider moves, and what each step takes."""
 
 from __future__ import annotations
 

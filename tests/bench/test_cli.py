@@ -108,13 +108,13 @@ def test_bad_input_is_refused_before_work(capsys, tmp_path, monkeypatch, words, 
         "demo --preset smoke --set capture.head=none.npz",
         "synth --cameras 99",
         "run --data none",
-        "suite --methods none",
+        "run suite --methods none",
         "render none --capture none",
-        "refit none --target 2023",
+        "prepare refit none --target 2023",
         "inspect none",
         "export colmap none",
         "import ga none.ply",
-        "compact none",
+        "export compact none",
     ],
 )
 def test_a_refused_command_leaves_no_folder(capsys, tmp_path, monkeypatch, words):
@@ -188,18 +188,18 @@ def toy_benchmark(monkeypatch, tmp_path):
 
 @pytest.mark.usefixtures("toy_benchmark")
 def test_a_benchmark_prints_tables_or_json_and_writes_a_file(capsys, tmp_path):
-    assert cli.main(["bench", "toy_benchmark:SPEC"]) == 0
+    assert cli.main(["doctor", "bench", "toy_benchmark:SPEC"]) == 0
     assert capsys.readouterr().out == "a table\n"
     out = tmp_path / "out.json"
-    assert cli.main(["bench", "toy_benchmark:SPEC", "--quick", "--json", "--out", str(out)]) == 0
+    assert cli.main(["doctor", "bench", "toy_benchmark:SPEC", "--quick", "--json", "--out", str(out)]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads(out.read_text()) == {"quick": True}
 
 
 @pytest.mark.usefixtures("toy_benchmark")
 def test_a_benchmark_that_finds_a_fault_fails_the_command(capsys):
-    assert cli.main(["stress", "toy_benchmark:SPEC"]) == 1
+    assert cli.main(["doctor", "stress", "toy_benchmark:SPEC"]) == 1
     assert capsys.readouterr().out == "a bad table\n"
-    assert cli.main(["bench", "toy_benchmark:SPEC", "--tradeoffs"]) == 2
+    assert cli.main(["doctor", "bench", "toy_benchmark:SPEC", "--tradeoffs"]) == 2
     assert "tradeoffs" in capsys.readouterr().err
 
 
@@ -250,13 +250,13 @@ LONG = "n" * 300
         ["run", "--config", "."],
         ["synth", "--out", LONG],
         ["synth", "--out", "/dev/null"],
-        ["stress", "statistics", "--out", "."],
-        ["bench", "statistics", "--out", LONG],
-        ["bench", "statistics", "--out", "/dev/null"],
-        ["gate", ".", "--baseline", "b", "--junit", "."],
-        ["gate", ".", "--baseline", "b", "--junit", LONG],
-        ["gate", ".", "--baseline", "b", "--markdown", "/dev/full"],
-        ["gate", ".", "--baseline", ".", "--update"],
+        ["doctor", "stress", "statistics", "--out", "."],
+        ["doctor", "bench", "statistics", "--out", LONG],
+        ["doctor", "bench", "statistics", "--out", "/dev/null"],
+        ["compare", ".", "--baseline", "b", "--junit", "."],
+        ["compare", ".", "--baseline", "b", "--junit", LONG],
+        ["compare", ".", "--baseline", "b", "--markdown", "/dev/full"],
+        ["compare", ".", "--baseline", ".", "--update"],
     ],
     ids=lambda arguments: " ".join(arguments).replace(LONG, "LONG"),
 )
@@ -276,7 +276,7 @@ def test_a_path_that_cannot_be_used_is_code_2(arguments, tmp_path, monkeypatch, 
         ("headbench --help > /dev/full", 2),
         ("headbench list methods >&-", 0),
         ("headbench list methods | true; exit ${PIPESTATUS[0]}", 0),
-        ("headbench gate none --baseline none | true; exit ${PIPESTATUS[0]}", 3),
+        ("headbench compare none --baseline none | true; exit ${PIPESTATUS[0]}", 3),
     ],
 )
 def test_output_that_goes_nowhere(command, code):

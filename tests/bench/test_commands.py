@@ -108,7 +108,7 @@ def test_commands_that_take_an_avatar_describe_it_alike():
         for name, own in settings.items()
         if get_type_hints(own).get("avatar") is str
     }
-    assert {"compact", "export html", "export ply", "render", "submission render"} <= found.keys()
+    assert {"export compact", "export html", "export ply", "render", "submission render"} <= found.keys()
     assert set(found.values()) == {AvatarFolder}
 
 
@@ -181,7 +181,12 @@ def test_bash_completes_commands_their_second_words_and_options(capsys):
     with pytest.raises(SystemExit):
         cli.main(["--tyro-print-completion", "bash"])
     script = capsys.readouterr().out
-    for typed, offered in (("ex", "export extremes"), ("export p", "ply"), ("run --da", "--data")):
+    for typed, offered in (
+        ("ex", "export"),
+        ("export p", "ply"),
+        ("run --da", "--data"),
+        ("run swe", "sweep"),
+    ):
         ask = f"COMP_WORDS=(headbench {typed}); COMP_CWORD={len(typed.split())}; _tyro_headbench; echo ${{COMPREPLY[*]}}"
         lines = f"{script}\n{ask}\n"
         answer = subprocess.run(["bash"], check=True, input=lines, capture_output=True, text=True)
@@ -195,14 +200,24 @@ def test_help_shows_the_settings_text(offer, capsys):
     assert "Most that may be wrong." in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("names", "lost"), [(("look", "look at"), "look at"), (("look at", "look"), "look")])
-def test_a_command_that_is_the_first_word_of_another_is_broken(offer, capsys, names, lost):
-    offer(*names)
-    assert cli.main(["list", "commands"]) == 0
-    assert re.search(
-        rf"(?m)^{lost} +broken: '{names[0]}' of unknown is a command, too", capsys.readouterr().out
-    )
-    assert cli.main([*names[0].split(), "here"]) == 0
+def test_a_word_calls_a_command_alone_and_before_a_second_word(offer, capsys):
+    offer("make")
+    monkeyed = registry.entry_points(group="headbench.commands")
+    offer("make twice", spec="toy_command:COUNT")
+    both = [*monkeyed, *registry.entry_points(group="headbench.commands")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "entry_points", lambda group: both)
+        assert cli.main(["make", "here"]) == 0
+        assert capsys.readouterr().out == "looked at here\n"
+        assert cli.main(["make", "twice", "here", "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["lists"] == [["here"], [], [1.0]]
+
+
+@pytest.mark.parametrize("word", commands.MOVED)
+def test_a_word_of_an_earlier_version_is_answered_with_the_new_line(capsys, word):
+    assert cli.main([*word.split(), "a b", "--out", "c"]) == 2
+    assert f"It is now `headbench {commands.MOVED[word]} 'a b' --out c`" in capsys.readouterr().err
+    assert commands.MOVED[word] in registry.discover("commands")
 
 
 @pytest.mark.parametrize(
@@ -244,16 +259,17 @@ def test_a_folder_that_is_written_is_locked(offer, capsys, tmp_path):
 
 def test_every_command_with_a_folder_to_write_locks_it():
     """All but those that lock for themselves: they check first, or lock what they find to be written."""
-    own = {"curve", "demo", "evaluate", "extremes", "prepare nersemble", "reenact", "run", "sweep", "synth"}
+    own = {"demo", "evaluate", "prepare nersemble", "run", "synth"}
+    own |= {f"run {what}" for what in ("curve", "extremes", "reenact", "sweep")}
     files = {
-        "bench",
+        "doctor bench",
         "bundle",
         "export glb",
         "export html",
         "export ply",
         "export sog",
         "report",
-        "stress",
+        "doctor stress",
         "table",
     }  # --out is one
     for plugin in registry.discover("commands").values():
@@ -273,12 +289,22 @@ def test_a_folder_of_another_kind_is_refused_untouched(capsys, tmp_path, mark):
         "export colmap x",
         "import ga x.ply",
         "inspect x",
-        "refit x --target ga",
+        "prepare refit x --target ga",
         "render x --capture x",
     ]
-    commands += ["compact x", "pareto x", "tongue x", "demo", "synth", "report x --split"]
-    continued = {"run.json": {"demo"}, "subject.npz": {"import ga x.ply", "compact x"}}
-    continued |= {"sparse/x": {"export colmap x"}, "900_A/transforms.json": {"synth", "refit x --target ga"}}
+    commands += [
+        "export compact x",
+        "report pareto x",
+        "prepare tongue x",
+        "demo",
+        "synth",
+        "report x --split",
+    ]
+    continued = {"run.json": {"demo"}, "subject.npz": {"import ga x.ply", "export compact x"}}
+    continued |= {
+        "sparse/x": {"export colmap x"},
+        "900_A/transforms.json": {"synth", "prepare refit x --target ga"},
+    }
     for command in commands:
         if command not in continued.get(mark, ()):
             assert cli.main([*command.split(), "--out", str(tmp_path)]) == 2

@@ -9,13 +9,13 @@ from headbench.bench.io.images import probe_image
 
 COMMANDS = {
     "inspect": (["--timesteps", "1", "--cameras", "2"], ["inspection.png", "inspection.json"]),
-    "steps": (
+    "inspect steps": (
         ["--bases", "3", "--clusters", "2"],
         ["jaw_bases.png", "expression_clusters.png", "steps.json"],
     ),
-    "tongue": (["--cameras", "1"], ["tongue.yaml", "tongue_901.png"]),
+    "prepare tongue": (["--cameras", "1"], ["tongue.yaml", "tongue_901.png"]),
     "export colmap": (["--tracking"], ["sparse/0/images.bin", "flame_param/00000.npz", "head_model.npz"]),
-    "record nersemble": ([], ["recording/metadata_sequences.csv", "head_model.npz"]),
+    "export nersemble": ([], ["recording/metadata_sequences.csv", "head_model.npz"]),
 }
 
 

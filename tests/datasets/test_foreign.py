@@ -89,7 +89,9 @@ def test_a_json_without_tracked_heads_names_whose_it_is(tmp_path, file, frame, e
     assert caught.value.key == "frames[0].flame_param_path"
 
 
-@pytest.mark.parametrize("command", ["run --out o --data", "lint", "tongue --out o", "inspect --out o"])
+@pytest.mark.parametrize(
+    "command", ["run --out o --data", "lint", "prepare tongue --out o", "inspect --out o"]
+)
 def test_every_command_on_captures_answers_alike(tmp_path, monkeypatch, capsys, command):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "me.mp4").touch()

@@ -138,7 +138,7 @@ SMALL = (
 RUN = ("run/run.json", "run/protocols/*.json", "run/rows.parquet")
 CELLS = (*RUN, "run/901/**/*")
 MEAN = "--methods mean-image --preset smoke --set metrics=psnr --set frames_per_task=1"
-GATE = "gate run --baseline baseline.json"
+GATE = "compare run --baseline baseline.json"
 PLY = f"{GA}/point_cloud.ply"
 EXCLUSIONS = "reviewed/tongue.yaml"
 FUNCTIONS = (
@@ -168,10 +168,10 @@ COMMANDS = tuple(
         ("capture run", "capture", f"run --data capture --out out {MEAN}", ("**/*",), 3),
         ("capture lint", "capture", "lint capture", ("**/*",), 3),
         ("capture inspect", "capture", "inspect capture --out out", ("**/*",), 3),
-        ("capture tongue", "capture", "tongue capture --out out", ("**/*",), 3),
-        ("capture steps", "capture", "steps capture --out out", ("**/*",), 3),
+        ("capture tongue", "capture", "prepare tongue capture --out out", ("**/*",), 3),
+        ("capture steps", "capture", "inspect steps capture --out out", ("**/*",), 3),
         ("capture colmap", "capture", "export colmap capture --out out", ("**/*",), 3),
-        ("capture refit", "capture", "refit capture --target 2020 --out out", ("**/*",), 3),
+        ("capture refit", "capture", "prepare refit capture --target 2020 --out out", ("**/*",), 3),
         ("recording check", "recording", f"{PREPARE} --out out --check", ("**/*",), 3),
         ("recording", "recording", f"{PREPARE} --out out", ("**/*",), 3),
         ("videos", "videos", f"{PREPARE} --out out", ("recording/**/*",), 3),
@@ -179,21 +179,21 @@ COMMANDS = tuple(
         ("run table", "run", "table run", RUN, 6),
         ("run table cost", "run", "table run --layout cost --format html", RUN, 3),
         ("run compare", "run", "compare run", RUN, 4),
-        ("run pareto", "run", "pareto run --out out", RUN, 3),
+        ("run pareto", "run", "report pareto run --out out", RUN, 3),
         ("run gate", "run", GATE, (*RUN, "baseline.json"), 4),
         ("baseline", "run", GATE, ("baseline.json",), 6),
         ("run verify", "run", "verify run", CELLS, 3),
         ("bundle verify", "run", "verify bundles/renders.zip --data capture", ("bundles/renders.zip",), 4),
-        ("leaderboard", "run", "leaderboard build bundles --out out", ("bundles/*.zip",), 4),
-        ("run extremes", "run", "extremes run --views 1 --dimensions 1", CELLS, 3),
-        ("run sweep", "run", "sweep run --methods ga --variants half", CELLS, 3),
-        ("run reenact", "two_subjects", "reenact run --frames 1", ("**/*",), 3),
+        ("leaderboard", "run", "report leaderboard bundles --out out", ("bundles/*.zip",), 4),
+        ("run extremes", "run", "run extremes run --views 1 --dimensions 1", CELLS, 3),
+        ("run sweep", "run", "run sweep run --methods ga --variants half", CELLS, 3),
+        ("run reenact", "two_subjects", "run reenact run --frames 1", ("**/*",), 3),
         ("run continued", "run", "run --config config.json", CELLS, 3),
         ("images", "run", "evaluate images --like run --out out --label theirs", ("images/**/*",), 3),
         ("avatar export", "run", f"export ply {OURS} --out out.ply --capture capture", (f"{OURS}/*",), 3),
-        ("avatar to compact", "run", f"compact {OURS} --out out", ("run/901/ours/**/*",), 3),
+        ("avatar to compact", "run", f"export compact {OURS} --out out", ("run/901/ours/**/*",), 3),
         ("ply import", "run", f"import ga {PLY} --capture capture --out out", (PLY,), 4),
-        ("exclusions tongue", "heads", "tongue capture --out reviewed", (EXCLUSIONS,), 3),
+        ("exclusions tongue", "heads", "prepare tongue capture --out reviewed", (EXCLUSIONS,), 3),
         ("settings", "files", "run --config config.yaml", ("config.yaml",), 6),
         ("synthetic", "synthetic", f"synth {SYNTH} --out synthetic", ("**/*",), 3),
     )

@@ -149,7 +149,7 @@ def heads(folder: Path, samples: Path) -> None:
     (folder / "FLAME_masks.pkl").write_bytes(pickle.dumps(masks, protocol=2))
     rings = {name: np.asarray(region).tolist() for name, region in head.regions.items() if "ring" in name}
     (folder / "regions.json").write_text(json.dumps(rings))
-    _main("tongue", str(folder / "capture"), "--out", str(folder / "reviewed"))
+    _main("prepare", "tongue", str(folder / "capture"), "--out", str(folder / "reviewed"))
 
 
 def recording(folder: Path, samples: Path) -> None:
@@ -179,8 +179,8 @@ def run(folder: Path, samples: Path) -> None:
     """
     _run(folder, samples, METHODS)
     with contextlib.chdir(folder):
-        _main("gate", "run", "--baseline", "baseline.json", "--update")
-        _main("compact", OURS, "--out", "compact")
+        _main("compare", "run", "--baseline", "baseline.json", "--update")
+        _main("export", "compact", OURS, "--out", "compact")
         Path("bundles").mkdir()
         for name, options in (("renders", ["--renders"]), ("values", ["--methods", "ours"])):
             _main("bundle", "run", "--out", f"bundles/{name}.zip", "--by", "Somebody", *options)

@@ -1,4 +1,4 @@
-"""``headbench refit``."""
+"""``headbench prepare refit``."""
 
 from __future__ import annotations
 

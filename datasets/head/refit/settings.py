@@ -72,7 +72,7 @@ class RefitSettings:
 
 @dataclass(frozen=True)
 class RefitCommandSettings(CaptureOptions):
-    """What ``headbench refit`` takes."""
+    """What ``headbench prepare refit`` takes."""
 
     capture: Annotated[str, tyro.conf.Positional]
     """Capture, in a layout that a reader knows."""

@@ -1,4 +1,4 @@
-"""``headbench steps``."""
+"""``headbench inspect steps``."""
 
 from __future__ import annotations
 

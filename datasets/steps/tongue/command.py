@@ -1,4 +1,4 @@
-"""``headbench tongue``."""
+"""``headbench prepare tongue``."""
 
 from __future__ import annotations
 

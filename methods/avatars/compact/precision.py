@@ -1,4 +1,4 @@
-"""How finely a compact avatar is stored. Light to import: options of ``headbench compact``."""
+"""How finely a compact avatar is stored. Light to import: options of ``headbench export compact``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class Precision:
 
     Each step is in a unit in which equal errors look equally bad, so that one number serves a whole part, whatever
     its range: the entropy coder, not a fixed number of bits, pays for rare large values. The defaults cost less than
-    0.1 dB together (``headbench compact --compare`` measures each).
+    0.1 dB together (``headbench export compact --compare`` measures each).
     """
 
     positions: float = 0.08

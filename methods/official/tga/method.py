@@ -73,7 +73,7 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
             expected = (
                 f"{fixed[0]} vertices and {fixed[1]} triangles with teeth, as {_MODEL_SOURCE} fixes them"
             )
-            remedy = "Refit the capture to FLAME (headbench refit), or compare with ours, the native method."
+            remedy = "Refit the capture to FLAME (headbench prepare refit), or compare with ours, the native method."
             raise InputError(where, "template, faces", expected, f"{found[0]} and {found[1]}", remedy)
         if "face" not in clip.head.regions:
             raise InputError(where, "regions", "a region face", "none", "Load the head model with its masks.")

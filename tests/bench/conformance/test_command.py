@@ -1,4 +1,4 @@
-"""``headbench check-plugin`` on plug-ins written outside, which import nothing but the root of headbench."""
+"""``headbench doctor check`` on plug-ins written outside, which import nothing but the root of headbench."""
 
 import ast
 import json
@@ -22,7 +22,7 @@ PLUGINS = ("grey:SPEC", "outside_reader:SPEC", "mae:MAE") + tuple(
 def test_plugins_written_outside_conform(outside, npz_capture, capsys, plugin):
     read_by = ["--reader", "outside_reader:SPEC", "--data", str(npz_capture)]
     data = {"grey:SPEC": read_by, "outside_reader:SPEC": read_by[2:]}.get(plugin, [])
-    assert cli.main(["check-plugin", plugin, *data]) == 0
+    assert cli.main(["doctor", "check", plugin, *data]) == 0
     assert "keeps its contract" in capsys.readouterr().out
 
 
@@ -82,7 +82,7 @@ def test_a_method_written_outside_draws_the_tracked_mesh(outside, capsys):
 @pytest.fixture
 def grey(npz_capture):
     """The words that check the README's method."""
-    return ["check-plugin", "grey:SPEC", "--reader", "outside_reader:SPEC", "--data", str(npz_capture)]
+    return ["doctor", "check", "grey:SPEC", "--reader", "outside_reader:SPEC", "--data", str(npz_capture)]
 
 
 def test_breaches_are_listed_and_the_exit_code_is_one(outside, grey, capsys, monkeypatch):
@@ -130,7 +130,7 @@ def test_without_data_a_method_is_tried_on_a_synthetic_capture(monkeypatch):
     ],
 )
 def test_wrong_usage_is_refused(outside, capsys, arguments, error):
-    assert cli.main(["check-plugin", *arguments]) == 2
+    assert cli.main(["doctor", "check", *arguments]) == 2
     assert error in capsys.readouterr().err
 
 

@@ -341,11 +341,14 @@ def test_a_metric_that_is_missing_says_why(make_run, monkeypatch):
 
 def test_ga_learns_more_with_more_of_its_budget(tiny_run, capsys):
     run = tiny_run("ga")
-    assert cli.main(["curve", str(run), "--fractions", "1/16", "1", "--frames", "2", "--json"]) == ExitCode.OK
+    assert (
+        cli.main(["run", "curve", str(run), "--fractions", "1/16", "1", "--frames", "2", "--json"])
+        == ExitCode.OK
+    )
     first, last = json.loads(capsys.readouterr().out)["points"]
     assert (first["budget_iterations"], last["budget_iterations"]) == (4, 60)
     assert last["processor_seconds"] > first["processor_seconds"] > 0
     assert last["psnr_camera"] > first["psnr_camera"]
     with pytest.raises(SystemExit) as ended:
-        cli.main(["curve", str(run), "--fractions", "2"])
+        cli.main(["run", "curve", str(run), "--fractions", "2"])
     assert ended.value.code == ExitCode.BAD_INPUT

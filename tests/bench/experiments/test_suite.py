@@ -15,7 +15,7 @@ SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16
 
 @pytest.mark.slow
 def test_the_suite_makes_subjects_and_tables_by_region_and_part(tmp_path, capsys):
-    words = ["suite", "--out", str(tmp_path / "s"), "--methods", "mean-image", "ga", "ours"]
+    words = ["run", "suite", "--out", str(tmp_path / "s"), "--methods", "mean-image", "ga", "ours"]
     assert cli.main([*words, "--preset", "smoke", *SMALL]) == 0
     text = (tmp_path / "s" / "results.md").read_text()
     titles = re.findall("^## (.*)", text, re.MULTILINE)
@@ -55,6 +55,6 @@ def test_every_ablation_is_a_setting_of_ours_that_changes_it(name):
     ],
 )
 def test_what_cannot_be_run_is_refused_before_a_capture_is_made(tmp_path, capsys, words, match):
-    assert cli.main(["suite", "--out", str(tmp_path / "s"), *words]) == 2
+    assert cli.main(["run", "suite", "--out", str(tmp_path / "s"), *words]) == 2
     assert match in capsys.readouterr().err
     assert not (tmp_path / "s" / "capture").exists()

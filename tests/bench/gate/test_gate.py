@@ -20,13 +20,13 @@ from headbench.bench.runner.store import RunFolder
 @pytest.fixture
 def baseline(run, tmp_path, capsys):
     path = tmp_path / "baseline.json"
-    assert cli.main(["gate", str(run), "--baseline", str(path), "--update"]) == 0
+    assert cli.main(["compare", str(run), "--baseline", str(path), "--update"]) == 0
     capsys.readouterr()
     return path
 
 
 def gate(run, baseline, *options):
-    return cli.main(["gate", str(run), "--baseline", str(baseline), *options])
+    return cli.main(["compare", str(run), "--baseline", str(baseline), *options])
 
 
 def worse_by(decibels):
@@ -361,10 +361,19 @@ def test_a_baseline_that_makes_no_sense_is_code_3_naming_what(run, baseline, cha
     assert match in capsys.readouterr().out
 
 
-def test_wrong_usage_is_code_2(run, baseline, capsys):
+@pytest.mark.parametrize(
+    "words", ["--update", "--junit x", "--baseline b --level 0.1", "--baseline b --captures same"]
+)
+def test_options_that_have_no_effect_are_refused(run, capsys, words):
+    assert cli.main(["compare", str(run), *words.split()]) == 2
+    assert "it has no effect" in capsys.readouterr().err
+
+
+def test_a_baseline_is_compared_with_one_run(run, baseline, capsys):
     with pytest.raises(SystemExit) as stop:
-        cli.main(["gate", str(run)])
+        cli.main(["compare", str(run), str(run), "--baseline", str(baseline)])
     assert stop.value.code == 2
+    assert "one folder with --baseline, found 2" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", ["--junit", "--markdown", "--baseline"])

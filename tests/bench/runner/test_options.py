@@ -110,9 +110,9 @@ def test_a_module_that_a_run_names_is_not_imported(run, monkeypatch, tmp_path, c
     every = ("methods", *NEEDED)
     for command, code, needed in (
         (["verify"], 3, every if stored == "avatars" else NEEDED),
-        (["sweep"], 2, every),
-        (["extremes"], 2, every),
-        (["reenact"], 2, every),
+        (["run", "sweep"], 2, every),
+        (["run", "extremes"], 2, every),
+        (["run", "reenact"], 2, every),
         (["evaluate", str(run), "--out", str(tmp_path / "out"), "--like"], 2, NEEDED),
         (["frames", "--out", str(tmp_path / "frames")], 2, NEEDED[:1]),
     ):

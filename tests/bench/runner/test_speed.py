@@ -217,9 +217,9 @@ def test_a_folder_in_use_and_a_run_without_speed_are_refused(config):
 
 def test_the_command_prints_what_changed(config, capsys):
     runner.run(config)
-    assert cli.main(["speed", config.out, "--trust", "--methods", "toy", "--json"]) == 0
+    assert cli.main(["run", "speed", config.out, "--trust", "--methods", "toy", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [change["subject"] for change in found["changes"]] == ["subject1", "subject2"]
     assert (
-        cli.main(["speed", config.out]) == 2
+        cli.main(["run", "speed", config.out]) == 2
     )  # plug-ins that a run folder names are imported with --trust alone

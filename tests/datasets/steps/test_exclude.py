@@ -73,7 +73,7 @@ def test_reasons_come_from_a_file_of_exclusions_or_of_labels(tmp_path):
 
 def test_exclusions_of_another_subject_or_numbering_are_refused(tmp_path):
     clip = make_clip(4)
-    with pytest.raises(InputError, match="headbench tongue") as caught:
+    with pytest.raises(InputError, match="headbench prepare tongue") as caught:
         read_reasons(_decisions(tmp_path / "a.yaml", subject="t"), clip)
     assert caught.value.key == "subjects"
     with pytest.raises(InputError, match="numbers its timesteps") as caught:

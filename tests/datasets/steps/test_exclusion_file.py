@@ -115,5 +115,5 @@ def test_keep_however_it_is_written_and_an_emptied_section(tmp_path, written, re
 
 
 def test_a_missing_file_says_how_to_make_one(tmp_path):
-    with pytest.raises(InputError, match="headbench tongue"):
+    with pytest.raises(InputError, match="headbench prepare tongue"):
         read_exclusions(tmp_path / "none.yaml")

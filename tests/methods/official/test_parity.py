@@ -1,4 +1,4 @@
-"""``headbench parity`` around a stand-in for the authors' repository."""
+"""``headbench run parity`` around a stand-in for the authors' repository."""
 
 import json
 import math
@@ -38,7 +38,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def parity(*words):
-    line = "parity ga --checkout repository --python ./python --commit= --device cpu-shim --data capture --out out"
+    line = "run parity ga --checkout repository --python ./python --commit= --device cpu-shim --data capture --out out"
     return cli.main([*line.split(), *words])
 
 

@@ -43,7 +43,7 @@ def submit(folder):
 @pytest.fixture
 def build(folder, tmp_path):
     def build():
-        assert cli.main(["leaderboard", "build", str(folder), "--out", str(tmp_path / "out")]) == 0
+        assert cli.main(["report", "leaderboard", str(folder), "--out", str(tmp_path / "out")]) == 0
         return [(tmp_path / "out" / f"leaderboard.{suffix}").read_text() for suffix in ("md", "html")]
 
     return build
@@ -108,6 +108,6 @@ def test_notes_of_two_tables_have_names_of_their_own(write_run, submit, build):
 def test_a_folder_without_sound_bundles_is_refused(folder, tmp_path, content, words, capsys):
     for name, data in content.items():
         (folder / name).write_bytes(data)
-    assert cli.main(["leaderboard", "build", str(folder), "--out", str(tmp_path / "out")]) == 2
+    assert cli.main(["report", "leaderboard", str(folder), "--out", str(tmp_path / "out")]) == 2
     assert words in capsys.readouterr().err
     assert not list(tmp_path.glob("out/*"))

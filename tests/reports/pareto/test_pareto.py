@@ -1,4 +1,4 @@
-"""``headbench pareto`` on run folders with known rows."""
+"""``headbench report pareto`` on run folders with known rows."""
 
 import csv
 import itertools

@@ -1,4 +1,4 @@
-"""``headbench extremes`` on avatars whose behaviour at extremes is known beforehand."""
+"""``headbench run extremes`` on avatars whose behaviour at extremes is known beforehand."""
 
 import json
 from types import SimpleNamespace

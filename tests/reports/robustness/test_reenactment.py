@@ -1,4 +1,4 @@
-"""``headbench reenact`` on balls that stand where their pose says."""
+"""``headbench run reenact`` on balls that stand where their pose says."""
 
 import json
 from dataclasses import replace
@@ -133,7 +133,7 @@ def test_a_source_tracked_with_another_head_model_is_refused(ball_run, tmp_path,
             self.head.version = "cube"
 
     monkeypatch.setattr(balls.BallClip, "__init__", other_head)
-    with pytest.raises(InputError, match="headbench refit"):
+    with pytest.raises(InputError, match="headbench prepare refit"):
         reenact_run(settings(folder, source=str(tmp_path / "others")))
 
 
@@ -217,5 +217,5 @@ def test_coefficients_of_another_head_model_are_refused(version, count):
         return SimpleNamespace(version=version, expression_basis=np.zeros((2, 3, count)))
 
     check_heads(head("m", 4), head("m", 4), "source s")
-    with pytest.raises(InputError, match="headbench refit"):
+    with pytest.raises(InputError, match="headbench prepare refit"):
         check_heads(head(version, count), head("m", 4), "source s")

@@ -1,4 +1,4 @@
-"""``headbench refit`` on a capture on disk: what it writes reads back, and what it refuses."""
+"""``headbench prepare refit`` on a capture on disk: what it writes reads back, and what it refuses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``headbench compact`` on an avatar trained on a capture on disk."""
+"""``headbench export compact`` on an avatar trained on a capture on disk."""
 
 import re
 
