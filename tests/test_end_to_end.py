@@ -27,8 +27,11 @@ from headbench.bench.runner.store import RunFolder
 from headbench.metrics import speed
 
 from .datasets.flat_renderer import flat_pictures
+from .fuzz.samples import SETTINGS
 
-TINY = ("--preset", "smoke", "--set", "frames_per_task=3")
+SMALL = (f"--set=settings.{name}={json.dumps(SETTINGS[name])}" for name in ("gbs", "gha", "insta"))
+TINY = ("--preset", "smoke", "--set=frames_per_task=3", *SMALL)
+"""Few frames; two iterations of the methods of which nothing but that they run is asked."""
 METHODS = {"mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours"}
 
 
