@@ -11,9 +11,8 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from functools import partial
-from pathlib import Path
 
 import cv2
 import pandas as pd
@@ -27,8 +26,11 @@ from headbench.bench.runner.store import RunFolder
 from headbench.metrics import speed
 
 from .datasets.flat_renderer import flat_pictures
+from .fuzz.samples import SETTINGS
 
-TINY = ("--preset", "smoke", "--set", "frames_per_task=3")
+SMALL = (f"--set=settings.{name}={json.dumps(SETTINGS[name])}" for name in ("gbs", "gha", "insta"))
+TINY = ("--preset", "smoke", "--set=frames_per_task=3", *SMALL)
+"""Few frames; two iterations of the methods of which nothing but that they run is asked."""
 METHODS = {"mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours"}
 
 
@@ -44,8 +46,9 @@ def timed_in_few_frames():
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_timed_frames():
-    with timed_in_few_frames():
+def quick():
+    """Speed of few frames, and captures drawn in milliseconds: those that are ray-traced have tests of their own."""
+    with timed_in_few_frames(), flat_pictures():
         yield
 
 
@@ -125,8 +128,11 @@ def test_the_result_is_there_for_machines(demo):
 
 
 @pytest.mark.slow
-def test_killed_at_random_moments_it_ends_with_the_same_numbers(run, tmp_path):
-    command = [sys.executable, "-m", "headbench.bench.start", "demo", "--out", str(tmp_path / "demo"), *TINY]
+def test_killed_at_random_moments_it_ends_with_the_same_numbers(tmp_path):
+    """Processes of their own, whose capture is ray-traced."""
+    words = [sys.executable, "-m", "headbench.bench.start", "demo", *TINY, "--out"]
+    subprocess.run([*words, str(tmp_path / "whole")], check=True, capture_output=True, cwd=tmp_path)
+    command = [*words, str(tmp_path / "demo")]
     draw = random.Random(time.time_ns())  # the moment must not matter
     for _ in range(4):
         process = subprocess.Popen(
@@ -138,9 +144,9 @@ def test_killed_at_random_moments_it_ends_with_the_same_numbers(run, tmp_path):
             process.send_signal(signal.SIGKILL)
             process.wait()
     subprocess.run(command, check=True, capture_output=True, cwd=tmp_path)
-    resumed, whole = quality(RunFolder(tmp_path / "demo")), quality(run)
-    assert resumed.equals(whole)
-    assert Path(tmp_path / "demo" / "contact_sheet.png").read_bytes() == run.contact_sheet.read_bytes()
+    resumed, whole = (RunFolder(tmp_path / name) for name in ("demo", "whole"))
+    assert quality(resumed).equals(quality(whole))
+    assert resumed.contact_sheet.read_bytes() == whole.contact_sheet.read_bytes()
 
 
 FORMATS = {
@@ -167,7 +173,7 @@ def cell(method):
 
 
 OTHERS = "synth --out others --subjects 2 --cameras 2 --timesteps 4 --size 24x32"
-PLAIN = "run --data {capture} --out plain --methods mean-image,nearest-camera --preset smoke --set metrics=psnr,ssim --set frames_per_task=3"
+PLAIN = "run --data {capture} --out plain --methods mean-image,nearest-camera --preset smoke --set metrics=psnr,ssim,fps --set frames_per_task=3"
 SUITE = "run suite --out suite --methods mean-image --preset smoke --subjects 1 --cameras 2 --timesteps 60 --size 32x32"
 GATE = "compare plain --baseline baseline.json"
 RECORD = "export nersemble {capture} --out recording"
@@ -180,7 +186,7 @@ CASES = {
     "demo": [],  # the run of this module
     "synth": [case(OTHERS, "others", "others/synthesis.json")],
     "run": [case(PLAIN, r"\| nearest-camera", "plain/rows.parquet", "plain/tables/comparison.md")],
-    "run speed": [case("run speed {demo} --methods mean-image", "speed measured again, avatars: 1")],
+    "run speed": [case("run speed plain --methods mean-image", "speed measured again, avatars: 1")],
     "status": [case("status plain", "2 cells: 0 waiting, 0 running, 2 done, 0 failed")],
     "run suite": [case(SUITE, "Sequence FREE-3-beyond", "suite/results.md", "suite/run/rows.parquet")],
     "list": [case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets")],
@@ -194,7 +200,7 @@ CASES = {
     ],
     "report": [
         case("report {demo} --out report.html --max-mb 5", "frames with pictures", "report.html"),
-        case("report {demo} --split", "frames with pictures", "report/index.html"),
+        case("report plain --split", "frames with pictures", "report/index.html"),
     ],
     "view": [case("view {demo} --port 0 --seconds 0", "the viewer of .*ours has ended")],
     "verify": [case("verify {demo}", "as recorded")],
@@ -373,8 +379,7 @@ def test_the_command_works_from_another_directory(command, run, elsewhere, monke
     (union,) = (run.root / "capture").glob("UNION*")
     places = {"demo": run.root, "capture": union, "subject": union.name.rpartition("_")[2]}
     for words, prints, leaves in CASES[command]:
-        with flat_pictures() if command in ("run suite", "synth") else nullcontext():
-            code = cli.main(words.format(**places).split())
+        code = cli.main(words.format(**places).split())
         printed = capsys.readouterr()
         assert code == 0, printed.err
         assert re.search(prints, printed.out), printed.out

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -50,13 +51,13 @@ METHODS = {
 }
 ITERATIONS = {"gha": 30, "insta": 24}  # of gha, 12 are of the mesh phase
 KILLS = [
-    # Right after a densification, right before one, after a reset, and several kills in one run.
-    *((name, kills) for name in ("ga", "ours", "gbs") for kills in ((8,), (15,), (10, 16, 33))),
+    # Right after a densification, after a reset, right before a densification and right after it, and near the end.
+    *((name, (8, 10, 15, 16, 33)) for name in ("ga", "ours", "gbs")),
     # Within the mesh phase, right after it, right before its result is used, within the Gaussian phase.
     ("gha", (5, 12, 13, 25)),
     *(pytest.param("gha", (kill,), marks=pytest.mark.slow) for kill in (5, 12, 13, 25, 29)),
-    # Between refreshes of the occupancy grid, right after one, and twice in one run.
-    *(("insta", kills) for kills in ((6,), (8,), (3, 17))),
+    # Between refreshes of the occupancy grid, right after one.
+    ("insta", (3, 6, 8, 17)),
 ]
 
 
@@ -81,16 +82,21 @@ def content(avatar):
     return {path.name: path.read_bytes() for path in avatar.files()}
 
 
-@pytest.fixture(scope="module", params=[*METHODS])
-def unbroken(request, clip, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("unbroken")
-    return request.param, content(fit(request.param, clip, folder))
+@pytest.fixture(scope="module")
+def trained(clip, tmp_path_factory):
+    """Files of an avatar of a method by name, trained once without interruption."""
+    return cache(lambda name: content(fit(name, clip, tmp_path_factory.mktemp("unbroken"))))
 
 
-@pytest.mark.parametrize("seed", [7, 8])
-def test_equal_seeds_repeat_a_run_and_other_seeds_do_not(unbroken, clip, tmp_path, seed):
+@pytest.fixture(params=[*METHODS])
+def unbroken(request, trained):
+    return request.param, trained(request.param)
+
+
+def test_another_seed_gives_another_avatar(unbroken, clip, tmp_path):
+    """That the same seed gives the same is part of what follows."""
     name, expected = unbroken
-    assert (content(fit(name, clip, tmp_path, seed=seed)) == expected) == (seed == 7)
+    assert content(fit(name, clip, tmp_path, seed=8)) != expected
 
 
 @pytest.mark.parametrize(("unbroken", "kills"), KILLS, indirect=["unbroken"])

@@ -223,6 +223,7 @@ def lip_numbers(head) -> tuple[tuple[list[int], list[int]], tuple[int, int]]:
 # ------------------------------------------------------------------ Gaussian Head Avatar
 
 HEAD_AVATAR = {
+    "torch.py": "def manual_seed(seed):\n    print('torch seeded with', seed)\n",  # torch itself takes seconds to import
     "lib/dataset/Dataset.py": "",
     "config/config.py": "",
     "lib/recorder/Recorder.py": """

@@ -51,6 +51,7 @@ def test_both_stages_are_run_and_frames_come_back_by_key(method, official_clip, 
     assert calls[-1][0] == frames + 20
     assert (frames + 7, "loss 0.5000") in calls
     log = (tmp_path / "a" / TRAINING_LOG).read_text()
+    assert log.count("torch seeded with 0") == 2
     assert [int(n) for n in re.findall(r"^headbench: iteration (\d+)", log, re.MULTILINE)] == [*range(1, 21)]
     names = {path.name for path in avatar.files()}
     assert names == {"gaussianhead_latest", "supres_latest", "subject.npz", "square.json"}

@@ -12,6 +12,7 @@ from headbench.bench.contracts import Budget
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.rows import Row, Rows
+from headbench.bench.runner import run as runner
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.official.config import GHAOfficialConfig
 from headbench.methods.official.gha.method import GHAOfficial
@@ -34,6 +35,7 @@ def folder(tmp_path, monkeypatch):
     make_repository(tmp_path / "repository", *lip_numbers(toy_head(16)))
     make_interpreter(tmp_path / "python")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runner, "write_reports", lambda out: [])  # nothing here reads them
     return tmp_path
 
 
