@@ -69,9 +69,6 @@ def run(
     record : Any
         Added to the manifest.
     """
-    resolve_cells(config)  # before a folder is made
-    resolve_metrics(config)
-    check_executor(execution or Execution(), config.device)
     check_kind(Path(config.out), "a run")
     check_output_folder(Path(config.out))
     with locked(Path(config.out)):
@@ -204,6 +201,7 @@ def grown(config: RunConfig, folder: RunFolder) -> RunConfig:
             raise
         log.warning("%s It is written again.", error)
         return config  # rows that would be lost are an error when they are written
+    _check_not_foreign(earlier, config, folder.manifest)
     before = product(earlier.methods, earlier.seeds)
     asked = product(config.methods, config.seeds)
     every = product({*earlier.methods, *config.methods}, {*earlier.seeds, *config.seeds})
@@ -234,6 +232,25 @@ def grown(config: RunConfig, folder: RunFolder) -> RunConfig:
         settings={**earlier.settings, **config.settings},
         frames_per_task=None if None in frames else max(frames),  # type: ignore[type-var]
     )
+
+
+def _check_not_foreign(earlier: RunConfig, config: RunConfig, manifest: Path) -> None:
+    """Refuse what would import a module or run a program that only the run folder names: it may come from anybody."""
+    remedy = "Name it in this call, if you trust who made the run; or choose another --out."
+    for key in ("methods", "metrics", "metric_profiles"):
+        for name in sorted({*getattr(earlier, key)} - {*getattr(config, key)}):
+            if ":" in name:
+                raise InputError(manifest, f"configuration.{key}", "registered names", repr(name), remedy)
+            if key == "methods" and not get("methods", name).native:
+                expected = "methods that run no program which the run folder names"
+                raise InputError(manifest, f"configuration.{key}", expected, name, remedy)
+    programs = {name for name in config.methods if not get("methods", name).native}
+    known = {condition.name: condition for condition in config.conditions}
+    for condition in earlier.conditions:
+        own = known.get(condition.name)
+        changes = {condition.clip.name, condition.derive.name, condition.drive.name}
+        if own is None and (any(":" in name for name in changes) or (condition.settings and programs)):
+            raise InputError(manifest, f"configuration.conditions, {condition.name}", "none", "one", remedy)
 
 
 def _same_place(first: str, second: str) -> bool:

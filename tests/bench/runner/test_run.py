@@ -260,7 +260,8 @@ def test_a_run_that_would_lose_rows_is_refused(config, refuses, tmp_path, change
     ],
 )
 def test_results_that_are_not_asked_for_again_are_kept(config, toy, less):
-    config = replace(config, **BOTH)
+    methods, metrics = ("toy_plugin:METHOD", "mean-image"), ("toy_plugin:ERROR", "psnr")
+    config = replace(config, methods=methods, metrics=metrics, seeds=(0, 1))
     before = rows_of(config)
     toy.FITS.clear()
     assert rows_of(config, **less).equals(before)
@@ -586,3 +587,9 @@ def test_a_received_run_is_not_written_through_its_links(
     for target in outside.iterdir():
         assert target.read_text() == "victim" if target.is_file() else not list(target.iterdir())
     assert code == expected, error
+
+
+def test_a_run_folder_names_no_module_for_a_later_call(config, refuses, monkeypatch):
+    runner.run(replace(config, methods=("toy_plugin:METHOD", "toy_plugin:MIRROR")))
+    refuses(config, "methods: expected registered names, found 'toy_plugin:MIRROR'")
+    refuses(replace(config, metrics=("psnr",), methods=("toy_plugin:METHOD", "toy_plugin:MIRROR")), "metrics")
