@@ -316,7 +316,7 @@ class CommandSpec:
     group : heading of ``headbench --help`` that it stands under: one of `COMMAND_GROUPS`, or another, shown after them.
     summary : one sentence.
     settings : "package.module:Class" of a frozen dataclass. Its attributes become the options, the strings below them the
-        help. Help of the command loads this module.
+        help. Help of the command loads this module. A static method ``notes() -> str`` gives more text for the help.
     function : "package.module:function" of ``(settings, progress: Progress) -> Findings``. The exit code is 0, or 1 where
         the findings did not pass, unless they give one.
     writes : the setting with the folder that the command writes: no other process works in it meanwhile; "" for none.
@@ -334,3 +334,6 @@ class CommandSpec:
 
 COMMAND_GROUPS = ("compare", "inspect", "data", "export", "validate")
 """Headings of ``headbench --help``, in this order."""
+
+HELP = ("-h", "--help")
+"""Words that ask for help."""

@@ -122,7 +122,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
         replace(manifest, status="done").write(folder.manifest)
         write_reports(folder.root)
     together = [*([Path(settings.like)] if settings.like else []), folder.root]
-    text = resolve(get("reports", "table-text").implementation)(together, "md")
+    text = resolve(get("reports", "table-text").implementation)(together)
     data = {"out": folder.root, "method": method.spec.name, "version": method.spec.version, "rows": len(rows)}
     return Findings(f"{text}\n{folder.root}", data)
 
