@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 
 from .errors import EXIT_CODES, ExitCode, InputError
 from .registry import Plugin, discover
-from .specs import COMMAND_GROUPS
+from .specs import COMMAND_GROUPS, HELP
 from .streams import show
 
 _ALIASES = {
@@ -60,7 +60,6 @@ ABOUT = (
 )
 FIRST = ("demo", "run", "status", "table", "compare")
 """Commands that stand first in their group of the help."""
-HELP = ("-h", "--help")
 
 
 def call(words: Sequence[str]) -> int:

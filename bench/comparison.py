@@ -25,6 +25,7 @@ from .io.files import (
     removed_if_empty,
 )
 from .io.lock import locked
+from .listing import presets_of_methods
 from .machine import check_device
 from .options import DependentOptions
 from .progress import log_to_file
@@ -102,7 +103,7 @@ class RunSettings:
     mean-image,nearest-camera,ga,ours."""
     preset: str | None = None
     """How much training: smoke (seconds), demo (minutes), fast, paper (the published schedule), or another that each
-    method of the run has; see `headbench list presets`. Default: fast."""
+    method of the run has: those above. Default: fast."""
     config: str | None = None
     """YAML file with any settings of a run."""
     head: str | None = None
@@ -125,6 +126,11 @@ class RunSettings:
     repeatable."""
 
     dependent = (DependentOptions(("estimates",), "dry_run"),)
+
+    @staticmethod
+    def notes() -> str:
+        """What the help says of presets."""
+        return presets_of_methods()
 
 
 def run(settings: RunSettings, progress: Progress) -> Findings:

@@ -3,10 +3,11 @@
 # Without `from __future__ import annotations`: the parser reads annotations that are made when a command is called.
 
 import inspect
+import io
 import json as json_module
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext, redirect_stderr, suppress
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
@@ -20,10 +21,13 @@ from .io.lock import locked
 from .options import check_dependent, given_options
 from .progress import log_to_terminal, progress
 from .registry import Plugin, get, resolve
-from .specs import CommandSpec
+from .specs import HELP, CommandSpec
 from .streams import show
 
-Command = Callable[..., int]
+Command = Callable[..., Callable[[], int]]
+"""Takes settings and returns what runs the command, so that errors of parsing are told from those of the command."""
+RULE = re.compile(r"[ ─╰╯+-]*")
+"""A line across the parser's box, in Unicode or ASCII."""
 
 
 def call_command(name: str, plugins: Mapping[str, Plugin], words: Sequence[str]) -> int:
@@ -32,12 +36,14 @@ def call_command(name: str, plugins: Mapping[str, Plugin], words: Sequence[str])
     Raises `HeadbenchError` for a command that cannot be loaded.
     """
     words = [with_home(word) for word in words]
-    return _parse(_command(name, plugins[name], words), f"headbench {name}", words)
+    run: Callable[[], int] = _parse(_command(name, plugins[name], words), f"headbench {name}", words)
+    return run()
 
 
 def print_completion(plugins: Mapping[str, Plugin], words: Sequence[str]) -> int:
     """Print, or write, the completion of a shell for all commands, as the parser's own options ask."""
-    return _parse(_all_commands(plugins), "headbench", words)
+    run: Callable[[], int] = _parse(_all_commands(plugins), "headbench", words)
+    return run()
 
 
 def with_home(word: str) -> str:
@@ -51,11 +57,28 @@ def with_home(word: str) -> str:
     return match[1] + expand_home(match[2], "command line")
 
 
-def _parse(command: Command, program: str, words: Sequence[str]) -> int:
-    """Call a command with the options that the words give."""
+def _parse(command: Any, program: str, words: Sequence[str]) -> Any:
+    """What ``command`` returns for the options that the words give.
+
+    Raises `HeadbenchError` with the message of the parser, which prints it in a box, in one line.
+    """
     config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
-    code: int = tyro.cli(command, prog=program, args=words, config=config, registry=_values())
-    return code
+    printed = io.StringIO()
+    try:
+        with redirect_stderr(printed):
+            return tyro.cli(command, prog=program, args=words, config=config, registry=_values())
+    except SystemExit as ended:
+        if not ended.code:
+            raise
+        box = re.sub(r"\x1b\[[\d;]*m", "", printed.getvalue()).splitlines()[1:]  # without its title
+        lines = (line.strip(" │|") for line in box)
+        text = "\n".join("" if RULE.fullmatch(line) else line for line in lines)
+        parts = re.split(r"\n\n+", text.strip())
+        parts = [
+            " ".join(part.split()).rstrip(".") for part in parts if not part.startswith("For full helptext")
+        ]
+        message = ". ".join(parts)
+        raise HeadbenchError(f"command line: {message}. `{program} --help` lists the options.") from None
 
 
 def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
@@ -69,7 +92,10 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
         raise HeadbenchError(f"command {name!r} of {plugin.origin} is broken: {error}") from error
     settings_type: Any = Annotated[settings_class, tyro.conf.OmitArgPrefixes]
 
-    def command(settings: settings_type, json: bool = False) -> int:
+    def command(settings: settings_type, json: bool = False) -> Callable[[], int]:
+        return lambda: run(settings, json)
+
+    def run(settings: Any, json: bool) -> int:
         dependent = getattr(settings_class, "dependent", ())
         check_dependent(dependent, given_options(words, settings_class), settings)
         folder = getattr(settings, spec.writes) if spec.writes else None
@@ -83,7 +109,9 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
             return findings.code
         return ExitCode.OK if findings.passed else ExitCode.NEGATIVE
 
-    command.__doc__ = f"{spec.summary}\n\nArgs:\n    json: Print the result as JSON."
+    notes = settings_class.notes() if hasattr(settings_class, "notes") and {*HELP} & {*words} else ""
+    about = f"{spec.summary}\n\n{notes}" if notes else spec.summary
+    command.__doc__ = f"{about}\n\nArgs:\n    json: Print the result as JSON."
     return command
 
 
@@ -107,7 +135,7 @@ def _nested(group: Mapping[str, Command]) -> Command:
     choices = [Annotated[Any, tyro.conf.subcommand(name=n, constructor=c)] for n, c in words.items()]
     choice: Any = Union[(*choices, Annotated[None, tyro.conf.Suppress])]
 
-    def chosen(command: choice) -> int:
+    def chosen(command: choice) -> Callable[[], int]:
         return command
 
     if own is not None:

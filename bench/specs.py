@@ -381,7 +381,8 @@ class CommandSpec:
         One sentence.
     settings : str
         "package.module:Class" of a frozen dataclass. Its attributes become the options, the strings below them the
-        help. Help of the command loads this module.
+        help. Help of the command loads this module. A static method ``notes() -> str``
+        gives more text for the help.
     function : str
         "package.module:function" of ``(settings, progress: Progress) -> Findings``. The exit code is 0, or 1 where
         the findings did not pass, unless they give one.
@@ -402,3 +403,6 @@ class CommandSpec:
 
 COMMAND_GROUPS = ("compare", "inspect", "data", "export", "validate")
 """Headings of ``headbench --help``, in this order."""
+
+HELP = ("-h", "--help")
+"""Words that ask for help."""

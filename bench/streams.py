@@ -22,6 +22,11 @@ def prepare_streams() -> None:
             stream.reconfigure(errors="headbench")
 
 
+def on_terminal() -> bool:
+    """Whether standard output is a terminal, which a person reads."""
+    return sys.stdout.isatty()
+
+
 def _in_ascii(error: UnicodeError) -> tuple[str, int]:
     """Handle characters that an encoding lacks: ours by `IN_ASCII`, others as JSON escapes them."""
     if not isinstance(error, UnicodeEncodeError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -23,8 +24,9 @@ class TableSettings:
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of the runs."""
-    format: Literal["md", "csv", "latex", "html", "json"] | None = None
-    """Markdown, CSV, LaTeX (booktabs), a page of HTML, or JSON. Default: by the suffix of --out, md without it."""
+    format: Literal["text", "md", "csv", "latex", "html", "json"] | None = None
+    """Aligned columns, Markdown, CSV, LaTeX (booktabs), a page of HTML, or JSON. Default: by the suffix of --out; without
+    it text on a terminal, else md."""
     layout: str = "comparison"
     """Which table: comparison, speed (latency, throughput, stages), cost (storage, training), or the paper's: paper-1
     (all methods), paper-3 (INSTA and ours), paper-4 (what an expression may change: a run each)."""
@@ -57,10 +59,12 @@ def print_table(settings: TableSettings, progress: Progress) -> Findings:
         if settings.format is None and Path(out).suffix.lower() not in SUFFIXES:
             expected = f"a suffix that names a format ({', '.join(SUFFIXES)}), or --format"
             raise InputError("command line", "--out", expected, out)
-    options["format"] = settings.format or (SUFFIXES[Path(out).suffix.lower()] if out else "md")
+    if settings.format is None:
+        options["format"] = SUFFIXES[Path(out).suffix.lower()] if out else None
     runs = [Path(run) for run in options.pop("runs")]
     text = table_text(runs, **options)
-    data = {"format": options["format"], "table": text}
+    plain = re.sub(r"\x1b\[\d+m", "", text)  # without the styles of a terminal
+    data = {"format": options["format"] or ("md" if plain == text else "text"), "table": plain}
     if out is None:
         return Findings(text, data)
     write_text(Path(out), text)

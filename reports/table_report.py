@@ -21,9 +21,10 @@ from ..bench.io.files import grouped_writes, write_text
 from ..bench.manifest import MethodRecord
 from ..bench.registry import unknown
 from ..bench.specs import MetricSpec
+from ..bench.streams import on_terminal
 from .runs import WHOLE, Part, RunSet
 from .tables import AVATAR_TITLE, Table, TableCell, TableRow, build_table
-from .writers import WRITERS, column_name
+from .writers import WRITERS, column_name, to_text
 
 NAMES = {
     "insta": "INSTA",
@@ -253,7 +254,7 @@ def write_tables(run_folder: Path) -> list[Path]:
 
 def table_text(
     run_folders: Sequence[Path],
-    format: str = "md",
+    format: str | None = None,
     layout: str = COMPARISON,
     published: bool = False,
     region: str = WHOLE.region,
@@ -261,19 +262,22 @@ def table_text(
     columns: tuple[str, ...] = (),
     digits: tuple[str, ...] = (),
 ) -> str:
-    """Return a table of one or more runs as text, in a format of `WRITERS`.
+    """Return a table of one or more runs as text, in a format of `WRITERS` or as "text", which has aligned columns.
 
+    Without a format it is "text" where standard output is a terminal, else "md".
     ``published`` adds columns with the figures that papers printed; ``region`` and ``sequences`` are those of `Part`,
     ``columns`` and ``digits`` those of `Columns`. Raises `InputError` for a format, a layout, columns or runs that do not fit.
     """
-    if format not in WRITERS:
-        raise InputError("table", "format", f"one of {', '.join(WRITERS)}", repr(format))
+    styled = format is None and on_terminal()
+    format = format or ("text" if styled else "md")
+    if format not in (*WRITERS, "text"):
+        raise InputError("table", "format", f"one of {', '.join(WRITERS)}, text", repr(format))
     runs = RunSet.read(run_folders, Part(region, sequences))
     known = (*layouts(runs), *PAPER)
     if layout not in known:
         raise InputError(run_folders[0], "layout", f"one of {', '.join(known)}", repr(layout))
-    _, write = WRITERS[format]
-    return write(table_of(runs, layout, published, Columns(columns, digits)))
+    table = table_of(runs, layout, published, Columns(columns, digits))
+    return to_text(table, styled=styled) if format == "text" else WRITERS[format][1](table)
 
 
 def layouts(runs: RunSet) -> tuple[str, ...]:

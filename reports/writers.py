@@ -1,4 +1,4 @@
-"""Writers of a table: Markdown, LaTeX, HTML, CSV and JSON."""
+"""Writers of a table: plain text, Markdown, LaTeX, HTML, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -52,6 +52,57 @@ def _markdown_cell(cell: TableCell) -> str:
     before, after = MARKDOWN_RANKS.get(cell.rank or 0, ("", ""))
     text = f"{before}{escape_markdown(cell.shown)}{after}"
     return text if cell.note is None else f"{text}<sup>{cell.note + 1}</sup>"
+
+
+RANK_STYLES = {1: "1", 2: "4", 3: "3"}
+"""Escape codes of terminals by rank: bold, underlined, italic."""
+
+
+def to_text(table: Table, *, styled: bool = False) -> str:
+    """Write aligned columns for a terminal, without Markdown; ``styled`` marks ranks as the caption says.
+
+    Two lines of headers: tasks over their columns, then metrics with units. Notes are numbered in brackets.
+    """
+    names = ["Method"]
+    for column in table.columns:
+        unit = f" ({column.unit})" if column.unit else ""
+        names.append("published" if column.published else f"{column.label}{unit} {column.arrow}".rstrip())
+    lines: list[list[str]] = []
+    marks: dict[tuple[int, int], int] = {}
+    for title, rows in table.groups:
+        if len(table.groups) > 1:
+            lines.append([title])
+        for row in rows:
+            marks |= {
+                (len(lines), i): cell.rank for i, cell in enumerate(row.cells, 1) if cell.rank in RANK_STYLES
+            }
+            noted = ("" if cell.note is None else f" [{cell.note + 1}]" for cell in row.cells)
+            lines.append([row.method, *(f"{cell.shown}{note}" for cell, note in zip(row.cells, noted))])
+    full = [names, *(line for line in lines if len(line) > 1)]
+    widths = [max(len(line[i]) for line in full) for i in range(len(names))]
+    heads, start = [" " * widths[0]], 1
+    for title, count in _spans(table):
+        width = sum(widths[start : start + count]) + 2 * (count - 1)
+        if len(title) > width:
+            widths[start] += len(title) - width
+            width = len(title)
+        heads.append(title.center(width))
+        start += count
+
+    def shown(line: list[str], index: int = -1) -> str:
+        cells = [line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]
+        if styled:
+            for i, text in enumerate(cells):
+                if rank := marks.get((index, i)):
+                    bare = text.lstrip()
+                    cells[i] = f"{text[: len(text) - len(bare)]}\x1b[{RANK_STYLES[rank]}m{bare}\x1b[0m"
+        return "  ".join(cells).rstrip()
+
+    rule = "  ".join("-" * width for width in widths)
+    body = [line[0] if len(line) == 1 else shown(line, index) for index, line in enumerate(lines)]
+    text = "\n".join(["  ".join(heads).rstrip(), shown(names), rule, *body])
+    notes = [f"[{i}] {note}" for i, note in enumerate(table.notes, 1)]
+    return "\n\n".join([text, table.caption, *(["\n".join(notes)] if notes else [])]) + "\n"
 
 
 LATEX_ESCAPES = {

@@ -8,6 +8,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..executors.options import ExecutionOptions
+from ..listing import presets_of_methods
 from ..runner.config import parse_size
 
 SEED = 26_000
@@ -49,7 +50,7 @@ class SuiteSettings(ExecutionOptions):
     """Methods; default: those of `headbench demo`."""
 
     preset: str = "fast"
-    """How much training, as for `headbench run`."""
+    """How much training, as for `headbench run`, whose help lists the presets."""
 
     seeds: tuple[int, ...] = (0,)
     """Seeds of the training."""
@@ -79,6 +80,11 @@ class SuiteSettings(ExecutionOptions):
         unknown = [name for name in self.ablations if name not in (*ABLATIONS, ALL)]
         if unknown:
             raise InputError("command line", "--ablations", f"{', '.join(ABLATIONS)} or {ALL}", unknown[0])
+
+    @staticmethod
+    def notes() -> str:
+        """What the help says of presets."""
+        return presets_of_methods()
 
     @property
     def chosen(self) -> tuple[str, ...]:

@@ -86,11 +86,14 @@ class CapacityPlan:
         """The plan as plain values, for JSON."""
         return asdict(self)
 
-    def lines_of_text(self) -> list[str]:
-        """One line per decision."""
-        head = f"capacity for motion above {self.tolerance:g} pixels of {1000 * self.pixel:.2f} mm"
-        head += "" if self.lines else ": nothing is dynamic, no lines"
-        return [head, *(f"{d.name}: {d.chosen} of {d.configured}, {d.reason}" for d in self.decisions)]
+    def summary(self) -> str:
+        """One line: every size, and the configured one where it was changed; the reasons are in `record`."""
+        sizes = (
+            f"{d.name} {d.chosen}" + f" of {d.configured}" * (d.chosen != d.configured)
+            for d in self.decisions
+        )
+        nothing = "" if self.lines else "nothing is dynamic, no lines; "
+        return f"capacity for motion above {self.tolerance:g} pixels: {nothing}{', '.join(sizes)}"
 
 
 def plan_capacity(clip: Clip, mesh: SubjectMesh, config: OursConfig) -> CapacityPlan:

@@ -57,8 +57,7 @@ class Ours(TrainedMethod[OursConfig, OursAvatar]):
     def _train(self, fit: Fit, config: OursConfig) -> None:
         clip, out, device, plan = fit.clip, fit.out, fit.device, self._plan
         if plan is not None:
-            log.info("%s", "; ".join(plan.lines_of_text()))
-            fit.progress(0, fit.budget.iterations or 1, plan.lines_of_text()[0])
+            log.info("%s", plan.summary())
         mesh = _mesh(clip, device)
         within = None if plan is None else plan.box(device)
         appearance = OursAppearance(mesh, clip, config, device, fit.seed, lines_within=within)

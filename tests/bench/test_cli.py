@@ -2,6 +2,7 @@ import errno
 import io
 import json
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import pytest
 
 from headbench.bench import cli, comparison
 from headbench.bench.errors import HeadbenchError, InputError
-from headbench.bench.registry import Plugin
+from headbench.bench.registry import Plugin, discover
 from headbench.bench.runner import captures
 from headbench.bench.runner.config import DemoConfig, parse_size
 from headbench.bench.specs import Findings
@@ -171,6 +172,34 @@ def test_json_gives_the_numbers_of_the_table():
     expected = own.groupby("sequence")["value"].mean().mean()
     assert found["novel_view", "ga", "psnr"] == (pytest.approx(expected, abs=1e-9), "ok")
     assert len(found) == len(means) == 7 * 8  # methods, columns of the comparison
+
+
+@pytest.mark.parametrize(
+    ("words", "terminal", "pipes", "styles"),
+    [
+        ([], True, False, True),
+        ([], False, True, False),
+        (["--format", "md"], True, True, False),
+        (["--format", "text"], False, False, False),
+        (["--json"], True, False, False),
+    ],
+)
+def test_a_table_is_aligned_text_on_a_terminal(capsys, monkeypatch, words, terminal, pipes, styles):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
+    assert cli.main(["table", str(GALLERY), *words]) == 0
+    printed = capsys.readouterr().out
+    assert ("|" in printed, "\x1b" in printed) == (pipes, styles)
+    assert ("<ins>" in printed) == pipes
+
+
+@pytest.mark.parametrize("command", ["run", "run suite"])
+def test_help_lists_the_presets_of_every_method(capsys, command):
+    with pytest.raises(SystemExit):
+        cli.main([*command.split(), "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    for name, plugin in discover("methods").items():
+        if plugin.spec.presets:
+            assert re.search(rf"\b{name}\b[^:]*: {', '.join(plugin.spec.presets)}[;.]", text), name
 
 
 @pytest.fixture

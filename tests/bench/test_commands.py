@@ -95,10 +95,22 @@ def test_lists_have_commas_or_spaces(offer, capsys, words, lists):
 @pytest.mark.parametrize("words", [["--levels"], ["--levels", ","], ["--names", "--levels", "1"]])
 def test_a_list_without_values_is_refused(offer, capsys, words):
     offer("count", spec="toy_command:COUNT")
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["count", "a", *words])
-    assert ended.value.code == 2
+    assert cli.main(["count", "a", *words]) == 2
     assert "at least one value" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [("look", "What to look at"), ("look here --limti 1", "--limti"), ("look here --limit much", "--limit")],
+)
+def test_words_that_do_not_parse_end_in_one_line(offer, capsys, words, named):
+    offer("look")
+    assert cli.main(words.split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("headbench: command line: ")
+    assert named in line
+    assert line.count("--help") == 1
+    assert not re.search("[│─╭|]", line)
 
 
 def test_commands_that_take_an_avatar_describe_it_alike():
@@ -214,7 +226,7 @@ def test_a_word_calls_a_command_alone_and_before_a_second_word(offer, capsys):
 
 
 @pytest.mark.parametrize("word", commands.MOVED)
-def test_a_word_of_an_earlier_version_is_answered_with_the_new_line(capsys, word):
+def test_a_word_of_earlier_versions_leads_to_the_new_line(capsys, word):
     assert cli.main([*word.split(), "a b", "--out", "c"]) == 2
     assert f"It is now `headbench {commands.MOVED[word]} 'a b' --out c`" in capsys.readouterr().err
     assert commands.MOVED[word] in registry.discover("commands")

@@ -6,7 +6,7 @@ from headbench.bench import cli
 
 AVATAR = "{command} avatar --out out"
 PLY, GLB, SOG, HTML = (AVATAR.format(command=f"export {form}") for form in ("ply", "glb", "sog", "html"))
-COMPACT, EVALUATE = AVATAR.format(command="compact"), "evaluate images --out out"
+COMPACT, EVALUATE = AVATAR.format(command="export compact"), "evaluate images --out out"
 IMPORT = "import ga a.ply --out out"
 RENDER = "render avatar --capture c --out out"
 UNION = "prepare nersemble --union-root unions"

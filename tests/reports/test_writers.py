@@ -17,6 +17,7 @@ from headbench.reports.writers import (
     to_html,
     to_latex,
     to_markdown,
+    to_text,
 )
 
 from .latex import check_latex, compile_latex, depth
@@ -35,6 +36,27 @@ def table(make_rows, metrics):
 
 def cells_of(line):
     return [c.strip() for c in re.split(r"(?<!\\)\|", line)[1:-1]]
+
+
+def test_text_has_aligned_columns_and_no_markup(table):
+    text = to_text(table)
+    head, _, rest = text.partition("\n\n")
+    lines = head.splitlines()
+    rule = next(line for line in lines if set(line) == {"-", " "})
+    ends = [match.end() for match in re.finditer("-+", rule)]
+    for row in ("good", NASTY, "floor"):
+        (line,) = (line for line in lines if line.startswith(row))
+        assert len(line) == ends[-1]
+        assert all(line[end : end + 2].strip() == "" for end in ends[:-1])
+    assert NASTY in head
+    assert "[1] " in rest
+    assert not re.search(r"<ins>|<sup>|\*\*", text)
+
+
+def test_styles_of_a_terminal_mark_ranks(table):
+    styled = to_text(table, styled=True)
+    assert "\x1b[1m30.13\x1b[0m" in styled
+    assert re.sub(r"\x1b\[\d+m", "", styled) == to_text(table)
 
 
 def test_markdown_is_a_table_of_equal_lines(table):

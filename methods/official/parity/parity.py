@@ -12,6 +12,7 @@ from typing import Any
 
 from scipy.stats import t as student_t
 
+from ....bench.benchmarks import table as aligned
 from ....bench.condition import PLAIN
 from ....bench.configuration import build
 from ....bench.contracts import Progress, no_progress
@@ -27,6 +28,7 @@ from ....bench.runner.scoring import FULL
 from ....bench.runner.store import RunFolder
 from ....bench.runner.stored import TRAINING_FILE
 from ....bench.specs import Findings
+from ....bench.streams import on_terminal
 from ...shared.config import PAPER_ITERATIONS, SplatTraining
 from ...shared.schedule import DensifySchedule, Timeline
 from .settings import ParitySettings
@@ -96,8 +98,9 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Findi
     }
     changed = sorted({line for cell in cells[official] for line in cell["differences"]})
     causes = [*CAUSES[settings.method], *changed]
-    text = _text(settings, native, official, differences, cells, causes, rows)
-    write_text(out / "parity.md", text)
+    found = (settings, native, official, differences, cells, causes, rows)
+    write_text(out / "parity.md", _text(*found))
+    text = _text(*found, markdown=not on_terminal())
     data = {
         "native": native,
         "official": official,
@@ -249,31 +252,19 @@ def _text(
     cells: Mapping[str, Sequence[Mapping[str, Any]]],
     causes: Sequence[str],
     rows: Rows,
+    *,
+    markdown: bool = True,
 ) -> str:
-    titles = {name: get("metrics", name).label for name in METRICS}
     lines = [
-        f"# {native} and {official}, {settings.iterations:,} iterations each",
+        f"{'# ' if markdown else ''}{native} and {official}, {settings.iterations:,} iterations each",
         "",
         (
             "Equal settings and the same image in each iteration; every order of the images is a training of both. Means over "
             "frames, then sequences, then subjects; the difference is official minus native, with its 95 % interval over orders."
         ),
         "",
-        "| task | metric | order | " + f"{native} | {official} | difference |",
-        "| :--- | :--- | ---: | ---: | ---: | ---: |",
+        _table(differences, native, official, markdown=markdown),
     ]
-    for each in differences:
-        digits = 2 if each.metric == "psnr" else 4
-        head = f"{each.task.replace('_', ' ')} | {titles[each.metric]}"
-        for order, ours, theirs in zip(each.orders, each.native, each.official, strict=True):
-            lines.append(
-                f"| {head} | {order} | {ours:.{digits}f} | {theirs:.{digits}f} | {theirs - ours:+.{digits}f} |"
-            )
-        width = "" if each.half_width is None else f" ± {each.half_width:.{digits}f}"
-        lines.append(
-            f"| {head} | all | {fmean(each.native):.{digits}f} | {fmean(each.official):.{digits}f} "
-            f"| **{each.difference:+.{digits}f}{width}** |"
-        )
     splats = [
         f"{name}: " + ", ".join(str(cell["splats"] or "?") for cell in cells[name])
         for name in (native, official)
@@ -283,3 +274,26 @@ def _text(
     if rows.failed:
         lines += ["", f"Failed: {', '.join(rows.failed)}; see run/tables/comparison.md for the reasons."]
     return "\n".join(lines) + "\n"
+
+
+def _table(differences: Sequence[Difference], native: str, official: str, *, markdown: bool) -> str:
+    """Both values and their difference, for every order and over all: a pipe table, or aligned columns for a terminal."""
+    titles = {name: get("metrics", name).label for name in METRICS}
+    rows: list[dict[str, str]] = []
+    for each in differences:
+        digits = 2 if each.metric == "psnr" else 4
+        width = "" if each.half_width is None else f" ± {each.half_width:.{digits}f}"
+        mean = ("all", fmean(each.native), fmean(each.official), each.difference, width)
+        of_orders = zip(each.orders, each.native, each.official, strict=True)
+        every = [*((order, a, b, b - a, "") for order, a, b in of_orders), mean]
+        for order, a, b, difference, interval in every:
+            where = {"task": each.task.replace("_", " "), "metric": titles[each.metric], "order": str(order)}
+            values = {native: f"{a:.{digits}f}", official: f"{b:.{digits}f}"}
+            shown = f"{difference:+.{digits}f}{interval}"
+            shown = f"**{shown}**" if markdown and order == "all" else shown
+            rows.append({**where, **values, "difference": shown})
+    if not markdown:
+        return aligned(rows)
+    names = ["task", "metric", "order", native, official, "difference"]
+    lines = [names, [":---"] * 2 + ["---:"] * 4, *([*row.values()] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

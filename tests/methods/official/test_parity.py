@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import sys
 
 import pytest
 
@@ -44,7 +45,7 @@ def parity(*words):
     return cli.main([*line.split(), *words])
 
 
-def test_both_are_trained_and_their_difference_tabled(folder, capsys):
+def test_both_are_trained_and_their_difference_tabled(folder, capsys, monkeypatch):
     words = ("--iterations", "5", "--orders", "1", "--tolerance", "200")
     assert parity(*words) == 0
     text = (folder / "out" / "parity.md").read_text()
@@ -62,7 +63,9 @@ def test_both_are_trained_and_their_difference_tabled(folder, capsys):
     assert any("order in which the native method" in line for line in record["differences"])
     # Again: nothing is trained anew, and another tolerance has another verdict.
     log = (avatar / "training.log").read_bytes()
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     assert parity(*words[:-1], "0.001") == 1
+    assert not re.search(r"[|#]|\*\*", capsys.readouterr().out)
     assert (avatar / "training.log").read_bytes() == log
 
 
