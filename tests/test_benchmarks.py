@@ -28,7 +28,10 @@ SMALLEST = {
     head.speed: ({"FLAME_SIZES": (12, 8), "QUICK_ROUNDS": 2}, [head.ONCE, "identity blended at each call"]),
     metrics.speed: ({"QUICK_SIZE": (40, 31)}, ["scikit-image", "torchmetrics", "headbench", "weights"]),
     refit.speed: ({"QUICK_TIMESTEPS": 3, "FLAME_SIZES": (12, 8)}, [case[0] for case in refit.CASES]),
-    viewer.speed: ({"QUICK_SPLATS": (700,), "QUICK_SECONDS": 0.1}, ["700", "images", "splats"]),
+    viewer.speed: (
+        {"QUICK_SPLATS": (700,), "QUICK_SECONDS": 0.1, "WINDOW": (640, 400)},
+        ["700", "images", "splats"],
+    ),
     calibration.stress: ({"QUICK_TRIALS": 3, "REPLICATES": 20}, [*calibration.CASES, "best by"]),
 }
 

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from headbench.methods.official.process import ProgramError
+
 from ..toy_clip import toy_clip
 from .repository import lip_numbers, make_repository
 
@@ -38,6 +40,21 @@ def behave(repository):
 
     yield set_behaviour
     set_behaviour("")
+
+
+@pytest.fixture
+def faults_are_found(behave):
+    """Each behaviour of the stand-in ends ``work`` with the error that is named for it, after which the work can be done."""
+
+    def check(faults, work):
+        for behaviour, expected in faults.items():
+            behave(behaviour)
+            with pytest.raises(ProgramError, match=expected):
+                work()
+            behave("")
+            assert work()
+
+    return check
 
 
 def brightness(pose, refined):

@@ -29,6 +29,11 @@ def views(clip, *splits):
     return {k: (clip.cameras[k.camera], clip.poses[k.timestep]) for s in splits for k in clip.splits[s]}
 
 
+def renders(avatar, clip, ground=(1.0, 1.0, 1.0)):
+    """Frames of the held-out view by key."""
+    return dict(avatar.render_listed(views(clip, "novel_view"), ground, no_progress))
+
+
 def workplace(folder):
     """An empty place to export to."""
     work = Workplace.at(folder)

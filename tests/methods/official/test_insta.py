@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
@@ -23,7 +22,7 @@ from headbench.methods.official.process import ProgramError
 from headbench.methods.shared.avatar_files import Subject
 
 from .insta_repository import make_insta_repository
-from .repository import BUDGET, fit, views, workplace
+from .repository import BUDGET, fit, renders, views, workplace
 from .repository import export as export_to
 
 GROUND = (1.0, 1.0, 1.0)
@@ -118,23 +117,16 @@ def test_a_training_that_fails_begins_anew(method, behave, official_clip, tmp_pa
     assert min(calls) > len(official_clip.splits["train"]), "the export was kept"
 
 
-def test_renders_that_are_not_what_was_listed_are_found(avatar, behave, official_clip):
-    def render():
-        return dict(avatar.render_listed(views(official_clip, "novel_view"), GROUND, no_progress))
-
-    for behaviour, expected in {
+def test_renders_that_are_not_what_was_listed_are_found(avatar, faults_are_found, official_clip):
+    faults = {
         "crash in rendering": "exit code 1.*out of memory",
         "one too few": r"lacks 1 of 3 renders, first 000001.png \(toy/",
         "other size": "expected 28x36 pixels, found 27x36",
         "reversed": "exit code 1.*rendered by the camera of another",
         "no cameras": "exit code 1.*wrote no .*transforms_overlay.json",
         "no coverage": "expected colours and coverage",
-    }.items():
-        behave(behaviour)
-        with pytest.raises(ProgramError, match=expected):
-            render()
-        behave("")
-        assert len(render()) == 3
+    }
+    faults_are_found(faults, lambda: renders(avatar, official_clip))
 
 
 @pytest.mark.parametrize(
