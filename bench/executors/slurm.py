@@ -24,7 +24,7 @@ from .outcome import forget_outcome, read_outcome
 from .results import TaskResult
 from .settings import Execution, import_submitit
 from .task import Task
-from .worker import FULL_DISK
+from .worker import FULL_DISK, run_job
 
 log = logging.getLogger(__name__)
 MAX_ARRAY = 1000
@@ -181,7 +181,7 @@ class Slurm:
         state, reason, code = end_of(job.number)
         if state in FINAL and not (job.earlier and state == "CANCELLED"):  # who starts again wants it done
             return TaskResult(job.task, f"job {job.number} {FINAL[state]}", again=False)
-        if code in FULL_DISK and not job.earlier:  # there may be room since; see `Task.__call__`
+        if code in FULL_DISK and not job.earlier:  # there may be room since; see `worker.run_job`
             raise OSError(code, f"{os.strerror(code)} (job {job.number})", str(job.task.folder))
         check_room(self._root)  # a job that could not even open its log leaves no reason
         return TaskResult(job.task, f"job {job.number} ended as {state}{reason}")
@@ -210,7 +210,7 @@ class Slurm:
         executor.update_parameters(**parameters)
         folder.mkdir(exist_ok=True)
         try:
-            return [str(job.job_id) for job in executor.map_array(_call, list(tasks))]
+            return [str(job.job_id) for job in executor.map_array(run_job, list(tasks))]
         except OSError as error:
             error.filename = error.filename or str(folder)  # the system reports a full disk without a name
             raise
@@ -220,10 +220,6 @@ class Slurm:
             remedy = "`sinfo` lists partitions and what they have."
             found = " ".join(str(error).split()).replace("sbatch: error: ", "")
             raise InputError("execution.slurm", asked, "jobs that sbatch takes", found, remedy) from error
-
-
-def _call(task: Task) -> None:
-    task()
 
 
 def job_name(root: Path) -> str:

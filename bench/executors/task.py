@@ -48,23 +48,3 @@ class Task:
     def folder(self) -> Path:
         """Where its outcome and its log lie."""
         return Path(self.root) / self.place
-
-    def __call__(self) -> None:
-        """Do it, in a job of its own. Raises what a task cannot be recorded as failed for."""
-        os.chdir(self.directory)
-        sys.path += [entry for entry in self.path if entry not in sys.path]
-        from .worker import FULL_DISK, execute_task
-
-        try:
-            execute_task(self)
-        except OSError as error:
-            if error.errno not in FULL_DISK:
-                raise
-            print(f"{error.filename}: {error.strerror}", file=sys.stderr, flush=True)
-            os._exit(error.errno)  # neither its outcome nor its log may have found room
-
-    def checkpoint(self) -> Any:
-        """What submitit submits again where a job runs out of time: the same, which continues."""
-        from submitit.helpers import DelayedSubmission
-
-        return DelayedSubmission(self)

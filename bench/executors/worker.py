@@ -75,6 +75,29 @@ def execute_task(task: Task) -> None:
         write_outcome(folder, {**ended, "seconds": round(before + time.monotonic() - start, 3)})
 
 
+def run_job(task: Task) -> None:
+    """Run a task in a job of its own. Raises what a task cannot be recorded as failed for."""
+    os.chdir(task.directory)
+    sys.path += [entry for entry in task.path if entry not in sys.path]
+    try:
+        execute_task(task)
+    except OSError as error:
+        if error.errno not in FULL_DISK:
+            raise
+        print(f"{error.filename}: {error.strerror}", file=sys.stderr, flush=True)
+        os._exit(error.errno)  # neither its outcome nor its log may have found room
+
+
+def _continued(task: Task) -> Any:
+    """What submitit submits again where a job runs out of time: the same, which continues."""
+    from submitit.helpers import DelayedSubmission
+
+    return DelayedSubmission(run_job, task)
+
+
+run_job.__dict__["checkpoint"] = _continued
+
+
 @cache
 def _machine(device: str) -> dict[str, Any]:
     from ..machine import machine_record

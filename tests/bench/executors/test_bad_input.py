@@ -8,12 +8,14 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
+from submitit.helpers import DelayedSubmission
 
 from headbench.bench import cli
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.executors import slurm
 from headbench.bench.executors.settings import Execution
 from headbench.bench.executors.task import Task
+from headbench.bench.executors.worker import run_job
 from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked
 
@@ -189,3 +191,10 @@ def test_a_list_of_jobs_from_elsewhere_is_refused(tmp_path):
     write_json(slurm.submitted_path(tmp_path), {"speed": False, "jobs": {"s/m/seed-0": "--help"}})
     with pytest.raises(InputError, match="the number of a job"):
         slurm.read_submitted(tmp_path)
+
+
+def test_a_job_that_runs_out_of_time_is_submitted_again(tmp_path):
+    task = Task.of(tmp_path, "cell", "module:function", seed=3)
+    again = DelayedSubmission(run_job, task)._checkpoint_function()
+    assert (again.function, again.args) == (run_job, (task,))
+    assert hasattr(run_job, "checkpoint")  # which submitit asks for before it submits again
