@@ -29,6 +29,7 @@ from .listing import presets_of_methods
 from .machine import check_device
 from .options import DependentOptions
 from .progress import log_to_file
+from .progress import progress as show_progress
 from .registry import get, resolve
 from .runner.config import (
     DemoConfig,
@@ -80,9 +81,9 @@ def demo(settings: DemoSettings, progress: Progress) -> Findings:
     check_output_folder(out)
     with _log_file(out):
         start = time.perf_counter()
-        with locked(out):
+        with locked(out), show_progress("capture") as report:
             make = resolve(get("datasets", "synthetic").implementation)
-            make(**config.capture_arguments(), progress=progress)
+            make(**config.capture_arguments(), progress=report)
         return _run(comparison, capture_seconds=round(time.perf_counter() - start, 3))
 
 

@@ -20,7 +20,7 @@ from .io.files import check_kind, expand_home, plain
 from .io.lock import locked
 from .options import check_dependent, given_options
 from .progress import log_to_terminal, progress
-from .registry import Plugin, get, resolve
+from .registry import Plugin, discover, get, resolve
 from .specs import HELP, CommandSpec
 from .streams import show
 
@@ -110,8 +110,13 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
         return ExitCode.OK if findings.passed else ExitCode.NEGATIVE
 
     notes = settings_class.notes() if hasattr(settings_class, "notes") and {*HELP} & {*words} else ""
-    about = f"{spec.summary}\n\n{notes}" if notes else spec.summary
-    command.__doc__ = f"{about}\n\nArgs:\n    json: Print the result as JSON."
+    others = ", ".join(
+        f"`headbench {other}`" for other in sorted(discover("commands")) if other.startswith(f"{name} ")
+    )
+    parts = (spec.summary, notes, f"With a second word: {others}." if others else "")
+    command.__doc__ = (
+        "\n\n".join(part for part in parts if part) + "\n\nArgs:\n    json: Print the result as JSON."
+    )
     return command
 
 

@@ -223,6 +223,9 @@ def test_a_word_calls_a_command_alone_and_before_a_second_word(offer, capsys):
         assert capsys.readouterr().out == "looked at here\n"
         assert cli.main(["make", "twice", "here", "--json"]) == 0
         assert json.loads(capsys.readouterr().out)["lists"] == [["here"], [], [1.0]]
+        with pytest.raises(SystemExit):
+            cli.main(["make", "--help"])
+        assert "`headbench make twice`" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("word", commands.MOVED)
