@@ -50,6 +50,13 @@ SUITE = ReportSpec(
     writes=False,
 )
 
+ROBUSTNESS = ReportSpec(
+    name="robustness",
+    summary="Contact sheet and summary of avatars rendered beyond a run, from what extremes and reenact left.",
+    implementation="headbench.reports.robustness.sheets:robustness_report",
+    writes=False,
+)
+
 STATISTICS = BenchmarkSpec(
     name="statistics",
     summary="tests and intervals on simulated comparisons: do they reject and cover as often as stated?",

@@ -23,16 +23,16 @@ from ..io.lock import locked
 from ..machine import check_device_answers, machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
 from ..progress import duration, run_progress
-from ..protocol import Protocol, make_protocols, missing_tasks
+from ..protocol import Protocol, make_protocols, missing_tasks, protocol_name
 from ..registry import discover, get, resolve
 from ..rows import DISCARD, Rows
-from ..specs import DatasetSpec, MetricSpec
+from ..specs import ConditionSpec, DatasetSpec, MetricSpec
 from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
 from .captures import changed, open_clips, open_run_clips, relative_paths, run_configuration
 from .config import ResolvedMethod, RunConfig, RunOptions, resolve_cells, resolve_metrics
 from .scoring import check_regions, make_metric
-from .steps import Job, derive, failed_rows, fit, measure, reason_of, render, steps_ahead
+from .steps import Job, derive, drive, failed_rows, fit, measure, reason_of, render, steps_ahead, stored_rows
 from .store import RunFolder
 
 log = logging.getLogger(__name__)
@@ -116,14 +116,20 @@ def _run(
         label = label_of(method.spec.name, condition.name)
         if not all(folder.cell(subject, label, seed).ended("measure") for subject, seed in places):
             check_settings([(method, condition)])
-    protocols = make_protocols(config.tasks, clips, config.frames_per_task)
+    if config.drive:
+        driven = make_jobs(config, cells, clips, {}, folder)
+        spec: ConditionSpec = get("conditions", config.drive.name)
+        protocols: dict[str, Protocol] = resolve(spec.protocols)(driven, **config.drive.parameters)
+    else:
+        protocols = make_protocols(config.tasks, clips, config.frames_per_task)
     planned = describe(config, cells, metrics, clips, protocols)
     folder.check_kept(planned)
     jobs = make_jobs(config, cells, clips, protocols, folder)
     for job in jobs:
         job.check()
         job.check_method()
-    warn_of_missing_metrics(metrics, clips[0])
+    if not config.drive:
+        warn_of_missing_metrics(metrics, clips[0])
     if not unchecked and not config.source:
         for clip in {job.clip.subject: job.clip for job in jobs if not job.cell.ended("fit")}.values():
             check_capture(config, clip)
@@ -135,7 +141,7 @@ def _run(
     )
     manifest = replace(planned, adapted=forms, **record)
     manifest.write(folder.manifest)
-    for reason in missing_tasks(config.tasks, protocols).values():
+    for reason in {} if config.drive else missing_tasks(config.tasks, protocols).values():
         log.warning("%s", reason)
     for protocol in protocols.values():
         log.info("%s, protocol %s: %d frames", protocol.task, protocol.hash, len(protocol.keys))
@@ -254,6 +260,7 @@ def make_jobs(
     forms = _Forms(config, folder, RunFolder(out or folder.root))
     forms.plan([(clip, method, condition) for clip in clips for method, condition in cells])
     source = RunFolder(Path(config.source)) if config.source else None
+    kept: dict[str, Any] = {}
     return [
         Job(
             clip,
@@ -261,11 +268,17 @@ def make_jobs(
             seed,
             config.device,
             folder.cell(clip.subject, label_of(method.spec.name, condition.name), seed),
-            protocols,
+            {
+                name: protocol
+                for name, protocol in protocols.items()
+                if not condition.drive or name == protocol_name(protocol.task, MethodNeeds.of(method.spec))
+            },
             forms.of(clip, method, condition),
             regions[clip.subject],
             condition,
             None if source is None else source.cell(clip.subject, method.spec.name, seed),
+            config,
+            kept=kept,
         )
         for clip in clips
         for method, condition in cells
@@ -329,8 +342,15 @@ def run_jobs(jobs: Sequence[Job], metrics: Sequence[MetricSpec]) -> Rows:
 
 
 def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
-    """Train or derive the avatar of a cell, render its frames and measure them; each stage continues where it was."""
+    """Train or derive the avatar of a cell, render its frames and measure them; each stage continues where it was.
+
+    A cell whose condition drives the avatar is rendered and judged by that change in place of the last two.
+    """
+    if job.condition.drive and (kept := stored_rows(job, metrics, retry=True)) is not None:
+        return kept
     avatar = fit(job) if job.source is None else derive(job)
+    if job.condition.drive:
+        return drive(job, avatar)
     render(job, avatar)
     return measure(job, avatar, metrics)
 
