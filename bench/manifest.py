@@ -122,9 +122,10 @@ def _read_protocol(run: Path, task: str, name: str) -> ProtocolRecord:
         expected = f"the protocol of {task} that {run.name} names"
         raise InputError(path, "", expected, "no such file", "Copy it from where the run was made.")
     record = checked(read_json(path), ProtocolRecord, path)
-    if (record.task, record.hash) != (task, name):
+    if (record.task, record.hash) != (task.partition("@")[0], name):
         raise InputError(path, "task, hash", f"{task}, {name}", f"{record.task}, {record.hash}")
-    for part in sorted({part for key in record.keys for part in (key.subject, key.sequence, key.camera)}):
+    names = {part for key in record.keys for part in (key.subject, *key.sequence.split("/"), key.camera)}
+    for part in sorted(names):  # a slash stands between a driving subject and its sequence
         check_name(part, path, "keys")
     if not is_label(record.id):
         raise InputError(path, "id", LABEL, repr(record.id))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 from .contracts import Clip, FrameKey, TaskName
 from .errors import InputError
@@ -106,7 +106,7 @@ def make_protocol(task: TaskName, clips: Sequence[Clip], max_frames: int | None 
                 "no frame of the training split",
                 f"{len(leaked)} shared, the first {min(leaked)}",
             )
-        chosen = _evenly(frames, max_frames)
+        chosen = evenly(frames, max_frames)
         keys += chosen
         sizes |= {(camera.width, camera.height) for camera in {clip.cameras[key.camera] for key in chosen}}
         excluded += sorted(clip.excluded.items())
@@ -139,6 +139,17 @@ def missing_tasks(tasks: Sequence[str], done: Container[str]) -> dict[str, str]:
         for task in tasks
         if task not in done
     }
+
+
+def protocol_name(task: str, needs: Any = None) -> str:
+    """What a run calls a protocol: the task, with a digest of what its methods need of a clip if that is anything.
+
+    Parameters
+    ----------
+    needs : MethodNeeds, optional
+        Given for tasks whose frames depend on it: avatars of methods with other needs are shown other frames.
+    """
+    return task if needs is None or needs == type(needs)() else f"{task}@{digest(asdict(needs))[:12]}"
 
 
 def make_protocol_without_truth(
@@ -175,7 +186,8 @@ def _background(clips: Sequence[Clip]) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _evenly(frames: list[FrameKey], count: int | None) -> list[FrameKey]:
+def evenly(frames: list[FrameKey], count: int | None) -> list[FrameKey]:
+    """At most ``count`` frames, each in the middle of its equal share; None: all."""
     if count is None or count >= len(frames):
         return frames
     if count < 1:

@@ -314,15 +314,23 @@ class ConditionSpec:
         "clip": ``implementation`` names a function ``(clip, config, **parameters) -> clip``, where ``config`` is the
         `RunConfig`; what takes long it keeps in ``config.out``.
         "derive": a function ``(method spec, avatar folder, folder to write, clip, device, **parameters) -> Avatar``.
-        "drive": a function ``(job, avatar, folder to write, progress, **parameters) -> Rows``.
+        "drive": a function ``(job, avatar, progress, **parameters) -> (Rows, details, files)`` that writes below the folder
+        of the run: details are what JSON has, files those that have to be as they were for the rows to be kept.
     implementation : str
         "package.module:function".
+    protocols : str
+        "package.module:function" of a change of kind "drive": ``(jobs, **parameters) -> protocols``, one for all jobs of
+        methods with equal needs; see `bench.protocol.protocol_name` for their names.
+    metrics : tuple of MetricSpec
+        What a change of kind "drive" measures.
     """
 
     name: str
     summary: str
     kind: Literal["clip", "derive", "drive"]
     implementation: str
+    protocols: str = ""
+    metrics: tuple[MetricSpec, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,13 @@ SUITE_REPORT = ReportSpec(
     writes=False,
 )
 
+ROBUSTNESS = ReportSpec(
+    name="robustness",
+    summary="Contact sheet and summary of avatars rendered beyond a run, from what extremes and reenact left.",
+    implementation="headbench.reports.robustness.sheets:robustness_report",
+    writes=False,
+)
+
 STATISTICS = BenchmarkSpec(
     name="statistics",
     summary="tests and intervals on simulated comparisons: do they reject and cover as often as stated?",
@@ -78,21 +85,6 @@ COMPARE = CommandSpec(
     function="headbench.reports.statistics.command:compare_runs",
 )
 
-EXTREMES = CommandSpec(
-    name="run extremes",
-    group="compare",
-    summary="Render views and expressions beyond training; check stability limits.",
-    settings="headbench.reports.robustness.settings:ExtremesSettings",
-    function="headbench.reports.robustness.command:extremes_run",
-)
-
-REENACT = CommandSpec(
-    name="run reenact",
-    group="compare",
-    summary="Drive avatars with another subject's expressions; check stability limits.",
-    settings="headbench.reports.robustness.settings:ReenactSettings",
-    function="headbench.reports.robustness.command:reenact_run",
-)
 
 REPORT_COMMAND = CommandSpec(
     name="report",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..specs import CommandSpec, ConditionSpec
+from ..specs import CommandSpec, ConditionSpec, MetricSpec
 
 SUITE = CommandSpec(
     name="run suite",
@@ -27,6 +27,22 @@ CURVE = CommandSpec(
     summary="Measure quality against training time, cameras, timesteps or tracking error.",
     settings="headbench.bench.experiments.curve_settings:CurveSettings",
     function="headbench.bench.experiments.curve:curve_run",
+)
+
+EXTREMES_COMMAND = CommandSpec(
+    name="run extremes",
+    group="compare",
+    summary="Render views and expressions beyond training; check stability limits.",
+    settings="headbench.bench.experiments.robustness_settings:ExtremesSettings",
+    function="headbench.bench.experiments.robustness:extremes_run",
+)
+
+REENACT_COMMAND = CommandSpec(
+    name="run reenact",
+    group="compare",
+    summary="Drive avatars with another subject's expressions; check stability limits.",
+    settings="headbench.bench.experiments.robustness_settings:ReenactSettings",
+    function="headbench.bench.experiments.robustness:reenact_run",
 )
 
 HOLD_OUT = ConditionSpec(
@@ -62,4 +78,31 @@ VARIANT = ConditionSpec(
     summary="Derives a smaller or faster avatar without training, see `MethodSpec.variants`.",
     kind="derive",
     implementation="headbench.bench.experiments.sweep:variant",
+)
+
+MEASURES = (
+    MetricSpec("non_finite", "Not finite", "share", False, 3, ""),
+    MetricSpec("coverage", "Coverage", "ratio", True, 3, ""),
+    MetricSpec("translucent", "Translucent", "share", False, 3, ""),
+    MetricSpec("largest_splat", "Largest splat", "share of the height", False, 3, ""),
+    MetricSpec("mean_opacity", "Mean opacity", "ratio", True, 3, ""),
+)
+"""What `stability.Measures` has of a frame, against limits."""
+
+EXTREMES = ConditionSpec(
+    name="extremes",
+    summary="Renders views and expressions beyond those of training; checks stability limits.",
+    kind="drive",
+    implementation="headbench.bench.experiments.extremes:drive",
+    protocols="headbench.bench.experiments.extremes:protocols",
+    metrics=MEASURES,
+)
+
+REENACT = ConditionSpec(
+    name="reenact",
+    summary="Renders the held-out performance of other subjects; checks stability limits and identity.",
+    kind="drive",
+    implementation="headbench.bench.experiments.reenactment:drive",
+    protocols="headbench.bench.experiments.reenactment:protocols",
+    metrics=(*MEASURES, MetricSpec("identity", "Identity", "CIEDE2000", False, 2, "")),
 )

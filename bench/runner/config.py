@@ -96,6 +96,10 @@ class RunConfig:
                 raise ValueError(
                     f"conditions: {condition.name} derives avatars; source has to name their run"
                 )
+        if len({condition.drive.name for condition in self.conditions}) > 1:
+            raise ValueError(
+                "conditions: all are driven by one registered change, or none is; found a mixture"
+            )
         for name in ("methods", "seeds", "tasks", "metrics", "metric_profiles"):
             values = getattr(self, name)
             if not values:
@@ -110,6 +114,11 @@ class RunConfig:
             raise ValueError(f"divide is {self.divide}; a whole number from 1")
         if self.frames_per_task is not None and self.frames_per_task < 1:
             raise ValueError(f"frames_per_task is {self.frames_per_task}; at least 1, or none for all")
+
+    @property
+    def drive(self) -> Named:
+        """What renders in place of the scored frames; tasks and metrics are then those of this change."""
+        return self.conditions[0].drive
 
 
 def build_run_config(values: Mapping[str, Any], source: str) -> RunConfig:
@@ -259,6 +268,8 @@ def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
     InputError : an unknown metric or profile, a metric that none of the profiles asked for defines.
     """
     forget_code()
+    if config.drive:
+        return list(get("conditions", config.drive.name).metrics)
     profiles: list[ProfileSpec] = [get("profiles", name) for name in config.metric_profiles]
     defined = {metric.name for metric in get("profiles", CANONICAL).metrics}
     found: list[MetricSpec] = []

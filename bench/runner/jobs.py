@@ -6,12 +6,13 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from ..condition import Condition, label_of
 from ..contracts import Avatar, Clip
 from ..errors import InputError
 from ..io.files import atomic_path, digest, output_inside
-from ..protocol import Protocol
+from ..protocol import Protocol, protocol_name
 from ..rows import Rows
 from ..specs import MetricSpec
 from . import adaptation
@@ -19,7 +20,7 @@ from .adaptation import AdaptedClip, MethodNeeds
 from .captures import changed, open_run_clips, run_configuration
 from .config import ResolvedMethod, RunConfig, RunOptions, resolve_cells
 from .scoring import check_regions
-from .steps import Job, derive, fit, measure, render
+from .steps import Job, derive, drive, fit, measure, render, stored_rows
 from .store import RunFolder
 
 
@@ -52,6 +53,7 @@ def make_jobs(
     forms = _Forms(config, folder, RunFolder(out or folder.root))
     forms.plan([(clip, method, condition) for clip in clips for method, condition in cells])
     source = RunFolder(Path(config.source)) if config.source else None
+    kept: dict[str, Any] = {}
     return [
         Job(
             clip,
@@ -59,11 +61,17 @@ def make_jobs(
             seed,
             config.device,
             folder.cell(clip.subject, label_of(method.spec.name, condition.name), seed),
-            protocols,
+            {
+                name: protocol
+                for name, protocol in protocols.items()
+                if not condition.drive or name == protocol_name(protocol.task, MethodNeeds.of(method.spec))
+            },
             forms.of(clip, method, condition),
             regions[clip.subject],
             condition,
             None if source is None else source.cell(clip.subject, method.spec.name, seed),
+            config,
+            kept=kept,
         )
         for clip in clips
         for method, condition in cells
@@ -121,8 +129,15 @@ def _copy_kept(source: Path, folder: Path) -> None:
 
 
 def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
-    """Train or derive the avatar of a cell, render its frames and measure them; each stage continues where it was."""
+    """Train or derive the avatar of a cell, render its frames and measure them; each stage continues where it was.
+
+    A cell whose condition drives the avatar is rendered and judged by that change in place of the last two.
+    """
+    if job.condition.drive and (kept := stored_rows(job, metrics, retry=True)) is not None:
+        return kept
     avatar = fit(job) if job.source is None else derive(job)
+    if job.condition.drive:
+        return drive(job, avatar)
     render(job, avatar)
     return measure(job, avatar, metrics)
 

@@ -26,7 +26,7 @@ from ..progress import duration, run_progress
 from ..protocol import Protocol, make_protocols, missing_tasks
 from ..registry import discover, get, resolve
 from ..rows import DISCARD, Rows
-from ..specs import DatasetSpec, MetricSpec
+from ..specs import ConditionSpec, DatasetSpec, MetricSpec
 from . import adaptation
 from .captures import open_clips, relative_paths
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
@@ -124,7 +124,8 @@ def _run(
     start = time.perf_counter()
     clips = open_clips(config) if clips is None else clips
     planned, protocols, jobs = _planned(config, cells, metrics, folder, clips)
-    warn_of_missing_metrics(metrics, clips[0])
+    if not config.drive:
+        warn_of_missing_metrics(metrics, clips[0])
     if not unchecked and not config.source:
         for clip in {job.clip.subject: job.clip for job in jobs if not job.cell.ended("fit")}.values():
             check_capture(config, clip)
@@ -136,7 +137,7 @@ def _run(
     )
     manifest = replace(planned, adapted=forms, **record)
     manifest.write(folder.manifest)
-    for reason in missing_tasks(config.tasks, protocols).values():
+    for reason in {} if config.drive else missing_tasks(config.tasks, protocols).values():
         log.warning("%s", reason)
     for protocol in protocols.values():
         log.info("%s, protocol %s: %d frames", protocol.task, protocol.hash, len(protocol.keys))
@@ -167,7 +168,12 @@ def _planned(
         label = label_of(method.spec.name, condition.name)
         if not all(folder.cell(subject, label, seed).ended("measure") for subject, seed in places):
             check_settings([(method, condition)])
-    protocols = make_protocols(config.tasks, clips, config.frames_per_task)
+    if config.drive:
+        driven = make_jobs(config, cells, clips, {}, folder)
+        spec: ConditionSpec = get("conditions", config.drive.name)
+        protocols: dict[str, Protocol] = resolve(spec.protocols)(driven, **config.drive.parameters)
+    else:
+        protocols = make_protocols(config.tasks, clips, config.frames_per_task)
     planned = describe(config, cells, metrics, clips, protocols)
     folder.check_kept(planned)
     jobs = make_jobs(config, cells, clips, protocols, folder, out)

@@ -39,7 +39,7 @@ from ..rows import ALL, Row, Rows
 from ..source import code_digest, is_outside
 from ..specs import ConditionSpec, MetricSpec
 from .adaptation import AdaptedClip, TrainingView
-from .config import ResolvedMethod
+from .config import ResolvedMethod, RunConfig
 from .scoring import FULL, ScoredFrames, make_metric, score_frames
 from .store import Cell, StepState, avatar_files
 from .stored import shown_by, training_losses, write_avatar_record
@@ -58,7 +58,7 @@ class Job:
 
     ``clip`` is what is compared: the ground truth of every metric. ``adapted`` is its form for this method and condition, None
     where that is the clip itself. ``regions`` are measured beside the whole frame. ``source`` is the cell whose avatar is taken
-    instead of training. ``line`` shows the progress of the run.
+    instead of training. ``config`` is that of the run. ``kept`` is shared by the cells of a run, for what takes long to read. ``line`` shows the progress of the run.
     """
 
     clip: Clip
@@ -71,8 +71,10 @@ class Job:
     regions: tuple[str, ...] = ()
     condition: Condition = PLAIN
     source: Cell | None = None
+    config: RunConfig | None = None
     line: RunProgress | None = None
     created: list[Any] = field(default_factory=list, repr=False, compare=False)
+    kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     def create(self) -> Any:
         """The `Method` of this cell, created when it is first asked for."""
@@ -92,6 +94,11 @@ class Job:
     @property
     def name(self) -> str:
         return f"{self.clip.subject} {self.label} seed {self.seed}"
+
+    @property
+    def run(self) -> Path:
+        """Folder of the run."""
+        return self.cell.folder.parents[2]
 
     @property
     def label(self) -> str:
@@ -153,6 +160,8 @@ def steps_ahead(job: Job, metrics: Sequence[MetricSpec]) -> dict[str, str]:
     trained = job.cell.is_done("fit", job.fit_fingerprint)
     if trained and job.cell.is_done("measure", job.fit_fingerprint):
         return {}
+    if job.condition.drive:
+        return {} if stored_rows(job, metrics, retry=True) is not None else {RENDERING: job.label}
     method = job.label
     steps = {} if trained or job.source is not None else {TRAINING: method}
     steps[RENDERING] = method
@@ -267,6 +276,54 @@ def derive(job: Job) -> Avatar:
     files = job.cell.digests(path for path in job.cell.avatar.rglob("*") if path.is_file())
     job.cell.finish("fit", job.fit_fingerprint, derived_from=derived_from, files=files)
     return avatar
+
+
+def drive(job: Job, avatar: Avatar) -> Rows:
+    """Have the condition's change render the avatar and judge what it shows; leave the rows and a record in the cell.
+
+    The record has the details of the change, and digests of its files by their place in the run folder.
+    """
+    change = job.condition.drive
+    spec: ConditionSpec = get("conditions", change.name)
+    with job.progress(RENDERING) as report:
+        rows, details, files = resolve(spec.implementation)(job, avatar, report, **change.parameters)
+    rows.write(job.cell.rows)
+    job.cell.finish(
+        "measure",
+        job.fit_fingerprint,
+        fingerprints={change.name: _drive_fingerprint(job)},
+        details={change.name: details},
+        files=Cell(job.run).digests(set(files)),
+        rows=digest_file(job.cell.rows),
+    )
+    return rows  # type: ignore[no-any-return]
+
+
+def _drive_fingerprint(job: Job) -> str:
+    """Digest of everything that a driven avatar's rows depend on."""
+    change = job.condition.drive
+    spec: ConditionSpec = get("conditions", change.name)
+    code = code_digest(spec.implementation) if is_outside(spec.implementation) else ""
+    state = None if job.source is None else job.source.step("fit")
+    source = None if state is None else (state["fingerprint"], state.get("files"))
+    protocols = sorted(protocol.hash for protocol in job.protocols.values())
+    return digest(
+        RESULT_FORMAT, job.fit_fingerprint, asdict(change), code, source, _avatar_record(job), protocols
+    )
+
+
+def _driven_before(job: Job, retry: bool) -> Rows | None:
+    """Rows of a driven avatar, read back; None where it has to be driven (``retry``: again if nothing could be measured)."""
+    state = job.cell.step("measure")
+    if state is None or not job.cell.is_done("fit", job.fit_fingerprint):
+        return None
+    known, _, rows = _measured_before(job)
+    if known.get(job.condition.drive.name) != _drive_fingerprint(job):
+        return None
+    damaged = Cell(job.run).damage(state.get("files", {}))
+    if damaged:
+        _warn(job, damaged, "rendered again")
+    return None if damaged or (retry and not rows.metrics_with_values) else rows
 
 
 def log_kept(job: Job) -> None:
@@ -487,6 +544,8 @@ def stored_rows(job: Job, metrics: Sequence[MetricSpec], *, retry: bool = False)
 
     ``retry``: measurements that could not be had count as missing, since they are to be tried again.
     """
+    if job.condition.drive:
+        return _driven_before(job, retry)
     fitted = job.cell.step("fit")
     made_of = digest(job.fit_fingerprint, _avatar_record(job))
     if fitted is None or not job.cell.is_done("fit", job.fit_fingerprint):

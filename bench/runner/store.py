@@ -287,7 +287,7 @@ class RunFolder:
         for what, found, known in (
             ("method", rows.methods, {method.label for method in manifest.methods}),
             ("metric", rows.metrics, {metric.name for metric in manifest.metrics}),
-            ("task", rows.tasks, manifest.protocols.keys()),
+            ("task", rows.tasks, {protocol.task for protocol in manifest.protocols.values()}),
         ):
             if found - known:
                 names = ", ".join(sorted(known)), ", ".join(sorted(found - known))

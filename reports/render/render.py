@@ -11,6 +11,8 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.experiments.extremes import head_center
+from ...bench.experiments.viewpoints import turntable
 from ...bench.io.files import grouped_writes
 from ...bench.io.images import quantise, read_png, write_png
 from ...bench.io.provenance import COMPOSITE, RENDER
@@ -21,8 +23,6 @@ from ...bench.runner.config import RunConfig
 from ...bench.runner.store import Cell
 from ...bench.runner.stored import open_avatar
 from ...bench.specs import Findings
-from ..robustness.extremes import head_center
-from ..robustness.viewpoints import turntable
 from .settings import RenderSettings
 
 ORBIT = "orbit"

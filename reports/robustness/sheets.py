@@ -9,37 +9,63 @@ from typing import Any
 
 import cv2
 
-from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.images import read_png
+from ...bench.specs import Findings
 from ..drawing import SheetSection, Tile, TileRow, write_sheet
 from ..runs import evenly_spaced
-from .stability import RECORD_FILE, SHEET_FILE
+
+RECORD_FILE, SHEET_FILE = "record.json", "contact_sheet.png"
 
 EXTRAPOLATED, BROKEN = "#e88714", "#cd142d"
 EXTREMES_WIDTH, REENACT_WIDTH, REENACT_COLUMNS = 110, 150, 8
 
 
-def write_extremes_sheet(folder: Path, width: int = EXTREMES_WIDTH) -> Path:
-    """Draw the sheet of a folder that ``headbench run extremes`` left: a column a view, a row a step; returns the PNG.
+def robustness_report(folder: Path) -> Findings:
+    """Draw the contact sheet of what ``headbench run extremes`` or ``headbench run reenact`` left in a folder, and summarise it.
+
+    Does not pass where an avatar broke a limit or failed.
+    """
+    record = read_json(folder / RECORD_FILE)
+    avatars, failed = record["avatars"], record.get("failed", [])
+    rendered = [avatar for avatar in avatars if "missing" not in avatar]
+    text = table(avatars)
+    for each in failed:
+        text += f"\n{each['subject']} {each['method']} seed {each['seed']} failed: {each['reason']}"
+    if rendered:
+        write = write_extremes_sheet if "views" in rendered[0] else write_reenact_sheet
+        write(folder, rendered)
+        text += f"\n{folder / SHEET_FILE}"
+    passed = not failed and all(avatar["frames_broken"] == 0 for avatar in avatars)
+    return Findings(text, {"out": folder, "avatars": avatars}, passed)
+
+
+def write_extremes_sheet(
+    folder: Path, avatars: Sequence[Mapping[str, Any]], width: int = EXTREMES_WIDTH
+) -> None:
+    """Draw the sheet of avatars that ``headbench run extremes`` rendered into a folder: a column a view, a row a step.
 
     Views beyond the training cameras have an orange frame, frames that break a limit a red one. In every view the
     expression goes along one component, named above its column, from the mean in the first row outwards.
     """
     write_sheet(
         folder / SHEET_FILE,
-        [_extremes_section(folder, avatar, width) for avatar in _avatars(folder)],
+        [_extremes_section(folder, avatar, width) for avatar in avatars],
         title="Novel views and expressions",
         subtitle="Turntable between the training cameras; every column goes along one principal component of the "
         "training expressions, in steps of its standard deviation. No ground truth.",
         marks={EXTRAPOLATED: "view beyond the training cameras", BROKEN: "a limit is broken"},
         label_width=66,
     )
-    return folder / SHEET_FILE
 
 
-def write_reenact_sheet(folder: Path, width: int = REENACT_WIDTH, columns: int = REENACT_COLUMNS) -> Path:
-    """Draw the sheet of a folder that ``headbench run reenact`` left; returns the PNG.
+def write_reenact_sheet(
+    folder: Path,
+    rendered: Sequence[Mapping[str, Any]],
+    width: int = REENACT_WIDTH,
+    columns: int = REENACT_COLUMNS,
+) -> None:
+    """Draw the sheet of avatars that ``headbench run reenact`` rendered into a folder.
 
     The source's frame above, the avatars it drives below: up to ``columns`` timesteps of each pair of target and
     source, evenly spaced. A frame that breaks a limit has a red frame.
@@ -49,7 +75,7 @@ def write_reenact_sheet(folder: Path, width: int = REENACT_WIDTH, columns: int =
         return avatar["subject"], avatar["source"]
 
     sections = []
-    for (target, source), group in groupby(sorted(_avatars(folder), key=pair), key=pair):
+    for (target, source), group in groupby(sorted(rendered, key=pair), key=pair):
         avatars = list(group)
         chosen = evenly_spaced(range(len(avatars[0]["shown"])), columns)
         first = [avatars[0]["shown"][i] for i in chosen]
@@ -71,7 +97,6 @@ def write_reenact_sheet(folder: Path, width: int = REENACT_WIDTH, columns: int =
         subtitle="Expressions of the source in the first row, avatars of another subject below; no ground truth.",
         marks={BROKEN: "a limit is broken"},
     )
-    return folder / SHEET_FILE
 
 
 def _extremes_section(folder: Path, avatar: Mapping[str, Any], width: int) -> SheetSection:
@@ -99,15 +124,6 @@ def _extremes_section(folder: Path, avatar: Mapping[str, Any], width: int) -> Sh
     return SheetSection(title, heads, rows)
 
 
-def _avatars(folder: Path) -> Sequence[Mapping[str, Any]]:
-    """Records of the avatars that were rendered."""
-    avatars: Sequence[Mapping[str, Any]] = read_json(folder / RECORD_FILE)["avatars"]
-    rendered = [avatar for avatar in avatars if "missing" not in avatar]
-    if not rendered:
-        raise InputError(folder / RECORD_FILE, "avatars", "at least one that was rendered", "none")
-    return rendered
-
-
 def _picture(path: Path, width: int) -> Any:
     """The image at a width, by area where that is smaller; frames that were not finite left no file."""
     if not path.exists():
@@ -127,3 +143,23 @@ def _steps(names: Sequence[str]) -> list[str]:
     """The mean (as ""), then the steps of the first component: small ones first, each with its opposite."""
     steps = [name[3:] for name in names if _component(name) == 1]
     return ["", *sorted(steps, key=lambda step: (abs(float(step)), -float(step)))]
+
+
+def table(summaries: Sequence[Mapping[str, Any]]) -> str:
+    """Summaries for a terminal."""
+    names = ("coverage", "translucent", "largest_splat", "mean_opacity")
+    form = "{:<10} {:<16} {:>4} {:>6} {:>6}  {:>13} {:>13} {:>13} {:>13}".format
+    lines = [form("subject", "method", "seed", "frames", "broken", *(n.replace("_", " ") for n in names))]
+    for s in summaries:
+        ranges = [s["ranges"][name] for name in names]
+        shown = ["-" if low is None else f"{low:.2f} to {high:.2f}" for low, high in ranges]
+        lines.append(form(s["subject"], s["method"], s["seed"], s["frames"], s["frames_broken"], *shown))
+        if "missing" in s:
+            lines.append(f"  missing: {s['missing']}")
+        if s.get("identity") is not None:
+            known = [f"{name} {value:.1f}" for name, value in s["identity"].items() if value is not None]
+            lines.append(f"  colour difference from the subject's recordings (CIEDE2000): {', '.join(known)}")
+        lines += [f"  {b['key']}: {'; '.join(b['limits'])}" for b in s["broken"][:5]]
+        if len(s["broken"]) > 5:
+            lines.append(f"  and {len(s['broken']) - 5} more; all are in {RECORD_FILE}")
+    return "\n".join(lines)

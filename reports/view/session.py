@@ -15,10 +15,10 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray
 from ...bench.errors import HeadbenchError
+from ...bench.experiments.viewpoints import turntable
 from ...bench.io.images import write_png
 from ...bench.io.provenance import COMPOSITE
 from ...bench.io.video import write_webm
-from ..robustness.viewpoints import turntable
 from .drawing import draw, rotations, splats_of
 from .panel import ControlPanel
 from .scene import Scene

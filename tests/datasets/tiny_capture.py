@@ -12,11 +12,11 @@ from typing import Self
 import numpy as np
 
 from headbench.bench.contracts import Camera, HeadPose
+from headbench.bench.experiments import viewpoints
 from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePlan
 from headbench.datasets.head.arrays import HeadArrays
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.head.teeth import with_teeth
-from headbench.reports.robustness import viewpoints
 
 from .head.toy import toy_head
 

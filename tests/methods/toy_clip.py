@@ -9,12 +9,12 @@ import numpy as np
 import torch
 
 from headbench.bench.contracts import Camera, FrameKey, HeadPose, StepRecord
+from headbench.bench.experiments import viewpoints
 from headbench.bench.io.files import digest
 from headbench.datasets.head.arrays import HeadArrays
 from headbench.methods.ops.splats import to_world
 from headbench.methods.shared.subject_mesh import SubjectMesh
 from headbench.methods.splats import rasterize
-from headbench.reports.robustness import viewpoints
 
 
 @dataclass(frozen=True, eq=False)

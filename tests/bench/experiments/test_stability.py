@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Camera, Frame
-from headbench.reports.robustness.stability import Limits, Measures, judge, measure, typical
+from headbench.bench.experiments.stability import Limits, Measures, judge, measure, typical
 
 CAMERA = Camera("c", 40, 20, np.array([[50.0, 0, 20], [0, 50, 10], [0, 0, 1]]), np.eye(4))
 

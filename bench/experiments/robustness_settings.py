@@ -1,13 +1,14 @@
-"""Settings of the robustness tests."""
+"""Settings of ``headbench run extremes`` and ``headbench run reenact``."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import tyro
 
-from ...bench.executors.options import ExecutionOptions
-from ...bench.runner.config import RunOptions
+from ..executors.options import ExecutionOptions
+from ..runner.config import RunOptions
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,15 @@ class ExtremesSettings(RunOptions, ExecutionOptions):
         if len(set(self.sigmas)) != len(self.sigmas) or 0.0 in self.sigmas:
             raise ValueError("sigmas: each once, and without 0, which is always rendered")
 
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Of the registered change "extremes"."""
+        chosen = {"views": self.views, "beyond": self.beyond, "dimensions": self.dimensions}
+        return {**chosen, "sigmas": list(self.sigmas)}
+
 
 @dataclass(frozen=True)
-class ReenactSettings(RunOptions):
+class ReenactSettings(RunOptions, ExecutionOptions):
     """Drive a run's avatars with another subject's expressions (cross-reenactment); 1 where a limit is broken."""
 
     run: tyro.conf.Positional[str]
@@ -69,3 +76,8 @@ class ReenactSettings(RunOptions):
     def __post_init__(self) -> None:
         if self.frames is not None and self.frames < 1:
             raise ValueError(f"frames is {self.frames}; at least 1")
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Of the registered change "reenact"."""
+        return {"source": self.source, "camera": self.camera, "frames": self.frames}

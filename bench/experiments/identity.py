@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from skimage.color import deltaE_ciede2000
 
-from ...bench.contracts import (
+from ..contracts import (
     BoolArray,
     ByteArray,
     Camera,
@@ -34,7 +34,7 @@ from ...bench.contracts import (
     HeadPose,
     IntArray,
 )
-from ...bench.io.images import quantise
+from ..io.images import quantise
 from .extremes import training_poses
 from .stability import LimitCheck
 

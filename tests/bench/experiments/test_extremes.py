@@ -11,14 +11,13 @@ from sklearn.decomposition import PCA
 
 from headbench.bench.contracts import FrameKey, HeadPose
 from headbench.bench.errors import InputError
+from headbench.bench.experiments import robustness
+from headbench.bench.experiments.extremes import ExpressionComponents, extremes, typical_pose
+from headbench.bench.experiments.robustness import RECORD_FILE, extremes_run
+from headbench.bench.experiments.robustness_settings import ExtremesSettings
 from headbench.bench.io.images import read_png
 from headbench.bench.io.lock import LOCK_FILE, locked
-from headbench.bench.runner import run as runner
-from headbench.reports.robustness.command import extremes_run
-from headbench.reports.robustness.extremes import ExpressionComponents, extremes, typical_pose
-from headbench.reports.robustness.settings import ExtremesSettings
-from headbench.reports.robustness.sheets import BROKEN, EXTRAPOLATED
-from headbench.reports.robustness.stability import RECORD_FILE, ROWS_FILE, SHEET_FILE
+from headbench.reports.robustness.sheets import BROKEN, EXTRAPOLATED, SHEET_FILE
 
 VIEWS, COMPONENTS, STEPS = 6, 2, 6
 
@@ -35,7 +34,7 @@ def test_a_stable_avatar_passes_and_every_pair_has_its_rows(ball_run):
     folder = ball_run("BALL", "FLOOR")
     found = extremes_run(settings(folder))
     assert found.passed
-    rows = pd.read_parquet(folder / "extremes" / ROWS_FILE)
+    rows = pd.read_parquet(folder / "extremes" / "rows.parquet")
     frames = VIEWS * (1 + COMPONENTS * STEPS)  # the third coefficient never varies: no third component
     assert set(rows["method"]) == {"ball"}
     assert set(rows["task"]) == {"extremes"}
@@ -65,7 +64,7 @@ def test_avatars_that_render_lists_alone_are_missing(ball_run, others):
     found = extremes_run(settings(folder))
     assert found.passed
     assert "missing: Frames come in lists alone. Ask for a list." in found.text
-    rows = pd.read_parquet(folder / "extremes" / ROWS_FILE)
+    rows = pd.read_parquet(folder / "extremes" / "rows.parquet")
     missing = rows[rows["method"] == "listed"]
     assert set(missing["status"]) == {"missing"}
     assert missing["reason"].str.contains("in lists alone").all()
@@ -73,41 +72,25 @@ def test_avatars_that_render_lists_alone_are_missing(ball_run, others):
     assert (folder / "extremes" / SHEET_FILE).exists() == bool(others)
 
 
-def test_by_tasks_the_files_are_the_same(ball_run):
-    folder = ball_run("BURSTING", "LISTED", "BALL")
-    outs = [folder.parent / name for name in ("inline", "tasks")]
-    found = [
-        extremes_run(settings(folder, out=str(out), **how))
-        for out, how in zip(outs, ({}, {"executor": "processes", "workers": 2}))
-    ]
-    assert [f.passed for f in found] == [False, False]
-    left = [{p.relative_to(out).as_posix(): p for p in out.rglob("*") if p.is_file()} for out in outs]
-    assert left[1].keys() - left[0].keys() == {
-        f"{subject}/{method}/seed-0/{name}"
-        for subject in ("ball-a", "ball-bee")
-        for method in ("bursting", "listed", "ball")
-        for name in ("outcome.json", "job.log")
-    }
-    for name, path in left[0].items():
-        assert path.read_bytes().replace(b"inline", b"tasks") == left[1][name].read_bytes(), name
-
-
-@pytest.mark.parametrize("less", [{"methods": ("ball",)}, {"beyond": 10.0}])
-def test_rows_that_are_there_are_not_left_out(ball_run, less):
+def test_rows_that_are_there_are_kept(ball_run):
     folder = ball_run("BALL", "BURSTING")
-    whole = {"methods": ("ball", "bursting")}
-    extremes_run(settings(folder, **whole))
-    before = (folder / "extremes" / ROWS_FILE).read_bytes()
-    with pytest.raises(InputError, match="hoose another --out"):
-        extremes_run(settings(folder, **{**whole, **less}))
-    assert (folder / "extremes" / ROWS_FILE).read_bytes() == before
+    extremes_run(settings(folder, methods=("ball", "bursting")))
+    before = (folder / "extremes" / "rows.parquet").read_bytes()
+    with pytest.raises(InputError, match="hoose another --out"):  # other views: another protocol
+        extremes_run(settings(folder, beyond=10.0))
+    assert (folder / "extremes" / "rows.parquet").read_bytes() == before
+    assert {a["method"] for a in extremes_run(settings(folder, methods=("ball",))).data["avatars"]} == {
+        "ball",
+        "bursting",
+    }
+    assert (folder / "extremes" / "rows.parquet").read_bytes() == before
 
 
 def test_a_burst_is_found_where_it_is_and_nowhere_else(ball_run):
     folder = ball_run("BURSTING", "BALL")
     found = extremes_run(settings(folder))
     assert not found.passed
-    rows = pd.read_parquet(folder / "extremes" / ROWS_FILE)
+    rows = pd.read_parquet(folder / "extremes" / "rows.parquet")
     failed = rows[rows["status"] == "failed"]
     # The first coefficient has a deviation of 0.82 about 0: two and three of them are beyond 1.5.
     assert set(failed["sequence"]) == {"pc1-3", "pc1-2", "pc1+2", "pc1+3"}
@@ -134,7 +117,7 @@ def test_values_that_are_no_numbers_break_a_limit(ball_run):
 
 def test_a_splat_that_grows_is_found_in_the_splats_alone(ball_run):
     folder = ball_run("SPLATTY")
-    rows = extremes_run(settings(folder)) and pd.read_parquet(folder / "extremes" / ROWS_FILE)
+    rows = extremes_run(settings(folder)) and pd.read_parquet(folder / "extremes" / "rows.parquet")
     failed = rows[rows["status"] == "failed"]
     assert set(failed["metric"]) == {"largest_splat"}
     assert set(failed["sequence"]) == {"pc1-3", "pc1-2", "pc1+2", "pc1+3"}
@@ -185,7 +168,7 @@ def test_clips_are_adapted_in_its_folder_while_that_is_locked(ball_run, monkeypa
         seen.append((out, (out / LOCK_FILE).exists()))
         raise InputError("a", "b", "c", "d")
 
-    monkeypatch.setattr(runner, "trained", trained)
+    monkeypatch.setattr(robustness, "trained", trained)
     folder = ball_run("BALL")
     with pytest.raises(InputError):
         extremes_run(settings(folder))

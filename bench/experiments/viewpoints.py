@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...bench.contracts import Camera, FloatArray
-from ...bench.errors import InputError
+from ..contracts import Camera, FloatArray
+from ..errors import InputError
 
 NEAR_M = 1e-6
 LEAST_SPREAD = 0.15

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
+from headbench.bench.experiments.reenactment import RigidMean, check_heads, retarget
+from headbench.bench.experiments.robustness import RECORD_FILE, reenact_run
+from headbench.bench.experiments.robustness_settings import ReenactSettings
 from headbench.bench.io.images import read_png
-from headbench.reports.robustness.command import reenact_run
-from headbench.reports.robustness.reenactment import RigidMean, check_heads, retarget
-from headbench.reports.robustness.settings import ReenactSettings
-from headbench.reports.robustness.stability import RECORD_FILE, ROWS_FILE, SHEET_FILE
+from headbench.reports.robustness.sheets import SHEET_FILE
 
 
 def settings(folder, **changes):
@@ -29,7 +29,7 @@ def test_every_subject_is_driven_by_the_other_and_keyed_by_both(ball_run):
     found = reenact_run(settings(folder))
     out = folder / "cross_reenactment"
     assert found.passed
-    rows = pd.read_parquet(out / ROWS_FILE)
+    rows = pd.read_parquet(out / "rows.parquet")
     assert set(rows["task"]) == {"cross_reenactment"}
     assert set(rows["method"]) == {"ball"}
     pairs = set(zip(rows["subject"], rows["sequence"], rows["timestep"], rows["camera"]))
@@ -58,9 +58,9 @@ def test_another_performance_is_another_protocol(ball_run):
     for frames in (1, 2):
         out = folder / f"frames-{frames}"
         reenact_run(settings(folder, frames=frames, out=str(out)))
-        hashes |= set(pd.read_parquet(out / ROWS_FILE)["protocol"])
+        hashes |= set(pd.read_parquet(out / "rows.parquet")["protocol"])
     assert len(hashes) == 2
-    with pytest.raises(InputError, match="another protocol"):  # the rows of two frames would be lost
+    with pytest.raises(InputError, match="Choose another --out"):  # the rows of two frames would be lost
         reenact_run(settings(folder, frames=1, out=str(out)))
 
 
@@ -88,8 +88,9 @@ def test_a_driver_beyond_what_the_avatar_bears_is_found(ball_run, monkeypatch, b
             self.poses[5].expression[0] = 2.0
 
     monkeypatch.setattr(balls.BallClip, "__init__", wild)
-    assert not reenact_run(settings(folder)).passed
-    rows = pd.read_parquet(folder / "cross_reenactment" / ROWS_FILE)
+    out = folder / "wild"
+    assert not reenact_run(settings(folder, out=str(out))).passed
+    rows = pd.read_parquet(out / "rows.parquet")
     failed = rows[rows["status"] == "failed"]
     assert set(zip(failed["subject"], failed["sequence"], failed["timestep"])) == {
         ("ball-a", "ball-bee/FREE", 5)
@@ -100,7 +101,7 @@ def test_a_capture_beside_the_run_can_drive(ball_run, tmp_path):
     folder = ball_run("BALL")
     (tmp_path / "others" / "ball-cool").mkdir(parents=True)
     reenact_run(settings(folder, source=str(tmp_path / "others"), frames=1))
-    rows = pd.read_parquet(folder / "cross_reenactment" / ROWS_FILE)
+    rows = pd.read_parquet(folder / "cross_reenactment" / "rows.parquet")
     assert set(zip(rows["subject"], rows["sequence"], rows["timestep"])) == {
         ("ball-a", "ball-cool/FREE", 5),
         ("ball-bee", "ball-cool/FREE", 5),

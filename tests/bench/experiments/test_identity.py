@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from headbench.bench.contracts import Camera, Frame, FrameKey, HeadPose
-from headbench.datasets.head.model import HeadModel
-from headbench.reports.robustness.identity import (
+from headbench.bench.experiments.identity import (
     NO_APPEARANCE,
     RecordedAppearance,
     RigidVertices,
@@ -17,7 +16,8 @@ from headbench.reports.robustness.identity import (
     of_recording,
     sample,
 )
-from headbench.reports.robustness.viewpoints import look_at
+from headbench.bench.experiments.viewpoints import look_at
+from headbench.datasets.head.model import HeadModel
 
 RADIUS, SIDE = 0.1, 96
 CENTER = np.array([0.02, 0.01, 0.03])

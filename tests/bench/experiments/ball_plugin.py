@@ -7,8 +7,8 @@ import numpy as np
 
 from headbench.bench.contracts import Camera, Frame, FrameKey, HeadPose
 from headbench.bench.errors import UnavailableError
+from headbench.bench.experiments.viewpoints import look_at
 from headbench.bench.specs import DatasetSpec, MethodSpec
-from headbench.reports.robustness.viewpoints import look_at
 
 RADIUS = 0.1
 SIZE = (24, 30)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -10,28 +10,27 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from ...bench.condition import PLAIN
-from ...bench.contracts import Camera, Clip, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
-from ...bench.errors import InputError
-from ...bench.io.files import digest
-from ...bench.io.images import write_png
-from ...bench.runner.captures import open_clips, run_configuration
-from ...bench.runner.jobs import load, make_jobs
-from ...bench.runner.steps import Job
-from ...bench.runner.store import RunFolder
-from ..runs import evenly_spaced
+from ..condition import PLAIN
+from ..contracts import Avatar, Camera, Clip, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
+from ..errors import InputError
+from ..io.files import digest
+from ..io.images import write_png
+from ..protocol import Protocol, evenly
+from ..rows import Row, Rows
+from ..runner.captures import open_clips
+from ..runner.jobs import make_jobs
+from ..runner.steps import Job
+from ..runner.store import RunFolder
 from .extremes import training_poses
 from .identity import RecordedAppearance, identity, mean_known, of_recording
-from .settings import ReenactSettings
 from .stability import (
     JudgedFrame,
     Limits,
-    RobustnessCase,
-    cell_folder,
-    checked_protocols,
+    ShownFrames,
     judge,
+    judged_rows,
+    protocols_of,
     render_measured,
-    run_cases,
     typical,
     write_frame,
 )
@@ -91,8 +90,9 @@ def _mean_rotation(rotations: Sequence[FloatArray]) -> FloatArray:
 
 TASK: Literal["cross_reenactment"] = "cross_reenactment"
 REFERENCE_FRAMES = 12
-LIMITS = Limits(coverage=(0.67, 1.5), translucent_rise=0.15)
+OWN_LIMITS = Limits(coverage=(0.67, 1.5), translucent_rise=0.15)
 """Against the median over the avatar's own training poses in the same view; the head turns and moves."""
+LIMITS = asdict(OWN_LIMITS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,48 +108,61 @@ class Driven:
     def fingerprint(self) -> str:
         """Digest of what is rendered and how it is judged."""
         clips = (self.job.form.clip.fingerprint, self.source.form.clip.fingerprint)
-        return digest(TASK, 1, clips, self.camera.id, [str(key) for key in self.keys], asdict(LIMITS))[:12]
+        return digest(TASK, 1, clips, self.camera.id, [str(key) for key in self.keys], LIMITS)[:12]
 
 
-def judge_reenactment(
-    jobs: Sequence[Job], settings: ReenactSettings, out: Path, progress: Progress
-) -> list[dict[str, Any]]:
-    """Render and judge every avatar driven by every other subject; return the record of each pair.
+def protocols(jobs: Sequence[Job], **parameters: Any) -> dict[str, Protocol]:
+    """The protocols of the registered change "reenact".
 
-    Under ``out`` it leaves the frames, those of the source beside them, the rows, and a record. Raises `InputError`
-    where there is no other subject, one has no held-out performance, the head models differ, or the camera is not
-    there.
+    Raises `InputError` where there is no other subject, one has no held-out performance, the head models differ, or the
+    camera is not there.
     """
-    pairs = []
-    sources = _sources(jobs, settings)
-    for job in jobs:
-        clip = job.form.clip
-        camera = _camera(clip, settings.camera)
-        for source in sources:
-            same_method = source.method.spec.name == job.method.spec.name
-            if source.clip.subject == job.clip.subject or not same_method:
-                continue
-            check_heads(source.form.clip.head, clip.head, f"source {source.clip.subject}")
-            pairs.append(Driven(job, source, camera, _performance(source.clip, camera.id, settings.frames)))
+    pairs = [driven for job in jobs for driven in _pairs(job, **parameters)]
     if not pairs:
         found = ", ".join(sorted({job.clip.subject for job in jobs}))
         remedy = "Name a capture of another subject with --source."
-        raise InputError(settings.run, "subjects", "another subject to drive with", f"{found} alone", remedy)
-    cases = [_case(driven, out) for driven in pairs]
-    protocols = checked_protocols(TASK, cases, out)
-    return run_cases(TASK, cases, protocols, settings, asdict(LIMITS), out, progress)
+        raise InputError("run", "subjects", "another subject to drive with", f"{found} alone", remedy)
+    return protocols_of(TASK, [_shown(driven) for driven in pairs])
 
 
-def _case(driven: Driven, out: Path) -> RobustnessCase:
+def drive(
+    job: Job, avatar: Avatar, progress: Progress, **parameters: Any
+) -> tuple[Rows, dict[str, Any], list[Path]]:
+    """Render and judge the avatar driven by every other subject; the registered change "reenact".
+
+    The details have the record of each pair. The files are the frames, and those of the source in ``sources``.
+    """
+    files: list[Path] = []
+    rows: list[Row] = []
+    avatars = []
+    for driven in _pairs(job, **parameters):
+        keys = _shown(driven).keys
+        own, record = judged_rows(job, keys, lambda d=driven: _judged(d, avatar, files, progress))  # type: ignore[misc]
+        rows += own
+        avatars.append(record)
+    return Rows.of(rows), {"avatars": avatars}, files
+
+
+def _pairs(job: Job, source: str | None, camera: str | None, frames: int | None) -> list[Driven]:
+    """The avatar of a cell with everyone who drives it."""
+    clip = job.form.clip
+    view = _camera(clip, camera)
+    pairs = []
+    for other in _sources(job, source):
+        if other.clip.subject != job.clip.subject:
+            check_heads(other.form.clip.head, clip.head, f"source {other.clip.subject}")
+            pairs.append(Driven(job, other, view, _performance(other.clip, view.id, frames)))
+    return pairs
+
+
+def _shown(driven: Driven) -> ShownFrames:
     target, source = driven.job.clip, driven.source.clip
-    return RobustnessCase(
+    return ShownFrames(
         driven.job,
-        f"{driven.job.name} driven by {source.subject}",
         [target, source],
         [_target(driven, key) for key in driven.keys],
         [(driven.camera.width, driven.camera.height)],
         (f"{source.subject} drives {target.subject}", driven.fingerprint),
-        lambda report: _judged(driven, out, report),
     )
 
 
@@ -159,11 +172,11 @@ def _target(driven: Driven, key: FrameKey) -> FrameKey:
 
 
 def _judged(
-    driven: Driven, out: Path, report: Callable[[int], None]
+    driven: Driven, avatar: Avatar, files: list[Path], report: Progress
 ) -> tuple[list[JudgedFrame], dict[str, Any]]:
     job, source, camera = driven.job, driven.source, driven.camera
     appearance = RecordedAppearance.recorded(job.form.clip, camera.id, REFERENCE_FRAMES)
-    avatar, clip = load(job), job.form.clip
+    clip, out = job.form.clip, job.run
     background = [float(v) for v in clip.background]
     poses = training_poses(clip)
     means = RigidMean.of(training_poses(source.form.clip)), RigidMean.of(poses)
@@ -177,15 +190,15 @@ def _judged(
         frame, found = render_measured(avatar, camera, pose, background)
         target = _target(driven, key)
         name = f"{key.subject}_{key.sequence}_{key.timestep:05d}"
-        rendered = cell_folder(out, job) / f"{name}_{camera.id}.png"
+        rendered = job.cell.folder / f"{name}_{camera.id}.png"
         original = out / "sources" / f"{name}_{key.camera}.png"
-        write_frame(rendered, frame)
         write_png(original, source.clip.image(key))
-        checks = [*judge(found, reference, LIMITS), identity(appearance, frame, camera, pose)]
+        files += [*write_frame(rendered, frame), original]
+        checks = [*judge(found, reference, OWN_LIMITS), identity(appearance, frame, camera, pose)]
         frames.append(JudgedFrame(target, checks))
         places = {"source": original, "driven": rendered}
         shown.append({"key": str(target), **{n: p.relative_to(out).as_posix() for n, p in places.items()}})
-        report(index + 1)
+        report(index + 1, len(driven.keys), f"driven by {source.clip.subject}")
     details = {"identity": _identity(driven, appearance, frames), "shown": shown}
     return frames, {"source": source.clip.subject, **details}
 
@@ -207,16 +220,18 @@ def _identity(
     }
 
 
-def _sources(jobs: Sequence[Job], settings: ReenactSettings) -> list[Job]:
-    """Cells whose clips drive, one a subject and method: those of the run, or of a capture beside it."""
-    if settings.source is None:
-        first = {(job.clip.subject, job.method.spec.name): job for job in reversed(jobs)}
-        return sorted(first.values(), key=lambda job: job.clip.subject)
-    folder = RunFolder((Path(settings.out) if settings.out else Path(settings.run) / TASK) / "sources")
-    config = run_configuration(Path(settings.run), replace(settings, data=settings.source))
-    config = replace(config, out=str(folder.root))
-    methods = [(m, PLAIN) for m in {job.method.spec.name: job.method for job in jobs}.values()]
-    return make_jobs(replace(config, seeds=(0,)), methods, open_clips(config), {}, folder)
+def _sources(job: Job, source: str | None) -> Sequence[Job]:
+    """Cells of the job's method whose clips drive: of every capture of the run, or of a capture beside it."""
+    config = job.config
+    assert config is not None
+    if source is not None:
+        config = replace(config, data=source)
+    if "drivers" not in job.kept:
+        job.kept["drivers"] = open_clips(config)
+    folder = RunFolder(job.run if source is None else job.run / "sources")
+    config = replace(config, out=str(folder.root), conditions=(PLAIN,), seeds=(0,), source="")
+    clips = sorted(job.kept["drivers"], key=lambda clip: clip.subject)
+    return make_jobs(config, [(job.method, PLAIN)], clips, {}, folder)
 
 
 def _camera(clip: Clip, wanted: str | None) -> Camera:
@@ -237,4 +252,4 @@ def _performance(clip: Clip, camera: str, count: int | None) -> list[FrameKey]:
     keys = [chosen[timestep] for timestep in sorted(chosen)]
     if not keys:
         raise InputError(f"clip {clip.subject}", "splits.self_reenactment", "at least one frame", "none")
-    return keys if count is None else evenly_spaced(keys, count)
+    return evenly(keys, count)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
-from headbench.reports.robustness.viewpoints import look_at, turntable
+from headbench.bench.experiments.viewpoints import look_at, turntable
 
 CENTER = np.array([0.1, 1.5, -0.2])
 UP = np.array([0.0, 1.0, 0.0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -10,27 +10,24 @@ from typing import Any, Literal, NamedTuple
 import cv2
 import numpy as np
 
-from ...bench.contracts import Clip, FloatArray, FrameKey, HeadPose, Progress
-from ...bench.executors.task import Task
-from ...bench.io.files import digest
-from ...bench.runner.jobs import load, trained
-from ...bench.runner.steps import Job, trained_files
-from .settings import ExtremesSettings
+from ..contracts import Avatar, Clip, FloatArray, FrameKey, HeadPose, Progress
+from ..io.files import digest
+from ..protocol import Protocol
+from ..rows import Rows
+from ..runner.steps import Job
 from .stability import (
     EXPRESSION_LIMITS,
     VIEW_LIMITS,
     JudgedFrame,
-    RobustnessCase,
-    cell_folder,
-    checked_protocols,
+    ShownFrames,
     judge,
+    judged_rows,
+    protocols_of,
     render_measured,
-    run_cases,
     splats_of,
     typical,
     write_frame,
 )
-from .tasks import leave_frames, rendered_by_tasks
 from .viewpoints import Viewpoint, turntable
 
 NO_VARIATION = 1e-9
@@ -100,6 +97,7 @@ def extremes(clip: Clip, dimensions: int, sigmas: Sequence[float]) -> list[Extre
 
 
 TASK: Literal["extremes"] = "extremes"
+LIMITS = {"views": asdict(VIEW_LIMITS), "expressions": asdict(EXPRESSION_LIMITS)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,16 +109,17 @@ class ExtremesPlan:
     fingerprint: str
 
     @classmethod
-    def of(cls, clip: Clip, settings: ExtremesSettings) -> ExtremesPlan:
+    def of(
+        cls, clip: Clip, views: int, beyond: float, dimensions: int, sigmas: Sequence[float]
+    ) -> ExtremesPlan:
         """Choose views and expressions for a clip, from its training frames alone."""
         cameras = [clip.cameras[name] for name in sorted({key.camera for key in clip.splits["train"]})]
-        sigmas = sorted(settings.sigmas)
-        asked = (settings.views, settings.beyond, settings.dimensions, sigmas)
-        limits = (asdict(VIEW_LIMITS), asdict(EXPRESSION_LIMITS))
+        sigmas = sorted(sigmas)
+        asked = (views, beyond, dimensions, sigmas)
         return cls(
-            turntable(cameras, head_center(clip), settings.views, settings.beyond),
-            extremes(clip, settings.dimensions, sigmas),
-            digest(TASK, 1, clip.fingerprint, asked, limits)[:12],
+            turntable(cameras, head_center(clip), views, beyond),
+            extremes(clip, dimensions, sigmas),
+            digest(TASK, 1, clip.fingerprint, asked, tuple(LIMITS.values()))[:12],
         )
 
 
@@ -135,26 +134,21 @@ def head_center(clip: Clip) -> FloatArray:
     return np.asarray(rotation @ (middle - joint) + joint + pose.translation)
 
 
-def judge_extremes(
-    jobs: Sequence[Job], settings: ExtremesSettings, out: Path, progress: Progress
-) -> list[dict[str, Any]]:
-    """Render and judge every pair of view and expression; return the record of each avatar.
+def protocols(jobs: Sequence[Job], **parameters: Any) -> dict[str, Protocol]:
+    """The protocols of the registered change "extremes"."""
+    return protocols_of(TASK, [_shown(job, ExtremesPlan.of(job.form.clip, **parameters)) for job in jobs])
 
-    Under ``out`` it leaves the rows, a record of views, limits and findings, and the frames that the contact
+
+def drive(
+    job: Job, avatar: Avatar, progress: Progress, **parameters: Any
+) -> tuple[Rows, dict[str, Any], list[Path]]:
+    """Render and judge every pair of view and expression; the registered change "extremes".
+
+    The details have the record of the avatar: views, expressions and findings. The files are the frames that the contact
     sheet shows.
     """
-    plans = [ExtremesPlan.of(job.form.clip, settings) for job in jobs]
-    cases = [_case(job, plan, out) for job, plan in zip(jobs, plans)]
-    protocols = checked_protocols(TASK, cases, out)
-    if settings.execution.executor != "inline":
-        subjects = list(dict.fromkeys(job.clip.subject for job in jobs))
-        made_of = [_fingerprint(job, plan) for job, plan in zip(jobs, plans)]
-        cases = rendered_by_tasks(cases, subjects, made_of, settings, out)
-    limits = {"views": asdict(VIEW_LIMITS), "expressions": asdict(EXPRESSION_LIMITS)}
-    return run_cases(TASK, cases, protocols, settings, limits, out, progress)
-
-
-def _case(job: Job, plan: ExtremesPlan, out: Path) -> RobustnessCase:
+    plan = ExtremesPlan.of(job.form.clip, **parameters)
+    files: list[Path] = []
     details = {
         "views": [
             {"id": v.camera.id, "azimuth": round(v.azimuth, 2), "extrapolated": v.extrapolated}
@@ -162,42 +156,31 @@ def _case(job: Job, plan: ExtremesPlan, out: Path) -> RobustnessCase:
         ],
         "expressions": [extreme.name for extreme in plan.extremes],
     }
-    return RobustnessCase(
+    keys = _shown(job, plan).keys
+    rows, record = judged_rows(job, keys, lambda: (_judged(job, avatar, plan, files, progress), details))
+    return Rows.of(rows), {"avatars": [record]}, files
+
+
+def _shown(job: Job, plan: ExtremesPlan) -> ShownFrames:
+    return ShownFrames(
         job,
-        job.name,
         [job.clip],
         [_key(job, extreme, n, view) for n, extreme in enumerate(plan.extremes) for view in plan.views],
         [(view.camera.width, view.camera.height) for view in plan.views],
         (f"views and expressions of {job.clip.subject}", plan.fingerprint),
-        lambda report: (_judged(job, plan, cell_folder(out, job), report), details),
     )
-
-
-def _fingerprint(job: Job, plan: ExtremesPlan) -> str:
-    """What the frames of an avatar depend on."""
-    return digest(plan.fingerprint, job.fit_fingerprint, trained_files(job))
-
-
-def render_avatar(task: Task, report: Callable[[str], None]) -> None:
-    """Render and judge one avatar, as an executor's task; leave what came out in its folder."""
-    given = {**task.arguments["settings"]}
-    given |= {name: tuple(given[name]) for name in ("methods", "sigmas")}
-    settings, out = ExtremesSettings(**given), Path(task.root)
-    chosen = task.arguments["method"], task.arguments["seed"]
-    _, jobs = trained(Path(settings.run), chosen[:1], settings, out, only=task.arguments["capture"])
-    (job,) = (job for job in jobs if (job.method.spec.name, job.seed) == chosen)
-    plan = ExtremesPlan.of(job.form.clip, settings)
-    leave_frames(_case(job, plan, out), _fingerprint(job, plan), cell_folder(out, job), report)
 
 
 def _key(job: Job, extreme: ExtremePose, number: int, view: Viewpoint) -> FrameKey:
     return FrameKey(job.clip.subject, extreme.name, number, view.camera.id)
 
 
-def _judged(job: Job, plan: ExtremesPlan, folder: Path, report: Callable[[int], None]) -> list[JudgedFrame]:
+def _judged(
+    job: Job, avatar: Avatar, plan: ExtremesPlan, files: list[Path], report: Progress
+) -> list[JudgedFrame]:
     """The mean expression first, since it is the reference of all others in its view."""
-    avatar, clip = load(job), job.form.clip
-    background = [float(v) for v in clip.background]
+    background = [float(v) for v in job.form.clip.background]
+    total = len(plan.extremes) * len(plan.views)
     components = max(extreme.component for extreme in plan.extremes)
     frames: list[JudgedFrame] = []
     references = []
@@ -209,8 +192,8 @@ def _judged(job: Job, plan: ExtremesPlan, folder: Path, report: Callable[[int], 
             measured.append(found)
             # The contact sheet shows in each view every step along one component, which changes from view to view.
             if not extreme.component or extreme.component == index % components + 1:
-                write_frame(folder / f"{extreme.name}_{view.camera.id}.png", frame)
-            report(number * len(plan.views) + index + 1)
+                files += write_frame(job.cell.folder / f"{extreme.name}_{view.camera.id}.png", frame)
+            report(number * len(plan.views) + index + 1, total, TASK)
         if number == 0:
             references = measured
             between = [m for m, view in zip(measured, plan.views) if not view.extrapolated]

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...bench.contracts import (
+from ..contracts import (
     Avatar,
     Camera,
     Clip,
@@ -23,20 +23,17 @@ from ...bench.contracts import (
     Frame,
     FrameKey,
     HeadPose,
-    Progress,
     SplatAvatar,
     Splats,
 )
-from ...bench.errors import UnavailableError
-from ...bench.executors.options import ExecutionOptions
-from ...bench.io.files import write_json
-from ...bench.io.images import quantise, write_png
-from ...bench.io.provenance import RENDER
-from ...bench.protocol import Protocol, TaskWithoutTruth, make_protocol_without_truth
-from ...bench.rows import Row, Rows, earlier_rows
-from ...bench.runner.adaptation import MethodNeeds
-from ...bench.runner.scoring import FULL
-from ...bench.runner.steps import Job
+from ..errors import UnavailableError
+from ..io.images import quantise, write_png
+from ..io.provenance import RENDER
+from ..protocol import Protocol, TaskWithoutTruth, make_protocol_without_truth, protocol_name
+from ..rows import Row
+from ..runner.adaptation import MethodNeeds
+from ..runner.scoring import FULL
+from ..runner.steps import Job
 
 log = logging.getLogger(__name__)
 COVERED, SOLID = 0.05, 0.95
@@ -167,9 +164,6 @@ def _ratio(value: float | None, reference: float | None) -> float | None:
     return value / reference
 
 
-ROWS_FILE, RECORD_FILE, SHEET_FILE = "rows.parquet", "record.json", "contact_sheet.png"
-
-
 @dataclass(frozen=True)
 class JudgedFrame:
     """A rendered frame; ``checks`` stand in the order of `Measures`, further ones after."""
@@ -183,97 +177,49 @@ class JudgedFrame:
         return [check for check in self.checks if not check.passed]
 
 
-@dataclass(frozen=True, eq=False)
-class RobustnessCase:
-    """One avatar and the frames that it is rendered for.
-
-    ``render`` renders and judges all frames and reports how many are done; it also returns entries of the record.
-    """
+class ShownFrames(NamedTuple):
+    """What an avatar is rendered for, as its protocol has it."""
 
     job: Job
-    name: str  # for the progress
-    clips: Sequence[Clip]  # that take part in the protocol
-    keys: Sequence[FrameKey]  # of the protocol
+    clips: Sequence[Clip]
+    keys: Sequence[FrameKey]
     sizes: Sequence[tuple[int, int]]  # of the images, (width, height)
     condition: tuple[str, str]  # what is rendered in words, and a fingerprint of it
-    render: Callable[[Callable[[int], None]], tuple[list[JudgedFrame], dict[str, Any]]]
-
-    @property
-    def needs(self) -> MethodNeeds:
-        """What the avatar's method wants of a clip."""
-        return MethodNeeds.of(self.job.method.spec)
 
 
-def checked_protocols(
-    task: TaskWithoutTruth, cases: Sequence[RobustnessCase], out: Path
-) -> dict[MethodNeeds, Protocol]:
-    """The protocols of all cases; avatars of methods with equal needs are shown the same frames, and so share one.
-
-    Raises `InputError`, before any work, where rows of an earlier call in ``out`` would be lost.
-    """
-    protocols: dict[MethodNeeds, Protocol] = {}
-    for needs in {case.needs: None for case in cases}:
-        own = [case for case in cases if case.needs == needs]
-        protocols[needs] = make_protocol_without_truth(
+def protocols_of(task: TaskWithoutTruth, shown: Sequence[ShownFrames]) -> dict[str, Protocol]:
+    """The protocols of some avatars; those of methods with equal needs are shown the same frames, and so share one."""
+    named: dict[str, list[ShownFrames]] = {}
+    for each in shown:
+        named.setdefault(protocol_name(task, MethodNeeds.of(each.job.method.spec)), []).append(each)
+    return {
+        name: make_protocol_without_truth(
             task,
-            [clip for case in own for clip in case.clips],
-            [key for case in own for key in case.keys],
-            [size for case in own for size in case.sizes],
-            dict(case.condition for case in own),
+            [clip for each in own for clip in each.clips],
+            [key for each in own for key in each.keys],
+            [size for each in own for size in each.sizes],
+            dict(each.condition for each in own),
         )
-    jobs = [case.job for case in cases]
-    earlier = earlier_rows(out / ROWS_FILE)
-    if earlier is not None:
-        earlier.check_kept(
-            out / ROWS_FILE,
-            method=dict.fromkeys(job.method.spec.name for job in jobs),
-            subject=dict.fromkeys(job.clip.subject for job in jobs),
-            seed=dict.fromkeys(job.seed for job in jobs),
-            protocol=[protocol.hash for protocol in protocols.values()],
-        )
-    return protocols
+        for name, own in named.items()
+    }
 
 
-def run_cases(
-    task: TaskWithoutTruth,
-    cases: Sequence[RobustnessCase],
-    protocols: Mapping[MethodNeeds, Protocol],
-    settings: Any,
-    limits: Any,
-    out: Path,
-    progress: Progress,
-) -> list[dict[str, Any]]:
-    """Render and judge all cases; leave rows and a record under ``out``, and return the record of each avatar.
+def judged_rows(
+    job: Job, keys: Sequence[FrameKey], judged: Callable[[], tuple[list[JudgedFrame], dict[str, Any]]]
+) -> tuple[list[Row], dict[str, Any]]:
+    """The rows of an avatar, and its record: a summary, and what ``judged``, which renders and judges, adds to it.
 
     An avatar that cannot be rendered so (`UnavailableError`) has missing rows, and its record says why.
-    ``protocols`` are those of `checked_protocols`.
     """
-    done, total = 0, sum(len(case.keys) for case in cases)
-    rows: list[Row] = []
-    avatars = []
-    for case in cases:
-        protocol = protocols[case.needs].hash
-        try:
-            frames, details = case.render(
-                lambda n, done=done, name=case.name: progress(done + n, total, name)  # type: ignore[misc]
-            )
-        except UnavailableError as error:
-            log.warning("%s is missing: %s", case.name, error)
-            absent = [LimitCheck(field.name, None, 0.0, 0.0, str(error)) for field in fields(Measures)]
-            frames, details = [JudgedFrame(key, absent) for key in case.keys], {"missing": str(error)}
-        done += len(case.keys)
-        rows += _rows(case.job, task, frames, protocol)
-        avatars.append({**_summary(case.job, frames), **details, "protocol": protocol})
-    Rows.of(rows).write(out / ROWS_FILE)
-    by_hash = sorted({protocol.hash: protocol for protocol in protocols.values()}.items())
-    record = {
-        "settings": settings.others if isinstance(settings, ExecutionOptions) else asdict(settings),
-        "limits": limits,
-        "protocols": [{"id": p.id, "hash": name, **asdict(p)} for name, p in by_hash],
-        "avatars": avatars,
-    }
-    write_json(out / RECORD_FILE, record)
-    return avatars
+    (protocol,) = job.protocols.values()
+    try:
+        frames, details = judged()
+    except UnavailableError as error:
+        log.warning("%s is missing: %s", job.name, error)
+        absent = [LimitCheck(field.name, None, 0.0, 0.0, str(error)) for field in fields(Measures)]
+        frames, details = [JudgedFrame(key, absent) for key in keys], {"missing": str(error)}
+    record = {**_summary(job, frames), **details, "protocol": protocol.hash}
+    return _rows(job, protocol, frames), record
 
 
 def render_measured(
@@ -289,20 +235,16 @@ def splats_of(avatar: Avatar, pose: HeadPose) -> Splats | None:
     return avatar.splats(pose) if isinstance(avatar, SplatAvatar) else None
 
 
-def write_frame(path: Path, frame: Frame) -> None:
+def write_frame(path: Path, frame: Frame) -> list[Path]:
     """Write the frame as 8-bit PNG; one that is not finite leaves no file, since any level would hide it."""
     if np.isfinite(frame.rgb).all():
         write_png(path, quantise(frame.rgb), RENDER)
-    else:
-        path.unlink(missing_ok=True)
+        return [path]
+    path.unlink(missing_ok=True)
+    return []
 
 
-def cell_folder(root: Path, job: Job) -> Path:
-    """Where the frames of an avatar go."""
-    return root / job.clip.subject / job.method.spec.name / f"seed-{job.seed}"
-
-
-def _rows(job: Job, task: str, frames: Sequence[JudgedFrame], protocol: str) -> list[Row]:
+def _rows(job: Job, protocol: Protocol, frames: Sequence[JudgedFrame]) -> list[Row]:
     """Rows as every measurement leaves them; a broken limit has status "failed" and says which."""
     method = job.method.spec
     rows = []
@@ -313,8 +255,9 @@ def _rows(job: Job, task: str, frames: Sequence[JudgedFrame], protocol: str) -> 
                 value, outcome = math.nan, ("missing", check.absent)
             elif not check.passed:
                 outcome = ("failed", str(check))
-            where = (method.name, method.version, job.seed, task, *frame.key)
-            rows.append(Row(*where, FULL, check.measure, value, protocol, *outcome))
+            where = (method.name, method.version, job.seed, protocol.task, *frame.key)
+            row = Row(*where, FULL, check.measure, value, protocol.hash, *outcome)
+            rows.append(replace(row, condition=job.condition.name))
     return rows
 
 
@@ -337,23 +280,3 @@ def _range(values: Sequence[float | None]) -> tuple[float | None, float | None]:
     """Least and largest finite value; None without any."""
     finite = [v for v in values if v is not None and math.isfinite(v)]
     return (min(finite), max(finite)) if finite else (None, None)
-
-
-def table(summaries: Sequence[Mapping[str, Any]]) -> str:
-    """Summaries for a terminal."""
-    names = ("coverage", "translucent", "largest_splat", "mean_opacity")
-    form = "{:<10} {:<16} {:>4} {:>6} {:>6}  {:>13} {:>13} {:>13} {:>13}".format
-    lines = [form("subject", "method", "seed", "frames", "broken", *(n.replace("_", " ") for n in names))]
-    for s in summaries:
-        ranges = [s["ranges"][name] for name in names]
-        shown = ["-" if low is None else f"{low:.2f} to {high:.2f}" for low, high in ranges]
-        lines.append(form(s["subject"], s["method"], s["seed"], s["frames"], s["frames_broken"], *shown))
-        if "missing" in s:
-            lines.append(f"  missing: {s['missing']}")
-        if s.get("identity") is not None:
-            known = [f"{name} {value:.1f}" for name, value in s["identity"].items() if value is not None]
-            lines.append(f"  colour difference from the subject's recordings (CIEDE2000): {', '.join(known)}")
-        lines += [f"  {b['key']}: {'; '.join(b['limits'])}" for b in s["broken"][:5]]
-        if len(s["broken"]) > 5:
-            lines.append(f"  and {len(s['broken']) - 5} more; all are in {RECORD_FILE}")
-    return "\n".join(lines)

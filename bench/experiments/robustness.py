@@ -1,0 +1,94 @@
+"""``headbench run extremes`` and ``headbench run reenact``: avatars of a run driven beyond it, as a condition of a run with a source."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from ..condition import Condition, Named
+from ..contracts import Progress, no_progress
+from ..executors.settings import check_executor
+from ..io.files import check_kind, output_inside, write_json
+from ..io.lock import locked
+from ..registry import get, resolve
+from ..rows import ALL, Rows
+from ..runner.jobs import trained
+from ..runner.run import run_locked
+from ..runner.store import RunFolder
+from ..specs import Findings
+from .robustness_settings import ExtremesSettings, ReenactSettings
+
+RECORD_FILE = "record.json"
+"""Settings, limits, protocols and what was found of each avatar, beside the rows."""
+
+
+def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -> Findings:
+    """Render a run's avatars in views and expressions beyond those of training; check stability limits.
+
+    Does not pass where a limit is broken or an avatar failed. Started again, it keeps what is done. Raises `InputError` for a
+    folder that is no finished run, and for a capture that is not the run's.
+    """
+    return _run(settings, "extremes", "extremes")
+
+
+def reenact_run(settings: ReenactSettings, progress: Progress = no_progress) -> Findings:
+    """Drive a run's avatars with another subject's expressions; check stability limits.
+
+    Does not pass where a limit is broken or an avatar failed. Started again, it keeps what is done. Raises `InputError` for a
+    folder that is no finished run, where nobody else is there to drive, and for a source tracked with another head model.
+    """
+    return _run(settings, "reenact", "cross_reenactment")
+
+
+def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) -> Findings:
+    """Run the plan in the folder of the task; write the record and have the report drawn."""
+    source = RunFolder(Path(settings.run))
+    source.read_manifest()  # before a folder is made in what is no run
+    out = Path(settings.out) if settings.out else source.root / task
+    check_kind(out, "a run")
+    with nullcontext() if settings.out else output_inside(source.root), locked(out):
+        config, jobs = trained(source.root, settings.methods, settings, out)
+        check_executor(settings.execution, config.device)
+        names = {job.method.spec.name for job in jobs}
+        config = replace(
+            config,
+            methods=tuple(name for name in config.methods if get("methods", name).name in names),
+            settings={name: value for name, value in config.settings.items() if name in names},
+            regions=(),
+            conditions=(Condition(drive=Named(drive, settings.parameters)),),
+            source=settings.run,
+        )
+        clips = list({job.clip.subject: job.clip for job in jobs}.values())
+        rows = run_locked(config, settings.execution, clips=clips, reports=False)
+        _write_record(out, drive, rows, settings.others)
+        shown: Findings = resolve(get("reports", "robustness").implementation)(out)
+        return shown
+
+
+def _write_record(out: Path, drive: str, rows: Rows, settings: dict[str, Any]) -> None:
+    """Write what was found of each avatar, in the order of the run; of those that failed, why."""
+    folder = RunFolder(out)
+    manifest = folder.read_manifest()
+    table = rows.select(method=ALL, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    without = table[table["timestep"] < 0].drop_duplicates(["subject", "method", "seed"])
+    failed = without[["subject", "method", "seed", "reason"]].to_dict("records")
+    places = {(each["subject"], each["method"], each["seed"]) for each in failed}
+    avatars: list[dict[str, Any]] = []
+    for clip in manifest.clips:
+        for method in manifest.methods:
+            for seed in manifest.configuration.seeds:
+                state = folder.cell(clip.subject, method.label, seed).step("measure")
+                if (clip.subject, method.name, seed) not in places and state is not None:
+                    avatars += state["details"][drive]["avatars"]
+    record = {
+        "settings": settings,
+        "limits": resolve(get("conditions", drive).implementation.partition(":")[0] + ":LIMITS"),
+        "protocols": [
+            asdict(each) for each in sorted(manifest.protocols.values(), key=lambda each: each.hash)
+        ],
+        "avatars": avatars,
+        **({"failed": failed} if failed else {}),
+    }
+    write_json(out / RECORD_FILE, record)
