@@ -54,11 +54,6 @@ def violations(path: Path, source: str) -> list[str]:
 
 
 MODULES = {".".join(("headbench", *path.relative_to(ROOT).with_suffix("").parts)): path for path in SOURCES}
-UNTIL_THE_ENGINE = (
-    {"bench.executors.cell", "bench.executors.run", "bench.runner.run"},
-    {"bench.executors.task", "bench.executors.worker"},
-)
-"""Circles that go with the runner."""
 
 
 def circles(sources: dict[str, str]) -> list[set[str]]:
@@ -86,7 +81,7 @@ def circles(sources: dict[str, str]) -> list[set[str]]:
 
 def test_modules_do_not_import_each_other_in_circles():
     sources = {name: path.read_text() for name, path in MODULES.items()}
-    assert [group for group in circles(sources) if group not in UNTIL_THE_ENGINE] == []
+    assert circles(sources) == []
 
 
 @pytest.mark.parametrize(

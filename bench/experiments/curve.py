@@ -69,7 +69,7 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Find
         tasks = tuple(task for task in (CAMERA, TIMESTEPS) if all(task in clip.splits for clip in clips))
         config = replace(config, tasks=tasks, conditions=tuple(conditions(settings, wanted, clips)))
         _drop_interrupted(out)
-        run_locked(config, settings.execution, clips=clips, reports=False)
+        run_locked(config, settings.execution, trust=settings.trust, clips=clips, reports=False)
         found: Findings = resolve(get("reports", "curve").implementation)(out, settings.over)
         return found
 

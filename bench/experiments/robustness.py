@@ -61,7 +61,7 @@ def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) ->
             source=settings.run,
         )
         clips = list({job.clip.subject: job.clip for job in jobs}.values())
-        rows = run_locked(config, settings.execution, clips=clips, reports=False)
+        rows = run_locked(config, settings.execution, trust=settings.trust, clips=clips, reports=False)
         _write_record(out, drive, rows, settings.others)
         shown: Findings = resolve(get("reports", "robustness").implementation)(out)
         return shown

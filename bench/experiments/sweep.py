@@ -70,7 +70,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
             source=settings.run,
         )
         clips = list({job.clip.subject: job.clip for job in able}.values())
-        run_locked(config, settings.execution, clips=clips, reports=False)
+        run_locked(config, settings.execution, trust=settings.trust, clips=clips, reports=False)
         shown: Findings = resolve(get("reports", "pareto").implementation)(
             (str(out),), out, settings.task, settings.metric, settings.time
         )

@@ -36,10 +36,14 @@ def turntable(
 
     Parameters
     ----------
-    cameras : training cameras, at least one; views have the size of the first.
-    center : (3,) what to look at, metres.
-    count : number of views, at least 1.
-    beyond_degrees : how far views go beyond the outermost cameras on either side, in [0, 180).
+    cameras : Sequence[Camera]
+        Training cameras, at least one; views have the size of the first.
+    center : FloatArray
+        (3,) point to look at, metres.
+    count : int
+        Number of views, at least 1.
+    beyond_degrees : float
+        How far views go beyond the outermost cameras on either side, in [0, 180).
     """
     if not cameras:
         raise InputError("turntable", "cameras", "at least one", "none")

@@ -84,6 +84,7 @@ def run_locked(
     cells: Sequence[tuple[ResolvedMethod, Condition]] | None = None,
     metrics: Sequence[MetricSpec] | None = None,
     each: RunCell | None = None,
+    trust: bool = False,
     reports: bool = True,
     **record: Any,
 ) -> Rows:
@@ -95,10 +96,12 @@ def run_locked(
         What the configuration resolves to, where it does not name them; then ``each`` is to be given.
     each : callable, optional
         Does the work of a cell in this process, in place of `run_cell`.
+    trust : bool
+        Import modules and run programs that only a run in the folder names.
     """
     start = time.perf_counter()
     folder = RunFolder(Path(config.out))
-    config = grown(config, folder)
+    config = grown(config, folder, trust=trust) if cells is None else config
     cells = resolve_cells(config) if cells is None else cells
     metrics = resolve_metrics(config) if metrics is None else metrics
     execution = execution or Execution()
@@ -193,7 +196,7 @@ def planned_jobs(config: RunConfig) -> list[Job]:
         return _planned(config, resolve_cells(config), metrics, folder, clips, Path(scratch))[2]
 
 
-def grown(config: RunConfig, folder: RunFolder) -> RunConfig:
+def grown(config: RunConfig, folder: RunFolder, *, trust: bool = False) -> RunConfig:
     """The configuration together with what the run in the folder has already: methods, seeds, tasks, metrics, conditions.
 
     Raises `InputError` where a setting of both, which decides results of all cells, has another value.
@@ -207,7 +210,8 @@ def grown(config: RunConfig, folder: RunFolder) -> RunConfig:
             raise
         log.warning("%s It is written again.", error)
         return config  # rows that would be lost are an error when they are written
-    _check_not_foreign(earlier, config, folder.manifest)
+    if not trust:
+        _check_not_foreign(earlier, config, folder.manifest)
     before = product(earlier.methods, earlier.seeds)
     asked = product(config.methods, config.seeds)
     every = product({*earlier.methods, *config.methods}, {*earlier.seeds, *config.seeds})

@@ -76,7 +76,7 @@ def test_an_experiment_written_outside_runs_its_conditions(
 
 
 def test_a_method_written_outside_draws_the_tracked_mesh(outside, capsys):
-    assert cli.main(["check-plugin", "outside_method:SPEC"]) == 0, capsys.readouterr().out
+    assert cli.main(["doctor", "check", "outside_method:SPEC"]) == 0, capsys.readouterr().out
 
 
 @pytest.fixture
