@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -33,27 +31,6 @@ def test_cameras_survive_the_json(axis, place, focal, center, cy):
     np.testing.assert_allclose(layout.intrinsics_from_json(entries, 550, 802, cy), K, rtol=0, atol=1e-12)
     stored = np.array(layout.extrinsics_to_json(matrix))
     np.testing.assert_allclose(layout.extrinsics_from_json(stored), matrix, rtol=0, atol=1e-12)
-
-
-def test_a_point_ahead_of_an_opengl_camera_is_ahead_in_opencv():
-    """Camera at (0, 0, 1) with OpenGL axes equal to the world's looks along -z: at the origin."""
-    stored = np.eye(4)
-    stored[2, 3] = 1.0
-    world_to_camera = layout.extrinsics_from_json(stored)
-    np.testing.assert_allclose(world_to_camera @ [0, 0, 0, 1], [0, 0, 1, 1], atol=1e-15)
-    np.testing.assert_allclose(world_to_camera @ [0.2, 0.1, 0, 1], [0.2, -0.1, 1, 1], atol=1e-15)  # up is -y
-
-
-def test_field_of_view_alone_means_square_pixels_and_the_centre():
-    K = layout.intrinsics_from_json({"camera_angle_x": math.pi / 2}, 200, 300, "bottom")
-    np.testing.assert_allclose(K, [[100, 0, 100], [0, 100, 150], [0, 0, 1]], rtol=1e-12)
-
-
-def test_centre_ignores_the_principal_point():
-    entries = {"fl_x": 50.0, "fl_y": 60.0, "cx": 7.0, "cy": 9.0}
-    np.testing.assert_array_equal(
-        layout.intrinsics_from_json(entries, 40, 30, "centre"), [[50, 0, 20], [0, 60, 15], [0, 0, 1]]
-    )
 
 
 @pytest.mark.parametrize(

@@ -206,14 +206,6 @@ def test_teeth_are_appended_and_the_offset_padded(tmp_path, rows_in_file):
         read_capture(write_ga_style(tmp_path / "other", plan, offset_rows=len(bare.template) - 7), head=bare)
 
 
-@pytest.mark.parametrize("version", ["flame2023", "toy"])
-def test_every_head_without_teeth_gets_them(tmp_path, version):
-    head = toy_head(16, version=version)
-    union = write_ga_style(tmp_path, make_plan(head=head))
-    assert read_capture(union, head=head).head.fingerprint() == with_teeth(head).fingerprint()
-    assert read_capture(union, head=head, teeth="keep").head.fingerprint() == head.fingerprint()
-
-
 # ------------------------------------------------------------------ the principal point
 
 
