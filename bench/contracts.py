@@ -1,17 +1,17 @@
-"""The contracts between the packages: what a capture, a method, an avatar and a metric are.
+"""Contracts between the packages for captures, methods, avatars and metrics.
 
-What the registry lists of them is in `specs`.
+Their registry entries are defined in `specs`.
 
-Numpy and the standard library only. The behaviours are `Protocol`s, so a plug-in inherits nothing:
-it offers these attributes and passes the conformance kit. The values are frozen dataclasses.
+Only NumPy and the standard library are imported. Behaviours are `Protocol`s, so a plug-in inherits nothing:
+it provides these attributes and passes the conformance kit. Values are frozen dataclasses.
 
-Conventions, fixed once here
-----------------------------
+Conventions
+-----------
 * Lengths are metres, angles radians, images row-major ``(height, width, channel)``.
 * Cameras have OpenCV axes: x right, y down, z forward. ``world_to_camera`` maps world points to camera
   points; ``K`` is in pixels, with the centre of the top left pixel at (0.5, 0.5).
 * Colours are display-referred sRGB in [0, 1] unless a name says 8-bit.
-* The identity of an image, a render or a row is its `FrameKey`; order in a list never means anything.
+* The identity of an image, a render or a row is its `FrameKey`; the order of a list has no meaning.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Camera:
         return replace(self, width=width, height=height, K=scale @ self.K)
 
     def boxed(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The view of a box of the image, in whole pixels; a box that reaches beyond the image pads it."""
+        """The view of a box of the image, in whole pixels; a box that extends beyond the image pads it."""
         K = np.array(self.K, dtype=np.float64)
         K[:2, 2] -= left, top
         return replace(self, width=width, height=height, K=K)
@@ -89,11 +89,12 @@ class Camera:
 class HeadPose:
     """One timestep of the driving signal. Rotations are axis-angle.
 
-    Coefficients belong to one basis: ``head_model`` names it ("flame2020", "flame2023", ...), and those of
-    one model mean nothing to another.
+    Coefficients belong to one basis, named by ``head_model`` ("flame2020", "flame2023", ...). They are
+    meaningless for other models.
 
-    ``subject`` and ``timestep`` say where the signal was recorded. An avatar may use them to find tracking it
-    refined in training for that very timestep of its own subject; for any other signal ``timestep`` is None.
+    ``subject`` and ``timestep`` identify the recording of the signal. An avatar may use them to find tracking
+    that it refined in training for the same timestep of its own subject; ``timestep`` is None for any other
+    signal.
     """
 
     head_model: str
@@ -118,7 +119,7 @@ class HeadAsset(Protocol):
 
     @property
     def version(self) -> str:
-        """Names the expression basis; equals `HeadPose.head_model` of poses that fit."""
+        """Name of the expression basis; equals `HeadPose.head_model` of compatible poses."""
 
     @property
     def template(self) -> FloatArray: ...  # (V, 3)
@@ -157,10 +158,10 @@ TaskName = Literal["novel_view", "self_reenactment"]
 
 @runtime_checkable
 class Clip(Protocol):
-    """A prepared capture of one subject. Memory stays bounded however long it is: images are read lazily.
+    """A prepared capture of one subject. Images are read lazily, so memory does not grow with its length.
 
     ``splits`` has "train", "novel_view" (held-out camera, training timesteps) and "self_reenactment"
-    (held-out sequence). Keys of different splits never meet.
+    (held-out sequence). The splits are disjoint.
     """
 
     @property
@@ -204,20 +205,20 @@ class Clip(Protocol):
 
 @runtime_checkable
 class RegionalClip(Protocol):
-    """What a clip may offer besides: where the parts of the head are in a frame."""
+    """Optional capability of a clip: locate the parts of the head in a frame."""
 
     @property
     def region_names(self) -> Sequence[str]: ...
     def region_masks(self, key: FrameKey, names: Sequence[str]) -> Mapping[str, BoolArray]:
-        """(H, W) masks of the pixels in which each region is seen; all False where it is not."""
+        """(H, W) masks of the pixels in which each region is visible; all False if it is not."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How much training may cost: iterations, or seconds, or both (whichever ends first).
+    """Limit of the training cost: iterations, seconds, or both (whichever ends first).
 
-    Schedules are fractions of the budget, so that a short run follows the course of a long one. With
-    seconds alone the method estimates its iterations from the first steps and says so.
+    Schedules are fractions of the budget, so that a short run follows the course of a long one. With only a
+    limit in seconds, the method estimates its iterations from the first steps and reports the estimate.
     """
 
     iterations: int | None = None
@@ -225,7 +226,7 @@ class Budget:
 
 
 class Frame(NamedTuple):
-    """What an avatar renders."""
+    """The output of an avatar for one frame."""
 
     rgb: FloatArray  # (H, W, 3) float32 in [0, 1], composited on the background asked for
     alpha: FloatArray  # (H, W) float32 in [0, 1]
@@ -236,13 +237,13 @@ class Frame(NamedTuple):
 
 @runtime_checkable
 class Avatar(Protocol):
-    """A trained head. It renders any camera and any pose of its head model."""
+    """A trained head that renders any camera and any pose of its head model."""
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """Render one frame. Raises `InputError` where the pose is not of this avatar's head model."""
+        """Render one frame. Raises `InputError` if the pose belongs to another head model."""
 
     def files(self) -> Sequence[Path]:
-        """Files needed to render this avatar and nothing else: what counts as its storage.
+        """Files needed to render this avatar, which count as its storage.
 
         Shared assets (the head model) and the driving signal do not count; the subject's shape does.
         """
@@ -254,9 +255,9 @@ class Variant(NamedTuple):
     name: str
     """Unique among the variants of an avatar, fit for a folder."""
     summary: str
-    """What is changed."""
+    """Description of the change."""
     make: Callable[[Path], Avatar]
-    """Writes its files under a folder and returns the avatar as read back from them."""
+    """Write its files under a folder and return the avatar as read back from them."""
 
 
 STAGES = ("drive", "deform", "rasterize", "post")
@@ -266,7 +267,7 @@ primitives to image; whatever changes the image afterwards (a decoder, clipping)
 
 @runtime_checkable
 class StagedAvatar(Avatar, Protocol):
-    """An avatar whose frame can be timed stage by stage, and drawn ahead of being read back. Optional.
+    """An avatar whose frame can be timed by stage, and rendered before it is read back. Optional.
 
     Its `render` is ``read_back(draw(camera, pose, background))``.
     """
@@ -274,14 +275,14 @@ class StagedAvatar(Avatar, Protocol):
     def draw(
         self, camera: Camera, pose: HeadPose, background: Sequence[float], end_stage: Callable[[str], None]
     ) -> Any:
-        """Draw a frame where the avatar computes, without waiting for it; what comes out `read_back` understands.
+        """Render a frame on the avatar's device without waiting for it; `read_back` accepts the result.
 
-        Calls ``end_stage`` with the name of a stage as soon as its work was handed over, in the order of `STAGES`; a stage
-        that this avatar does not have is left out.
+        Calls ``end_stage`` with the name of each stage in the order of `STAGES` as soon as its work is
+        submitted; stages that the avatar does not have are skipped.
         """
 
     def read_back(self, drawn: Any) -> Frame:
-        """Wait for what `draw` gave and bring it into host memory."""
+        """Wait for the result of `draw` and copy it into host memory."""
 
 
 @runtime_checkable
@@ -312,7 +313,7 @@ class SplatAvatar(Avatar, Protocol):
     """An avatar of 3D Gaussians. Optional."""
 
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> Splats:
-        """Splats of a pose; with colours where a camera says from where they are seen."""
+        """Splats of a pose; with colours if a camera gives the viewpoint."""
 
 
 @runtime_checkable
@@ -331,9 +332,10 @@ class HarmonicAvatar(SplatAvatar, Protocol):
 
 @runtime_checkable
 class ListedFrames(Avatar, Protocol):
-    """An avatar that another program draws, for many frames in one call. Optional.
+    """An avatar that another program renders, with many frames in one call. Optional.
 
-    Its `render` raises `UnavailableError`, which says so: what asks for single frames (speed, extremes) is missing for it.
+    Its `render` raises `UnavailableError`, so metrics that request single frames (speed, extremes) are
+    missing.
     """
 
     def render_listed(
@@ -342,56 +344,57 @@ class ListedFrames(Avatar, Protocol):
         background: Sequence[float],
         progress: Progress,
     ) -> Iterator[tuple[FrameKey, Frame]]:
-        """Render these frames and no others; give each once, with its key, in any order.
+        """Render exactly these frames; yield each once, with its key, in any order.
 
-        Where the program tells no coverage, ``alpha`` is 1. Raises `HeadbenchError` with the program's last lines where it
-        fails or leaves a frame out.
+        ``alpha`` is 1 if the program does not output coverage. Raises `HeadbenchError` with the program's
+        last lines if it fails or leaves a frame out.
         """
 
 
 class Progress(Protocol):
-    """Where long work reports to. A no-op is a valid implementation."""
+    """Receives the progress of long work. A no-op is a valid implementation."""
 
     def __call__(self, done: int, total: int, note: str = "") -> None: ...
 
 
 @runtime_checkable
 class Method(Protocol):
-    """A way of making avatars. Made from its resolved configuration by `MethodSpec.create`."""
+    """A training method, created from its resolved configuration by `MethodSpec.create`."""
 
     def fit(
         self, clip: Clip, out: Path, budget: Budget, *, device: str, seed: int, progress: Progress
     ) -> Avatar:
-        """Train on ``clip.splits["train"]`` alone; write the avatar under ``out``.
+        """Train on ``clip.splits["train"]`` only; write the avatar under ``out``.
 
-        Continues from what an earlier, killed call with the same arguments left in ``out``, and then ends
-        with the same avatar as an unbroken one. Raises `InputError` before training where the clip lacks what
-        the method needs.
+        Resumes from the files that an earlier, killed call with the same arguments left in ``out``, and ends
+        with the same avatar as an uninterrupted call. Raises `InputError` before training if the clip lacks
+        something that the method needs.
         """
 
     def load(self, path: Path, *, device: str) -> Avatar:
-        """Read an avatar that `fit` wrote to ``path``. Its files are data, never code."""
+        """Read an avatar that `fit` wrote to ``path``. Its files are read as data, never as code."""
 
 
 @runtime_checkable
 class CheckedMethod(Method, Protocol):
-    """A method that can tell before any long work whether `fit` could do it. Optional."""
+    """A method that can check the inputs of `fit` before any long work. Optional."""
 
     def check(self, clip: Clip | None, budget: Budget) -> None:
-        """Raise `InputError` for settings that name what is not there, and for what `fit` would refuse.
+        """Raise `InputError` for settings that refer to missing files, and for inputs that `fit` would
+        refuse.
 
-        First called without a clip, before anything is made that takes long: then all but the clip is looked at.
+        First called without a clip, before any long work: then everything except the clip is checked.
         """
 
 
 @runtime_checkable
 class PreparedMethod(Method, Protocol):
-    """A method with something to load or compile for a device that is no part of training. Optional."""
+    """A method that loads or compiles something for a device outside of training. Optional."""
 
     def prepare(self, device: str) -> None:
         """Load or compile what is needed; the time is not counted as training time.
 
-        Raises `UnavailableError` where it cannot be had.
+        Raises `UnavailableError` if that is not possible.
         """
 
 
@@ -406,19 +409,19 @@ class Metric(Protocol):
     def __call__(self, image: ByteArray, target: ByteArray) -> float:
         """Compare two (H, W, 3) 8-bit images.
 
-        Raises an error of any kind for images of another type or of two sizes, `UnavailableError` where the metric
-        cannot be had.
+        Raises an error of any kind for images of another type or of different sizes, and `UnavailableError`
+        if the metric is not available.
         """
 
 
 @runtime_checkable
 class RegionalMetric(Metric, Protocol):
-    """A metric that can also be taken over a part of the frame (`MetricSpec.kind` "regional")."""
+    """A metric that can also be computed over a part of the frame (`MetricSpec.kind` "regional")."""
 
     def in_regions(
         self, image: ByteArray, target: ByteArray, masks: Mapping[str, BoolArray]
     ) -> Mapping[str, float]:
-        """Value over each (H, W) mask; masks without a pixel are left out."""
+        """Value over each (H, W) mask; masks without pixels are left out."""
 
 
 @runtime_checkable
@@ -428,13 +431,14 @@ class TemporalMetric(Protocol):
     def __call__(
         self, image: ByteArray, target: ByteArray, other_image: ByteArray, other_target: ByteArray
     ) -> float:
-        """Compare how the image changes to its neighbour with how the ground truth does; (H, W, 3) 8-bit each."""
+        """Compare the change of the image between the frames with that of the ground truth; (H, W, 3) 8-bit
+        each."""
 
 
 class Measurement(NamedTuple):
     """One number for an avatar as a whole, and auxiliary values of the measurement.
 
-    Metrics of the same implementation are one measurement: `MetricSpec.detail` says which of its numbers each shows.
+    Metrics with the same implementation are measured together: `MetricSpec.detail` selects the value of each.
     """
 
     value: float
@@ -446,7 +450,8 @@ class AvatarMetric(Protocol):
     """One number per avatar (storage, speed), not per frame."""
 
     def __call__(self, avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurement:
-        """Measure an avatar; ``workload`` are pairs in which camera and pose always differ from the last."""
+        """Measure an avatar; ``workload`` are pairs of camera and pose that both differ from the previous
+        ones."""
 
 
 @runtime_checkable
@@ -454,9 +459,10 @@ class TrainingMetric(Protocol):
     """One number of how an avatar was trained (time, memory)."""
 
     def __call__(self, record: Mapping[str, Any]) -> Measurement:
-        """Take it from the record of the fit: ``seconds``, ``interruptions``, ``peak_memory_bytes``, ``load``.
+        """Compute it from the record of the fit: ``seconds``, ``interruptions``, ``peak_memory_bytes``,
+        ``load``.
 
-        Raises `UnavailableError` where the record does not have it.
+        Raises `UnavailableError` if the record lacks the value.
         """
 
 

@@ -1,4 +1,4 @@
-"""``headbench doctor``: what methods, metrics and readers need, and what of it this machine has."""
+"""``headbench doctor``: requirements of methods, metrics and readers, and whether this machine meets them."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ State = Literal["ready", "partly", "missing"]
 
 @dataclass(frozen=True)
 class DoctorSettings:
-    """Say for every method, metric and reader what is missing on this machine, and how to get it.
+    """Report what is missing on this machine for every method, metric and reader, and how to install it.
 
-    Exit code 0: all default methods, or those named, can run here; 3: one cannot. Nothing is fetched or written.
+    Exit code 0: all default methods, or the named ones, can run here; 3: at least one cannot. Nothing is
+    downloaded or written.
     """
 
     methods: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Methods to look at, and to decide the exit code by: names or "module:SPEC"; default: all, decided by the default
-    methods. Official repositories are looked at where settings name their checkout."""
+    """Methods to check and to decide the exit code by: names or "module:SPEC"; by default all are checked,
+    and the default methods decide. Official repositories are checked if settings name their checkout."""
 
     device: str = "cpu"
-    """Where the methods are to run: cpu, cuda, cuda:1, ..."""
+    """Device that the methods run on: cpu, cuda, cuda:1, ..."""
 
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")] = ()
     """A setting of a method, as for `headbench run`: `settings.ga-official.checkout=DIR`; repeatable."""
 
 
 class PluginStatus(NamedTuple):
-    """A plug-in that was looked at."""
+    """A plug-in that was checked."""
 
     group: str
     name: str
@@ -56,7 +57,7 @@ class PluginStatus(NamedTuple):
 def doctor(settings: DoctorSettings, progress: Progress) -> Findings:
     """Report for every method, metric and reader what is missing on this machine, and how to install it.
 
-    Raises `InputError` for unknown methods and settings, and for a device that is none.
+    Raises `InputError` for unknown methods and settings, and for an invalid device.
     """
     from .configuration import parse_assignments
     from .errors import InputError
@@ -169,7 +170,8 @@ def _method(
 
 
 def _asked(needs: str, config: Any, device: str) -> Iterator[Need]:
-    """What a plug-in says that it needs; how it fails to say so is what it lacks."""
+    """The requirements that a plug-in declares; an exception of the declaration is reported as a missing
+    one."""
     from .registry import resolve
 
     try:

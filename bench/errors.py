@@ -12,11 +12,12 @@ class ExitCode(IntEnum):
 
     OK = 0
     NEGATIVE = 1
-    """The work was done and its answer is negative: a method failed, a number got worse, a check did not pass."""
+    """The command finished with a negative result: a method failed, a number got worse, a check did not
+    pass."""
     BAD_INPUT = 2
     """Wrong usage, bad input, or a file or folder that cannot be read or written."""
     NO_VERDICT = 3
-    """What a verdict needs is missing or invalid."""
+    """Data that the verdict needs is missing or invalid."""
     UNEXPECTED = 70
     """An unexpected exception, to be reported; its traceback is printed (EX_SOFTWARE of sysexits.h)."""
     HANGUP = 129
@@ -45,13 +46,13 @@ class HeadbenchError(Exception):
 
 
 LONGEST_PLACE, LONGEST_WORDS, LONGEST_FOUND = 400, 1200, 300
-"""Characters of an error's parts; what is longer is cut in its middle."""
+"""Maximum characters of an error's parts; longer text is cut in the middle."""
 
 
 class InputError(HeadbenchError):
     """Bad input, found before any long work started.
 
-    Its message is short whatever the input holds, and without control characters.
+    Its message is short for any input and has no control characters.
 
     Parameters
     ----------
@@ -77,17 +78,18 @@ class InputError(HeadbenchError):
 
 
 def is_damage(error: BaseException) -> bool:
-    """Whether a reading error is caused by the file's content, and not by the disk, permissions, or lack of memory."""
+    """Whether a reading error is caused by the file's content, and not by the disk, permissions, or lack of
+    memory."""
     cause = error.__cause__
     machine = isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno is not None)
     return not machine and (cause is None or is_damage(cause))
 
 
 class UnavailableError(HeadbenchError):
-    """Something optional is not there (a package, weights, a compiler); says how to get it.
+    """An optional component (a package, weights, a compiler) is missing; the message says how to get it.
 
-    A metric that raises this is shown as missing with the reason, never guessed. ``note`` is what tables say of it, one short
-    line; default: the whole message.
+    A metric that raises this is shown as missing with the reason. ``note`` is the short reason in tables; by
+    default the whole message.
     """
 
     def __init__(self, what: str, remedy: str, note: str = ""):
@@ -96,12 +98,13 @@ class UnavailableError(HeadbenchError):
 
 
 def install_extra(extra: str) -> str:
-    """How to install an optional extra of pyproject.toml. It names the checkout: headbench is on no package index."""
+    """How to install an optional extra of pyproject.toml from the checkout, since headbench is on no package
+    index."""
     return f"Run in the headbench checkout: pip install -e '.[{extra}]'"
 
 
 def shortened(text: str, longest: int) -> str:
-    """Text of bounded length, its middle left out, and without control characters other than line ends."""
+    """Text of bounded length, cut in the middle, and without control characters other than line ends."""
     if len(text) > longest:
         text = f"{text[: longest // 2]} [...] {text[-longest // 4 :]}"
     if text.isprintable():

@@ -1,4 +1,4 @@
-"""What machine and software a number was measured with."""
+"""The machine and software of a measurement."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def processor_count() -> int:
 def machine_record(device: str = "cpu") -> dict[str, Any]:
     """Processor, memory, system and the versions of packages that influence results.
 
-    For a CUDA ``device`` the entry "device" tells its name, memory, compute capability, the CUDA version of torch, and whether
-    matrix products and convolutions may round to TF32.
+    For a CUDA ``device`` the entry "device" has its name, memory, compute capability, the CUDA version of
+    torch, and whether matrix products and convolutions may round to TF32.
     """
     import psutil
 
@@ -55,7 +55,8 @@ def machine_record(device: str = "cpu") -> dict[str, Any]:
 
 
 def _device_record(device: str) -> dict[str, Any]:
-    """The entry ``device``; none for the CPU, and where a run is described on another machine than the one that executes it."""
+    """The entry ``device``; empty for the CPU, and if the run is described on another machine than the one
+    that executes it."""
     if not is_cuda(device) or not resolve("torch:cuda").is_available():
         return {}
     use_device(device)
@@ -70,7 +71,7 @@ def _device_record(device: str) -> dict[str, Any]:
 
 
 def use_device(device: str) -> None:
-    """Make a CUDA device the current one, whose work is waited for, and turn TF32 off; nothing for other devices.
+    """Make a CUDA device the current one and turn TF32 off; no effect for other devices.
 
     TF32 rounds the factors of matrix products and convolutions to 10 bits of mantissa; torch lets convolutions do so.
     """
@@ -83,7 +84,7 @@ def use_device(device: str) -> None:
 
 
 def check_device_answers(device: str) -> None:
-    """Raise `HeadbenchError` where a CUDA device answers this process no more, as after an illegal access to its memory."""
+    """Raise `HeadbenchError` if a CUDA device no longer responds, as after an illegal memory access."""
     if not is_cuda(device):
         return
     try:
@@ -97,7 +98,8 @@ def check_device_answers(device: str) -> None:
 
 
 def accelerators() -> list[dict[str, str]]:
-    """NVIDIA devices with driver, memory, power limit and clocks, as their driver reports; none without it."""
+    """NVIDIA devices with driver, memory, power limit and clocks, as their driver reports; empty without
+    it."""
     program = shutil.which("nvidia-smi")
     if program is None:
         return []
@@ -111,10 +113,11 @@ def accelerators() -> list[dict[str, str]]:
 
 
 class PeakMemory:
-    """Context that finds the largest resident memory of this process while it lasts, and of a CUDA device what torch took.
+    """Context that measures the largest resident memory of this process and, on a CUDA device, torch's peak
+    memory.
 
-    Linux keeps that maximum, and lets a process reset it; elsewhere a thread looks every 20 ms, which can miss a
-    short spike. A child that ended meanwhile counts singly, if it was the largest so far: others are not known.
+    Linux records that maximum and lets a process reset it; elsewhere a thread samples it every 20 ms, which
+    can miss short peaks. Of the children that ended in the context only the largest one so far is known.
 
     Attributes
     ----------
@@ -183,10 +186,10 @@ BUSY = ("user", "nice", "system", "irq", "softirq", "steal")
 
 
 class ProcessorLoad:
-    """Context that finds how many of the cores that this process may use were kept busy by other processes meanwhile.
+    """Context that measures how many of this process's cores other processes kept busy.
 
-    The processor times of those cores less those of this process and its children: the load average counts this process,
-    too, and follows a change only within a minute.
+    It subtracts the processor times of this process and its children from those of its cores. The load
+    average would include this process, and follows a change only within a minute.
 
     Parameters
     ----------
@@ -231,13 +234,13 @@ class ProcessorLoad:
 
     @property
     def details(self) -> dict[str, float]:
-        """Its numbers, for a `Measurement`; without `other_cores` if that is not known."""
+        """The numbers for a `Measurement`; without `other_cores` if that is unknown."""
         known = {} if self.other_cores is None else {"other_cores": self.other_cores}
         return {"threads": self.threads, "cores": self.cores, **known}
 
 
 def machine_name(device: str = "cpu") -> str:
-    """The processor with the number of cores that this process may use, and the CUDA device: times compare on one alone."""
+    """Processor, number of usable cores and CUDA device; times are comparable only if they are equal."""
     cores = processor_count()
     name = f"{_processor()} ({cores} core{'s' * (cores > 1)})"
     record = _device_record(device).get("device")
@@ -245,7 +248,7 @@ def machine_name(device: str = "cpu") -> str:
 
 
 def _own_processor_seconds() -> float:
-    """Processor time of this process, of its finished children and of those that run."""
+    """Processor time of this process and of its finished and running children."""
     import psutil
 
     seconds = processor_seconds()
@@ -257,7 +260,7 @@ def _own_processor_seconds() -> float:
 
 
 def _busy_seconds() -> float | None:
-    """Time that the cores which this process may use have worked, together; None where the system does not tell."""
+    """Total busy time of the cores that this process may use; None if the system does not report it."""
     import psutil
 
     try:
@@ -299,7 +302,7 @@ def _processor() -> str:
 
 
 def _entry(path: Path, name: str) -> str:
-    """What a file of the kernel says of ``name`` first; "" where it is not there."""
+    """The first value of ``name`` in a kernel file; "" if it is missing."""
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(name)), "")
 
@@ -314,7 +317,7 @@ def _version(name: str) -> str | None:
 def check_device(device: str) -> None:
     """Raise `InputError` unless torch can use ``device`` ("cpu", "cuda", "cuda:1", "mps", "xpu").
 
-    The CPU needs no question; for others torch is asked by name, as this package knows it no more than it knows methods.
+    "cpu" is always accepted; torch checks others by name, since this package knows no device kinds.
     """
     kind, _, index = device.partition(":")
     if kind == "cpu":

@@ -1,4 +1,4 @@
-"""Progress that a waiting person can read: a bar with time left on a terminal, log lines elsewhere."""
+"""Progress display: a bar with the remaining time on a terminal, log lines elsewhere."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ if TYPE_CHECKING:
 LOG_EVERY_S, SHOW_EVERY_S = 15.0, 0.2
 """Seconds between lines of a log, and between changes of the line on a terminal."""
 BASIS_S, SAMPLES, SAMPLE_EVERY_S = 5.0, 60, 1.0
-"""Seconds of steps from which on their speed is known, how many samples of it are kept, how far apart."""
+"""Seconds of steps after which their speed is known, number of samples kept, and their distance in
+seconds."""
 Show = Callable[[Callable[[], str]], None]
-"""Shows a line that a function makes, if it is time to."""
+"""Shows a line returned by a function if the refresh interval has passed."""
 log = logging.getLogger("headbench")
 
 
@@ -87,14 +88,14 @@ def progress(label: str) -> Iterator[Progress]:
 
 
 class TimeLeft:
-    """How long a number of steps still takes, by those of the last while: steps may grow faster or slower."""
+    """Estimates the remaining time from the most recent steps, since their speed may change."""
 
     def __init__(self) -> None:
         self._left = 0
         self._samples: deque[tuple[float, int]] = deque(maxlen=SAMPLES)
 
     def step(self, done: int, total: int) -> None:
-        """Take note of where the work is."""
+        """Record the current position."""
         now = time.monotonic()
         self._left = total - done
         if self._samples and done < self._samples[-1][1]:
@@ -104,7 +105,7 @@ class TimeLeft:
 
     @property
     def seconds(self) -> float | None:
-        """Seconds left; None as long as nothing can be said of the speed."""
+        """Seconds left; None while the speed is unknown."""
         if not self._samples:
             return None
         (start, base), (end, done) = self._samples[0], self._samples[-1]
@@ -115,16 +116,16 @@ class TimeLeft:
 
 @contextmanager
 def run_progress(cells: Mapping[str, Mapping[str, str]]) -> Iterator[RunProgress]:
-    """Show one line for the work on all cells of a run, see `RunProgress`."""
+    """Show one line for all cells of a run, see `RunProgress`."""
     with _line() as show:
         yield RunProgress(cells, show)
 
 
 class RunProgress:
-    """One line for the work on all cells of a run: which cell it is at, what it does there, the time that all takes.
+    """One line for all cells of a run: the current cell, its step, and the remaining time of the run.
 
-    How long a step of a cell takes is estimated from its own count, before it by such steps that were worked on already. As
-    long as some of the work has no such basis, only a lower bound is shown.
+    The time of a step is estimated from its own count, or, before it starts, from finished steps of the same
+    kind. While some steps have no estimate, only a lower bound is shown.
 
     Parameters
     ----------
@@ -142,7 +143,7 @@ class RunProgress:
 
     @contextmanager
     def step(self, cell: str, step: str) -> Iterator[Progress]:
-        """Work on a step of a cell; give its `Progress`. A step that fails says nothing of others."""
+        """Start a step of a cell; yield its `Progress`. A failed step does not affect estimates of others."""
         left, started = TimeLeft(), time.monotonic()
         first: list[tuple[float, int]] = []
         steps = 0
@@ -191,7 +192,7 @@ def _text(text: str, left: float | None, note: str, bound: str = "") -> str:
 
 @contextmanager
 def _line() -> Iterator[Show]:
-    """Give what shows a line: over the last one on a terminal, as a line of the log elsewhere, if it is time to."""
+    """Return a function that shows a line: replacing the last one on a terminal, as a log line elsewhere."""
     on_terminal = sys.stderr.isatty()
     every = SHOW_EVERY_S if on_terminal else LOG_EVERY_S
     last = time.monotonic() - (every if on_terminal else 0.0)
@@ -219,7 +220,7 @@ def _line() -> Iterator[Show]:
 
 
 def duration(seconds: float) -> str:
-    """Write a duration as a person would say it: 42 s, 3 min 10 s, 2 h 05 min."""
+    """Format a duration: 42 s, 3 min 10 s, 2 h 05 min."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

@@ -1,7 +1,7 @@
-"""The protocol of a comparison: which frames are shown and scored, and how. An object with an id and a hash.
+"""The protocol of a comparison: the frames and how they are rendered and scored. It has an id and a hash.
 
-The task picks the protocol, never the method. Its hash stands in every row; rows of different hashes are
-never compared.
+The task selects the protocol, never the method. Every row has its hash; rows with different hashes are never
+compared.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ TASK_TITLES: Mapping[str, str] = {
 }
 
 TaskWithoutTruth = Literal["cross_reenactment", "extremes"]
-"""Tasks without ground truth: what is measured is how steady an avatar stays, and whose look it keeps."""
+"""Tasks without ground truth, which measure the stability of an avatar and whose appearance it keeps."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """What is measured. Everything that changes a number is a field, and so changes the hash.
+    """Definition of a measurement. Everything that changes a number is a field and thus part of the hash.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class Protocol:
 
     @cached_property
     def hash(self) -> str:
-        """First 12 hex digits of the digest of all fields; made once, since every row asks for it."""
+        """First 12 hex digits of the digest of all fields, cached because every row uses it."""
         fields = asdict(self)
         if not self.conditions:
             del fields["conditions"]  # so that protocols made before there were any keep their hashes
@@ -123,16 +123,17 @@ def make_protocol(task: TaskName, clips: Sequence[Clip], max_frames: int | None 
 def make_protocols(
     tasks: Sequence[TaskName], clips: Sequence[Clip], max_frames: int | None
 ) -> dict[str, Protocol]:
-    """The protocol of each task that can be done, see `make_protocol`.
+    """The protocol of each possible task, see `make_protocol`.
 
-    A task that no clip has frames for is left out where another can be done: a video of one camera has no novel view.
+    A task without frames in any clip is left out if another task has frames: monocular videos have no novel
+    view.
     """
     done = [task for task in tasks if any(clip.splits.get(task) for clip in clips)] or tasks
     return {task: make_protocol(task, clips, max_frames) for task in done}
 
 
 def missing_tasks(tasks: Sequence[str], done: Container[str]) -> dict[str, str]:
-    """Why a task that was asked for is not measured, by task: what tables and the run's log say in place of numbers."""
+    """Why a requested task is not measured, by task; shown in tables and in the run's log."""
     reasons = {"novel_view": "the captures hold out no camera, as videos of one camera cannot"}
     return {
         task: f"{TASK_TITLES.get(task, task)} is missing: {reasons.get(task, 'the captures hold out no frames for it')}."

@@ -1,4 +1,4 @@
-"""Rows: what was measured, one for each method, seed, frame, region and metric, and the one query on them."""
+"""Rows: one measured value for each method, seed, frame, region and metric, and the query on them."""
 
 from __future__ import annotations
 
@@ -32,12 +32,13 @@ STATUSES = ("ok", "missing", "failed")
 
 @dataclass(frozen=True)
 class Row:
-    """One measured value, or why there is none. Per-avatar values have no task, timestep -1 and no camera.
+    """One measured value, or the reason why it is missing. Per-avatar values have no task, timestep -1 and no
+    camera.
 
     ``condition`` names what was changed against the plain comparison, see `bench.condition.Condition`; "" for nothing.
 
-    ``machine``, ``threads`` and ``other_cores`` are of times alone, see `machine.ProcessorLoad`: "", 0 and NaN elsewhere, and
-    where they were not recorded.
+    ``machine``, ``threads`` and ``other_cores`` are recorded for times only, see `machine.ProcessorLoad`;
+    elsewhere, and in older records, they are "", 0 and NaN.
     """
 
     method: str
@@ -75,7 +76,7 @@ ROWS = "a Parquet file of rows"
 MAX_FILE_BYTES = 256 * 2**20
 MAX_TEXT_BYTES = 256 * 2**20
 MAX_UNPACKED_BYTES = 512 * 2**20
-"""Of all columns, as the file declares them."""
+"""Schema of all columns in the file."""
 READING: Any = {"thrift_string_size_limit": 2**20, "thrift_container_size_limit": 2**16, "pre_buffer": False}
 """Longest text and list in what describes the columns; a list takes its declared length in memory. Without reading ahead,
 which would leave the file to threads of pyarrow that may hold it longer than the reader."""
@@ -88,7 +89,7 @@ MAX_REASON = 4_000
 
 
 class All(Enum):
-    """Every method, metric, task, region or seed; a value of its own, so that a query has to name it."""
+    """Selects every method, metric, task, region or seed, so that a query states it explicitly."""
 
     ALL = "all"
 
@@ -98,17 +99,17 @@ ALL: Final = All.ALL
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Rows of one or several runs. `select` is the only way to their values.
+    """Rows of one or several runs. Values are read only by `select`.
 
-    A frame has a row for each region, metric, task, seed and method; an average over rows that differ in one of
-    these by oversight is a wrong number, so a query names them all.
+    A frame has a row for each region, metric, task, seed and method. An average over rows that differ in one
+    of these by mistake is wrong, so a query names them all.
     """
 
     _table: pd.DataFrame
 
     @classmethod
     def of(cls, rows: Iterable[Row]) -> Rows:
-        """Rows that were just measured."""
+        """Build rows from measured values."""
         frame = pd.DataFrame([asdict(row) for row in rows], columns=list(COLUMNS))
         return cls(frame.astype(TYPES))
 
@@ -138,7 +139,7 @@ class Rows:
         return cls(upgraded_rows(_checked(table, path)))
 
     def write(self, path: Path) -> None:
-        """Write them as Parquet, atomically."""
+        """Write the rows as Parquet, atomically."""
         repeated = [name for name in COLUMNS if name != "value"]
         with atomic_path(path) as temporary:
             self._table.to_parquet(
@@ -163,7 +164,7 @@ class Rows:
         subject: str | All = ALL,
         condition: str | All = "",
     ) -> pd.DataFrame:
-        """Return the rows that agree with everything named, a table with the columns of `Row`.
+        """Return the rows that match all arguments, as a table with the columns of `Row`.
 
         ``task`` "" is for metrics of the avatar as a whole, whose region is the full image. ``condition`` "" is the plain
         comparison.
@@ -187,31 +188,31 @@ class Rows:
 
     @property
     def tasks(self) -> set[str]:
-        """Tasks that there are rows of; "" is none."""
+        """Tasks of the rows; "" is left out."""
         return set(self._table["task"].unique()) - {""}
 
     @property
     def methods(self) -> set[str]:
-        """Methods that there are rows of."""
+        """Methods of the rows."""
         return set(self._table["method"].unique())
 
     @property
     def metrics(self) -> set[str]:
-        """Metrics that there are rows of."""
+        """Metrics of the rows."""
         return set(self._table["metric"].unique())
 
     @property
     def metrics_with_values(self) -> set[str]:
-        """Metrics that any row has a value of."""
+        """Metrics with at least one value."""
         return set(self._table.loc[self._table["status"] == "ok", "metric"].unique())
 
     @property
     def subjects(self) -> set[str]:
-        """Subjects that there are rows of."""
+        """Subjects of the rows."""
         return set(self._table["subject"].unique())
 
     def seeds(self, method: str | All) -> set[int]:
-        """Seeds that a method was run with."""
+        """Seeds of a method."""
         return set(map(int, self._of(method)["seed"].unique()))
 
     def versions(self, method: str) -> list[str]:
@@ -249,7 +250,7 @@ class Rows:
         return Rows(self._table.assign(value=self._table["value"].astype(np.float32).astype(np.float64)))
 
     def of_part(self, region: str, sequences: Collection[str], full: str) -> Rows:
-        """Rows of frames over one region, which stands for the ``full`` one, in some sequences (none named: all).
+        """Rows of frames over one region, relabelled as the ``full`` one, in some sequences (default: all).
 
         Rows of avatars as a whole stay, and so do those that stand for all frames of a task because a method failed, for
         every task and metric that the part has frames of.
@@ -265,9 +266,10 @@ class Rows:
         return Rows(table[avatar | chosen | failed].assign(region=full))
 
     def updated(self, new: Rows) -> Rows:
-        """These rows in their order, those of ``new`` in place of the ones of the same method, seed, frame, region and metric.
+        """These rows in their order, replaced by rows of ``new`` with the same method, seed, frame, region
+        and metric.
 
-        Raises `InputError` for new rows in whose place there is none.
+        Raises `InputError` for new rows that replace nothing.
         """
         identity = ["method", "condition", "seed", "task", *FRAME, "region", "metric"]
         own, others = (pd.MultiIndex.from_frame(table[identity]) for table in (self._table, new._table))
@@ -281,7 +283,7 @@ class Rows:
 
     @property
     def regions(self) -> set[str]:
-        """Regions that frames were measured over."""
+        """Regions of the rows of frames."""
         return set(self._table.loc[self._table["task"] != "", "region"].unique())
 
     @property
@@ -315,7 +317,7 @@ class Rows:
             raise InputError("rows", f"version of {mixed.index[0]}", "one version of each method", found)
 
     def values_lacking(self, other: Rows) -> list[str]:
-        """What ``other`` has measured values of and these rows have none of, whatever the version and protocol."""
+        """Values that ``other`` has and these rows lack, regardless of version and protocol."""
         columns = ["metric", "region", "method", "seed", "task", *FRAME, "condition"]
         theirs, own = (r._table.loc[r._table["status"] == "ok", columns] for r in (other, self))
         lacking = theirs[~pd.MultiIndex.from_frame(theirs).isin(pd.MultiIndex.from_frame(own))]
@@ -347,9 +349,10 @@ class Rows:
                 raise InputError(path, f"{column}s", expected, found, DISCARD)
 
     def check_protocols(self, source: Path | str, expected: Mapping[str, str] | None = None) -> None:
-        """Raise `InputError` where rows of one task come from several protocols, or from another than ``expected``.
+        """Raise `InputError` if rows of one task have several protocols, or another than ``expected``.
 
-        Numbers of different protocols do not compare. ``expected`` holds the hash of each task's protocol.
+        Numbers of different protocols are not comparable. ``expected`` holds the hash of each task's
+        protocol.
         """
         for task in sorted(self.tasks):
             found = self.protocols(task)
@@ -365,11 +368,12 @@ class Rows:
 
 
 DISCARD = "Choose another --out. To discard the results in this file, delete it: trained avatars are kept."
-"""What to do about rows that would be lost."""
+"""Remedy for rows that would be lost."""
 
 
 def replace_rows(path: Path, rows: Rows) -> None:
-    """Write rows in place of those of a file. Raises `InputError`, and leaves it as it is, where it has values that they lack."""
+    """Replace the rows of a file. Raises `InputError` and leaves the file unchanged if it has values that
+    they lack."""
     earlier = earlier_rows(path)
     lost = [] if earlier is None else rows.values_lacking(earlier)
     if lost:
@@ -380,7 +384,7 @@ def replace_rows(path: Path, rows: Rows) -> None:
 
 
 def earlier_rows(path: Path) -> Rows | None:
-    """The rows that are about to be replaced; None where there are none. For a damaged file a warning is logged."""
+    """The rows that will be replaced; None if there are none. A warning is logged for a damaged file."""
     if not path.exists():
         return None
     try:

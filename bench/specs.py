@@ -1,7 +1,7 @@
-"""What the registry lists: light descriptions of methods, readers, metrics, reports, benchmarks and commands.
+"""Entries of the registry: light descriptions of methods, readers, metrics, reports, benchmarks and commands.
 
-Loading a spec imports neither torch nor what it describes; that is named as ``"package.module:Object"`` and
-resolved when it is used. The behaviours behind the names are in `contracts`.
+Loading a spec imports neither torch nor its implementation, which is named as ``"package.module:Object"`` and
+resolved when it is used. The behaviours are defined in `contracts`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 MAX_LABEL = 120
 LABEL = f"at most {MAX_LABEL} printable characters"
-"""What names, units, versions and hashes are, in rows and manifests; see `is_label`."""
+"""Form of names, units, versions and hashes in rows and manifests; see `is_label`."""
 
 
 def is_label(text: str) -> bool:
@@ -27,7 +27,7 @@ def _check_labels(**texts: str) -> None:
 
 
 class Need(NamedTuple):
-    """Something that a method, a metric or a reader uses, and whether this machine has it (``headbench doctor``).
+    """A requirement of a method, metric or reader, and whether this machine has it (``headbench doctor``).
 
     Attributes
     ----------
@@ -49,11 +49,11 @@ class Need(NamedTuple):
 
 @dataclass(frozen=True)
 class ResolutionRule:
-    """The image size that a method works at, as declared by it. Metrics are taken at the protocol's size.
+    """The image size that a method works at. Metrics are computed at the protocol's size.
 
-    Applied in this order: square, reduction, enlargement. A capture of 550x802 becomes the 2048x2048 that a method
-    for 2K images wants by ``square="pad", size=(2048, 2048)``; one recorded at 2K loses the detail that other
-    methods do not see by ``divide=4, multiply=4``.
+    Applied in this order: square, reduction, enlargement. ``square="pad", size=(2048, 2048)`` turns a capture
+    of 550x802 into 2048x2048 for a method for 2K images; ``divide=4, multiply=4`` removes the detail of a 2K
+    capture that other methods do not see.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class ResolutionRule:
     speed_size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what has no meaning."""
+        """Refuse invalid combinations."""
         sides = [self.divide, self.multiply, *(self.size or ()), *(self.speed_size or ())]
         if min(sides) < 1 or self.square not in ("", "pad", "crop"):
             raise ValueError(
@@ -88,13 +88,13 @@ class ResolutionRule:
 
     @property
     def native(self) -> bool:
-        """Whether images stay as they are."""
+        """Whether images are not changed."""
         return self.divide == self.multiply == 1 and not self.square and self.size is None
 
 
 @dataclass(frozen=True)
 class MethodSpec:
-    """What listing a method needs. Loading a spec imports neither torch nor the implementation.
+    """Description of a method. Loading it imports neither torch nor the implementation.
 
     Attributes
     ----------
@@ -165,11 +165,11 @@ class MethodSpec:
     preset_resolutions: Mapping[str, ResolutionRule] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what no results could be read with."""
+        """Refuse values that would make results unreadable."""
         _check_labels(name=self.name, version=self.version)
 
     def computes_on(self, device: str) -> bool:
-        """Tell whether it computes on a device such as "cuda:1"."""
+        """Whether it supports a device such as "cuda:1"."""
         return not self.devices or device.split(":")[0] in self.devices
 
     def at_preset(self, preset: str) -> MethodSpec:
@@ -179,7 +179,7 @@ class MethodSpec:
 
 
 MAX_DIGITS = 12
-"""Digits behind the point that a table shows."""
+"""Decimals shown in tables."""
 
 
 MetricKind = Literal["frame", "regional", "temporal", "avatar", "training"]
@@ -187,7 +187,7 @@ MetricKind = Literal["frame", "regional", "temporal", "avatar", "training"]
 
 @dataclass(frozen=True)
 class MetricSpec:
-    """What a table needs to know of a metric.
+    """Description of a metric.
 
     Attributes
     ----------
@@ -230,11 +230,11 @@ class MetricSpec:
 
     @property
     def per_frame(self) -> bool:
-        """Whether there is a value for every frame; otherwise there is one for the avatar."""
+        """Whether every frame has a value; otherwise the avatar has one."""
         return self.kind in ("frame", "regional", "temporal")
 
     def __post_init__(self) -> None:
-        """Refuse what no table could show, and no results could be read with."""
+        """Refuse values that tables cannot show or results cannot be read with."""
         _check_labels(name=self.name, label=self.label, unit=self.unit)
         if not 0 <= self.digits <= MAX_DIGITS:
             raise ValueError(f"digits is {self.digits}; from 0 to {MAX_DIGITS}")
@@ -261,7 +261,7 @@ class ProfileSpec:
     metrics: tuple[MetricSpec, ...]
 
     def __post_init__(self) -> None:
-        """Refuse what would be taken for another profile's metric."""
+        """Refuse metrics that could be confused with those of another profile."""
         for metric in self.metrics:
             if metric.profile != self.name:
                 raise ValueError(f"{metric.name}: profile is {metric.profile!r}, not {self.name!r}")
@@ -348,24 +348,24 @@ class ReportSpec:
 
 
 class Findings(NamedTuple):
-    """What a command, or a benchmark of the toolkit itself, found out."""
+    """Result of a command or of a benchmark of the toolkit."""
 
     text: str
     """Tables for a terminal."""
     data: Any
     """The same as plain values, for JSON."""
     passed: bool = True
-    """False where something did not behave as expected."""
+    """False if a check did not pass."""
     code: int | None = None
     """Exit code of a command that has others than 0 (passed) and 1 (did not pass); None for those two."""
 
 
 @dataclass(frozen=True)
 class BenchmarkSpec:
-    """Measurements of a part of the toolkit itself, as opposed to those of avatars.
+    """A benchmark of the toolkit itself, as opposed to one of avatars.
 
-    ``speed``, ``tradeoffs`` and ``stress`` each name a function ``(quick, progress) -> Findings``, or are "" where
-    there is none: how fast it is, what settings that give up accuracy for speed buy, how it behaves at extremes.
+    ``speed``, ``tradeoffs`` and ``stress`` each name a function ``(quick, progress) -> Findings``, or are "":
+    speed, settings that trade accuracy for speed, and behaviour at extreme inputs.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""``headbench doctor bench metrics``: the image metrics beside the usual libraries, whose values are the same."""
+"""``headbench doctor bench metrics``: compare the image metrics with common libraries, in speed and values."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ Ways = Mapping[str, Callable[[], float]]
 
 
 def speed(quick: bool, progress: Progress) -> Findings:
-    """Milliseconds an image of PSNR + SSIM and of LPIPS, ours and by other libraries, and their values."""
+    """Milliseconds per image of PSNR + SSIM and of LPIPS, in this package and other libraries, and their
+    values."""
     height, width = QUICK_SIZE if quick else SIZE
     pairs = noisy_pairs(IMAGES, height, width)
     rows: list[Row] = []
@@ -60,7 +61,8 @@ def speed(quick: bool, progress: Progress) -> Findings:
 
 
 def structural_ways(pairs: Pairs, pool: ThreadPoolExecutor) -> dict[str, Ways]:
-    """PSNR and SSIM of every pair, by form of the SSIM; each way returns the sum of both over all pairs."""
+    """PSNR and SSIM of every pair, by form of the SSIM; each implementation returns the sum of both over all
+    pairs."""
     from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
     from .psnr import psnr
@@ -96,7 +98,8 @@ def structural_ways(pairs: Pairs, pool: ThreadPoolExecutor) -> dict[str, Ways]:
 
 
 def lpips_ways(pairs: Pairs) -> tuple[Ways, str]:
-    """LPIPS (AlexNet) of every pair, summed, and what is missing; no ways without the network's weights."""
+    """LPIPS (AlexNet) of every pair, summed, and what is missing; no implementations without the network's
+    weights."""
     from .lpips_network import ALEX, Lpips, find_backbone, load_backbone
 
     try:
@@ -131,7 +134,7 @@ def _tensor(image: ByteArray):
 
 
 def noisy_pairs(count: int, height: int, width: int) -> Pairs:
-    """Smooth images with noise and without, all different."""
+    """Different smooth images, with noise and without."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:height, :width][..., None]
     pairs = []

@@ -1,4 +1,4 @@
-"""Flicker: how much the image changes over time in other ways than the ground truth does."""
+"""Flicker: temporal change of the image that differs from that of the ground truth."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ FLICKER = MetricSpec(
 def flicker(image: ByteArray, target: ByteArray, other_image: ByteArray, other_target: ByteArray) -> float:
     """Root mean square, in 8-bit levels, of ``(image - other_image) - (target - other_target)``.
 
-    ``other`` is a neighbour in time, from the same camera; which of the two comes first does not matter. What an
-    avatar gets wrong alike in both frames (a wrong colour, a blur that moves along) cancels; what appears in one of
-    them does not. 0 for a render that changes as the ground truth does. All are (H, W, 3) 8-bit images of one size.
+    ``other`` is a neighbour in time from the same camera; the order of the two does not matter. Errors that
+    both frames share (a wrong colour, a blur that moves along) cancel; others do not. 0 for a render that
+    changes as the ground truth does. All are (H, W, 3) 8-bit images of one size.
     """
     check_pair(image, target)
     check_pair(other_image, other_target)

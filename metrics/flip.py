@@ -1,11 +1,12 @@
-"""FLIP: how different two images look when one flips between them, per pixel.
+"""FLIP: perceived per-pixel difference of two images that are shown alternately.
 
-Andersson, Nilsson, Akenine-Moeller, Oskarsson, Astrom, Fairchild, "FLIP: a difference evaluator for alternating
-images", Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020; numbers of sections and equations are theirs. For
-images of low dynamic range, after the formulas alone.
+Andersson, Nilsson, Akenine-Moeller, Oskarsson, Astrom, Fairchild, "FLIP: a difference evaluator for
+alternating images", Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020; numbers of sections and equations
+are theirs. For images of low dynamic range, implemented from the formulas.
 
-A pixel's error is in [0, 1]. It depends on how large the image is seen: pixels per degree of visual angle, by default
-those of the paper's viewer, 0.7 m before a monitor 0.7 m and 3840 pixels wide. The score is the mean of the map.
+A pixel's error is in [0, 1]. It depends on the viewing size in pixels per degree of visual angle; the default
+is the paper's viewer, 0.7 m before a monitor that is 0.7 m and 3840 pixels wide. The score is the mean of the
+map.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class _Filter(NamedTuple):
 
 @dataclass(frozen=True)
 class Flip:
-    """FLIP of 8-bit images at a given size on the eye.
+    """FLIP of 8-bit images at a given viewing size.
 
     Attributes
     ----------
@@ -84,7 +85,7 @@ class Flip:
         return float(self.map(image, target).mean())
 
     def in_regions(self, image: ByteArray, target: ByteArray, masks: Mapping[str, Mask]) -> dict[str, float]:
-        """Mean over each (H, W) boolean mask; regions without a pixel are left out."""
+        """Mean over each (H, W) boolean mask; regions without pixels are left out."""
         check_masks(masks, target)
         error = self.map(image, target)
         return {name: float(error[mask].mean()) for name, mask in masks.items() if mask.any()}
@@ -98,7 +99,7 @@ class Flip:
         return color ** (1 - feature)
 
     def _seen(self, opponent: FloatArray) -> FloatArray:
-        """Section 4.1.1 to 4.1.3: what the eye resolves, in Lab with the Hunt effect."""
+        """Section 4.1.1 to 4.1.3: filter by contrast sensitivity, in Lab with the Hunt effect."""
         filters = _sensitivity_filters(self.pixels_per_degree)
         blurred = [blur(np.ascontiguousarray(opponent[..., i])) for i, blur in enumerate(filters)]
         linear = np.clip(_from_opponent(np.stack(blurred, axis=-1)), 0, 1)
@@ -143,7 +144,7 @@ def _lab(linear: FloatArray) -> FloatArray:
 
 
 def _hunt(lab: FloatArray) -> FloatArray:
-    """Equation 9: colours look the less colourful the darker they are."""
+    """Equation 9: colours look less colourful the darker they are."""
     adjusted = lab.copy()
     adjusted[..., 1:] *= 0.01 * lab[..., :1]
     return adjusted

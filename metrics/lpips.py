@@ -1,9 +1,9 @@
 """Learned perceptual image patch similarity of one frame.
 
 Zhang, Isola, Efros, Shechtman, Wang, "The unreasonable effectiveness of deep features as a perceptual metric",
-CVPR 2018, equation 1, version 0.1 (with the scaling layer). Inputs are brought to [-1, 1], as the scaling
-layer's constants expect. Feeding [0, 1] instead, as some published avatar code does, gives lower numbers; the
-two do not compare. `Lpips` can do both, under different names.
+CVPR 2018, equation 1, version 0.1 (with the scaling layer). Inputs are scaled to [-1, 1], as the scaling
+layer's constants expect. Feeding [0, 1] instead, as some published avatar code does, gives lower numbers that
+are not comparable. `Lpips` supports both, under different names.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ LPIPS_VGG = replace(
 
 @dataclass(frozen=True)
 class SharedLpips:
-    """LPIPS whose weights are loaded when first used, once in a process and for a device.
+    """LPIPS that loads its weights on first use, once per process and device.
 
-    Every use raises `UnavailableError` where the weights cannot be had. Attributes: see `Lpips`.
+    Every use raises `UnavailableError` if the weights are not available. Attributes: see `Lpips`.
     """
 
     net: str = "alex"
@@ -76,7 +76,7 @@ class SharedLpips:
 
 @functools.cache
 def _load(net: str, scaled: bool, device: str) -> Lpips | UnavailableError:
-    """The network, or why there is none: remembered either way."""
+    """The network, or the reason why it is unavailable; both are cached."""
     from .lpips_network import Lpips
 
     use_device(device)
@@ -93,7 +93,7 @@ lpips_vgg_unscaled = SharedLpips("vgg", scaled=False)
 
 
 def needs_alex(config: Any, device: str) -> Iterator[Need]:
-    """Weights of AlexNet, looked for and not fetched."""
+    """Weights of AlexNet on this machine, without a download."""
     yield _weights("alex")
 
 

@@ -1,4 +1,4 @@
-"""The network behind LPIPS: `Lpips`, its feature networks, and where their weights come from.
+"""The network of LPIPS: `Lpips`, its feature networks, and the location of their weights.
 
 The feature networks are the convolutional parts of AlexNet (Krizhevsky, "One weird trick for parallelizing convolutional
 neural networks", 2014), SqueezeNet 1.1 (Iandola et al., 2016) and VGG-16 (Simonyan, Zisserman, 2015, configuration D),
@@ -138,7 +138,7 @@ class Lpips:
                 yield from map(float, self.distances(np.stack(images), np.stack(targets)))
 
     def _target_features(self, targets: ByteArray) -> list[Tensor]:
-        """The same as `_features`, from the cache where a frame was seen before: every method has the same ground truth."""
+        """As `_features`, cached per frame, since every method is compared with the same ground truth."""
         places = [
             (hashlib.blake2b(np.ascontiguousarray(target), digest_size=16).digest(), target.shape)
             for target in targets
@@ -182,7 +182,7 @@ class Fire(nn.Module):
 
 
 class TappedNetwork(nn.Module):
-    """A chain of layers that also returns what some of them put out."""
+    """A chain of layers that also returns the outputs of some of them."""
 
     def __init__(self, layers: list[nn.Module], taps: tuple[int, ...]) -> None:
         super().__init__()
@@ -215,7 +215,7 @@ class NetworkSpec:
         return f"https://download.pytorch.org/models/{self.file}"
 
     def build(self) -> TappedNetwork:
-        """Make the network, weights not yet meaningful."""
+        """Create the network with uninitialised weights."""
         return {"alex": _alexnet, "squeeze": _squeezenet, "vgg": _vgg16}[self.name]()
 
 
@@ -266,7 +266,7 @@ def _vgg16() -> TappedNetwork:
 
 
 def present_backbone(spec: NetworkSpec, path: Path | None = None) -> Path | None:
-    """The file with the weights of ``spec`` on this machine, None where there is none; errors as of `find_backbone`."""
+    """The file with the weights of ``spec`` on this machine, or None; errors as for `find_backbone`."""
     if path is not None:
         return _named(spec, path, "weights")
     if value := os.environ.get(VARIABLE):
@@ -276,7 +276,7 @@ def present_backbone(spec: NetworkSpec, path: Path | None = None) -> Path | None
 
 
 def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
-    """Return the file with the weights of ``spec``, fetched if need be (see the module).
+    """Return the file with the weights of ``spec``, downloaded if necessary (see the module).
 
     Raises
     ------
@@ -302,7 +302,8 @@ def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
 def load_backbone(spec: NetworkSpec, path: Path) -> dict[str, Tensor]:
     """Read the convolutional part of a weights file: a full torchvision one, or one of features alone.
 
-    Raises `InputError` for a file that is none, lacks a parameter, or has one of another shape or not finite.
+    Raises `InputError` for a file of another kind, and for parameters that are missing, not finite or of
+    another shape.
     """
     return read_weights(path, {name: tuple(value.shape) for name, value in spec.build().state_dict().items()})
 
@@ -347,7 +348,7 @@ def _in_folder(spec: NetworkSpec, folder: Path) -> Path | None:
 
 @functools.cache
 def _fetch(url: str, sha256_prefix: str, target: Path) -> str:
-    """Fetch ``url``; return what went wrong, or "". Remembered, so that a dead network is waited for once."""
+    """Download ``url``; return the error, or "". Cached, so that an unreachable network is tried once."""
     try:
         with urllib.request.urlopen(url, timeout=TIMEOUT_S) as response, atomic_path(target) as temporary:
             with temporary.open("wb") as stream:

@@ -16,8 +16,8 @@ Mask = NDArray[np.bool_]
 def check_pair(image: ByteArray, target: ByteArray, smallest: int = 1) -> None:
     """Raise `InputError` unless both are (H, W, 3) 8-bit images of one size.
 
-    Raises `UnavailableError` where H or W is below ``smallest``: the metric has no value for such images, which is
-    shown in its place.
+    Raises `UnavailableError` if H or W is below ``smallest``: the metric is undefined for such images, and
+    tables show that reason.
     """
     for key, array in (("image", image), ("target", target)):
         if not isinstance(array, np.ndarray) or array.dtype != np.uint8:

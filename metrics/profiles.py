@@ -1,4 +1,4 @@
-"""The metric profiles: which definitions stand behind the usual names, by who prints them. Light to import.
+"""The metric profiles: definitions of the usual names in libraries and the code of papers. Light to import.
 
 All are taken from the stored 8-bit frames. Where the original has no bound, PSNR is capped at 100 dB here.
 """
@@ -21,7 +21,7 @@ CANONICAL = ProfileSpec(
 
 
 def _of(profile: str, metric: MetricSpec, implementation: str, summary: str) -> MetricSpec:
-    """A metric as a profile has it; whatever reads rows by the bare name does not see it."""
+    """A metric of a profile; queries for the bare name do not return it."""
     return replace(
         metric,
         name=f"{metric.name}@{profile}",

@@ -55,7 +55,7 @@ class Psnr:
     def in_regions(self, image: ByteArray, target: ByteArray, masks: Mapping[str, Mask]) -> dict[str, float]:
         """PSNR over the pixels of each (H, W) boolean mask: the error is averaged over the region, not diluted.
 
-        Regions without a pixel are left out.
+        Regions without pixels are left out.
         """
         check_pair(image, target)
         check_masks(masks, target)
@@ -68,7 +68,7 @@ class Psnr:
         return {name: self._decibels(errors.astype(np.int64), counts[name]) for name, errors in sums.items()}
 
     def _decibels(self, errors: IntArray, pixels: int) -> float:
-        """From the (3,) summed squared error of each channel."""
+        """PSNR from the (3,) summed squared error of each channel."""
         groups = errors if self.per_channel else errors.sum(keepdims=True)
         samples = 3 * pixels // len(groups)
         return float(np.mean([self._of_mean(int(error) / (255.0**2 * samples)) for error in groups]))

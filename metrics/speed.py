@@ -1,9 +1,9 @@
-"""Speed: how fast an avatar is animated, driven and seen afresh every frame.
+"""Speed of an avatar whose driving signal and camera change in every frame.
 
-One measurement, in this order: warm-up until frame times are stationary; latency, waiting for every frame; throughput,
-with several frames under way; the stages of a frame; and the same frame over and over, which shows what is kept
-between frames. Latency and throughput are separate, as in MLPerf's single-stream and offline scenarios (Reddi et al.,
-"MLPerf Inference Benchmark", ISCA 2020).
+One measurement, in this order: warm-up until frame times are stationary; latency, waiting for every frame;
+throughput, with several frames in flight; the stages of a frame; and the same frame repeatedly, which shows
+what is cached between frames. Latency and throughput are separate, as in MLPerf's single-stream and offline
+scenarios (Reddi et al., "MLPerf Inference Benchmark", ISCA 2020).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ FPS = MetricSpec(
 
 
 def _milliseconds(name: str, label: str, detail: str, summary: str) -> MetricSpec:
-    """A time of `FPS`'s measurement."""
+    """One of the times in the measurement of `FPS`."""
     return replace(
         FPS,
         name=name,
@@ -108,7 +108,7 @@ class Drawing(Protocol):
 
 
 class WholeFrames:
-    """An avatar without stages: all of a frame happens in drawing it."""
+    """An avatar without stages: `draw` renders the whole frame."""
 
     def __init__(self, avatar: Avatar):
         self._avatar = avatar
@@ -120,13 +120,14 @@ class WholeFrames:
         return self._avatar.render(camera, pose)
 
     def read_back(self, drawn: Any) -> Any:
-        """Nothing is left to do."""
+        """Return the rendered frame."""
         return drawn
 
 
 @dataclass(frozen=True)
 class SpeedProtocol:
-    """How much is timed. Every loop ends at its number of frames or, after one frame at least, at its seconds.
+    """Amount of timed work. Every loop ends after its number of frames, or after its seconds and at least one
+    frame.
 
     Attributes
     ----------
@@ -174,7 +175,7 @@ def measure_speed(
     protocol: SpeedProtocol | None = None,
     clock: Clock = time.perf_counter,
 ) -> Measurement:
-    """The measurement of `fps` to another protocol or by another clock (seconds, monotonic)."""
+    """Measure `fps` with another protocol or clock (seconds, monotonic)."""
     plan = protocol or SpeedProtocol()
     if len(workload) < 2:
         raise InputError("speed", "workload", "two or more pairs of camera and pose", str(len(workload)))
@@ -213,10 +214,10 @@ def measure_speed(
 
 
 def fresh_frames(workload: Sequence[tuple[Camera, HeadPose]]) -> Stream:
-    """The workload over and over, without end, as a live signal: no pose comes twice.
+    """The workload repeated endlessly as a live signal: no pose occurs twice.
 
-    Every lap adds `NUDGE` to the expression once more, and no pose names subject and timestep, so that nothing kept
-    for a known or earlier pose can be used.
+    Every lap adds `NUDGE` to the expression once more, and no pose has subject and timestep, so that nothing
+    cached for a known or earlier pose can be used.
     """
     for lap in count(1):
         for camera, pose in workload:
@@ -225,7 +226,8 @@ def fresh_frames(workload: Sequence[tuple[Camera, HeadPose]]) -> Stream:
 
 
 def warm_up(drawing: Drawing, stream: Stream, plan: SpeedProtocol, clock: Clock) -> tuple[int, bool]:
-    """Draw until frame times are stationary; return after how many frames, and whether they were."""
+    """Draw until frame times are stationary; return the number of frames, and whether they became
+    stationary."""
     times: list[float] = []
     for seconds in _waited_for(drawing, stream, plan.warm_up_limit, plan.warm_up_s, clock):
         times.append(seconds)
@@ -238,14 +240,14 @@ def warm_up(drawing: Drawing, stream: Stream, plan: SpeedProtocol, clock: Clock)
 
 
 def latencies(drawing: Drawing, stream: Stream, frames: int, limit_s: float, clock: Clock) -> FloatArray:
-    """Milliseconds of each frame from driving signal to host memory, one waited for after the other."""
+    """Milliseconds of each frame from driving signal to host memory, waiting for each frame."""
     return 1000 * np.asarray(list(_waited_for(drawing, stream, frames, limit_s, clock)))
 
 
 def _waited_for(
     drawing: Drawing, stream: Stream, frames: int, limit_s: float, clock: Clock
 ) -> Iterator[float]:
-    """Seconds of each of so many frames, or until ``limit_s`` are over."""
+    """Seconds of each frame, up to a number of frames or ``limit_s``."""
     synchronise = synchroniser()
     for frame in _within(islice(stream, frames), limit_s, clock):
         synchronise()
@@ -255,7 +257,7 @@ def _waited_for(
 
 
 def _within(frames: Iterable[Frame], limit_s: float, clock: Clock) -> Iterator[Frame]:
-    """Frames until so many seconds are over, one at least."""
+    """Render for a number of seconds, at least one frame."""
     begin = clock()
     for frame in frames:
         yield frame
@@ -266,7 +268,7 @@ def _within(frames: Iterable[Frame], limit_s: float, clock: Clock) -> Iterator[F
 def throughput(
     drawing: Drawing, stream: Stream, frames: int, limit_s: float, depth: int, clock: Clock
 ) -> float:
-    """Frames per second where up to ``depth`` frames are under way before the oldest is waited for."""
+    """Frames per second with up to ``depth`` frames in flight before the oldest is waited for."""
     under_way: deque[Any] = deque()
     drawn = 0
     synchroniser()()
@@ -286,8 +288,8 @@ def stage_times(
 ) -> dict[str, float]:
     """Median milliseconds of each stage and of reading back, each waited for.
 
-    Waiting keeps stages from overlapping, so that together they may take longer than a frame. Raises `InputError` for
-    a stage that is none of `STAGES`.
+    Waiting keeps stages from overlapping, so that together they may take longer than a frame. Raises
+    `InputError` for a stage that is not in `STAGES`.
     """
     times: dict[str, list[float]] = {}
     synchronise = synchroniser()
@@ -311,7 +313,7 @@ def stage_times(
 
 
 def synchroniser() -> Callable[[], None]:
-    """What waits for the work handed to an accelerator; nothing to wait for where torch has begun no such work.
+    """Function that waits for the work of an accelerator; it does nothing if torch has started none.
 
     It waits for torch's current device, which `use_device` has made that of the avatar.
     """

@@ -1,8 +1,8 @@
-"""Structural similarity of one frame, in the forms that are in use: one pair of images, several numbers.
+"""Structural similarity of one frame, in its common forms, which give different numbers for the same images.
 
 Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to structural similarity",
 IEEE TIP 2004, equation 13 with K1 = 0.01, K2 = 0.03 and L = 255. Channels are compared one by one, then all are
-averaged. Libraries differ in the window and in what it sees beyond the image, see `SsimForm`.
+averaged. Libraries differ in the window and in the treatment of the border, see `SsimForm`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Border = Literal["valid", "reflect", "zero"]
 
 @dataclass(frozen=True)
 class SsimForm:
-    """What one implementation of SSIM does differently from another.
+    """Differences between implementations of SSIM.
 
     Attributes
     ----------
@@ -75,13 +75,13 @@ class SsimForm:
 
     @property
     def covariance_scale(self) -> float:
-        """What variances and covariance are multiplied by."""
+        """Factor of variances and covariance."""
         count = len(self.weights) ** 2
         return count / (count - 1) if self.sample_covariance else 1.0
 
     @property
     def smallest(self) -> int:
-        """Pixels that height and width must have."""
+        """Minimum height and width in pixels."""
         return {"valid": 2 * self.radius + 1, "reflect": self.radius + 1, "zero": 1}[self.border]
 
     @property
@@ -101,7 +101,7 @@ class Ssim:
         return float(ssim_map(image, target, self.form).mean())
 
     def in_regions(self, image: ByteArray, target: ByteArray, masks: Mapping[str, Mask]) -> dict[str, float]:
-        """Mean over the windows centred in each (H, W) boolean mask; regions without one are left out."""
+        """Mean over the windows centred in each (H, W) boolean mask; regions without windows are left out."""
         check_pair(image, target, self.form.smallest)
         check_masks(masks, target)
         inset, blocks = self.form.inset, _blocks(self.form, target)
@@ -153,7 +153,7 @@ def _channel_map(x: FloatArray, y: FloatArray, form: SsimForm) -> FloatArray:
 
 
 def _blocks(form: SsimForm, image: ByteArray) -> int:
-    """Side of the blocks that are averaged first."""
+    """Side of the blocks that are averaged before SSIM."""
     return max(1, round(min(image.shape[:2]) / 256)) if form.downsample else 1
 
 

@@ -1,4 +1,4 @@
-"""Storage: what an avatar occupies on disk, and what its driving signal takes on a line. SI units."""
+"""Storage of an avatar on disk, and bitrate of its driving signal. SI units."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STORAGE = MetricSpec(
 
 
 def _detail(name: str, detail: str, label: str, unit: str, digits: int, summary: str) -> MetricSpec:
-    """A further number of `STORAGE`'s measurement; less is better."""
+    """Another value of the measurement of `STORAGE`; lower is better."""
     own = {"detail": detail, "label": label, "unit": unit, "digits": digits, "summary": summary}
     return replace(STORAGE, name=name, tables=("cost",), **own)  # type: ignore[arg-type]
 
@@ -52,15 +52,15 @@ CHUNK = 1 << 20
 def storage(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]] = ()) -> Measurement:
     """Size of all files needed to render ``avatar``, in megabytes (SI: 1 MB = 1 000 000 bytes).
 
-    The avatar declares its files (`Avatar.files`: shared assets and the driving signal do not count); one that
-    it names twice counts once.
+    The avatar declares its files (`Avatar.files`: shared assets and the driving signal do not count); a file
+    that is named twice counts once.
 
     Details: ``bytes``; ``files``; ``packed_mb``, the files packed losslessly by xz one after the other;
     ``shared_mb``, where the avatar names its shared assets; ``primitives`` and ``primitive_bytes`` (bytes of all
     files over primitives), where it has splats and ``workload`` a pose; ``driving_bytes`` of one pose as float32 and
     ``driving_kb_s``, kilobytes per second at 25 frames per second, where ``workload`` has a pose.
 
-    Raises `InputError` where the avatar names no file, or one that is not there.
+    Raises `InputError` if the avatar names no file, or a missing one.
     """
     files = _checked(avatar.files())
     if not files:

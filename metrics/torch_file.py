@@ -1,4 +1,5 @@
-"""State dictionaries that ``torch.save`` wrote, read by ``torch.load(weights_only=True)``, which runs nothing of them."""
+"""State dictionaries written by ``torch.save``, read by ``torch.load(weights_only=True)``, which executes no
+code."""
 
 from __future__ import annotations
 

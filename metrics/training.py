@@ -1,4 +1,4 @@
-"""What training an avatar took, from the record of its fit."""
+"""Training time and memory of an avatar, from the record of its fit."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def training_time(record: Mapping[str, Any]) -> Measurement:
 
     Details: ``seconds``, and where the record has them ``threads``, ``cores`` and ``other_cores`` of `ProcessorLoad`.
 
-    Raises `UnavailableError` where the training was interrupted, since the record has the last part alone.
+    Raises `UnavailableError` if the training was interrupted, since only its last part was recorded.
     """
     interruptions = int(record.get("interruptions", 0))
     if interruptions:
@@ -53,7 +53,8 @@ def training_time(record: Mapping[str, Any]) -> Measurement:
 def training_memory(record: Mapping[str, Any]) -> Measurement:
     """Largest resident memory of the training process, in gigabytes (SI), its interpreter and libraries included.
 
-    Details: ``bytes``; ``before_bytes``, what was resident when the training began, by earlier cells of a run too.
+    Details: ``bytes``; ``before_bytes``, resident memory when the training began, including earlier cells of
+    a run.
     """
     peak = _number(record, "peak_memory_bytes")
     details = {"bytes": peak}

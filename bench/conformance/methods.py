@@ -1,4 +1,4 @@
-"""Does a method keep its contract? And how the kit calls a plug-in: what it raises is a breach, not an error."""
+"""Check that a method keeps its contract. An exception of a plug-in is reported as a breach, not raised."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from ..runner.config import ResolvedMethod
 
 @contextmanager
 def attempt(breaches: list[str], what: str) -> Iterator[None]:
-    """Note an exception of the block as a breach: ``what``, the exception and the line that raised it.
+    """Record an exception of the block as a breach: ``what``, the exception and the line that raised it.
 
-    `UnavailableError` passes through: the plug-in needs something that is not installed.
+    `UnavailableError` is not caught: the plug-in needs something that is not installed.
     """
     try:
         yield
@@ -40,7 +40,7 @@ def described(error: Exception) -> str:
 
 
 def refusal(call: Callable[[], Any], what: str, *, expected: type[Exception] = InputError) -> Iterator[str]:
-    """A breach unless ``call`` raises ``expected``."""
+    """Record a breach unless ``call`` raises ``expected``."""
     try:
         call()
     except expected:
@@ -54,10 +54,10 @@ def refusal(call: Callable[[], Any], what: str, *, expected: type[Exception] = I
 def check_method(method: ResolvedMethod, clip: Clip, out: Path, *, device: str = "cpu") -> list[str]:
     """Train a method briefly on ``clip`` and return every breach of the contract found; empty means it conforms.
 
-    Checked: `fit` reads training images alone, reports progress, can be repeated without training again into
-    something else; `load` gives back the same avatar to the bit; frames have the camera's size, finite float32
-    colours in [0, 1] and coverage in [0, 1]; the background shows where nothing covers it; rendering does not
-    depend on what was rendered before; files exist; a pose of another head model is refused.
+    Checks: `fit` reads only training images, reports progress, and does not change a finished avatar when
+    repeated; `load` returns a bit-identical avatar; frames have the camera's size, finite float32 colours in
+    [0, 1] and coverage in [0, 1]; the background is visible where coverage is 0; rendering does not depend on
+    earlier renders; files exist; a pose of another head model is refused.
 
     Parameters
     ----------

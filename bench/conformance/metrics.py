@@ -1,4 +1,4 @@
-"""Does a metric keep the contract of `MetricSpec` and its protocol in `contracts`?"""
+"""Check that a metric keeps the contract of `MetricSpec` and its protocol in `contracts`."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ from ..specs import MetricSpec
 from .methods import attempt, refusal
 
 SIZE = (96, 80)
-"""Height and width of the images that metrics are tried on."""
+"""Height and width of the test images."""
 NOISE = (4.0, 16.0, 64.0)
-"""Standard deviations, in levels, of the noise that makes images worse and worse."""
+"""Standard deviations, in levels, of increasing noise."""
 TOLERANCE = 1e-4
-"""Relative difference allowed between a value alone and one of a batch, whose sums may run in another order."""
+"""Relative difference allowed between single and batched values, whose sums may use another order."""
 
 Compare = Callable[[ByteArray, ByteArray], float]
 
 
 def check_metric(spec: MetricSpec) -> list[str]:
-    """Try a metric on images made on the spot and return every breach of the contract found.
+    """Try a metric on generated images and return every breach of the contract found.
 
-    Checked of a metric of frames: finite numbers; the value of equal images is the best; more noise gives a worse
-    one, in the direction that ``higher_is_better`` states; a value depends on its pair alone (again, in threads, in
-    a batch, in another memory layout); inputs are not changed; images of two sizes or another type are refused.
-    Metrics of regions, of neighbours in time, of avatars and of trainings are checked by their own protocols.
+    Checks for frame metrics: values are finite; equal images have the best value; more noise gives a worse
+    one, in the direction that ``higher_is_better`` states; a value depends only on its pair (repeated, in
+    threads, in a batch, in another memory layout); inputs are not changed; images of different sizes or
+    another type are refused. Regional, temporal, avatar and training metrics are checked by their own
+    protocols.
 
-    Raises `UnavailableError` where the metric needs something that is not installed.
+    Raises `UnavailableError` if the metric needs something that is not installed.
     """
     breaches: list[str] = []
     check_name(spec.name, "metric", "name")
@@ -88,7 +89,7 @@ def _noisy(image: ByteArray, sigma: float, seed: int = 1) -> ByteArray:
 
 
 def _over_time(metric: Any) -> Compare:
-    """A metric of neighbours in time as one of frames: the neighbour is rendered without a fault."""
+    """A temporal metric as a frame metric: the neighbouring frame is rendered without error."""
     return lambda image, truth: metric(image, truth, _neighbour(truth), _neighbour(truth))
 
 
@@ -188,7 +189,7 @@ def _region_breaches(metric: Any, spec: MetricSpec) -> Iterator[str]:
 
 
 class _GreyAvatar:
-    """Renders one grey level; something to measure."""
+    """Renders one grey level, as input for metrics."""
 
     def __init__(self, folder: Path):
         self._file = folder / "level.txt"

@@ -1,4 +1,4 @@
-"""Does a reader keep the contract of `DatasetSpec` and `Clip`?"""
+"""Check that a reader keeps the contract of `DatasetSpec` and `Clip`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .methods import attempt, refusal
 
 SPLITS = ("train", *get_args(TaskName))
 COPIED_BYTES = 256e6
-"""Largest capture that is copied, to see that its fingerprint does not depend on where it lies."""
+"""Largest capture that is copied to check that its fingerprint does not depend on its location."""
 RIGID = 1e-4
 Read = Callable[[Path], list[Clip]]
 FRAMES = 4
@@ -32,10 +32,11 @@ FRAMES = 4
 def check_reader(spec: DatasetSpec, path: Path, settings: Mapping[str, Any] | None = None) -> list[str]:
     """Read a capture and return every breach of the contract found; empty means the reader conforms.
 
-    Checked: `find` lists what `read` takes; the clip has what `Clip` names, in the shapes, types and units stated
-    there; keys, cameras and poses refer to each other; splits are disjoint and hold out cameras and timesteps;
-    images are 8-bit, of the camera's size, the same whenever they are asked for; the fingerprint is the same when
-    the capture is read again and from another place; what is no capture is an `InputError`.
+    Checks: `find` lists paths that `read` accepts; the clip has the attributes of `Clip` with the stated
+    shapes, types and units; keys, cameras and poses refer to each other; splits are disjoint and hold out
+    cameras and timesteps; images are 8-bit, of the camera's size, and identical when read again; the
+    fingerprint is the same when the capture is read again and from another location; other paths raise an
+    `InputError`.
 
     Parameters
     ----------
@@ -257,7 +258,7 @@ def _spread(count: int) -> list[int]:
 
 
 def _repeated(read: Read, path: Path, clips: Sequence[Clip]) -> Iterator[str]:
-    """Breaches of what has to be the same when the capture is read again, here and elsewhere."""
+    """Breaches of what must be equal when the capture is read again, here and from another location."""
     before = [clip.fingerprint for clip in clips]
     if [clip.fingerprint for clip in read(path)] != before:
         yield "the fingerprint differs when the capture is read again"

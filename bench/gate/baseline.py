@@ -1,4 +1,4 @@
-"""The numbers of a finished run as the gate compares them, and the baseline file that keeps them (JSON)."""
+"""The numbers of a finished run that the gate compares, and the baseline file that stores them (JSON)."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from .settings import Captures
 AVATAR = "avatar"
 
 
-class Place(NamedTuple):
-    """What a number is of; written with slashes it is the key in a baseline file."""
+class ResultKey(NamedTuple):
+    """Identifies a number; written with slashes it is the key in a baseline file."""
 
     task: str  # AVATAR for a number of the avatar as a whole
     method: str
@@ -43,9 +43,9 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class ProtocolIdentity:
-    """What must agree for two numbers of a task to compare.
+    """Conditions that must agree for two numbers of a task to be comparable.
 
-    ``design`` is the hash of all but the fingerprints of the captures.
+    ``design`` is the hash of all fields except the fingerprints of the captures.
     """
 
     id: str
@@ -55,28 +55,28 @@ class ProtocolIdentity:
 
 @dataclass(frozen=True)
 class Results:
-    """What was measured, and of what it lacks a number, with the reason.
+    """The measured numbers, and the missing ones with the reason.
 
-    ``frames`` says how many frames of each seed a number is the mean of; 1 for a number of the avatar.
-    ``unavailable`` numbers are those that no seed could have: an avatar that offers no stage times, a metric whose
-    weights are not installed. ``problems`` are all others.
+    ``frames`` is the number of frames per seed that a number is the mean of; 1 for a number of the avatar.
+    ``unavailable`` numbers are those that no seed could have: an avatar that reports no stage times, a metric
+    whose weights are not installed. ``problems`` are all others.
     """
 
     source: Path
-    values: Mapping[Place, float]
-    problems: Mapping[Place, str]
+    values: Mapping[ResultKey, float]
+    problems: Mapping[ResultKey, str]
     metrics: Mapping[str, MetricSpec]
     protocols: Mapping[str, ProtocolIdentity]
-    frames: Mapping[Place, int]
+    frames: Mapping[ResultKey, int]
     environment: Mapping[str, Any] = field(default_factory=dict)
-    unavailable: Mapping[Place, str] = field(default_factory=dict)
+    unavailable: Mapping[ResultKey, str] = field(default_factory=dict)
 
 
 def read_results(root: Path) -> Results:
     """Read a run folder.
 
-    A number is the mean over the frames of a sequence, then over sequences, then over seeds. It is there only where
-    every frame of the protocol has one, for every seed.
+    A number is the mean over the frames of a sequence, then over sequences, then over seeds. It is present
+    only if every frame of the protocol has a value, for every seed.
 
     Raises
     ------
@@ -93,14 +93,14 @@ def read_results(root: Path) -> Results:
     protocols = {task: ProtocolIdentity(p.id, p.hash, p.design) for task, p in manifest.protocols.items()}
     seeds = set(manifest.configuration.seeds)
     rows.check_protocols(folder.rows, {task: identity.hash for task, identity in protocols.items()})
-    values: dict[Place, float] = {}
-    frames: dict[Place, int] = {}
-    problems: dict[Place, str] = {}
-    unavailable: dict[Place, str] = {}
+    values: dict[ResultKey, float] = {}
+    frames: dict[ResultKey, int] = {}
+    problems: dict[ResultKey, str] = {}
+    unavailable: dict[ResultKey, str] = {}
     every = rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
-    for parts, own in every.groupby([*Place._fields], sort=True):
+    for parts, own in every.groupby([*ResultKey._fields], sort=True):
         task, *rest = map(str, parts)
-        place = Place(task or AVATAR, *rest)
+        place = ResultKey(task or AVATAR, *rest)
         wanted = expected[task][place.subject] if task else 1
         reason = _lacking(own, wanted, seeds)
         if (own["status"] == "missing").all():
@@ -115,7 +115,7 @@ def read_results(root: Path) -> Results:
 
 
 def _lacking(own: pd.DataFrame, frames: int, seeds: set[int]) -> str:
-    """Why these rows give no number; "" where they do."""
+    """Why these rows have no number; "" if they have one."""
     bad = own[own["status"] != "ok"]
     if len(bad):
         first = bad.iloc[0]
@@ -141,15 +141,15 @@ LAST_DIGITS = 10
 MACHINE_SHARE = 0.3
 KEPT_DIGITS = 3
 MACHINE = ("processor", "cores", "device")
-"""Entries of the environment in which two machines differ whose speeds do not compare."""
+"""Entries of the environment that must be equal for speeds to be comparable."""
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Which way a metric is better, and how far it may move without a verdict.
+    """The direction in which a metric is better, and its tolerance.
 
-    A number may differ by ``absolute`` or by ``relative`` times the baseline's size, whichever is more.
-    ``machine_bound`` numbers are judged on request, and on the machine of the baseline alone.
+    A number may differ by ``absolute`` or by ``relative`` times the baseline's value, whichever is larger.
+    ``machine_bound`` numbers are judged on request, and only on the baseline's kind of machine.
     """
 
     higher_is_better: bool
@@ -160,7 +160,7 @@ class Tolerance:
     digits: int = 4
 
     def __post_init__(self) -> None:
-        """Refuse a tolerance that would let everything pass, or nothing."""
+        """Refuse a tolerance with which everything or nothing would pass."""
         for name in ("absolute", "relative"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
@@ -176,13 +176,13 @@ class Tolerance:
         return cls(spec.higher_is_better, absolute, share, bound, spec.unit, spec.digits)
 
     def allowed(self, value: float) -> float:
-        """How far a number may lie from a baseline of ``value``."""
+        """The tolerance for a baseline of ``value``."""
         return max(self.absolute, self.relative * abs(value))
 
 
 @dataclass(frozen=True)
 class _File:
-    """The file as it stands."""
+    """The content of the file."""
 
     format: Literal[3]
     captures: Captures
@@ -199,25 +199,26 @@ class _File:
 class Baseline:
     """A baseline, read or made from results.
 
-    ``frames`` holds how many frames stand behind each value, since those in which a region is seen are not in the protocol.
-    ``unavailable`` holds what could not be measured when it was made, with the reason: to lack it is no loss.
+    ``frames`` is the number of frames of each value, because the protocol does not state in which frames a
+    region is visible. ``unavailable`` are the values that could not be measured when it was made, with the
+    reason; they are not required.
     """
 
     captures: Captures
     environment: Mapping[str, Any]
     protocols: Mapping[str, ProtocolIdentity]
     tolerances: Mapping[str, Tolerance]
-    values: Mapping[Place, float]
-    frames: Mapping[Place, int]
-    unavailable: Mapping[Place, str] = field(default_factory=dict)
+    values: Mapping[ResultKey, float]
+    frames: Mapping[ResultKey, int]
+    unavailable: Mapping[ResultKey, str] = field(default_factory=dict)
 
     @classmethod
     def of(
         cls, results: Results, earlier: Baseline | None = None, captures: Captures | None = None
     ) -> Baseline:
-        """Make the baseline of some results, with the tolerances of an ``earlier`` one where it has them.
+        """Make the baseline of some results, keeping the tolerances of an ``earlier`` one.
 
-        Raises `InputError` where a number is missing that could be had: a baseline with holes would hide what is missing
+        Raises `InputError` if a number is missing that is not unavailable, since the baseline would hide that
         later.
         """
         if results.problems or not results.values:
@@ -244,7 +245,8 @@ class Baseline:
     def read(cls, path: Path) -> Baseline:
         """Read a baseline file. Raises `InputError` naming what is missing or malformed.
 
-        A file that holds nothing to judge by, or fewer numbers than it says, would let everything pass.
+        A file without numbers to judge, or with fewer than it declares, is refused because everything would
+        pass.
         """
         record = read_json(path)
         if record.get("format") != FORMAT:
@@ -257,13 +259,13 @@ class Baseline:
             raise InputError(path, "frames", "a number from 1 for each of values", "others")
         values = {}
         for key, value in file.values.items():
-            place = _place(key, path, "values")
+            place = _result_key(key, path, "values")
             if place.metric not in file.tolerances:
                 raise InputError(path, "tolerances", f"an entry {place.metric!r}", "none")
             if place.task != AVATAR and place.task not in file.protocols:
                 raise InputError(path, "protocols", f"an entry {place.task!r}", "none")
             values[place] = value
-        unavailable = {_place(key, path, "unavailable"): why for key, why in file.unavailable.items()}
+        unavailable = {_result_key(key, path, "unavailable"): why for key, why in file.unavailable.items()}
         frames = {place: file.frames[str(place)] for place in values}
         return cls(
             file.captures, file.environment, file.protocols, file.tolerances, values, frames, unavailable
@@ -289,8 +291,8 @@ class Baseline:
         write_json(path, record)
 
 
-def _place(key: str, path: Path, group: str) -> Place:
+def _result_key(key: str, path: Path, group: str) -> ResultKey:
     parts = key.split("/")
-    if len(parts) != len(Place._fields) or not all(parts):
+    if len(parts) != len(ResultKey._fields) or not all(parts):
         raise InputError(path, f"{group}, {key}", "task/method/subject/region/metric", repr(key))
-    return Place(*(check_name(name, path, f"{group}, {key}") for name in parts))
+    return ResultKey(*(check_name(name, path, f"{group}, {key}") for name in parts))

@@ -1,4 +1,4 @@
-"""Results against a baseline: a verdict for every number; as text, Markdown and JUnit XML."""
+"""Compare results with a baseline: a verdict for every number; as text, Markdown and JUnit XML."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from typing import Any, Literal
 from xml.etree import ElementTree
 
 from ..errors import ExitCode, shortened
-from .baseline import MACHINE, Baseline, Place, Results, Tolerance
+from .baseline import MACHINE, Baseline, ResultKey, Results, Tolerance
 
 Outcome = Literal["pass", "regressed", "improved", "missing", "new", "unjudged"]
 ORDER: tuple[Outcome, ...] = ("missing", "regressed", "improved", "new", "unjudged", "pass")
 NOT_JUDGED = "such metrics depend on the machine and its load; --judge-speed judges them"
 ROUNDING = 1e-9
-"""Share of a tolerance that is rounding: a number moved by exactly the tolerance passes."""
+"""Fraction of a tolerance that is allowed for rounding: a difference of exactly the tolerance passes."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of one number. ``unjudged``: it depends on the machine, and was not to be judged or is of another one."""
+    """Verdict on a number. ``unjudged``: it depends on the machine, and is not to be judged or is from
+    another one."""
 
-    place: Place
+    place: ResultKey
     outcome: Outcome
     found: float | None = None
     baseline: float | None = None
@@ -58,11 +59,11 @@ def _shown(value: float, digits: int, sign: str = "") -> str:
 
 
 def judge(results: Results, baseline: Baseline, *, speed: bool = False) -> list[Verdict]:
-    """Give every number of baseline and results its verdict, most severe first.
+    """Give every number of baseline and results a verdict, most severe first.
 
-    Numbers of a task whose protocol is not the baseline's are missing: they were measured, but of something else.
-    ``speed``: judge machine-bound numbers as well, if both were measured on one machine; else they are unjudged, even
-    where there are none.
+    Numbers of a task with another protocol than the baseline's are missing, since they measure something
+    else. ``speed``: also judge machine-bound numbers, if both were measured on the same machine; otherwise
+    they are unjudged, even if they are missing.
     """
     other = _other_protocols(results, baseline)
     same_machine = all(baseline.environment.get(name) == results.environment.get(name) for name in MACHINE)
@@ -103,7 +104,8 @@ def judge(results: Results, baseline: Baseline, *, speed: bool = False) -> list[
 
 
 def exit_code(verdicts: Sequence[Verdict]) -> ExitCode:
-    """3 where a number is missing or none was judged, since nothing can be said then; else 1 where one regressed."""
+    """3 if a number is missing or none was judged, since then no verdict is possible; else 1 if one
+    regressed."""
     outcomes = {verdict.outcome for verdict in verdicts} - {"unjudged"}
     if "missing" in outcomes or not outcomes:
         return ExitCode.NO_VERDICT
@@ -111,11 +113,11 @@ def exit_code(verdicts: Sequence[Verdict]) -> ExitCode:
 
 
 MAX_NOTE = 400
-"""Characters of a note on what differs between environments."""
+"""Maximum characters of a note on the difference between environments."""
 
 
 def environment_changes(baseline: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
-    """What differs between two environments, as "name: before to now"."""
+    """The difference of two environments, as "name: before to now"."""
     before, now = _flat(baseline), _flat(found)
     return [
         shortened(f"{name}: {before.get(name)} to {now.get(name)}", MAX_NOTE)
@@ -133,7 +135,7 @@ def _outcome(found: float, expected: float, tolerance: Tolerance) -> Outcome:
 
 
 def _other_protocols(results: Results, baseline: Baseline) -> dict[str, str]:
-    """Tasks measured by another protocol than the baseline's, and how it differs."""
+    """Tasks measured by another protocol than the baseline's, and the difference."""
     other = {}
     for task, expected in baseline.protocols.items():
         found = results.protocols.get(task)
@@ -160,7 +162,7 @@ def _flat(record: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def unjudged_notes(verdicts: Sequence[Verdict]) -> list[str]:
     """A note for each reason why numbers were not judged, with the metrics."""
-    places: dict[str, list[Place]] = {}
+    places: dict[str, list[ResultKey]] = {}
     for verdict in verdicts:
         if verdict.outcome == "unjudged":
             places.setdefault(verdict.reason, []).append(verdict.place)
@@ -175,14 +177,14 @@ TITLES = {0: "nothing got worse", 1: "regressed", 3: "missing or invalid"}
 
 
 def headline(verdicts: Sequence[Verdict], code: int) -> str:
-    """One line: the outcome and how many of each verdict."""
+    """One line with the outcome and the count of each verdict."""
     counts = Counter(verdict.outcome for verdict in verdicts)
     counted = ", ".join(f"{counts[outcome]} {outcome}" for outcome in ORDER if counts[outcome])
     return f"Gate: {TITLES[code]} ({counted or 'no numbers'})"
 
 
 def to_text(verdicts: Sequence[Verdict], code: int, notes: Sequence[str]) -> str:
-    """Headline, everything that was judged and did not simply pass (most severe first), notes."""
+    """Headline, all judged numbers that did not pass (most severe first), and notes."""
     others = [verdict for verdict in verdicts if verdict.outcome not in ("pass", "unjudged")]
     lines = [headline(verdicts, code), *(f"  {verdict}" for verdict in others[:SHOWN])]
     if len(others) > SHOWN:
@@ -191,7 +193,7 @@ def to_text(verdicts: Sequence[Verdict], code: int, notes: Sequence[str]) -> str
 
 
 def to_markdown(verdicts: Sequence[Verdict], code: int, notes: Sequence[str]) -> str:
-    """A summary: what did not pass in a table, the rest folded below."""
+    """A summary: a table of the numbers that did not pass, the others folded below."""
     lines = [f"### {headline(verdicts, code)}", ""]
     others = [verdict for verdict in verdicts if verdict.outcome != "pass"]
     rest = [verdict for verdict in verdicts if verdict.outcome == "pass"]
@@ -204,7 +206,7 @@ def to_markdown(verdicts: Sequence[Verdict], code: int, notes: Sequence[str]) ->
 
 
 def to_junit(verdicts: Sequence[Verdict], notes: Sequence[str]) -> str:
-    """JUnit XML: a suite for each task; regressed is a failure, missing an error, unjudged skipped."""
+    """JUnit XML with a suite for each task: regressed is a failure, missing an error, unjudged skipped."""
     root = ElementTree.Element("testsuites", name="headbench compare")
     for task in dict.fromkeys(verdict.place.task for verdict in verdicts):
         own = [verdict for verdict in verdicts if verdict.place.task == task]
@@ -229,12 +231,12 @@ def to_junit(verdicts: Sequence[Verdict], notes: Sequence[str]) -> str:
 
 
 def failed_markdown(message: str) -> str:
-    """The summary where results or baseline are missing or invalid."""
+    """The summary for missing or invalid results or baseline."""
     return f"### Gate: {TITLES[3]}\n\n{_escaped(message)}\n"
 
 
 def failed_junit(message: str) -> str:
-    """The JUnit XML where results or baseline are missing or invalid: one test case, with an error."""
+    """The JUnit XML for missing or invalid results or baseline: one test case, with an error."""
     root = ElementTree.Element("testsuites", name="headbench compare")
     counts = {"tests": "1", "failures": "0", "errors": "1", "skipped": "0"}
     suite = ElementTree.SubElement(root, "testsuite", {"name": "gate", **counts})

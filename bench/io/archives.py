@@ -1,4 +1,4 @@
-"""ZIP files from outside: what their directory declares is checked before anything is unpacked."""
+"""ZIP files from outside: the sizes that their directory declares are checked before anything is unpacked."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def open_archive(
 ) -> Iterator[zipfile.ZipFile]:
     """Open a ZIP file; while the block runs, errors of unpacking it become `InputError`.
 
-    zipfile unpacks no more of a member than the directory declares, so that the checks bound what unpacking takes.
+    zipfile unpacks no more of a member than the directory declares, so these checks bound the unpacked size.
 
     Parameters
     ----------

@@ -22,10 +22,10 @@ compresses well, and tracked parameters of any length, which do not."""
 
 MAX_MEMBERS = 1000
 MAX_MAGNITUDE = 1e4
-"""Most that a number of a head model or its tracking may be: metres, radians, coefficients."""
+"""Largest magnitude of a number in a head model or its tracking: metres, radians, coefficients."""
 
 MAX_HEADER = 10_000
-"""Characters of what describes an array, which numpy parses as Python's literals."""
+"""Maximum characters of an array header, which numpy parses as Python literals."""
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _KINDS = "biufU"
@@ -34,7 +34,7 @@ _LARGEST_ITEM = 8
 
 @dataclass(frozen=True)
 class Member:
-    """What an array has to be.
+    """Requirements of an array.
 
     Attributes
     ----------
@@ -65,10 +65,10 @@ TEXT = Member("U", ())
 def read_arrays(
     path: Path, members: Mapping[str, Member], sizes: Mapping[str, int] | None = None
 ) -> dict[str, np.ndarray]:
-    """Read an npz whose members have to be as described; others are returned unchecked.
+    """Read an npz and check the described members; others are returned unchecked.
 
-    ``sizes`` gives sizes of axes by the names that stand in ``members``. Raises `InputError` where `read_npz` does,
-    and for the first member that is missing or not as described.
+    ``sizes`` gives sizes of the axes named in ``members``. Raises `InputError` as `read_npz` does, and for
+    the first member that is missing or not as described.
     """
     content = read_npz(path)
     check_arrays(path, content, members, sizes)

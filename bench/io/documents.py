@@ -1,7 +1,7 @@
 """Text, JSON and YAML from outside: bounded in size and nesting, every key once, checked against dataclasses.
 
-A document that breaks a rule is refused by an `InputError` with the file, the dotted key, what was expected and what
-was found. Non-finite numbers are refused everywhere: JSON has none, and whoever measures nothing writes null.
+A document that breaks a rule raises an `InputError` with the file, the dotted key, the expected and the found
+value. Non-finite numbers are refused everywhere: JSON has none, and a missing value is written as null.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ T = TypeVar("T")
 Source = str | PathLike[str]
 
 MAX_JSON_BYTES = 64 * 2**20
-"""Of the largest capture known, with 50,000 frames, the JSON has 35 MB. Objects take up to 25 times their text."""
+"""The JSON of the largest known capture, with 50,000 frames, has 35 MB. Objects take up to 25 times their
+text."""
 MAX_YAML_BYTES = 4 * 2**20
 """YAML is written by people, or lists frames to leave out; its parser is slower than JSON's."""
 MAX_DEPTH = 64
@@ -68,11 +69,11 @@ def parse_json(text: str | bytes, source: Source, key: str = "") -> dict[str, An
 
 
 def read_yaml(path: Path) -> dict[Any, Any]:
-    """Read a YAML mapping; an empty file is an empty one. Data, never code.
+    """Read a YAML mapping; an empty file is an empty mapping. It is read as data, never as code.
 
-    Of YAML's types there are text, numbers, true and false, null, lists and mappings. Raises `InputError` as
-    `read_json` does, and for anchors that are used, tags, dates, and whole numbers that YAML 1.1 takes otherwise than
-    they look (057 is 47 to it, 1:30 is 90).
+    Supported types are text, numbers, true and false, null, lists and mappings. Raises `InputError` as
+    `read_json` does, and for anchors that are used, tags, dates, and whole numbers that YAML 1.1 reads in an
+    unexpected way (057 is 47, 1:30 is 90).
     """
     value = _parse_yaml(read_text(path, "YAML", MAX_YAML_BYTES), path, "", literal=False)
     if value is None:
@@ -88,7 +89,7 @@ def parse_setting(text: str, source: Source, key: str) -> Any:
 
 
 def checked(value: Any, kind: type[T], source: Source, prefix: str = "", *, foreign: bool = False) -> T:
-    """Build a dataclass from a value that was read, nested ones included.
+    """Build a dataclass, including nested ones, from a parsed value.
 
     Parameters
     ----------
@@ -192,7 +193,7 @@ def _check_tree(value: Any) -> None:
 
 
 def _key_of(item: Any, value: Any) -> str | None:
-    """Dotted key of an object in a tree; None where it is not there."""
+    """Dotted key of an object in a tree; None if it is absent."""
     if value is item:
         return ""
     pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
@@ -266,7 +267,7 @@ def _scalar(node: yaml.ScalarNode, tag: str, source: Source, key: str, literal: 
 
 
 def _entries(kind: Any, place: Sequence[str | int]) -> list[str]:
-    """Names that a dataclass or typed dictionary somewhere inside a type knows."""
+    """Field names of the dataclasses and typed dictionaries inside a type."""
     for part in (*place, None):
         if get_origin(kind) in (Union, UnionType):
             kind = next(a for a in get_args(kind) if a is not NoneType)

@@ -1,4 +1,4 @@
-"""Files written whole or not at all, names fit for files, fingerprints of content."""
+"""Atomic writing of files, validation of file names, fingerprints of content."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ MAX_NAME_BYTES = 120
 """Longest name of a subject, a sequence or a camera; a file name made of several has to fit into 255 bytes."""
 
 GROUP_FILES, GROUP_SECONDS, FLUSHES = 64, 2.0, 16
-"""Most files of a group, how long the first of it waits, how many are flushed at once."""
+"""Maximum files of a group, maximum waiting time of the first one, and files that are flushed at once."""
 
 ROOM_BYTES = 64 * 2**10
-"""Less than that is no room to work with."""
+"""Less free space than this counts as a full disk."""
 
 TEMPORARY = ".tmp-headbench-"
-"""How the names of temporary files begin; those of dead processes are removed by this."""
+"""Prefix of temporary files, by which those of dead processes are found and removed."""
 
 _UMASK = os.umask(0o077)
 os.umask(_UMASK)
@@ -92,7 +92,8 @@ def flush_renames() -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Write:
-    """A file written under a temporary name. The open ``stream`` locks it: its process lives."""
+    """A file written under a temporary name. A lock on the open ``stream`` shows that its process is
+    alive."""
 
     stream: FileIO
     temporary: Path
@@ -112,7 +113,8 @@ class _Write:
 
 @contextmanager
 def _naming(write: _Write) -> Iterator[None]:
-    """Name the file meant in errors; the system reports a full disk without a name, or with the temporary one."""
+    """Set the file name of an error; the system reports a full disk without a name or with the temporary
+    one."""
     try:
         yield
     except OSError as error:
@@ -204,7 +206,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _start(path: Path) -> _Write:
-    """A new file beside ``path``, open and locked, so that others see that its process lives."""
+    """A new file beside ``path``, open and locked, which shows other processes that its process is alive."""
     if path.parent not in _searched:
         _searched.add(path.parent)
         with os.scandir(path.parent) as entries:
@@ -222,7 +224,7 @@ def _start(path: Path) -> _Write:
 
 
 def remove_dead_temporaries(folder: Path) -> None:
-    """Remove what processes that were killed left of unfinished files in a folder and all below."""
+    """Remove unfinished files of killed processes in a folder and its subfolders."""
     for root, _, names in os.walk(folder):
         _remove_dead(os.path.join(root, name) for name in names)
 
@@ -260,7 +262,8 @@ _roots: list[Path] = []
 
 @contextmanager
 def output_inside(root: Path) -> Iterator[None]:
-    """Refuse to write by links out of ``root``, which may have come from a stranger, while the block runs."""
+    """Refuse to write through links out of ``root``, which may come from another user, while the block
+    runs."""
     _roots.append(root)
     try:
         yield
@@ -370,10 +373,10 @@ RESULTS = {"rows.parquet", "headbench.json", "measure.json", "head_model.npz", "
 
 
 def check_kind(folder: Path, *kinds: str) -> None:
-    """Make sure, before anything is written, that the folder of ``--out`` holds nothing of another kind.
+    """Check, before anything is written, that the folder of ``--out`` holds nothing of another kind.
 
-    ``kinds``, out of `KINDS`, are those that the command writes, so that it may continue in one. Raises `InputError`
-    that names the file by which another was recognised.
+    ``kinds``, out of `KINDS`, are those that the command writes and may therefore continue. Raises
+    `InputError` that names the file by which another kind was recognised.
     """
     for kind, patterns in KINDS.items():
         marks = (path for pattern in patterns for path in folder.glob(pattern)) if kind not in kinds else ()
@@ -396,7 +399,7 @@ def removed_if_empty(folder: Path) -> Iterator[None]:
 
 
 def check_room(folder: Path) -> None:
-    """Write a little in a folder. Raises `OSError`, which names the folder, where the disk has no room for it."""
+    """Write a little in a folder. Raises `OSError` with the folder's name if the disk is full."""
     try:
         with tempfile.TemporaryFile(dir=folder, prefix=TEMPORARY) as stream:
             stream.write(bytes(ROOM_BYTES))
@@ -424,7 +427,7 @@ def _try_to_write(folder: Path) -> None:
 
 
 def _check_target(path: Path) -> None:
-    """Refuse what a rename must not replace; a device would be replaced by a file where the system lets us."""
+    """Refuse targets that a rename must not replace, such as devices."""
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
@@ -439,8 +442,8 @@ def _check_target(path: Path) -> None:
 def reading(path: str | os.PathLike[str], expected: str, key: str = "", remedy: str = "") -> Iterator[None]:
     """Turn any exception of a library that reads a file into one `InputError` with the library's words.
 
-    Errors of headbench pass, and so does a full disk. The block should call the library and nothing else, since a fault
-    of the program in it would be taken for one of the file.
+    Errors of headbench and a full disk are not converted. The block should only call the library, since an
+    error of the program in it would be reported as one of the file.
 
     Parameters
     ----------
@@ -500,11 +503,10 @@ def read_bytes(path: Path, expected: str, limit: int) -> bytes:
 
 
 def check_name(name: str, file: str | os.PathLike[str], key: str) -> str:
-    """Return a name if it can be one part of a path; it came from outside, and folders are named after it.
+    """Return a name if it can be one part of a path; it comes from outside, and folders are named after it.
 
-    Raises `InputError` for an empty name, one that starts with a dot, one longer than `MAX_NAME_BYTES`, and one
-    with a slash, a backslash, a colon or a control character: such a name could lead out of the folder that it
-    is put in.
+    Raises `InputError` for an empty name, one that starts with a dot or is longer than `MAX_NAME_BYTES`, and
+    one with a slash, a backslash, a colon or a control character, which could refer to another folder.
     """
     unfit = any(character in "/\\:" or not character.isprintable() for character in name)
     if not name or name.startswith(".") or unfit or len(name.encode(errors="replace")) > MAX_NAME_BYTES:
@@ -524,7 +526,7 @@ def is_system_file(name: str) -> bool:
 
 
 def entries(folder: Path, pattern: str = "*") -> list[Path]:
-    """What a folder holds that fits a pattern, sorted, without hidden files and files of operating systems.
+    """Entries of a folder that match a pattern, sorted, without hidden files and files of operating systems.
 
     For reading; empty where the folder does not exist.
     """
@@ -532,7 +534,8 @@ def entries(folder: Path, pattern: str = "*") -> list[Path]:
 
 
 def user_files(folder: Path, pattern: str = "*") -> list[Path]:
-    """As `entries`, with hidden files other than those of interrupted writes: what a command must not mix with."""
+    """As `entries`, including hidden files other than those of interrupted writes: content a command must not
+    mix with."""
     found = sorted(path for path in folder.glob(pattern) if not is_system_file(path.name))
     return [path for path in found if not path.name.startswith(TEMPORARY)]
 
@@ -552,7 +555,8 @@ def expand_home(text: str, source: str) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Turn a dataclass, array, path or set into what JSON knows; for ``json.dumps(default=plain)``."""
+    """Convert a dataclass, array, path or set to values that JSON supports; for
+    ``json.dumps(default=plain)``."""
     if is_dataclass(value) and not isinstance(value, type):
         return asdict(value)
     if isinstance(value, np.generic):
@@ -571,7 +575,7 @@ def plain(value: Any) -> Any:
 def cache_folder() -> Path:
     """The user's cache: ``$XDG_CACHE_HOME/headbench``, by default ``~/.cache/headbench``.
 
-    Raises `UnavailableError` where the user has no home.
+    Raises `UnavailableError` if the user has no home folder.
     """
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "headbench"

@@ -1,7 +1,8 @@
-"""Images: the one place that decodes and encodes them. Files are checked against bounds before any pixel is decoded.
+"""Decoding and encoding of images, in one place. Files are checked against bounds before pixels are decoded.
 
-Pixels are taken as they are stored, since intrinsics count stored pixels: orientation tags, colour profiles and gamma
-are ignored. Colour tables are applied. An alpha channel is what PNG calls one: RGBA, grey with alpha, or a tRNS chunk.
+Pixels are read as they are stored, since intrinsics refer to stored pixels: orientation tags, colour profiles
+and gamma are ignored. Colour tables are applied. Alpha channels are those of PNG: RGBA, grey with alpha, or a
+tRNS chunk.
 """
 
 from __future__ import annotations
@@ -55,12 +56,12 @@ _FOREIGN = {
     rb"\x00\x05\x16\x07": "AppleDouble (a ._ file of macOS)",
     rb"version https://git-lfs": "Git LFS pointer",
 }
-"""Other formats that images come in, by how their files begin."""
+"""Other image formats, by the first bytes of their files."""
 
 
 @dataclass(frozen=True)
 class ImageInfo:
-    """What the header of an image file says; 8 bits per channel."""
+    """Header of an image file; 8 bits per channel."""
 
     width: int
     height: int
@@ -72,12 +73,12 @@ class ImageInfo:
 
     @property
     def has_alpha(self) -> bool:
-        """Whether there is transparency beside grey or RGB: an alpha channel, or PNG's chunk tRNS."""
+        """Whether the image has transparency: an alpha channel, or PNG's chunk tRNS."""
         return self.channels in (2, 4)
 
 
 def probe_image(path: Path, *, decode: bool = False) -> ImageInfo:
-    """Read the size of a PNG or JPEG and make sure that the file is whole.
+    """Read the size of a PNG or JPEG and check that the file is complete.
 
     Costs a few small reads; ``decode`` decodes the pixels too and so finds damage in the middle. Bytes behind the end
     of the image are ignored. Raises `InputError` for a missing, empty, foreign or truncated file, more than 8 bits per
@@ -146,7 +147,7 @@ def _grey_with_alpha(grey: ByteArray, content: bytes) -> ByteArray:
 
 
 def _probe(path: Path, stream: BinaryIO) -> tuple[ImageInfo, int]:
-    """What the header says, and where the image ends."""
+    """The header, and the position where the image ends."""
     head = stream.read(33)
     if not head:
         raise InputError(path, "", "an image", "an empty file")
@@ -275,7 +276,8 @@ def quantise(rgb: FloatArray) -> ByteArray:
 def encode_image(image: ByteArray, suffix: str, options: Sequence[int] = (), *, place: Path | str) -> bytes:
     """Encode (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA, 8-bit, in the format that the suffix names.
 
-    ``options`` are OpenCV's, ``place`` is what an error names. Raises `InputError` for what the format cannot hold.
+    ``options`` are OpenCV's, ``place`` is named in errors. Raises `InputError` if the format cannot represent
+    the image.
     """
     order = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}.get(image.shape[2]) if image.ndim == 3 else None
     try:

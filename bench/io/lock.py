@@ -1,4 +1,5 @@
-"""One process at a time in a folder: two that write the same frames and rows would mix their results."""
+"""One process at a time in a folder: two processes that write the same frames and rows would mix their
+results."""
 
 from __future__ import annotations
 
@@ -31,10 +32,10 @@ _MOST = 1000  # characters of a lock file that are read
 def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
     """Keep other processes out of ``folder`` while the block writes in it; the lock file names the owner.
 
-    The lock is the system's (``flock``), so that it ends with its process however that ends: a file left by a killed
-    one keeps nobody out. Under it, temporary files of dead processes are removed, and nothing is written through
-    links that lead out of the folder. ``beside``: the lock file lies beside the folder, which may have to be empty. A new
-    folder in which nothing was written is removed.
+    The lock is the system's (``flock``) and ends with its process: a file left by a killed process locks
+    nobody out. Under it, temporary files of dead processes are removed, and nothing is written through links
+    that lead out of the folder. ``beside`` puts the lock file beside the folder, which may have to be empty.
+    A new folder in which nothing was written is removed.
 
     Raises
     ------
@@ -103,7 +104,7 @@ def _is_still(path: Path, stream: IO[str]) -> bool:
 
 
 def _described(text: str) -> str:
-    """The owner in words; the file may be half written, or not ours."""
+    """Description of the owner; the file may be incomplete or of another program."""
     try:
         owner = json.loads(text)
         return f"process {int(owner['process'])} on {owner['host']}, since {owner['since']}"

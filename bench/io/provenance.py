@@ -1,4 +1,4 @@
-"""Marks of provenance: files that leave the suite say that programs made what they show.
+"""Provenance marks: exported files declare that a program generated their content.
 
 The term is IPTC's digital source type (https://cv.iptc.org/newscodes/digitalsourcetype/), which image archives and social
 networks read. In images it stands in XMP beside the pixels, which stay as they are. Frames that metrics are computed from

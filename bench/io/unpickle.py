@@ -1,4 +1,4 @@
-"""Read the arrays in a FLAME pickle without running anything the file asks for.
+"""Read the arrays in a FLAME pickle without executing anything in the file.
 
 A pickle is a program that may call whatever it can import. FLAME and its masks come as Python-2 pickles full of chumpy
 and scipy objects, so every name in the stream is looked up in a closed table of stand-ins. A stand-in keeps what it is
@@ -68,7 +68,7 @@ def read_pickle(path: str | PathLike[str]) -> dict[str, Any]:
 
 
 class _StandIn:
-    """An object of the stream: what it was made of, and the state that it was given."""
+    """An object of the stream: its arguments and its state."""
 
     arguments: tuple[Any, ...]
     state: Any
@@ -212,7 +212,8 @@ def _table() -> dict[tuple[str, str], Any]:
 
 
 def _load_state(unpickler: Any) -> None:
-    """Give a state to a stand-in; to a class or a function it would stay for the next file."""
+    """Set the state of a stand-in. A class or function is refused, because it would keep the state for the
+    next file."""
     if not isinstance(unpickler.stack[-2], _StandIn):
         raise pickle.UnpicklingError("a state for something that has none")
     _PythonUnpickler.load_build(unpickler)

@@ -1,4 +1,5 @@
-"""Videos: mp4 by OpenCV, H.264 by the program FFmpeg where that encoder is asked for, WebM for browsers by PyAV."""
+"""Videos: mp4 by OpenCV, H.264 by the program FFmpeg if that encoder is requested, WebM for browsers by
+PyAV."""
 
 from __future__ import annotations
 
@@ -26,10 +27,10 @@ _H264, _MPEG4 = "avc1", "mp4v"
 
 @functools.cache
 def video_codec() -> str:
-    """Codec that videos are written with: H.264 ("avc1") where OpenCV can, else MPEG-4 part 2 ("mp4v").
+    """Codec of written videos: H.264 ("avc1") if OpenCV supports it, else MPEG-4 part 2 ("mp4v").
 
-    OpenCV's wheels come without an H.264 encoder. They say so at length on the error stream, so another process
-    asks.
+    OpenCV's wheels have no H.264 encoder and print long messages about it, so the check runs in another
+    process.
     """
     asked = (
         "import cv2, sys, tempfile\n"
@@ -86,7 +87,7 @@ def _check_whole(path: Path, written: Path, count: int) -> None:
 
 
 def webm_writer() -> Any:
-    """The module that writes WebM. Raises `UnavailableError` where it is not installed."""
+    """The module that writes WebM. Raises `UnavailableError` if it is not installed."""
     try:
         return importlib.import_module("av")
     except ImportError:
@@ -121,7 +122,7 @@ def write_webm(path: Path, frames: Iterable[ByteArray], fps: float, kind: str) -
 def ffmpeg() -> str:
     """The program ffmpeg: that on PATH, else the one in the package imageio-ffmpeg.
 
-    Raises `UnavailableError` where there is neither.
+    Raises `UnavailableError` if neither is found.
     """
     found = shutil.which("ffmpeg")
     if found is None:
@@ -138,8 +139,8 @@ def ffmpeg() -> str:
 def encode_h264(path: Path, frames: Iterable[ByteArray], size: tuple[int, int], fps: float, crf: int) -> None:
     """Encode (H, W, 3) RGB frames of (width, height) ``size`` as H.264, YUV 4:2:0 of 8 bits, by a constant rate factor.
 
-    Raises `UnavailableError` without ffmpeg, `HeadbenchError` with its words where it fails, and `InputError` for a frame of
-    another size.
+    Raises `UnavailableError` without ffmpeg, `HeadbenchError` with its message if it fails, and `InputError`
+    for a frame of another size.
     """
     width, height = size
     with atomic_path(path) as temporary, tempfile.TemporaryFile() as errors:

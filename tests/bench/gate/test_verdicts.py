@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.bench.gate.baseline import Baseline, Place, Results, Tolerance
+from headbench.bench.gate.baseline import Baseline, ResultKey, Results, Tolerance
 from headbench.bench.gate.verdicts import (
     Verdict,
     environment_changes,
@@ -23,7 +23,7 @@ numbers = st.floats(-1e6, 1e6)
 sizes = st.floats(0, 1e3)
 
 
-PLACE = Place("t", "a", "s", "full", "m")
+PLACE = ResultKey("t", "a", "s", "full", "m")
 
 
 def verdict_of(found, expected, tolerance, place=PLACE):
@@ -81,7 +81,7 @@ def test_a_number_without_rows_is_missing_with_the_reason():
 
 @given(st.text(), st.text(min_size=1))
 def test_any_name_gives_valid_xml_and_stays_in_its_cell(subject, note):
-    verdict = verdict_of(0.0, 1.0, Tolerance(True, 0.1), Place("t", "a", subject, "full", "m"))
+    verdict = verdict_of(0.0, 1.0, Tolerance(True, 0.1), ResultKey("t", "a", subject, "full", "m"))
     root = ElementTree.fromstring(to_junit([verdict], [note]).split("\n", 1)[1])
     assert root.find("testsuite/testcase/failure") is not None
     table = [line for line in to_markdown([verdict], 1, []).splitlines() if line.startswith("| regressed")]
