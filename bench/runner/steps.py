@@ -190,8 +190,8 @@ def fit(job: Job) -> Avatar:
     if earlier is None or earlier["status"] != "done":
         interruptions = 0 if earlier is None else earlier.get("interruptions", 0) + 1
         record = job.method.record()
+        use_device(job.device)  # before a record says that a training has begun
         job.cell.begin("fit", job.fit_fingerprint, interruptions=interruptions, method=record)
-        use_device(job.device)
         if isinstance(method, PreparedMethod):
             method.prepare(job.device)
         start, processor = time.perf_counter(), processor_seconds()

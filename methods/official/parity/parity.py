@@ -16,6 +16,7 @@ from ....bench.benchmarks import table as aligned
 from ....bench.condition import PLAIN
 from ....bench.configuration import build
 from ....bench.contracts import Progress, no_progress
+from ....bench.executors.settings import check_executor
 from ....bench.io.documents import read_json
 from ....bench.io.files import write_json, write_text
 from ....bench.io.lock import locked
@@ -87,11 +88,12 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Findi
     config = run_config(settings, out)
     methods = resolve_methods(config)
     check_settings((method, PLAIN) for method in methods)
+    check_executor(settings.execution, config.device)
     native, official = (method.spec.name for method in methods)
     with log_to_file(out / "parity.log"):
         if settings.data is None:
             _make_capture(settings, out, progress)
-        rows = run(config)
+        rows = run(config, settings.execution)
     differences = differences_of(rows, native, official, config.seeds)
     cells = {
         name: _cells(RunFolder(Path(config.out)), rows, name, config.seeds) for name in (native, official)

@@ -7,12 +7,13 @@ from typing import Literal
 
 import tyro
 
+from ....bench.executors.options import ExecutionOptions
 from ....bench.options import DependentOptions
 from ....bench.runner.config import parse_size
 
 
 @dataclass(frozen=True)
-class ParitySettings:
+class ParitySettings(ExecutionOptions):
     """Trains both on one capture with equal settings, the published ones at this length, both with the same image in each
     iteration, and scores all renders by one implementation of the metrics. Repeated with other orders of the images, for
     the order alone moves results by half a decibel. Writes parity.md, parity.json and the run. Started again after a kill
