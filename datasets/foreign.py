@@ -1,4 +1,4 @@
-"""What a path holds where it is no capture, and the way from there to one: for error messages."""
+"""Recognise other formats than captures and suggest a conversion, for error messages."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MONOCULAR = (
 
 
 class Foreign(NamedTuple):
-    """What was found in place of a capture, and what to do about it."""
+    """The format that was found instead of a capture, and what to do about it."""
 
     found: str
     remedy: str

@@ -33,14 +33,14 @@ _BACK_FACE = 0.45  # how bright the inside of a surface is, seen through an open
 
 
 class Fragments(NamedTuple):
-    """What each pixel's centre sees of a mesh."""
+    """The visible surface of a mesh at the centre of each pixel."""
 
     face: IntArray
-    """(H, W) int32 index of the triangle in front, -1 where there is none."""
+    """(H, W) int32 index of the triangle in front, -1 without one."""
     weights: FloatArray
-    """(H, W, 3) float32 perspective-correct barycentric weights of its corners; 0 where there is none."""
+    """(H, W, 3) float32 perspective-correct barycentric weights of its corners; 0 without a triangle."""
     depth: FloatArray
-    """(H, W) float32 camera-space z, metres; infinity where there is none."""
+    """(H, W) float32 camera-space z, metres; infinity without a triangle."""
 
 
 def draw_mesh(

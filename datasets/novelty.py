@@ -1,4 +1,4 @@
-"""How far the expressions of a test lie from those of training."""
+"""Novelty of test expressions relative to those of training."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SPAN_VARIANCE = 0.99
 
 
 class Novelty(NamedTuple):
-    """Of some expressions against those of training.
+    """Novelty of some expressions relative to those of training.
 
     Attributes
     ----------

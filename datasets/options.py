@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureOptions:
-    """How a capture is opened."""
+    """Options of opening a capture."""
 
     reader: str = ""
     """Reader of the capture: a name that `headbench list` shows, or "module:SPEC"; default: the one that finds it."""
@@ -25,7 +25,8 @@ class CaptureOptions:
     """Head model for captures that bring none: FLAME pickle or npz."""
 
     cy: Literal["auto", "top", "bottom", "centre"] = "auto"
-    """How the reader ga reads the principal point; auto takes the declared convention, else lets the images decide."""
+    """Principal-point convention of the reader ga; auto takes the declared one, else compares with the
+    images."""
 
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")] = ()
     """A setting of the reader, such as `exclude=tongue.yaml`, as reader_settings of `headbench run`; repeatable."""

@@ -1,4 +1,4 @@
-"""Where the parts of the tracked head are in a frame: from the posed mesh by a z-buffer, and from the mask.
+"""Masks of the parts of the tracked head in a frame: from the posed mesh by a z-buffer, and from the mask.
 
 * ``foreground``: pixels that the mask covers by half or more.
 * ``face``: the mesh's face, lips, eyes and the opening of the mouth, where nothing of the mesh is before them.

@@ -1,6 +1,6 @@
 """The head model: time of its forward pass (``headbench doctor bench head``) and extremes (``headbench doctor stress head``).
 
-Measured on a head with random bases of any size: as large as a licensed model's, licensed by nobody.
+Measured on a head with random bases of any size: as large as a licensed model's, without a licence.
 """
 
 from __future__ import annotations

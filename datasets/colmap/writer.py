@@ -36,7 +36,7 @@ _UNSEEN = (128, 128, 128)
 
 
 class Exported(NamedTuple):
-    """What was written."""
+    """Summary of an export."""
 
     cameras: int
     images: int
@@ -45,7 +45,7 @@ class Exported(NamedTuple):
 
 
 class _Observation(NamedTuple):
-    """Which vertices an image sees, where, and in what colour."""
+    """Indices, positions and colours of the vertices that an image sees."""
 
     vertices: np.ndarray
     pixels: FloatArray

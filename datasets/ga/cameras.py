@@ -151,7 +151,7 @@ def _shift(
         expected = f"cameras of {folder} that equal those of the first sequence but for one shift"
         found = f"rotations that differ by {turn:.3g} and shifts by {spread:.3g} m"
         raise InputError(any_entry.file, f"{any_entry.where}.transform_matrix", expected, found)
-    # A difference at the level of the stored digits is none: the cameras then stay exactly as written.
+    # A difference at the level of the stored digits is ignored: the cameras then stay exactly as written.
     return shift if np.abs(shift).max() > 1e-9 else np.zeros(3)
 
 

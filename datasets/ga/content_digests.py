@@ -19,14 +19,15 @@ _log = logging.getLogger(__name__)
 _THREADS = 4  # hashing releases the interpreter lock; more threads only help slow disks
 
 MAX_CACHE_BYTES = 128 * 2**20
-"""Of all captures together, about half a million files; the captures read longest ago are forgotten first."""
+"""Size of the cache for all captures, about half a million files; the least recently read captures are
+dropped first."""
 
 YOUNG_NS = 2 * 10**9
 """A file that changed so recently may change again within one step of the system's clock; it is not remembered."""
 
 
 class Stamp(NamedTuple):
-    """What the system says of a file. Whoever writes to it can set ``modified`` back, but not ``changed``."""
+    """File status of the system. A program can set ``modified`` back, but not ``changed``."""
 
     device: int
     inode: int

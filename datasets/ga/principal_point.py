@@ -176,13 +176,13 @@ def _agreement(pixels: FloatArray, faces: IntArray, distance: FloatArray) -> flo
 
 
 def _outline(filled: ByteArray) -> np.ndarray:
-    """Pixels of a filled shape next to unfilled ones; where the image border cuts the shape there are none."""
+    """Pixels of a filled shape next to unfilled ones; none where the image border cuts the shape."""
     eroded = cv2.erode(filled, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
     return (filled > 0) & (eroded == 0)
 
 
 def _distance_to_outline(foreground: ByteArray) -> FloatArray:
-    """(H, W) distance in pixels to the foreground's outline; far away everywhere where there is none."""
+    """(H, W) distance in pixels to the foreground's outline; a large value everywhere without one."""
     outline = _outline(foreground)
     if not outline.any():
         return np.full(foreground.shape, np.inf)

@@ -199,7 +199,7 @@ def find_captures(root: Path) -> list[Path]:
 
 
 def find_capture(path: str | Path) -> Path:
-    """The one capture at ``path``. Raises `InputError` where there is none or several."""
+    """The only capture at ``path``. Raises `InputError` if there is none or several."""
     folder = Path(os.path.abspath(path))  # "." has no name to take a subject from
     captures = find_captures(folder)
     if len(captures) != 1:
@@ -255,7 +255,7 @@ def _backgrounds(
     entries: Iterable[FrameEntry],
     infos: Mapping[Path, ImageInfo],
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """What images are read on, and what the clip is to be on: another where images are composited already."""
+    """Background of the stored images and of the clip; they differ if images are already composited."""
     declared = declaration.background if declaration else WHITE
     if wanted is None:
         return declared, declared

@@ -180,7 +180,8 @@ def read_animation(
 
 
 def _eyelids(where: Path, head: HeadArrays, closed: float) -> dict[str, str]:
-    """What becomes of eyelids that files close by up to ``closed``: a note, and a warning where they are lost."""
+    """How eyelids that files close by up to ``closed`` are treated: a note, and a warning if they are
+    lost."""
     if not closed:
         return {}
     note = f"closed by up to {closed:.2f}"

@@ -171,7 +171,7 @@ def check_disjoint(file: Path, splits: Mapping[str, Sequence[FrameKey]]) -> None
 def split_by_holding_out(
     file: Path, keys: Iterable[FrameKey], sequences: Sequence[str], cameras: Sequence[str]
 ) -> dict[str, tuple[FrameKey, ...]]:
-    """Split frames by what is held out.
+    """Split frames by the held-out sequences and cameras.
 
     All frames of the held-out sequences are self-reenactment, the held-out cameras' other frames are novel
     view, and the rest is training.

@@ -142,7 +142,7 @@ def _check(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> None
 
 
 def _middle_of_head(vertices: FloatArray, landmarks: IntArray) -> FloatArray:
-    """Middle of the bounding box of what lies above the chin."""
+    """Middle of the bounding box of the vertices above the chin."""
     above = vertices[vertices[:, 1] > vertices[landmarks[8], 1]]
     return 0.5 * (above.min(0) + above.max(0))
 
@@ -244,7 +244,7 @@ def mesh_parts(
     materials: Mapping[str, IntArray],
     jaw_open: FloatArray,
 ) -> Parts:
-    """Take the mesh apart: sorted vertex indices by what they belong to.
+    """Split the mesh: sorted vertex indices by part.
 
     Parameters
     ----------
@@ -376,7 +376,7 @@ class Hinge(NamedTuple):
         return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
     def displacement(self, points: FloatArray) -> FloatArray:
-        """What the full motion adds at points (n, 3)."""
+        """Displacement of points (n, 3) by the full motion."""
         return (points - self.center) @ (self.matrix - np.eye(3)).T
 
 

@@ -103,7 +103,7 @@ def load_head(
 
 
 _PICKLES = (b"\x80", b"(", b"}", b"c", b"]")
-"""How a pickle begins, by protocol and by what it holds."""
+"""First bytes of pickles, by protocol and content."""
 MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".fbx")
 
 
@@ -145,7 +145,7 @@ def flame_version(path: Path) -> str:
         return "flame2023_no_jaw" if "no_jaw" in stem else "flame2023"
     if years == {"2020"}:
         return "flame2020"
-    expected = "a name that tells FLAME's version (generic_model.pkl, flame2020.pkl, flame2023.pkl)"
+    expected = "a name with FLAME's version (generic_model.pkl, flame2020.pkl, flame2023.pkl)"
     found = path.name if not folder else f"{path.parent.name}/{path.name}"
     remedy = "Rename the file, or in Python give version='flame2020' or 'flame2023'. Their coefficients are not interchangeable."
     raise InputError(path, "version", expected, repr(found), remedy)

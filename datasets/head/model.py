@@ -206,7 +206,7 @@ class HeadModel(torch.nn.Module):
         return {name: part.clone() for name, part in zip(columns, parts)}
 
     def pose_columns(self, poses: Sequence[HeadPose]) -> dict[str, FloatArray]:
-        """What `pose_arguments` gives, as float64 arrays on the host: (T, n) each.
+        """Result of `pose_arguments` as float64 arrays on the host: (T, n) each.
 
         Raises
         ------

@@ -21,7 +21,7 @@ from ..mesh_pictures import draw_mesh, rasterize_mesh
 from .statistics import KEPT_VARIANCE, ExpressionSpace, SequenceRow, SplitRow
 
 WIDTH = 16.0
-"""Of the figure, inches."""
+"""Width of the figure, inches."""
 
 OVERLAY_HEIGHT = 2.8
 """Most that an overlay is high, inches."""
@@ -29,7 +29,7 @@ OVERLAY_HEIGHT = 2.8
 OVERLAY_PIXELS = 560
 MESH_OPACITY = 0.72
 FRUSTUM_M = 0.10
-"""How far a drawn frustum reaches."""
+"""Length of a drawn frustum."""
 
 SIGMA_BARS = 40
 """Coefficients whose standard deviation is shown: the leading ones matter."""

@@ -98,7 +98,7 @@ class ExpressionSpace:
 
 
 def split_rows(clip: CaptureClip) -> list[SplitRow]:
-    """Sizes of every split, and of what is excluded where there is any."""
+    """Sizes of every split, and of the excluded frames if there are any."""
     parts: dict[str, Sequence[FrameKey]] = {**clip.splits}
     if clip.excluded:
         parts["excluded"] = tuple(clip.excluded)

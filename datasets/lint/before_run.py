@@ -17,7 +17,7 @@ from .evidence import Evidence
 from .mesh import Parameters, TrackedSubject
 from .rules import apply
 from .settings import LintSettings
-from .views import Pixels, look, pick_views
+from .views import Pixels, inspect_views, pick_views
 
 if TYPE_CHECKING:
     from ..head.arrays import HeadArrays
@@ -32,7 +32,7 @@ MOST = 1000
 
 
 def errors(clip: Clip) -> list[str]:
-    """What the linter would say of a clip: code, fault and remedy of each error in `CODES`."""
+    """Errors of the linter for a clip: code, fault and remedy of each error in `CODES`."""
     if clip.head is None:
         return []  # a capture of something else, for methods that need no head
     keys = sorted({key for part in clip.splits.values() for key in part})
@@ -66,7 +66,7 @@ def errors(clip: Clip) -> list[str]:
         digests={},
         parameters=parameters,
         subject=subject,
-        views=look(chosen, pixels, subject, parameters, background, "top"),
+        views=inspect_views(chosen, pixels, subject, parameters, background, "top"),
         thumbnails=(),
         cameras={},
         expression_fit=None,

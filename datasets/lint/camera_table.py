@@ -32,7 +32,7 @@ WORKING_HEIGHT = 400
 """Images are compared at most this many pixels high."""
 
 MAX_LAG = 3
-"""Frames by which a camera may be late or early."""
+"""Maximum number of frames by which a camera may be late or early."""
 
 REACH = 0.1
 """Largest offset that is searched for, as a share of the working height."""
@@ -125,7 +125,7 @@ class _Shot(NamedTuple):
 
 
 class _Picked(NamedTuple):
-    """Where the vertices (F,) lie in an image of the working size."""
+    """Projection of the vertices (F,) into an image of the working size."""
 
     pixels: FloatArray  # (F, 2)
     seen: np.ndarray  # (F,) bool
@@ -254,7 +254,7 @@ def _shoot(entry: FrameEntry, pixels: Pixels, cy: CyConvention) -> _Shot:
 
 
 def _plain(shots: Sequence[_Shot]) -> CameraFacts:
-    """What a camera's images say without any geometry."""
+    """Measurements of a camera's images that need no geometry."""
     first = shots[0]
     whole = np.ones(first.grey.shape, dtype=bool)
     motion = [
@@ -304,7 +304,7 @@ class _Table:
         self._even_out()
 
     def pick(self, shot: _Shot, timestep: int, camera: Camera | None = None) -> _Picked:
-        """Where the vertices lie in an image, as its own or another camera's calibration has it."""
+        """Projection of the vertices into an image by the calibration of this or another camera."""
         camera = camera or shot.camera
         points = self.points[timestep]
         towards = camera.center - points

@@ -144,7 +144,7 @@ def implausible_distance(evidence: Evidence) -> float | None:
 
 
 def misplaced(evidence: Evidence) -> bool:
-    """Whether cameras stand so wrong that images and mesh cannot be held against each other."""
+    """Whether cameras are so wrong that images and mesh cannot be compared."""
     return bool(behind(evidence) or upside_down(evidence) or implausible_distance(evidence) is not None)
 
 
@@ -238,7 +238,7 @@ def _half_pixel(evidence: Evidence) -> Iterator[Hit]:
 
 
 def _convention(evidence: Evidence) -> str | None:
-    """What was asked for, else declared; None where neither says."""
+    """The requested convention, else the declared one; None without either."""
     if evidence.settings.cy != "auto":
         return evidence.settings.cy
     return evidence.declaration.cy if evidence.declaration else None

@@ -29,11 +29,12 @@ FRINGES = (0.65, 1.5)
 BLANK_COVERAGE = 0.001
 
 LIMITED_LOW, LIMITED_HIGH = (14, 24), (231, 237)
-"""Where the least and the largest level of limited-range images lie; resizing softens the ends a little."""
+"""Expected range of the minimum and maximum level of limited-range images; resizing softens the ends a
+little."""
 
 
 def unit_range(evidence: Evidence) -> bool:
-    """Whether images hold 0 and 1 alone, as when floats in [0, 1] are cast to 8 bits."""
+    """Whether images contain only 0 and 1, as when floats in [0, 1] are cast to 8 bits."""
     views = [view for view in evidence.views if view.error is None]
     return bool(views) and max(view.high for view in views) == 1
 
@@ -64,7 +65,7 @@ def _sound(mask: MaskFacts) -> bool:
 
 
 def sound_mask(view: ViewFacts) -> bool:
-    """Whether a frame has a mask that the geometry can be held against."""
+    """Whether a frame has a mask that the geometry can be compared with."""
     return view.mask is not None and _sound(view.mask)
 
 
@@ -377,7 +378,7 @@ def _lossy(evidence: Evidence) -> Iterator[Hit]:
 
 
 def _is_jpeg(path: Path) -> bool:
-    """By content; by name where the image is no file of its own."""
+    """Key of an image: its content, or its name if it is no separate file."""
     try:
         with path.open("rb") as stream:
             return stream.read(2) == b"\xff\xd8"

@@ -16,7 +16,7 @@ TELLING_MATCH = 0.4
 """Median correlation over the cameras from which their images can be compared at all."""
 
 BETTER = 0.05
-"""Correlation by which another camera's calibration has to match better."""
+"""Margin of the correlation by which another camera's calibration must match better."""
 
 LEAST_OFFSET = (1.5, 0.01)
 """Smallest limit of an offset: working pixels, and share of the image's height."""
@@ -49,7 +49,7 @@ def frozen_cameras(evidence: Evidence) -> list[str]:
 
 
 def dead_cameras(evidence: Evidence) -> set[str]:
-    """Cameras whose images show nothing of what happens."""
+    """Cameras whose images do not change with the performance."""
     return {*blank_cameras(evidence), *frozen_cameras(evidence)}
 
 
@@ -80,7 +80,7 @@ def _astray(evidence: Evidence) -> dict[str, tuple[float, float]]:
 
 
 def exchanged_cameras(evidence: Evidence) -> dict[str, str]:
-    """By camera, the other camera whose calibration fits its images."""
+    """The other camera whose calibration fits the images, by camera."""
     facts = _compared(evidence)
     return {
         c: facts[c].fits
@@ -97,7 +97,7 @@ def _spread(values: Mapping[str, float], least: float) -> tuple[float, float]:
 
 
 def blurred_cameras(evidence: Evidence) -> dict[str, float]:
-    """By camera, the limit that its sharpness falls below."""
+    """The limit below which sharpness is reported, by camera."""
     taken = exchanged_cameras(evidence)
     values = {c: f.sharpness for c, f in _compared(evidence).items() if np.isfinite(f.sharpness)}
     if len(values) < FEWEST_CAMERAS:
@@ -109,7 +109,7 @@ def blurred_cameras(evidence: Evidence) -> dict[str, float]:
 
 
 def late_cameras(evidence: Evidence) -> dict[str, float]:
-    """By camera, the limit in pixels that the change of its offset over time exceeds."""
+    """The exceeded limit of the offset's change over time in pixels, by camera."""
     facts = _compared(evidence)
     taken = {*exchanged_cameras(evidence), *blurred_cameras(evidence)}
     values = {c: f.unsteady for c, f in facts.items()}
@@ -141,7 +141,7 @@ def _apart(facts: Mapping[str, CameraFacts]) -> dict[str, float]:
 
 
 def faulty_cameras(evidence: Evidence) -> set[str]:
-    """Cameras that a rule on single cameras names; what else their images say is a consequence."""
+    """Cameras named by a rule on single cameras; other findings of their images are consequences."""
     return {
         *dead_cameras(evidence),
         *exchanged_cameras(evidence),

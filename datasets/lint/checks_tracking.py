@@ -31,7 +31,7 @@ REACH_M = 0.05
 """Metres; no face moves so far by expression alone, without jaw and head."""
 
 JUMP_M, JUMP_TIMES = 0.03, 6.0
-"""A step of the face is a jump where it is longer than this and than so many times the sequence's median."""
+"""A step of the face is a jump if it is longer than this and than this multiple of the sequence's median."""
 
 WORSE = 1.05
 """Expressions that fit the images by so much worse than none are not these images' expressions."""
@@ -337,7 +337,7 @@ SMALL = 0.2
 
 
 def _laid(evidence: Evidence) -> list[tuple[ViewFacts, MeshFacts, float]]:
-    """Frames whose mesh can be held against a sound mask, with the share of the face outside."""
+    """Frames whose mesh can be compared with a valid mask, with the fraction of the face outside."""
     if misplaced(evidence):
         return []
     faulty = faulty_cameras(evidence)

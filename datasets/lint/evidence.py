@@ -33,14 +33,14 @@ from .camera_table import CameraFacts, measure_cameras
 from .expression_fit import ExpressionFit, weigh_expression
 from .mesh import Parameters, TrackedSubject, not_finite, read_parameters
 from .settings import LintSettings
-from .views import Pixels, Thumbnail, ViewFacts, look, make_thumbnails, pick_views, pixels_of_files
+from .views import Pixels, Thumbnail, ViewFacts, inspect_views, make_thumbnails, pick_views, pixels_of_files
 
 THOROUGH_TIMESTEPS = 32
 """Timesteps on which cameras are measured with ``--thorough``."""
 
 
 class Slot(NamedTuple):
-    """Where a frame belongs in the grid of a capture."""
+    """Position of a frame in the grid of a capture."""
 
     timestep: int
     camera_index: int
@@ -48,7 +48,7 @@ class Slot(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a capture says of itself and what its files hold.
+    """Declarations of a capture, and the content of its files.
 
     Attributes
     ----------
@@ -178,7 +178,7 @@ def gather(folder: Path, settings: LintSettings, progress: Progress = no_progres
 def gather_clip(
     folder: Path, clip: CaptureClip, settings: LintSettings, progress: Progress = no_progress
 ) -> Evidence:
-    """What the linter looks at in a clip of any reader; the checks of the layout's own files need more."""
+    """Evidence from a clip of any reader; the checks of the layout's own files need more."""
     entries = {key: _entry_of(folder, clip, key) for part in clip.splits.values() for key in part}
     headers = {
         path: ImageInfo(clip.cameras[key.camera].width, clip.cameras[key.camera].height, 3)
@@ -225,11 +225,11 @@ def _looked_at(
     settings: LintSettings,
     progress: Progress,
 ) -> dict[str, Any]:
-    """What decoded frames say: fields of `Evidence`."""
+    """Evidence from decoded frames: fields of `Evidence`."""
     there = {name: [e for e in part if e.image in pixels.headers] for name, part in splits.items()}
     whole = [entry for part in there.values() for entry in part]
     chosen = whole if settings.thorough else pick_views(whole, settings.views)
-    views = look(chosen, pixels, subject, parameters, background, cy, progress=progress)
+    views = inspect_views(chosen, pixels, subject, parameters, background, cy, progress=progress)
     limit = len(whole) if settings.thorough else settings.duplicates
     return {
         "views": views,

@@ -61,7 +61,7 @@ class ExpressionFit(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Picked:
-    """What the face's vertices pick up from one frame."""
+    """Colours that the face's vertices have in one frame."""
 
     colours: FloatArray  # (F, 3)
     seen: np.ndarray  # (F,)
@@ -76,7 +76,7 @@ def weigh_expression(
     parameters: Mapping[int, Parameters],
     cy: CyConvention,
 ) -> ExpressionFit | None:
-    """Compare the expression with a face at rest; None where there is too little to compare.
+    """Compare the expression with a face at rest; None if there are too few data.
 
     Parameters
     ----------

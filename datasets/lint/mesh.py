@@ -133,7 +133,8 @@ FACE = ("face", "forehead", "nose")
 NOT_SKIN = ("lips", "eye_region", "left_eyeball", "right_eyeball", "mouth_socket", "teeth")
 
 SLACK = 0.04
-"""How far outside the foreground a vertex of the face may fall, as a share of the mesh's height in the image."""
+"""Distance outside the foreground that a vertex of the face may have, relative to the mesh's height in the
+image."""
 
 WORKING_HEIGHT = 400
 """Meshes are filled at most this many pixels high: what is asked of them is coarse."""
@@ -143,7 +144,7 @@ MIN_SKIN_PIXELS = 12
 
 @dataclass(frozen=True, eq=False)
 class MeshFacts:
-    """How the posed mesh of one frame lies before its camera.
+    """The posed mesh of one frame relative to its camera.
 
     Attributes
     ----------
@@ -184,7 +185,7 @@ class MeshFacts:
 def lay_mesh(
     subject: TrackedSubject, pose: HeadPose, camera: Camera, image: ByteArray, mask: ByteArray | None
 ) -> MeshFacts:
-    """Pose the subject's mesh and hold it against an image, (H, W, 3) RGB, and its mask, (H, W)."""
+    """Pose the subject's mesh and compare it with an image, (H, W, 3) RGB, and its mask, (H, W)."""
     vertices = subject.meshes([pose])[0]
     turn = camera.world_to_camera[:3, :3]
     centre = vertices.mean(axis=0)

@@ -1,4 +1,4 @@
-"""What a check of the linter is made of: a rule, its hits, the findings made of them."""
+"""Components of a check of the linter: a rule, its hits, and the resulting findings."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ MIN_FRINGE_PIXELS = 12
 
 @dataclass(frozen=True, eq=False)
 class MaskFacts:
-    """A frame's mask, and the image where the mask says there is none of the subject.
+    """Facts on a frame's mask, and on the image outside of the subject.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class MaskFacts:
 
 @dataclass(frozen=True, eq=False)
 class ViewFacts:
-    """What one decoded frame says.
+    """Facts on one decoded frame.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ def entry_camera(entry: FrameEntry, info: ImageInfo, cy: CyConvention) -> Camera
 
 @dataclass(frozen=True)
 class Pixels:
-    """Where the pixels of frames come from; both raise `InputError` for damaged files.
+    """Source of the pixels of frames; both functions raise `InputError` for damaged files.
 
     Attributes
     ----------
@@ -156,7 +156,7 @@ def pixels_of_files(headers: Mapping[Path, ImageInfo], background: Sequence[floa
     return Pixels(headers, lambda entry: read_image(entry.image, background), partial(_mask, headers))
 
 
-def look(
+def inspect_views(
     entries: Sequence[FrameEntry],
     pixels: Pixels,
     subject: TrackedSubject | None,

@@ -45,7 +45,7 @@ EXPRESSIONS, CANONICAL = "flame/exp", "canonical.obj"
 VIDEO = "video"
 """Name of the one sequence."""
 CHECKED_MESHES = 50
-"""Of a video whose parameters are all in files: meshes that are compared with them, enough to meet a blink."""
+"""Number of meshes of a video that are compared with complete parameters, enough to include a blink."""
 WORST_VERTEX = 1e-3
 """Metres that a vertex may lie from a mesh without a warning that eyelids are lost; they move by up to 9 mm."""
 MAX_TEXT = 2**16
@@ -245,7 +245,7 @@ class _Meshes:
         return HeadPose(head.version, expression, rest, rest, known[:3], known[3:], rest, lids)
 
     def notes(self) -> dict[str, Any]:
-        """How poses were had."""
+        """Source of the poses."""
         eyelids = f"from meshes, closed by up to {self._closed:.2f}"
         if self._head.eyelid_basis is None:
             eyelids = (
@@ -261,7 +261,8 @@ class _Meshes:
         }
 
     def _rotations(self, path: Path, count: int) -> FloatArray | None:
-        """Axis-angle vectors, one behind the other, of 6D rotations or axis-angle in a file; None where there is none."""
+        """Concatenated axis-angle vectors from 6D rotations or axis-angle in a file; None if they are
+        missing."""
         if not path.is_file():
             return None
         values = self._numbers(path)

@@ -23,7 +23,7 @@ from ..head.arrays import JOINT_NAMES, HeadArrays
 from ..head.model import HeadModel
 
 MAX_BYTES = 2**26
-"""Of a mesh; FLAME's takes 0.6 MB."""
+"""Maximum bytes of a mesh file; FLAME's takes 0.6 MB."""
 WORST_DISTANCE = 1e-4
 """Metres that the middle vertex may lie from the mesh: rounding leaves 1e-8, another head model of the same topology
 1e-3, and lids that the head model has no basis for move fewer than half of the vertices."""
@@ -53,7 +53,7 @@ def read_vertices(path: Path, count: int) -> FloatArray:
 
 
 class Identity(NamedTuple):
-    """What `MeshFit.fit_identity` finds."""
+    """Result of `MeshFit.fit_identity`."""
 
     shape: FloatArray
     """(S,)"""
@@ -64,7 +64,7 @@ class Identity(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """What `MeshFit.fit_pose` finds."""
+    """Result of `MeshFit.fit_pose`."""
 
     turns: FloatArray
     """(9,) axis-angle of jaw, left and right eye."""
@@ -99,7 +99,7 @@ class MeshFit:
         for _ in range(_MOST_STEPS):
             shaped = self._template + self._shape_basis @ shape
             posed, by_turn = self._linearised(shaped, turns)
-            # For given turns a posed mesh is linear in the mesh at rest but for what the correctives add.
+            # For given rotations a posed mesh is linear in the mesh at rest, except for the correctives.
             still = self._posed(np.zeros_like(shaped)[None], turns[None])
             parts = np.array_split(basis, max(size // _TOGETHER, 1))
             by_shape = [self._posed(part, turns[None]) - still for part in parts]

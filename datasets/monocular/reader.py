@@ -34,9 +34,10 @@ log = logging.getLogger(__name__)
 CONVENTION = 350
 """Frames held out at the end of a video, by INSTA's script and by GaussianBlendshapes' loader."""
 HELD_OUT_SUFFIX = "-held-out"
-"""Of the name of what is held out of a video that is trained on."""
+"""Suffix of the sequence that holds the held-out frames of a training video."""
 SHORT, SHORT_SHARE = 2 * CONVENTION, 4
-"""A video of fewer frames than the first has one of so many held out, since 350 would be most of it."""
+"""A video with fewer frames than the first number holds out the second fraction, since 350 would be most of
+it."""
 
 
 def find_videos(root: Path) -> list[Path]:
@@ -203,7 +204,7 @@ def _split(
 
 
 def _sequences(splits: Mapping[str, Sequence[FrameKey]]) -> dict[FrameKey, FrameKey]:
-    """What each frame is called: the held-out part of a video that is trained on is a sequence of its own."""
+    """Sequence name of each frame: the held-out part of a training video is a sequence of its own."""
     trained = {key.sequence for key in splits["train"]}
     names = {key: key for part in splits.values() for key in part}
     for key in splits["self_reenactment"]:

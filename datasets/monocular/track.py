@@ -1,4 +1,4 @@
-"""What the layouts of tracked videos have in common once they are read: frames with a camera and a pose each.
+"""Common representation of the layouts of tracked videos: frames with a camera and a pose each.
 
 In these layouts the head stands still, or nearly so, and every frame has a camera of its own. A clip has one camera,
 and the head moves before it: `fix_camera` turns the one into the other.
@@ -50,7 +50,7 @@ class VideoFrame:
 
     @property
     def name(self) -> tuple[str, int]:
-        """What frames are sorted and told apart by."""
+        """Identity and sort key of a frame."""
         return self.sequence, self.number
 
 
@@ -99,7 +99,7 @@ def ordered(root: Path, frames: Sequence[VideoFrame]) -> list[VideoFrame]:
 
 
 def frame_number(file: Path, entry: str, stem: str) -> int:
-    """Number that a frame's files are named by. Raises `InputError` for a name that is none."""
+    """Number in the names of a frame's files. Raises `InputError` for a name without one."""
     if not (stem.isascii() and stem.isdecimal() and len(stem) < 10):
         raise InputError(file, entry, "files named by the frame's number, such as 00012", repr(stem)[:60])
     return int(stem)

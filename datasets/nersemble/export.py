@@ -29,7 +29,7 @@ from .names import (
 
 @dataclass(frozen=True)
 class UnionReport:
-    """What a union folder holds.
+    """Summary of a union folder.
 
     Attributes
     ----------

@@ -84,7 +84,7 @@ def _ended(path: Path, number: int, count: int) -> InputError:
 
 @dataclass(frozen=True, eq=False)
 class _Stream:
-    """What one camera of one sequence still lacks."""
+    """Missing files of one camera of one sequence."""
 
     job: SequenceJob
     index: int

@@ -84,13 +84,13 @@ ABLATION_SUBJECT = "306"
 """Subject of the paper's Table 4; not one of the nine."""
 
 SUBJECT_NAMES = {"paper": SUBJECTS, "ablation": (ABLATION_SUBJECT,)}
-"""What names stand for where subjects are asked for."""
+"""Names that stand for several subjects."""
 
 NOVEL_VIEW_CAMERA = "222200037"
 """The frontal camera, held out for novel views."""
 
 FRONTAL_INDEX = 8
-"""Its index in the rig, by which exports without serials name it."""
+"""Its index in the rig, which identifies it in exports without serials."""
 
 TEST_SEQUENCE = "FREE"
 """The unscripted performance, held out for self-reenactment."""

@@ -1,4 +1,4 @@
-"""From a raw frame to the image of a capture: smaller, colours calibrated, on white where there is a mask.
+"""Convert a raw frame to the image of a capture: smaller, colour-calibrated, on white if there is a mask.
 
 Two forms of colour calibration exist. Version 1 is an affine map on the stored values, ``SER.npy``. Version 2 is a
 polynomial on linear values, ``color_calibration.json``. Images are 8-bit sRGB before and after. VHAP's reader

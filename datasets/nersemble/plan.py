@@ -1,4 +1,4 @@
-"""What there is to do for a subject, found out and checked whole before anything is decoded."""
+"""Plan of the work for a subject, validated completely before anything is decoded."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .settings import PrepareSettings
 from .tracking import TrackedSequence, find_tracked, read_tracked
 
 CY: layout.CyConvention = "bottom"
-"""Where VHAP's exports measure the principal point from."""
+"""Origin of the principal point in VHAP's exports."""
 
 IMAGES_VERSION = 1
 """Counted up when the same recording and settings make other images than before."""
@@ -90,7 +90,7 @@ class SequenceJob:
         return digest(IMAGES_VERSION, views, corrections, stills, cameras, list(self.recorded.numbers))
 
     def metadata_fingerprint(self, declaration: layout.Declaration) -> str:
-        """Digest of what decides the metadata beside the images: parameters and declaration."""
+        """Digest of the inputs of the metadata beside the images: parameters and declaration."""
         tracked = self.tracked
         arrays = {} if tracked is None else {**tracked.frames, **tracked.constant}
         return digest(*sorted(arrays), *(arrays[key] for key in sorted(arrays)), declaration)

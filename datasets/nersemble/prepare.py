@@ -41,7 +41,7 @@ _READABLE = (*layout.SPLIT_FILES.values(), layout.ALL_FRAMES_FILE)
 
 @dataclass(frozen=True)
 class SequenceState:
-    """What a sequence folder's record says. Empty fingerprints stand for things not there in whole."""
+    """Content of a sequence folder's record. Empty fingerprints stand for incomplete files."""
 
     images: str = ""
     images_complete: bool = False
@@ -50,7 +50,7 @@ class SequenceState:
 
 @dataclass(frozen=True)
 class SubjectResult:
-    """What was done for a subject.
+    """Result for a subject.
 
     Attributes
     ----------
@@ -264,7 +264,7 @@ def _write_union(plan: PreparationPlan) -> dict[str, int]:
 
 
 def _missing(plan: PreparationPlan) -> tuple[str, ...]:
-    """What the capture lacks, one sentence each."""
+    """Missing parts of the capture, one sentence each."""
     untracked = [job.recorded.name for job in plan.jobs if not _is_readable(job)]
     unmasked = [job.recorded.name for job in plan.jobs if not job.recorded.has_masks]
     plain = [job.recorded.name for job in plan.jobs if not job.corrections]

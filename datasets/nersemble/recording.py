@@ -96,7 +96,7 @@ class Participant:
 
 
 def participants(root: Path) -> dict[str, Participant]:
-    """Participants under ``root`` by id. Raises `InputError` where there is none."""
+    """Participants under ``root`` by id. Raises `InputError` if there are none."""
     if not root.is_dir():
         raise InputError(root, "", "a folder with recordings", "a file" if root.exists() else "nothing")
     listed = _listed_sequences(root)

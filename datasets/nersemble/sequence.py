@@ -24,7 +24,7 @@ from .names import numbered, serial_of
 from .recording import Calibration, Participant
 
 Source = Literal["auto", "video", "images"]
-"""Which frames to take: videos, or images beside them; "auto" takes images where they come with masks."""
+"""Source of the frames: videos, or images beside them; "auto" uses images if they come with masks."""
 
 EVERY_OF_73 = 3
 """Every third frame of 73 per second makes the 24.33 per second that "24 fps" stands for."""
@@ -38,7 +38,7 @@ _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 
 @dataclass(frozen=True, eq=False)
 class RecordedView:
-    """What one camera recorded.
+    """The recording of one camera.
 
     Attributes
     ----------
@@ -323,7 +323,7 @@ def _common_numbers(
 
 
 def _lacking(missing: Mapping[str, set[int]]) -> str:
-    """Which cameras lack which frames, cameras that lack the same ones together."""
+    """Missing frames by camera, cameras with the same missing frames together."""
     groups: dict[str, list[str]] = {}
     for serial, numbers in missing.items():
         if numbers:

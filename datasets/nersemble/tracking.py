@@ -57,7 +57,8 @@ class TrackedSequence:
         return {**rows, "translation": moved.astype(np.float32), **self.constant}
 
     def canonical(self) -> dict[str, FloatArray]:
-        """``canonical_flame_param.npz``: zeros but for identity, static offset and an open jaw (float64)."""
+        """``canonical_flame_param.npz``: zeros except for identity, static offset and an open jaw
+        (float64)."""
         zeros = {
             key: np.zeros_like(values[:1]) for key, values in self.frames.items() if key != "dynamic_offset"
         }
@@ -97,7 +98,7 @@ def read_tracked(
 
 
 def find_tracked(root: Path, subject: str, sequence: str) -> Path | None:
-    """Final parameters of a sequence under VHAP's output folder; None where there are none.
+    """Final parameters of a sequence under VHAP's output folder; None if there are none.
 
     Looks in folders named as VHAP's scripts name them (``074_EMO-1_v16_DS4_wBg_staticOffset``) or plainly
     ``074_EMO-1-shout+laugh``, takes the latest dated run inside, and its last epoch. Raises `InputError` where

@@ -34,9 +34,9 @@ LANDMARK_LIMIT = 500
 """Timesteps up to which all pairs are compared; beyond, at most as many landmarks stand for all."""
 
 LANDMARK_TOLERANCE = 0.01
-"""Fraction of the largest distance within which every face has a landmark, if so many are allowed."""
+"""Fraction of the largest distance within which every face has a landmark, if their number permits it."""
 
-_DIGITS = 6  # distances equal to so many digits, as parts of the largest, are those of one face
+_DIGITS = 6  # relative distances that are equal to this number of digits belong to one face
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class ExpressionClusters:
         return dict(zip(self.timesteps.tolist(), self.labels.tolist()))
 
     def record(self) -> dict[str, Any]:
-        """What a record of the step says."""
+        """Content of the step's record."""
         return {
             "timesteps": len(self.timesteps),
             "class_sizes": np.bincount(self.labels).tolist(),

@@ -93,7 +93,7 @@ def exclude_given(clip: Clip, exclude: Mapping[int, str] | str | Path | None) ->
 
 
 def read_labels(path: Path) -> dict[int, str]:
-    """Read frame labels: a JSON object {"<timestep>": "<reason>"}; `InputError` where it is none."""
+    """Read frame labels: a JSON object {"<timestep>": "<reason>"}. Raises `InputError` for other files."""
     labels = {}
     for key, reason in read_json(path).items():
         if not (key.isascii() and key.isdigit() and isinstance(reason, str)):
@@ -147,7 +147,7 @@ _HEADER = """\
 
 @dataclass(frozen=True)
 class FrameDecision:
-    """What the detector says of one timestep; ``score`` is in `UNIT`."""
+    """Decision of the detector on one timestep; ``score`` is in `UNIT`."""
 
     sequence: str
     score: float

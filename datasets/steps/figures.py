@@ -44,7 +44,7 @@ class JawFindings(NamedTuple):
     variant: str
 
     def record(self) -> dict[str, Any]:
-        """As plain values."""
+        """The values as plain types."""
         return {
             "variant": self.variant,
             "leaks": list(leaks(self.variant)),

@@ -29,7 +29,7 @@ TGA_TEST_STRIDE = 16
 
 
 def leaks(variant: str) -> tuple[str, ...]:
-    """What of the test signal the bases have seen; for records that stand beside results."""
+    """Test data that the bases have seen, for records of results."""
     return ("jaw bases drawn from held-out poses (published behaviour)",) if variant == "official" else ()
 
 

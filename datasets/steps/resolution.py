@@ -24,7 +24,7 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class Resize:
-    """To (width, height) pixels; covers the same extent."""
+    """Resizing to (width, height) pixels with the same extent."""
 
     width: int
     height: int
@@ -42,7 +42,7 @@ class PixelBox:
 
 @dataclass(frozen=True)
 class Alignment:
-    """How images of one size become those of a `ResolutionRule`, pixel for pixel, and the way back.
+    """Pixel-exact conversion of images of one size to those of a `ResolutionRule`, and its inverse.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ def take_box(image: FloatArray, box: PixelBox, background: Sequence[float] | Flo
 
 
 def alignments(cameras: Mapping[str, Camera], rule: ResolutionRule) -> dict[str, Alignment]:
-    """How each camera's images are aligned, by camera id."""
+    """Alignment of each camera's images, by camera id."""
     return {name: Alignment.of((c.width, c.height), rule) for name, c in cameras.items()}
 
 

@@ -1,4 +1,4 @@
-"""Where things are on a head: the points and curves that painting, hair and wrinkles hang on.
+"""Anatomy of a head: points and curves that painting, hair and wrinkles are based on.
 
 Everything is measured on the subject's own neutral shape, so that any head with the named landmarks (or the
 68 of iBUG's scheme) can be rendered. Left is the subject's left, +x; +y is up and +z is front; metres.

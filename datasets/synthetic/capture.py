@@ -143,7 +143,7 @@ def synthesize(
     done = 0
     progress(done, total, "planned")
     if execution is not None and execution.executor != "inline":
-        _work_off(out, plans, execution)
+        _run_all(out, plans, execution)
     for plan in plans:
         work = _left(plan)
         done += timesteps * cameras - sum(len(names) for _, _, names in work)
@@ -205,7 +205,7 @@ def _render(job: Job) -> None:
         _renderer[0].render_frames(*job)
 
 
-def _work_off(out: Path, plans: Sequence[SubjectPlan], execution: Execution) -> None:
+def _run_all(out: Path, plans: Sequence[SubjectPlan], execution: Execution) -> None:
     """Have an executor render the subjects that lack pictures. Raises `HeadbenchError` where one failed."""
     from ...bench.executors.schedule import Schedule
 
@@ -244,7 +244,7 @@ def render_subject(task: Task, report: Callable[[str], None]) -> None:
 
 
 def _left(plan: SubjectPlan) -> list[Job]:
-    """What is missing of a subject."""
+    """Missing parts of a subject."""
     missing = [
         (sequence, timestep, _missing(plan, sequence, timestep)) for sequence, timestep in plan.moments()
     ]
@@ -283,7 +283,7 @@ def _check(settings: SyntheticSettings) -> None:
 
 
 def _manifest(settings: SyntheticSettings, head: str) -> dict[str, Any]:
-    """What a folder holds that is of these settings and of a head of this fingerprint."""
+    """Files in a folder that belong to these settings and to a head of this fingerprint."""
     return {
         "version": _VERSION,
         **settings.described(),
@@ -345,7 +345,7 @@ def _claim(out: Path, wanted: Mapping[str, Any]) -> None:
 
 
 def _is_foreign(path: Path) -> bool:
-    """Whether a file is none that a killed start of this command may have left before the manifest."""
+    """Whether a file cannot come from a killed start of this command before the manifest."""
     if path.name == "README.txt" and path.is_file():
         ours = _README.encode()
         return path.stat().st_size != len(ours) or path.read_bytes() != ours

@@ -20,7 +20,7 @@ from .skin import FLUSHES, FOLDS, flush_strengths
 BUCKLES = (0.30, 0.55)
 """Range of the strength at which a fold buckles, drawn for each subject and fold."""
 SLACK = (0.12, 0.25)
-"""How far below that strength it becomes smooth again: the hysteresis, drawn likewise."""
+"""Hysteresis: difference to that strength at which it becomes smooth again, drawn likewise."""
 _SMOOTH = 0.3  # depth, as a share of the strength, of a fold that has not buckled
 _BUCKLED = (0.25, 0.75)  # depth of one that has: a constant, and a share of the strength
 _DEEPEST = 1.1
@@ -29,7 +29,7 @@ FLUSH_SECONDS = {"cheeks": (0.9, 2.5), "anger": (0.9, 2.5), "nose": (0.6, 1.5), 
 """Time constants with which blood comes and goes."""
 _REFILL = (0.0, 0.8)  # of skin that is pressed: pale at once, filled again within about two seconds
 DRYING = 4.0
-"""Seconds after which lips keep 1/e of what lip roll or tongue wetted."""
+"""Seconds after which the wetness of lips has decayed to 1/e."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ _AGED = np.array(
         for name in FOLDS
     ]
 )
-"""How deep folds of an aged face are at rest."""
+"""Depth of an aged face's folds at rest."""
 
 
 def coupled_strengths(a: Activations) -> FloatArray:

@@ -1,4 +1,4 @@
-"""What the synthetic capture needs of a machine, for `DatasetSpec.needs`."""
+"""Requirements of the synthetic capture on the machine, for `DatasetSpec.needs`."""
 
 from __future__ import annotations
 

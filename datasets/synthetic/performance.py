@@ -1,4 +1,4 @@
-"""What a subject performs: NeRSemble's sequences as smooth curves of the semantic controls.
+"""The performance of a subject: NeRSemble's sequences as smooth curves of the semantic controls.
 
 A sequence is a list of phrases, each a target set of controls held around its peak; curves between them are
 monotone cubics, so nothing overshoots and a held face stays held. Blinks, gaze and head motion run on top.
@@ -220,7 +220,7 @@ SEQUENCES: Mapping[str, tuple[Face, ...]] = {
 """Phrases by sequence, in NeRSemble's order."""
 
 BEYOND = 1.3
-"""How far beyond training the last part of FREE goes."""
+"""Distance of the last part of FREE beyond training."""
 
 
 def _beyond(face: Face) -> Face:
@@ -350,7 +350,7 @@ _IDLE = (
     *(("sway_x", 0.004, 4.1), ("sway_y", 0.003, 3.9), ("sway_z", 0.004, 4.7)),
     *(("gaze_left", 0.10, 1.3), ("gaze_up", 0.06, 1.7)),
 )
-"""(control, amplitude, seconds per swing) of what always moves."""
+"""(control, amplitude, seconds per swing) of permanent motion."""
 
 
 def _phrase_curves(

@@ -46,12 +46,12 @@ _LOOK_BELOW = 0.004  # metres below the middle of the head
 
 
 EDITION = 2
-"""Of what a capture shows, recorded with it: captures of one edition and the same settings have the same content."""
+"""Edition of the content: captures of one edition and the same settings have the same content."""
 
 
 @dataclass(frozen=True)
 class SyntheticSettings:
-    """What decides a synthetic capture's content. ``size`` is (width, height)."""
+    """Settings that define a synthetic capture's content. ``size`` is (width, height)."""
 
     subjects: int
     cameras: int
@@ -154,9 +154,10 @@ def plan_subject(out: Path, index: int, geometry: Geometry, settings: SyntheticS
 
 
 def _middle(anatomy: Anatomy, neutral: FloatArray, style: Style) -> FloatArray:
-    """Where the cameras look: the middle of the head with its hair, at rest, a little low so that the bust shows.
+    """Target of the cameras: the middle of the head with its hair, at rest, a little low so that the bust is
+    visible.
 
-    From the chin up only: neck and shoulders are no part of what must stay in the frame from every side.
+    Only parts above the chin are used: neck and shoulders need not be in the frame from every side.
     """
     skin = neutral[np.unique(anatomy.skin_faces)]
     above = skin[skin[:, 1] > anatomy["chin"][1]]

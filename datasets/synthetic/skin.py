@@ -94,7 +94,7 @@ def brow_share(person: Person, anatomy: Anatomy, points: FloatArray) -> FloatArr
 
 
 def lip_share(anatomy: Anatomy, points: FloatArray) -> FloatArray:
-    """How much a point belongs to the red of the lips, by the outline seen from the front."""
+    """Weight of a point in the red of the lips, by the outline seen from the front."""
     s, outline = anatomy.scale, anatomy.lip_outline
     near = _near(points, anatomy["mouth"], 0.06 * s)
     share = np.zeros(len(points))
@@ -103,7 +103,7 @@ def lip_share(anatomy: Anatomy, points: FloatArray) -> FloatArray:
 
 
 def sagging(person: Person, anatomy: Anatomy, points: FloatArray) -> FloatArray:
-    """(N,) metres along the normal by which skin of age differs from young skin: jowls and bags, hollow temples and cheeks."""
+    """(N,) metres along the normal between aged and young skin: jowls and bags, hollow temples and cheeks."""
     s, total = anatomy.scale, np.zeros(len(points))
     for side, sign in zip(SIDES, (1.0, -1.0)):
         corner, eye = anatomy[f"{side}_mouth_corner"], anatomy.eyes[side]
@@ -143,7 +143,7 @@ def _near(points: FloatArray, center: FloatArray, radius: float) -> FloatArray:
 
 
 def _flush(anatomy: Anatomy, points: FloatArray) -> FloatArray:
-    """Where blood shows: cheeks, nose, ears, chin."""
+    """Weight of visible blood: cheeks, nose, ears, chin."""
     s = anatomy.scale
     total = 0.9 * blob(points, anatomy["nose_tip"], 0.011 * s) + 0.35 * blob(
         points, anatomy["chin"], 0.014 * s
@@ -206,7 +206,7 @@ def _freckles(anatomy: Anatomy, points: FloatArray, seed: int) -> FloatArray:
 
 
 def stubble_share(anatomy: Anatomy, points: FloatArray, seed: int) -> FloatArray:
-    """Where a beard would grow, grained as stubble."""
+    """Weight of beard growth, grained as stubble."""
     s = anatomy.scale
     mouth, chin = anatomy["mouth"], anatomy["chin"]
     low = smoothstep(points[:, 1], mouth[1] + 0.018 * s, mouth[1] - 0.006 * s) * smoothstep(

@@ -40,7 +40,7 @@ class PosedMesh:
 
 @dataclass(frozen=True, eq=False)
 class RestMesh:
-    """What of a mesh does not change: triangles, colours at rest, material."""
+    """Constant parts of a mesh: triangles, colours at rest, material."""
 
     faces: IntArray
     albedo: FloatArray
@@ -157,7 +157,7 @@ class RenderedSubject:
         return points[root][strand] + np.einsum("nab,nb->na", turn[strand], local)
 
     def _joint_motions(self, pose: HeadPose) -> FloatArray:
-        """(J, 3, 4) motion of what hangs rigidly on each joint, from rest to ``pose``."""
+        """(J, 3, 4) motion of parts that are rigidly attached to each joint, from rest to ``pose``."""
         expression = torch.from_numpy(np.asarray(pose.expression, np.float64))
         joints = self._model.joints(torch.from_numpy(self.shape), expression)
         angles = np.stack([pose.rotation, pose.neck, pose.jaw, pose.eyes[:3], pose.eyes[3:]])
@@ -299,7 +299,8 @@ def _weights_on(corners: IntArray, parents: IntArray, weights: FloatArray) -> Fl
 def _split(
     triangles: IntArray, owner: IntArray, middle: IntArray, position: FloatArray
 ) -> tuple[IntArray, IntArray]:
-    """Replace each triangle by 1 to 4, by which of its edges (01, 12, 20) have a midpoint (>= 0)."""
+    """Replace each triangle by 1 to 4, depending on which of its edges (01, 12, 20) have a midpoint (>=
+    0)."""
     count = (middle >= 0).sum(axis=1)
     done, whose = [triangles[count == 0]], [owner[count == 0]]
 

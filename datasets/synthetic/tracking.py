@@ -28,17 +28,17 @@ FIELDS = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyeli
 FACE_MM, DETAIL_MM = 0.5, 2.5
 """Root mean square displacement at level 1: of the face by the error that is everywhere, and of lips and lids by all."""
 LID_SHARE = 0.5
-"""Of the largest displacement by a blink: what moves more belongs to the lids."""
+"""Fraction of the largest displacement by a blink above which a vertex belongs to the lids."""
 PERSISTENCE = 0.8
 """Correlation of the drift from one timestep to the next."""
 SHRINKAGE = (0.05, 0.3)
 """Part of a coefficient that regularisation takes away, drawn for each coefficient."""
 MIXING = 0.3
-"""Norm of what a unit coefficient leaks into the others."""
+"""Norm of the leakage of a unit coefficient into the others."""
 _MOMENTS = 48  # poses that amplitudes are measured on
 _PROBE = 1e-2  # part of an error at which its displacement is measured: there it is linear
 DRIFT = 0.2
-"""Of the drift, in spreads of a parameter or of the range of a control."""
+"""Amplitude of the drift, in spreads of a parameter or relative to the range of a control."""
 LID_CONTROLS = tuple(f"{name}_{side}" for name in ("blink", "squint", "eye_wide") for side in SIDES)
 LIP_CONTROLS = (
     *(f"{name}_{side}" for name in ("upper_lip_up", "lower_lip_down") for side in SIDES),

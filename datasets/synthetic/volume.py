@@ -23,7 +23,7 @@ _BEARD = 0.35  # mean thickness of a beard, as a part of its length
 
 
 def tracked_volume(person: Person, anatomy: Anatomy, head: HeadAsset, neutral: FloatArray) -> FloatArray:
-    """(V, 3) offsets, metres, of a subject's neutral vertices (V, 3); 0 where there is no skin. Joints stay where they are."""
+    """(V, 3) offsets, metres, of a subject's neutral vertices (V, 3); 0 without skin. Joints do not move."""
     s, style = anatomy.scale, STYLES[person.style]
     named = np.zeros(len(neutral))
     for ear in ("left_ear", "right_ear"):

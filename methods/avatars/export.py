@@ -19,7 +19,7 @@ from ..splats import rasterize
 from .formats import FORMATS, StoredSplats
 from .harmonics import DEGREE, harmonics_of
 from .settings import AvatarOptions, ExportGlbSettings, ExportOptions, ExportPlySettings, ExportSogSettings
-from .views import FIELD_OF_VIEW, direction_of, look
+from .views import FIELD_OF_VIEW, direction_of, orbit_camera
 from .web.bake import Source
 
 VIEWS = ((0.0, 0.0), (0.6, 0.0), (-0.6, 0.2))
@@ -87,14 +87,15 @@ def export_pose(settings: ExportOptions, name: str, progress: Progress) -> Findi
 
 
 def _least_psnr(avatar: SplatAvatar, pose: HeadPose, found: StoredSplats) -> float:
-    """dB, the least of `VIEWS`: the file's splats drawn by our renderer against the avatar's frames, on white."""
+    """Minimum PSNR over `VIEWS`, dB: the file's splats rendered by this package against the avatar's frames,
+    on white."""
     source = Source(avatar, pose, np.zeros(3), np.zeros((4, 3)))
     extent = np.quantile(source.seen(pose).means, (0.005, 0.995), axis=0)
     distance = float((extent[1] - extent[0]).max()) / np.tan(np.radians(FIELD_OF_VIEW))
     worst = np.inf
     for azimuth, elevation in VIEWS:
         camera = source.camera(
-            look(direction_of(azimuth, elevation), 1.5 * distance, extent.mean(axis=0), SIZE)
+            orbit_camera(direction_of(azimuth, elevation), 1.5 * distance, extent.mean(axis=0), SIZE)
         )
         view = view_of(camera, "cpu", (1.0, 1.0, 1.0))
         colors = harmonic_colors(found.dc, found.rest, found.means - view.center, DEGREE)

@@ -43,7 +43,7 @@ class StoredSplats(NamedTuple):
 
     @classmethod
     def of(cls, posed: Splats, dc: Tensor, rest: Tensor) -> StoredSplats:
-        """Of an avatar's splats and their harmonics; degrees that it does not have are zero."""
+        """Splats of an avatar with their harmonics; missing degrees are zero."""
         every = torch.zeros(len(dc), 3, 15)
         every[:, :, : rest.shape[2]] = rest
         means, quats, scales, opacities = (
@@ -54,7 +54,7 @@ class StoredSplats(NamedTuple):
 
 
 class Format(NamedTuple):
-    """How a file is written and read; ``check`` raises `UnavailableError` where that needs what is not installed."""
+    """Writer and reader of a format; ``check`` raises `UnavailableError` if a dependency is missing."""
 
     check: Callable[[], Any]
     write: Callable[[Path, StoredSplats], None]

@@ -11,7 +11,7 @@ from ..shared.rendering import view_of
 from ..splats import rasterize
 
 FIELD_OF_VIEW = 30.0
-"""Of the cameras of `look`, degrees."""
+"""Field of view of the cameras of `orbit_camera`, degrees."""
 SIZE = 128
 """Pixels along a side of a picture by which `visibility` looks at splats."""
 
@@ -40,7 +40,9 @@ def visibility(splats: Splats, directions: FloatArray) -> Tensor:
     middle = splats.means.mean(axis=0)
     radius = float(np.quantile(np.linalg.norm(splats.means - middle, axis=1), 0.99))
     distance = max(radius, 1e-3) / np.tan(np.radians(FIELD_OF_VIEW / 2))
-    weights = torch.stack([contribution(splats, look(d, distance, middle, SIZE)) for d in directions], dim=1)
+    weights = torch.stack(
+        [contribution(splats, orbit_camera(d, distance, middle, SIZE)) for d in directions], dim=1
+    )
     return weights / weights.amax(dim=1, keepdim=True).clamp_min(1e-6)
 
 
@@ -57,7 +59,7 @@ def camera_at(place: FloatArray) -> Camera:
     return Camera("place", 8, 8, np.eye(3), motion)
 
 
-def look(direction: FloatArray, distance: float, target: FloatArray, size: int) -> Camera:
+def orbit_camera(direction: FloatArray, distance: float, target: FloatArray, size: int) -> Camera:
     """A square view of a target, upright, from (3,) a unit vector to the camera that does not point straight up."""
     ahead = -np.asarray(direction, np.float64)
     right = np.cross(ahead, [0.0, 1.0, 0.0])

@@ -408,7 +408,7 @@ def _gradient_error(value: Tensor, truth: Tensor, case: Extreme, name: str) -> f
 
 
 def special_cases(backend: str) -> dict[str, str]:
-    """What is wrong with values that are not finite and with other numbers of threads, by case; empty where nothing is."""
+    """Faults with non-finite values and other numbers of threads, by case; empty for none."""
     found = {}
     for bad in (float("nan"), float("inf"), -float("inf")):
         scene = poisoned(bad)

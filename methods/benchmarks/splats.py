@@ -45,7 +45,7 @@ class Passes:
         return rasterize(*inputs, background=self._scene.background, **self._options)
 
     def __call__(self) -> None:
-        """Run both passes; keep the least seconds of the forward pass and of the kernel's stages."""
+        """Run both passes; keep the minimum seconds of the forward pass and of the kernel's stages."""
         for leaf in self._leaves:
             leaf.grad = None
         start = time.thread_time()

@@ -122,7 +122,7 @@ def _rasteriser(training: SplatTrainer) -> Callable[[], None]:
 
 
 def profiled(training: SplatTrainer, rounds: int) -> list[Row]:
-    """Where the time of an iteration goes, by operation; those of compiled passes have the names of their classes."""
+    """Time of an iteration by operation; operations of compiled passes have the names of their classes."""
     with profile(activities=[ProfilerActivity.CPU]) as found:
         for _ in range(rounds):
             iterate(training)

@@ -1,4 +1,4 @@
-"""Avatars that nobody trained, of any size, with a capture in memory that shows them: what benchmarks measure."""
+"""Untrained avatars of any size, with a capture in memory that shows them, for benchmarks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What there is to know of GaussianAvatars before it is imported. Light: no implementation is imported."""
+"""Spec of GaussianAvatars. Light: the implementation is not imported."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ...bench.specs import MethodSpec
 from ..shared.config import splat_presets
 
 SHORT: dict[str, Any] = {"sh_dc_lr": 0.02, "sh_rest_lr": 1e-3}
-"""Of runs much shorter than published (README.md, "Presets")."""
+"""Settings of runs much shorter than published (README.md, "Presets")."""
 
 GA = MethodSpec(
     name="ga",

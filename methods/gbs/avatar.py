@@ -81,7 +81,7 @@ MEMBERS = {
 
 
 class Stored(NamedTuple):
-    """What an avatar's file holds.
+    """Content of an avatar's file.
 
     Attributes
     ----------

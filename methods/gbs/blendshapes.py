@@ -32,7 +32,7 @@ def difference_widths(degree: int) -> dict[str, int]:
 
 
 class Entries(NamedTuple):
-    """Which rows of the differences belong to which splat, and to which expression.
+    """Splat and expression of each row of the differences.
 
     Attributes
     ----------
@@ -143,11 +143,11 @@ def apply_pose(neutral: Mapping[str, Tensor], differences: Tensor, motions: Poin
 
 
 PARTS = {"linear": 9, "offset": 3, "rotation": 9, "product": 16, "turn": 4, "shift": 3}
-"""Columns of what a pose says of each point."""
+"""Columns of the effect of a pose on each point."""
 
 
 class PointMotions(NamedTuple):
-    """What a pose does to splats.
+    """Effect of a pose on splats.
 
     Attributes
     ----------
@@ -234,7 +234,7 @@ class Rig:
 
     @torch.no_grad()
     def motions(self, arguments: Mapping[str, Tensor]) -> Tensor:
-        """What one pose does to each point, (P, 44) in the columns of `PARTS`."""
+        """Effect of one pose on each point, (P, 44) in the columns of `PARTS`."""
         model, expression = self.mesh.model, arguments["expression"]
         coefficients = self.coefficients(arguments)
         angles = model.angles(*(arguments[name] for name in ("rotation", "neck", "jaw", "eyes")))

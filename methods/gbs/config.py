@@ -13,7 +13,7 @@ from ..shared.config import Capacity, DensifiedTraining
 
 @dataclass(frozen=True)
 class BlendshapeTraining(DensifiedTraining):
-    """How the neutral splats are trained; lengths are metres, the extent of the scene is 1.
+    """Training of the neutral splats; lengths are metres, the extent of the scene is 1.
 
     Opacities are never reset. The published code also means to remove splats of a radius above 20 pixels, but clears
     the radii before it looks at them, as 3DGS does, so that there is no such rule here.

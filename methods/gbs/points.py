@@ -25,7 +25,7 @@ RADIUS = 0.77
 area per sample; measured between 1,000 and 50,000 samples of a head."""
 NEIGHBOURS = 3
 SMALLEST_SQUARE = 1e-7
-"""Square metres; the least mean squared distance to neighbours, as published."""
+"""Square metres; the minimum mean squared distance to neighbours, as published."""
 
 
 class SurfacePoints(NamedTuple):
@@ -134,7 +134,7 @@ def padded_offset(offset: FloatArray, vertices: int) -> FloatArray:
 
 
 def rows_of_teeth(head: HeadArrays) -> list[IntArray]:
-    """Triangles of the upper and of the lower teeth, where there are teeth."""
+    """Triangles of the upper and of the lower teeth, if there are teeth."""
     return [faces_in_region(head, name) for name in ROWS if name in head.regions]
 
 

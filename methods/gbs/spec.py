@@ -1,4 +1,4 @@
-"""What there is to know of GaussianBlendshapes before it is imported. Light: no implementation is imported."""
+"""Spec of GaussianBlendshapes. Light: the implementation is not imported."""
 
 from __future__ import annotations
 

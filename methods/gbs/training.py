@@ -40,7 +40,7 @@ gradients by the table are not scaled down to where Adam's epsilon counts."""
 
 
 class StartingPoints(NamedTuple):
-    """Where splats are put at the start.
+    """Initial positions of the splats.
 
     Attributes
     ----------
@@ -153,7 +153,7 @@ class GBSTraining(SplatTrainer):
         return self._of_teeth[1]
 
     def _splat_motions(self, pose: int) -> tuple[PointMotions, Tensor]:
-        """What a pose does to the splats as they are now bound, and with which shares it takes their differences."""
+        """Effect of a pose on the currently bound splats, and the weights of their differences."""
         binding = self.binding
         if self._of_splats is None or self._of_splats[0] is not binding:
             self._of_splats = binding, BoundedCache(self._splat_motions_at, self._poses_kept)
@@ -180,7 +180,7 @@ class GBSTraining(SplatTrainer):
         return table * self.entries.weights[:, None]
 
     def _on_background(self, image: Tensor) -> tuple[Tensor, Tensor | None]:
-        """(H, W, 3) colours on the background of training, and (H, W) coverage where there are masks.
+        """(H, W, 3) colours on the background of training, and (H, W) coverage if there are masks.
 
         A mask takes the background that the image was recorded on out of it.
         """

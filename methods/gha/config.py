@@ -186,5 +186,5 @@ class GHAConfig:
 
     @property
     def upscale(self) -> int:
-        """How many times smaller than the image splats are drawn."""
+        """Ratio of the image's size to the splatted size."""
         return 2 ** (len(self.sr_widths) - 1)

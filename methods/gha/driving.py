@@ -31,7 +31,7 @@ POSE_SIZE = 6
 """Axis-angle and translation."""
 
 ANGLES = 9
-"""Of jaw and eyes in the expression code, after the expression."""
+"""Names of jaw and eyes in the expression code, after the expression."""
 
 
 class Signal(NamedTuple):
@@ -45,7 +45,7 @@ class Signal(NamedTuple):
 
 
 class HeadMotion(NamedTuple):
-    """Where the head is."""
+    """Rigid motion of the head."""
 
     rotation: Tensor  # (3, 3) canonical frame to world
     translation: Tensor  # (3,) of the canonical frame's origin, metres
@@ -135,7 +135,7 @@ class Driver:
         return motion._replace(code=motion.code - self._code_shift)
 
     def rest_arguments(self, codes: Tensor) -> dict[str, Tensor]:
-        """Arguments of (B, E) expression codes with the head at rest: the inverse of what `signals` makes of them."""
+        """Arguments of (B, E) expression codes with the head at rest: the inverse of `signals`."""
         if self.expression_scale is not None:
             codes = codes * self.expression_scale
         expressions = self.model.expression_size
@@ -156,7 +156,7 @@ class Driver:
 
 
 def expression_codes(arguments: Mapping[str, Tensor]) -> Tensor:
-    """(T, E) expression, jaw, eyes and, where there are any, eyelids; angles within half a turn."""
+    """(T, E) expression, jaw, eyes and, if present, eyelids; angles within half a turn."""
     angles = torch.cat([arguments["jaw"], arguments["eyes"]], dim=1).unflatten(1, (ANGLES // 3, 3))
     parts = [arguments["expression"], _principal(angles).flatten(1)]
     if "eyelids" in arguments:
@@ -210,7 +210,7 @@ def mouth_box(lips: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 class Influence(NamedTuple):
-    """Which points a controller acts on, (n,) int64, and its (n,) weights there in (0, 1]."""
+    """Points that a controller acts on, (n,) int64, and their (n,) weights in (0, 1]."""
 
     rows: Tensor
     weights: Tensor

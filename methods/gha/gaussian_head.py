@@ -19,10 +19,12 @@ from .driving import HeadMotion, Signal, influences
 from .networks import ATTRIBUTES, Controllers, Influences, Weights, encode, encode_pose, uniform
 
 POINTS = {"points": 3, "log_scales": 3, "quats": 4, "opacities": 1}
-"""What a Gaussian has besides its features, with columns: canonical position and scale, rotation, opacity logit."""
+"""Attributes of a Gaussian except its features, with columns: canonical position and scale, rotation, opacity
+logit."""
 
 LARGEST_LOG_SCALE = 2.0
-"""A Gaussian is at most so large (of canonical units), however far an expression is outside of what was trained."""
+"""Maximum size of a Gaussian in canonical units, however far an expression is outside of the training
+range."""
 
 REACH = 2
 """Pixels of the feature image around a drawn one that super-resolution may still colour."""
@@ -41,7 +43,7 @@ class FeatureSplats(NamedTuple):
 
 
 class FeatureImage(NamedTuple):
-    """What a camera sees at the splatted size: the (h, w, C) feature image and its (h, w) alpha."""
+    """A view at the splatted size: the (h, w, C) feature image and its (h, w) alpha."""
 
     features: Tensor
     alpha: Tensor
@@ -80,7 +82,8 @@ class GaussianHead:
         return {n: s for mlp in self.controllers.of_gaussians for n, s in mlp.shapes().items()} | shapes
 
     def inputs(self, tensors: Weights) -> PointInputs:
-        """What all poses share: inputs of the networks that follow from the points and their features alone."""
+        """Values shared by all poses: inputs of the networks that depend only on the points and their
+        features."""
         c, points = self.config, tensors["points"]
         parts = influences(points, tensors["landmarks"].detach(), c.near_squared, c.far_squared)
         return PointInputs(parts, encode(points), torch.tanh(tensors["features"]))
@@ -197,7 +200,7 @@ class SuperResolution:
         return 2 ** (len(self.widths) - 1)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of every tensor, by name. Convolutions have no bias but for the last one."""
+        """Shape of every tensor, by name. Convolutions have no bias, except the last one."""
         shapes: dict[str, tuple[int, ...]] = {}
         before = self.channels
         for block, width in enumerate(self.widths):
@@ -230,7 +233,7 @@ class SuperResolution:
     def bounded(
         self, weights: Weights, drawn: FeatureImage, background: Tensor, at_once: int = AT_ONCE
     ) -> Tensor:
-        """What calling gives, without gradients, in bounded memory, in strips of rows.
+        """The same output without gradients, in bounded memory, in strips of rows.
 
         By calling, where no tensor there has more than ``at_once`` numbers. Otherwise no more than a block's output and
         that of the block before exist at a time, beside strips of so many numbers.

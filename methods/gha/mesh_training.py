@@ -26,7 +26,7 @@ from .mesh_head import DISC_OPACITY, MeshHead, TetGrid, spacing_for, tet_grid, v
 from .tracked_motion import TangentDistance, TrackedMotion, fitted, outer_vertices
 
 COLOR, SILHOUETTE, DISPLACEMENT, DISTANCE, SMOOTHNESS = 0.1, 0.1, 0.01, 0.1, 100.0
-"""Published weights of the losses, but for that of the landmarks, which is a setting."""
+"""Published weights of the losses, except that of the landmarks, which is a setting."""
 
 MARGIN = 0.3
 """Canonical units around the neutral mesh that the grid covers."""
@@ -141,7 +141,7 @@ class MeshTraining:
         return self._note
 
     def _landmark_error(self, landmarks: Tensor, offset: Tensor, row: int) -> Tensor:
-        """Mean squared component of what moved landmarks lack to the tracked ones of a timestep."""
+        """Mean squared component of the difference between moved and tracked landmarks of a timestep."""
         signal = self._scene.signals[row]
         expressed = self._head.expressed(self._optimiser, landmarks, signal.expression) + offset
         return F.mse_loss(expressed, self._tracked_landmarks[row])
@@ -252,7 +252,8 @@ FOLDER, RESULT_FILE = "mesh", "mesh.safetensors"
 
 
 class MeshResult(NamedTuple):
-    """What the mesh phase leaves: its tensors by name, iterations done, and seconds spent, those of its start included."""
+    """Result of the mesh phase: its tensors by name, iterations done, and seconds spent, including those of
+    its start."""
 
     tensors: Mapping[str, Tensor]
     iterations: int

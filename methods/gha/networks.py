@@ -21,7 +21,7 @@ from .config import GHAConfig
 from .driving import POSE_SIZE, Influence
 
 SLOPE = 0.01
-"""Of the leaky ReLU between layers."""
+"""Slope of the leaky ReLU between layers."""
 
 
 class Weights(Protocol):
@@ -42,7 +42,7 @@ class Mlp:
         Sizes of the two parts of the input, in this order.
     hidden, outputs : tuple[int, ...], int
         Widths of the layers.
-    deaf : bool
+    zero_condition_weights : bool
         Whether the condition's weights are initially zero. Conditions that training never shows then
         have no effect, instead of a random one.
     zero_initialised : bool
@@ -54,7 +54,7 @@ class Mlp:
     condition_inputs: int
     hidden: tuple[int, ...]
     outputs: int
-    deaf: bool = False
+    zero_condition_weights: bool = False
     zero_initialised: bool = False
 
     @property
@@ -63,20 +63,20 @@ class Mlp:
         return (self.point_inputs + self.condition_inputs, *self.hidden, self.outputs)
 
     @property
-    def _again(self) -> int:
-        """The layer that the inputs come into once more; 0 where there is one layer alone."""
+    def _skip_layer(self) -> int:
+        """Index of the layer with the input skip connection; 0 for a single layer."""
         return len(self.widths) // 2 if self.hidden else 0
 
     def takes_inputs(self, layer: int) -> bool:
-        """Whether the inputs come into a layer, after the values of the layer before, if any."""
-        return layer in (0, self._again)
+        """Whether a layer receives the inputs, after the values of the previous layer, if any."""
+        return layer in (0, self._skip_layer)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of every tensor, by name."""
         widths = self.widths
         shapes: dict[str, tuple[int, ...]] = {}
         for layer in range(len(widths) - 1):
-            extra = widths[0] if layer and layer == self._again else 0
+            extra = widths[0] if layer and layer == self._skip_layer else 0
             shapes[f"{self.name}.weight_{layer}"] = (widths[layer + 1], widths[layer] + extra)
             shapes[f"{self.name}.bias_{layer}"] = (widths[layer + 1],)
         return shapes
@@ -84,8 +84,8 @@ class Mlp:
     def initial(self, generator: torch.Generator, device: str = "cpu") -> dict[str, Tensor]:
         """Weights and biases uniform within 1 / sqrt(inputs) of a layer."""
         tensors = uniform(self.shapes(), generator, device)
-        if self.deaf and self.condition_inputs:
-            for layer in {0, self._again}:
+        if self.zero_condition_weights and self.condition_inputs:
+            for layer in {0, self._skip_layer}:
                 tensors[f"{self.name}.weight_{layer}"][:, -self.condition_inputs :] = 0
         if self.zero_initialised:
             for part in ("weight", "bias"):
@@ -97,7 +97,7 @@ class Mlp:
     ) -> Tensor:
         """(N, outputs) of (N, point_inputs) and (condition_inputs,); (B, N, outputs) for (B, condition_inputs).
 
-        ``outputs`` asks for so many of the first outputs only.
+        ``outputs`` limits the result to the first outputs.
         """
 
         count, size = len(self.widths) - 1, self.point_inputs
@@ -106,7 +106,7 @@ class Mlp:
             weight, bias = weights[f"{self.name}.weight_{layer}"], weights[f"{self.name}.bias_{layer}"]
             if layer == count - 1 and outputs is not None:
                 weight, bias = weight[:outputs], bias[:outputs]
-            again = layer > 0 and layer == self._again
+            again = layer > 0 and layer == self._skip_layer
             if layer == 0 or again:
                 start = self.widths[layer] if again else 0
                 if condition is not None:
@@ -206,7 +206,7 @@ class Controllers:
     ) -> Tensor:
         """(N, 3) displacements of points, whose (N, 27) encoding is given, each within (-1, 1), before their factor."""
         networks = (self.expression_deform, self.pose_deform)
-        return blended(networks, weights, encoded, influences, (expression, pose), squashed=True)
+        return blended(networks, weights, encoded, influences, (expression, pose), tanh_output=True)
 
 
 def encoded_size(size: int) -> int:
@@ -226,16 +226,16 @@ def blended(
     influences: Influences,
     conditions: tuple[Tensor, Tensor],
     *,
-    squashed: bool = False,
+    tanh_output: bool = False,
     channels: int | None = None,
 ) -> Tensor:
-    """(N, C) sum of two networks' outputs, their tanh if ``squashed``, at (N, F) inputs by their influences."""
+    """(N, C) sum of two networks' outputs, with tanh if ``tanh_output``, at (N, F) inputs."""
     parts = [
         network(weights, inputs.index_select(0, part.rows), condition, channels)
         for network, part, condition in zip(networks, influences, conditions)
     ]
     total = parts[0].new_zeros(len(inputs), parts[0].shape[1])
     for part, values in zip(influences, parts):
-        values = torch.tanh(values) if squashed else values
+        values = torch.tanh(values) if tanh_output else values
         total = total.index_add(0, part.rows, part.weights[:, None] * values)
     return total

@@ -1,4 +1,4 @@
-"""What there is to know of Gaussian Head Avatar before it is imported. Light: no implementation is imported."""
+"""Spec of Gaussian Head Avatar. Light: the implementation is not imported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the head model knows of the face's motion, as a teacher of the deformation network.
+"""The head model's motion of the face, which the deformation network is fitted to.
 
 The published network learns motion from landmarks and images of thousands of timesteps. A short clip shows few of the
 directions of the expression code; the head model that tracked it moves its face in all of them.
@@ -81,7 +81,7 @@ class TrackedMotion(NamedTuple):
         return (self.weights[rows] * squared).mean()
 
     def fitted(self, network: Mlp, initial: Mapping[str, Tensor], steps: int, seed: int) -> dict[str, Tensor]:
-        """The network's tensors after so many steps on `error`."""
+        """The network's tensors after a number of steps on `error`."""
 
         def loss(weights: Weights, step: int) -> Tensor:
             return self.error(network, weights, torch_generator(seed, "gha-motion-start", step))
@@ -107,7 +107,7 @@ def fitted(
     steps: int,
     rates: tuple[float, float],
 ) -> dict[str, Tensor]:
-    """A network's tensors after so many steps of Adam; ``initial`` has them and may have others.
+    """A network's tensors after a number of steps of Adam; ``initial`` has them and may have others.
 
     ``loss`` is of the tensors and the number of the step, from 1; ``rates`` are the learning rate of the first half of
     the steps, and the one that it falls to, log-linearly, in the second.

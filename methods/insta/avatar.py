@@ -153,7 +153,7 @@ def read_field(
 
 
 class RayColors(NamedTuple):
-    """What rays see, as float32 numpy arrays."""
+    """Result of rays, as float32 numpy arrays."""
 
     color: np.ndarray  # (R, 3) not yet composited on anything
     transmittance: np.ndarray  # (R,)
@@ -190,7 +190,7 @@ class Inference:
 
     @torch.no_grad()
     def render(self, scene: PosedRays) -> RayColors:
-        """What the rays of one pose see."""
+        """Result of the rays of one pose."""
         module = scene.surface.surface.module
         if self._trained is None or module is None:
             seen = render_rays(self.field, self.parameters, [scene], self.space, self.mouth, self.marching)

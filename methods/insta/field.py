@@ -35,7 +35,7 @@ class EncodedCube(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """What the logarithm of the density is before training: highest at the mesh. See `InstaConfig`."""
+    """Logarithm of the density before training: highest at the mesh. See `InstaConfig`."""
 
     bias: float
     depth: float
@@ -62,7 +62,7 @@ class Architecture(NamedTuple):
 
     @classmethod
     def of(cls, config: InstaConfig, expressions: int) -> Architecture:
-        """Sizes that a configuration asks for, with a head of so many expression coefficients."""
+        """Sizes for a configuration and a number of expression coefficients."""
         c, conditions = config, min(config.conditions, expressions)
         return cls(
             make_levels(c.levels, c.base_resolution, c.finest_resolution, c.log2_table),
@@ -219,7 +219,7 @@ BLOCK = 2048  # rows; their activations fit a core's second-level cache
 
 
 def layer_shapes(inputs: int, hidden: int, layers: int, outputs: int) -> list[tuple[int, int]]:
-    """(out, in) of every weight of a network with so many hidden layers."""
+    """(out, in) of every weight of a network with a number of hidden layers."""
     widths = [inputs, *[hidden] * layers, outputs]
     return [(widths[i + 1], widths[i]) for i in range(len(widths) - 1)]
 

@@ -22,7 +22,7 @@ from .warp import Blend, Found, Variant, blended, canonical_from_posed, first_hi
 Backend = Literal["auto", "kernel", "reference"]
 FREE_MAX = 255
 STRETCH_MAX = 2.0
-"""How much farther than in the canonical pose density is looked for where a pose stretches the mesh."""
+"""Factor on the search distance for density if a pose stretches the mesh."""
 
 
 class Rays(NamedTuple):
@@ -51,7 +51,7 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Where there may be density."""
+    """Region where density may be non-zero."""
 
     reach: np.ndarray  # (F,) float32 canonical metres from each triangle; negative for nowhere
     low: np.ndarray  # (3,) float32 corner of the occupancy grid, canonical metres

@@ -1,4 +1,4 @@
-"""Which cells of canonical space hold something, and how far from each triangle that reaches.
+"""Occupied cells of canonical space, and their maximum distance from each triangle.
 
 Instant NGP's grid (Mueller et al. 2022, appendix E.2), kept to the cells near the canonical mesh.
 """
@@ -52,7 +52,7 @@ class Occupancy:
         return self.values > min(self._config.occupancy_threshold, mean)
 
     def space(self) -> Space:
-        """Where rays are sampled now."""
+        """Currently sampled cells."""
         return occupied_space(self, self.candidates[self.occupied])
 
     def refresh(
@@ -130,7 +130,7 @@ class Occupancy:
         return reach
 
     def state(self) -> dict[str, Any]:
-        """What training changes."""
+        """Tensors that training changes."""
         return {"values": torch.from_numpy(self.values.copy())}
 
     def load_state(self, state: dict[str, Any]) -> None:

@@ -25,7 +25,7 @@ class PosedRays:
 
 
 class Rendered(NamedTuple):
-    """What all rays of all scenes see, scene by scene."""
+    """Rays of all scenes, in the order of the scenes."""
 
     color: Tensor  # (R, 3) not yet composited on anything
     transmittance: Tensor  # (R,)
@@ -35,7 +35,7 @@ class Rendered(NamedTuple):
 
 
 class Marching(NamedTuple):
-    """How rays are sampled; see `InstaConfig`."""
+    """Sampling of rays; see `InstaConfig`."""
 
     step: float
     round_samples: int
@@ -110,7 +110,7 @@ def _joined(parts: Sequence[np.ndarray], device: torch.device) -> Tensor:
 
 
 class Composite(NamedTuple):
-    """What rays gather."""
+    """Result of compositing along rays."""
 
     color: Tensor  # (R, C) weighted sums of the samples' values
     transmittance: Tensor  # (R,) what is left of the light behind

@@ -1,4 +1,4 @@
-"""What there is to know of INSTA before it is imported. Light: no implementation is imported."""
+"""Spec of INSTA. Light: the implementation is not imported."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SHORT: dict[str, Any] = {
     "learning_rate": 1e-2,
     "final_rate": 0.05,
 }
-"""For a few minutes of two cores (README.md, "Presets")."""
+"""Settings for a few minutes on two cores (README.md, "Presets")."""
 
 INSTA = MethodSpec(
     name="insta",

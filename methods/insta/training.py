@@ -84,11 +84,11 @@ class InstaTraining:
 
     @property
     def space(self) -> Space:
-        """Where rays are sampled now."""
+        """Currently sampled cells."""
         return self._space
 
     def parameters(self) -> dict[str, Tensor]:
-        """What the avatar is made of: the running mean of the parameters."""
+        """The avatar's tensors: the running mean of the parameters."""
         if not self._steps or not self._config.ema:
             return {name: self._optimiser[name].detach() for name in self._names}
         missing = 1 - self._config.ema**self._steps

@@ -60,7 +60,7 @@ print("headbench-devices", 0 if driver.cuInit(0) or driver.cuDeviceGetCount(ctyp
 
 @dataclass(frozen=True)
 class Repository:
-    """What there is to know of an official repository.
+    """Description of an official repository.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Checkout:
     record: dict[str, Any]
 
     def constant(self, file: str, pattern: str, what: str) -> str:
-        """What the first group of ``pattern`` matches in a source file. Raises `InputError` where nothing does."""
+        """First group of ``pattern`` in a source file. Raises `InputError` without a match."""
         return find_constant(self.folder, file, pattern, what)
 
 
@@ -117,10 +117,10 @@ def find_constant(folder: Path, file: str, pattern: str, what: str) -> str:
 
 
 Environment = tuple[tuple[str, ...], dict[str, Any]]
-"""Command of what runs the code of a checkout, and versions for the avatar's record."""
+"""Command that runs the code of a checkout, and versions for the avatar's record."""
 
 
-def look_at_interpreter(method: str, config: OfficialConfig, repository: Repository) -> Environment:
+def inspect_interpreter(method: str, config: OfficialConfig, repository: Repository) -> Environment:
     """Command and versions of the interpreter; see `look`."""
     python = _interpreter(method, config)
     if config.device != "cuda":
@@ -129,7 +129,7 @@ def look_at_interpreter(method: str, config: OfficialConfig, repository: Reposit
     return python, _probed(method, python, repository, cuda=config.device == "cuda")
 
 
-def look_at_program(method: str, config: INSTAOfficialConfig, repository: Repository) -> Environment:
+def inspect_program(method: str, config: INSTAOfficialConfig, repository: Repository) -> Environment:
     """Command and version of the program that a build leaves in the checkout, and a GPU; see `look`."""
     source = f"settings.{method}.program"
     try:
@@ -163,7 +163,7 @@ def look_at_program(method: str, config: INSTAOfficialConfig, repository: Reposi
 
 
 def _answer(command: Sequence[str], source: str) -> str:
-    """What a command says, both streams, within `PROBE_S`."""
+    """Output of a command, both streams, within `PROBE_S`."""
     try:
         done = subprocess.run(
             command,
@@ -183,7 +183,7 @@ def _answer(command: Sequence[str], source: str) -> str:
     return done.stdout.decode(errors="replace")
 
 
-def look(
+def inspect_checkout(
     method: str,
     config: OfficialConfig,
     repository: Repository,
@@ -191,15 +191,15 @@ def look(
 ) -> Checkout:
     """Check the settings of a method: folder, commit, what runs its code, what that can import, and a GPU.
 
-    ``environment`` looks at what runs the code; None takes `look_at_interpreter`. Raises `InputError` that names the
+    ``environment`` looks at what runs the code; None takes `inspect_interpreter`. Raises `InputError` that names the
     setting and the next step for the first that is not as it should be.
     """
-    folder, record = look_at_folder(method, config, repository)
-    python, versions = environment() if environment else look_at_interpreter(method, config, repository)
+    folder, record = inspect_folder(method, config, repository)
+    python, versions = environment() if environment else inspect_interpreter(method, config, repository)
     return Checkout(folder, python, record | versions)
 
 
-def look_at_folder(
+def inspect_folder(
     method: str, config: OfficialConfig, repository: Repository
 ) -> tuple[Path, dict[str, Any]]:
     """The checkout, and its commit and changes; see `look`."""
@@ -241,7 +241,7 @@ def look_at_folder(
 
 
 def _commit(folder: Path) -> tuple[str, dict[str, Any]]:
-    """Commit of a checkout ("" where there is none), and which of its files differ from it."""
+    """Commit of a checkout ("" without one), and its modified files."""
     top = _git(folder, "rev-parse", "--show-toplevel").strip()
     if not top or Path(top).resolve() != folder:
         return "", {}
@@ -339,7 +339,7 @@ def _probed(method: str, python: Sequence[str], repository: Repository, *, cuda:
 
 @dataclass(frozen=True)
 class _Probed:
-    """What the interpreter answers."""
+    """Answer of the interpreter."""
 
     python: str
     missing: dict[str, str]

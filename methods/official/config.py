@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 
 @dataclass(frozen=True)
 class OfficialConfig:
-    """Where the authors' code is, and what runs it.
+    """Location of the authors' code, and how to run it.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class OfficialConfig:
 
     @property
     def label(self) -> str:
-        """What stands behind the method's name in rows and tables."""
+        """Suffix of the method's name in rows and tables."""
         return "" if self.device == "cuda" else self.device
 
 

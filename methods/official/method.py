@@ -1,4 +1,5 @@
-"""What all official methods share: check, export, train by the authors' program, render by it, read back by key."""
+"""Common code of official methods: check, export, train and render by the authors' program, read back by
+key."""
 
 from __future__ import annotations
 
@@ -45,7 +46,7 @@ from ..shared.avatar_files import (
 from ..shared.loop import Fit, Outcome, check_budget, check_training_split
 from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import threads
-from .checkout import Checkout, Environment, Repository, look, look_at_interpreter
+from .checkout import Checkout, Environment, Repository, inspect_checkout, inspect_interpreter
 from .config import OfficialConfig
 from .process import ProgramEnd, described, run_program
 
@@ -79,7 +80,7 @@ class Workplace:
 
     @classmethod
     def at(cls, root: Path) -> Workplace:
-        """By absolute paths, since the program's working directory is another than ours."""
+        """Input with absolute paths, since the program has another working directory."""
         return cls(root.absolute())
 
     @property
@@ -192,7 +193,7 @@ class OfficialMethod(ABC, Generic[Config]):
 
     @abstractmethod
     def render_folder(self, folder: Path, work: Workplace) -> Path:
-        """Where the renders are."""
+        """Folder of the renders."""
 
     @abstractmethod
     def render_name(self, number: int) -> str:
@@ -211,11 +212,12 @@ class OfficialMethod(ABC, Generic[Config]):
         return False
 
     def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """For the record: ``leaks`` of held-out data, and ``differences`` from what the authors publish."""
+        """For the record: ``leaks`` of held-out data, and ``differences`` from the published code."""
         return {"leaks": [], "differences": []}
 
     def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
-        """Texts of their sources that the CPU shim replaces in memory in a training of so many iterations."""
+        """Texts of their sources that the CPU shim replaces in memory for a training with this number of
+        iterations."""
         return []
 
     def patches_to_render(self, folder: Path, checkout: Checkout) -> list[Patch]:
@@ -227,7 +229,7 @@ class OfficialMethod(ABC, Generic[Config]):
         return []
 
     def image_name(self, path: str) -> str:
-        """How their loader names an image of the export, by its place."""
+        """Name of an exported image in their loader, by its position."""
         return Path(path).name
 
     # ------------------------------------------------------------------ the method
@@ -275,7 +277,7 @@ class OfficialMethod(ABC, Generic[Config]):
         return [names[keys[sampler(i)]] for i in range(1, (fit.budget.iterations or 0) + 1)]
 
     def _of_launch(self, patches: Sequence[Patch]) -> list[str]:
-        """For the record, what our launcher changed."""
+        """Changes by the launcher, for the record."""
         differences = []
         if self.config.device != "cuda":
             differences.append(
@@ -285,13 +287,13 @@ class OfficialMethod(ABC, Generic[Config]):
             differences.append("images in the order in which the native method draws them with this seed")
         return differences + [f"{file}: {old!r} read as {new!r}" for file, old, new in patches]
 
-    def look(self) -> Checkout:
-        """Check the settings; see `checkout.look`."""
-        return look(self.name, self.config, self.repository, self.look_at_environment)
+    def inspect(self) -> Checkout:
+        """Check the settings; see `checkout.inspect_checkout`."""
+        return inspect_checkout(self.name, self.config, self.repository, self.inspect_environment)
 
-    def look_at_environment(self) -> Environment:
+    def inspect_environment(self) -> Environment:
         """Check what runs their code: an interpreter, by default."""
-        return look_at_interpreter(self.name, self.config, self.repository)
+        return inspect_interpreter(self.name, self.config, self.repository)
 
     def check(self, clip: Clip | None, budget: Budget) -> None:
         """Raise `InputError` for a checkout or an interpreter that is not there, and work that the code cannot do."""
@@ -305,7 +307,7 @@ class OfficialMethod(ABC, Generic[Config]):
                 "budget", "seconds", "iterations alone; their code knows no clock", "seconds", remedy
             )
         self.check_launch()
-        checkout = self.look()
+        checkout = self.inspect()
         self.check_length(budget.iterations, checkout)
         if clip is not None:
             check_training_split(clip)
@@ -392,7 +394,8 @@ class OfficialMethod(ABC, Generic[Config]):
         write_record(fit, Outcome(iterations, iterations, time.monotonic() - start), **recorded)
 
     def _export(self, fit: Fit, checkout: Checkout, work: Workplace) -> None:
-        """Write the program's input, or keep what an earlier call wrote whole; then hold it to the training split."""
+        """Write the program's input, or keep the complete one of an earlier call; then compare it with the
+        training split."""
         record = work.root / EXPORTED
         steps = len(fit.clip.splits["train"]) + (fit.budget.iterations or 0)
 
@@ -440,7 +443,7 @@ class OfficialAvatar:
     ) -> Iterator[tuple[FrameKey, Frame]]:
         """Render frames by the authors' program; give each with its key. See `ListedFrames`."""
         method, folder = self._method, self._folder
-        checkout = method.look()
+        checkout = method.inspect()
         frames = [Listed(number, key, *view) for number, (key, view) in enumerate(views.items())]
         work = Workplace.at(folder / RENDERING)
         with _alone(work.root) as held:
@@ -584,10 +587,10 @@ def _remove(folder: Path, but: str = "") -> None:
 
 
 def opaque(rgb: np.ndarray) -> Frame:
-    """A frame of an 8-bit image (H, W, 3) whose coverage nobody knows."""
+    """A frame of an 8-bit image (H, W, 3) with unknown coverage."""
     return opaque_colours(rgb.astype(np.float32) / 255)
 
 
 def opaque_colours(rgb: FloatArray) -> Frame:
-    """A frame of colours (H, W, 3) in [0, 1] whose coverage nobody knows."""
+    """A frame of colours (H, W, 3) in [0, 1] with unknown coverage."""
     return Frame(rgb, np.ones(rgb.shape[:2], np.float32))

@@ -1,4 +1,4 @@
-"""What official methods need of a machine, for ``headbench doctor``."""
+"""Requirements of official methods on the machine, for ``headbench doctor``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from ...bench.errors import InputError
 from ...bench.specs import Need
-from .checkout import look_at_folder
+from .checkout import inspect_folder
 from .config import OfficialConfig
 from .ga.method import GAOfficial
 from .gbs.method import GBSOfficial
@@ -44,14 +44,14 @@ def insta(config: OfficialConfig, device: str) -> Iterator[Need]:
 
 def _needs(method: type[OfficialMethod[Any]], config: OfficialConfig) -> Iterator[Need]:
     try:
-        folder, record = look_at_folder(method.name, config, method.repository)
+        folder, record = inspect_folder(method.name, config, method.repository)
     except InputError as error:
         yield Need("checkout", "", str(error))
     else:
         changed = f", {len(record['changed'])} files changed" if record.get("changed") else ""
         yield Need("checkout", f"{folder}, {record['commit'][:12] or 'no commit'}{changed}")
     try:
-        _, versions = method(config).look_at_environment()
+        _, versions = method(config).inspect_environment()
     except InputError as error:
         yield Need("environment", "", str(error))
     else:

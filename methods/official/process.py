@@ -42,14 +42,14 @@ class ProgramError(HeadbenchError):
 
 @dataclass(frozen=True)
 class ProgramEnd:
-    """How a program ended: its exit code (negative: the signal), its last lines, and where all of them are."""
+    """End of a program: its exit code (negative: the signal), its last lines, and the log file."""
 
     code: int
     lines: tuple[str, ...]
     log: Path
 
     def error(self, what: str) -> ProgramError:
-        """What went wrong, with the program's last lines."""
+        """The error with the program's last lines."""
         last = shortened(" | ".join(self.lines), 700) or "none"
         return ProgramError(f"{what.rstrip('.')}. Its last lines: {last}. All of them: {self.log}.")
 
@@ -64,7 +64,7 @@ def described(code: int) -> str:
 
 
 def environment(more: Mapping[str, str] | None = None) -> dict[str, str]:
-    """What a program is given as its environment."""
+    """Environment variables of a program."""
     return {name: os.environ[name] for name in KEPT if name in os.environ} | GIVEN | dict(more or {})
 
 

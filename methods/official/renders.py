@@ -1,4 +1,5 @@
-"""How the official repositories number the images that they render (`MethodSpec.renders`, ``headbench evaluate --names``)."""
+"""Numbering of renders in the official repositories (`MethodSpec.renders`, ``headbench evaluate
+--names``)."""
 
 from __future__ import annotations
 

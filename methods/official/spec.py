@@ -1,4 +1,4 @@
-"""What there is to know of the official methods before they are imported. Light: no implementation is imported."""
+"""Specs of the official methods. Light: no implementation is imported."""
 
 from __future__ import annotations
 

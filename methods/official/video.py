@@ -1,4 +1,5 @@
-"""What the codes that train on a tracked video have in common: straight colours, rotations of six numbers, the head's frame."""
+"""Common code for repositories that train on a tracked video: straight colours, 6D rotations, the head's
+frame."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ def check_masks(clip: Clip) -> None:
 
 
 def coverage_of(clip: Clip, key: FrameKey) -> ByteArray:
-    """(H, W) mask of a frame. Raises `InputError` where there is none."""
+    """(H, W) mask of a frame. Raises `InputError` if it is missing."""
     mask = clip.mask(key)
     if mask is None:
         expected = "a mask; the code trains on the head alone, by a fourth channel of its images"

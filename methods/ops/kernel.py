@@ -1,4 +1,4 @@
-"""How compiled forms of operations call the splat renderer's kernel, which holds them."""
+"""Calls from compiled forms of operations into the splat renderer's kernel, which contains them."""
 
 from __future__ import annotations
 

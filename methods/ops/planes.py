@@ -96,7 +96,7 @@ class Bounds(NamedTuple):
 
 
 class ColorNetwork(NamedTuple):
-    """What gives colours by place and direction.
+    """Colour as a function of position and direction.
 
     Attributes
     ----------
@@ -167,7 +167,7 @@ AXES = 3
 
 
 class LinePosition(NamedTuple):
-    """Where points lie on the three lines: rows of the (3 L)-row table and linear weights, (N, 6) each."""
+    """Position of points on the three lines: rows of the (3 L)-row table and linear weights, (N, 6) each."""
 
     rows: Tensor
     weights: Tensor
@@ -194,7 +194,7 @@ class OffsetLayers(NamedTuple):
     bias_2: Tensor
 
     def __call__(self, summed: Tensor) -> Tensor:
-        """(N, D): bias, ReLU, layer, ReLU, layer of what the first weights give, (N, H)."""
+        """(N, D): bias, ReLU, layer, ReLU, layer, applied to the output of the first weights, (N, H)."""
         hidden = torch.relu(summed + self.bias_0)
         hidden = torch.relu(torch.addmm(self.bias_1, hidden, self.weight_1.t()))
         return torch.addmm(self.bias_2, hidden, self.weight_2.t())
@@ -262,7 +262,7 @@ def shader(from_position: Tensor, of_direction: Tensor, last: Tensor) -> Shader:
 
 
 SAMPLES = 512
-"""Of a coordinate of directions, from -1 to 1."""
+"""Range of a coordinate of directions, from -1 to 1."""
 
 
 @shader.compiled(KERNEL)

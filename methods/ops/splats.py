@@ -26,7 +26,7 @@ class WorldSplats(NamedTuple):
 
 
 class Activated(NamedTuple):
-    """What parameters of local splats stand for: (N, 3) scales and (N, 4) unit quaternions wxyz."""
+    """Activated parameters of local splats: (N, 3) scales and (N, 4) unit quaternions wxyz."""
 
     scales: Tensor
     quats: Tensor

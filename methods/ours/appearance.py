@@ -45,7 +45,7 @@ FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weigh
 
 @dataclass(frozen=True, eq=False)
 class PreparedTimestep:
-    """What does not change while training: frames, directions, driving coefficients, penalty weights."""
+    """Constants of training: frames, directions, driving coefficients, penalty weights."""
 
     frames: Frames
     turns: Tensor  # (F, 3, 3) world directions to canonical ones
@@ -107,7 +107,8 @@ class OursAppearance:
         return {name: (value.to(self._device), rate) for name, (value, rate) in initial.items()}
 
     def stored(self, optimiser: Optimiser) -> dict[str, Tensor]:
-        """What `parameters` became, as an avatar reads it: the factors on directions are part of the weights."""
+        """Trained `parameters` in the form of an avatar: the factors on directions are part of the
+        weights."""
         return {name: optimiser[name] for name in self.parameters()} | self._network(optimiser)
 
     def begin(self, timeline: Timeline) -> None:

@@ -27,7 +27,8 @@ from .field import PLANE_MARGIN, line_box, plane_box
 
 LINE_SAMPLES_PER_PIXEL = 0.5
 SPLATS_PER_PIXEL = 1.0
-"""Of the whole surface, unrolled at the median footprint of a pixel; half as many lose 0.2 to 0.5 dB (README.md)."""
+"""Samples for the whole surface, unrolled at the median footprint of a pixel; half as many lose 0.2 to 0.5 dB
+(README.md)."""
 MINIMUM_PLANE, MINIMUM_LINE = 8, 4
 """Samples that are left in any case."""
 
@@ -114,7 +115,7 @@ def plan_capacity(clip: Clip, mesh: SubjectMesh, config: OursConfig) -> Capacity
 
 
 class _Planner:
-    """What the decisions share, and each of them."""
+    """Data shared by the decisions, and each decision."""
 
     def __init__(self, clip: Clip, mesh: SubjectMesh, config: OursConfig):
         self._clip, self._mesh, self._config = clip, mesh, config
@@ -141,7 +142,7 @@ class _Planner:
         self.decisions.append(Decision(name, configured, chosen, reason, numbers))
 
     def lines(self) -> None:
-        """Directions, jaw bases, box and samples of the lines; nothing where there are none."""
+        """Directions, jaw bases, box and samples of the lines; empty without lines."""
         if not self._config.lines.enabled:
             return
         self.dynamic = self._expressions() + self._jaw_bases() > 0
@@ -151,7 +152,7 @@ class _Planner:
             self._line_resolution()
 
     def _expressions(self) -> int:
-        """How many directions have lines."""
+        """Number of directions with lines."""
         configured = self._config.lines.expressions
         if self._kept("lines.expressions"):
             return configured
@@ -165,7 +166,7 @@ class _Planner:
         return chosen
 
     def _jaw_bases(self) -> int:
-        """How many jaw bases have lines."""
+        """Number of jaw bases with lines."""
         configured = self._config.lines.jaw_bases
         # The official choice looks at held-out poses; it is reproduced as it is or not at all.
         official = self._config.lines.jaw_bases_variant == "official"
@@ -286,7 +287,7 @@ def largest_displacements(mesh: SubjectMesh, poses: list[HeadPose]) -> FloatArra
 
 
 def leading_directions(coefficients: FloatArray, basis: FloatArray, tolerance: float) -> int:
-    """How many leading expression directions suffice.
+    """Sufficient number of leading expression directions.
 
     A constant expression needs no direction, as what does not change is not dynamic: deviations from the mean over
     the timesteps count.
@@ -351,7 +352,7 @@ def jaw_lever(mesh: SubjectMesh) -> float:
 def spanning_jaw_bases(
     poses: list[HeadPose], limit: int, lever: float, tolerance: float
 ) -> tuple[int, float]:
-    """How many jaw bases suffice, and what the rotations that they do not reach move.
+    """Sufficient number of jaw bases, and the motion by rotations that they do not reach.
 
     The weights |<q, q_i>| on the bases are linear in the quaternion q but for their common scale, so that lines
     for bases with the same span can say the same: four at most are ever needed, two for a jaw that only opens. A

@@ -8,7 +8,7 @@ from typing import Literal
 from ..shared.config import SplatTraining
 
 Dynamic = Literal["opacity", "position", "rotation", "scale", "color"]
-"""What an expression may change about a splat."""
+"""Attribute of a splat that an expression may change."""
 
 Planned = Literal[
     "lines.expressions",
@@ -160,7 +160,7 @@ class OuterLayers:
 
 @dataclass(frozen=True)
 class Sampling:
-    """Which training images are drawn.
+    """Sampling of training images.
 
     Attributes
     ----------
@@ -178,7 +178,7 @@ class Sampling:
 
 @dataclass(frozen=True)
 class PlannedCapacity:
-    """How large the avatar is.
+    """Size of the avatar.
 
     Attributes
     ----------

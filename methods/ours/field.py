@@ -1,4 +1,5 @@
-"""What an expression may change about a splat: its opacity as published, or, for the ablation, everything else.
+"""Attributes of a splat that an expression changes: opacity as published, or, for the ablation, everything
+else.
 
 "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations" (CVPR 2025,
 arXiv 2504.14967), section 3.3 and Table 4: offsets on position, rotation and scale win novel views and lose novel
@@ -35,10 +36,10 @@ PLANES = tuple(f"plane_{pair}" for pair, _, _ in PAIRS)
 FIRST_LAYER = "color_weight_0"
 LAST_LAYER = "color_weight_1"
 COLOR_NETWORK = (*PLANES, FIRST_LAYER, LAST_LAYER)
-"""What gives colours by place and direction: planes and the weights of both layers."""
+"""Colour as a function of position and direction: planes and the weights of both layers."""
 
 FIELDS = {"opacity": "logits", "position": "means", "rotation": "quats", "scale": "log_scales"}
-"""Of `LocalSplats`, to which offsets are added."""
+"""Attributes of `LocalSplats` that offsets are added to."""
 
 
 class LocalSplats(NamedTuple):

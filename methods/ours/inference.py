@@ -1,4 +1,5 @@
-"""What a stored avatar of "ours" computes per frame, prepared as far as it does not depend on the frame.
+"""Per-frame computation of a stored avatar of "ours", with everything precomputed that does not depend on the
+frame.
 
 `tests/methods/ours/test_formula.py` compares it with the definition in float64. README.md lists what was measured and left
 out.
@@ -18,7 +19,7 @@ from .field import blend_lines, line_table, normalised_weight, offset_layers
 
 
 class DrivenPose(NamedTuple):
-    """What a pose decides, as far as it is worth keeping for known poses."""
+    """Results for a pose that are cached for known poses."""
 
     frames: Frames
     turns: Tensor
@@ -65,7 +66,7 @@ class LineOffsets:
         return offsets
 
     def table(self, coefficients: Tensor) -> Tensor:
-        """(3 L, H) first layer, but for its bias, at the samples of a frame's blended lines."""
+        """(3 L, H) first layer without its bias, at the samples of a frame's blended lines."""
         expression, jaw = coefficients.split([len(coefficients) - self._jaw_bases, self._jaw_bases])
         return line_table(blend_lines(self._lines, expression, jaw), self._first)
 

@@ -46,7 +46,7 @@ class Ours(TrainedMethod[OursConfig, OursAvatar]):
         last digits depend on the number of threads."""
         config, lines = self.config, self.config.lines
         if config.sampling.balanced or (lines.enabled and (config.penalty.weight or lines.bounds == "face")):
-            faces_in_region(clip.head, "face")  # raises before the long work where there is no such region
+            faces_in_region(clip.head, "face")  # raises before long work if the region is missing
         if config.capacity.mode == "fixed":
             self._plan = None
             return config, config

@@ -1,4 +1,4 @@
-"""What there is to know of "ours" before it is imported. Light: no implementation is imported."""
+"""Spec of "ours". Light: the implementation is not imported."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHORT: dict[str, Any] = {
     "sh_rest_lr": 1e-3,
     "storage": "compact",
 }
-"""Of runs much shorter than published (README.md, "Presets")."""
+"""Settings of runs much shorter than published (README.md, "Presets")."""
 
 OURS = MethodSpec(
     name="ours",

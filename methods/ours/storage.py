@@ -66,7 +66,7 @@ def write_field(
 
 
 class Field(NamedTuple):
-    """What an avatar's file holds: its tensors by name, and what the lines change."""
+    """Content of an avatar's file: its tensors by name, and the attributes that the lines change."""
 
     tensors: dict[str, Tensor]
     dynamic: tuple[Dynamic, ...]

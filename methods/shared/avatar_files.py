@@ -87,7 +87,7 @@ def read_subject(path: Path, head: HeadAsset) -> Subject:
 
 
 class RefinedTracking:
-    """Tracking refined in training: replaces the tracked pose of a training timestep by what fits better.
+    """Tracking refined in training, which replaces the tracked pose of a training timestep.
 
     It answers to the very signal it was refined from and to nothing else: subject, timestep and all tracked
     values must be equal, so a held-out or foreign signal is never touched.

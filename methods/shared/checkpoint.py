@@ -45,7 +45,7 @@ def save_checkpoint(path: Path, run: str, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(path: Path, run: str, device: str) -> dict[str, Any] | None:
-    """Read the state of a run, or None where there is no checkpoint.
+    """Read the state of a run, or None without a checkpoint.
 
     Raises `InputError` for a damaged file or one that belongs to other settings, another clip, budget or seed.
     """
@@ -100,7 +100,7 @@ def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
 
 
 def _unpacked(tree: Any, tensors: Mapping[str, Tensor]) -> Any:
-    """What `_packed` was given."""
+    """Inverse of `_packed`."""
     if not isinstance(tree, dict):
         return tree
     ((kind, value),) = tree.items()

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class DensifiedTraining:
-    """How splats are trained and their number is adapted: 3DGS, section 5, with GaussianAvatars' values.
+    """Training and density control of splats: 3DGS, section 5, with GaussianAvatars' values.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class DensifiedTraining:
 
 @dataclass(frozen=True)
 class SplatTraining(DensifiedTraining):
-    """How splats bound to a mesh are trained: GaussianAvatars (CVPR 2024), section 3 and its code.
+    """Training of splats bound to a mesh: GaussianAvatars (CVPR 2024), section 3 and its code.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class SplatTraining(DensifiedTraining):
 
 @dataclass(frozen=True)
 class Capacity:
-    """How large an avatar is.
+    """Size of an avatar.
 
     Attributes
     ----------
@@ -156,7 +156,7 @@ class Capacity:
 
 PAPER_ITERATIONS = 600_000
 GPU_ITERATIONS = 60_000
-"""Of the preset "gpu", which is "paper" but for these: about an hour for a subject on one card, as estimated."""
+"""Preset "gpu": "paper" with these changes; an estimated hour per subject on one card."""
 
 SHORT_SPLATS: Mapping[str, Any] = {
     "initial_opacity": 0.5,

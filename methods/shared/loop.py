@@ -32,7 +32,8 @@ REPORT_EVERY = 10  # iterations between looks at the loss, each of which waits f
 
 
 class Trainable(Protocol):
-    """What the loop trains. It draws random numbers by iteration (`schedule`), never from a global state."""
+    """Trainable part of a method. Random numbers are drawn by iteration (`schedule`), never from a global
+    state."""
 
     @property
     def optimiser(self) -> Optimiser: ...
@@ -57,7 +58,7 @@ class Trainable(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What a method is asked to train.
+    """Request to train a method.
 
     Attributes
     ----------
@@ -84,7 +85,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run went: iterations done of those planned, and seconds over all its parts.
+    """Summary of a run: iterations done and planned, and seconds over all its parts.
 
     ``losses`` are pairs of an iteration and the loss of its image, from every `REPORT_EVERY`-th iteration, the first and the last planned one.
     """
@@ -179,7 +180,7 @@ def train(
 
 
 def synchroniser(device: str) -> Callable[[], None]:
-    """What waits for the work handed to a CUDA device; nothing for others, which do it at once."""
+    """Function that waits for the work of a CUDA device; it does nothing for other devices."""
     return partial(torch.cuda.synchronize, device) if is_cuda(device) else lambda: None
 
 
@@ -201,7 +202,8 @@ def _estimate(
     clock: Callable[[], float],
     wait: Callable[[], None],
 ) -> int:
-    """How many iterations fit into so many seconds, one at least, from a few steps that change nothing."""
+    """Number of iterations in a number of seconds, at least one, estimated from a few steps without
+    effect."""
     trainable.begin(Timeline(published_length, published_length))
     durations = []
     for step in range(1, TIMED_STEPS + 2):

@@ -1,4 +1,4 @@
-"""What a trained method does around its training: checks, resuming, reading back."""
+"""Common parts of trained methods around their training: checks, resuming, reading back."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Avatar = TypeVar("Avatar")
 
 
 class TrainedMethod(Generic[Config, Avatar]):
-    """A `Method` but for its training, `_train`, which writes the avatar under ``fit.out``.
+    """A `Method` except for its training, `_train`, which writes the avatar under ``fit.out``.
 
     A derived class names its settings' class, its avatar's (with ``read(folder, device)``), and the name and version
     of its spec; one that draws no splats says so.

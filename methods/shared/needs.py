@@ -1,4 +1,4 @@
-"""What native methods need of a machine, for `MethodSpec.needs`."""
+"""Requirements of native methods on the machine, for `MethodSpec.needs`."""
 
 from __future__ import annotations
 

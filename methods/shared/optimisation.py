@@ -222,7 +222,7 @@ class Densifier:
         return largest * face_sizes.index_select(0, self.binding)
 
     def _within_bound(self, asks: Tensor, gradient: Tensor) -> Tensor:
-        """Where a bound on splats leaves room for some only, take those with the largest gradients."""
+        """If a limit leaves room for some splats only, select those with the largest gradients."""
         if self._settings.max_splats is None:
             return asks
         room = max(self._settings.max_splats - len(self.binding), 0)
@@ -286,7 +286,7 @@ class Densifier:
 
 
 def rows_of_tables(counts: Tensor, splats: Tensor) -> Tensor:
-    """Where the rows of some splats lie in a table that has ``counts`` (N,) rows for each splat, in their order."""
+    """Rows of some splats in a table that has ``counts`` (N,) rows for each splat, in their order."""
     starts = counts.cumsum(0) - counts
     chosen = counts.index_select(0, splats)
     within = torch.arange(int(chosen.sum()), device=counts.device)

@@ -26,7 +26,7 @@ BEGIN, END = re.compile(rb"ply\r?\n"), re.compile(rb"\nend_header\r?\n")
 OPACITY, LARGEST_LOGIT = "opacity", 20.0  # the sigmoid of which is 1 in float32
 _COUNT = re.compile(r"[0-9]{1,18}")
 EXPECTED, MAX_BYTES = "a PLY file", 2**30
-HEADER_LIMIT = 65536  # bytes; a longer header is no file of ours
+HEADER_LIMIT = 65536  # bytes; a file with a longer header was not written here
 
 
 def write_ply(path: Path, names: tuple[str, ...], table: FloatArray, comment: str = "") -> None:

@@ -180,7 +180,7 @@ class PlacedSplats(NamedTuple):
 
 
 class LastPose(Generic[Value]):
-    """What ``compute`` gave for the last pose, as several cameras often look at one."""
+    """Cached result of ``compute`` for the last pose, since several cameras often render one."""
 
     def __init__(self, compute: Callable[[HeadPose, Callable[[str], None]], Value]):
         self._compute = compute
@@ -194,7 +194,7 @@ class LastPose(Generic[Value]):
 
 
 class StoredSplatAvatar:
-    """What avatars of splats share: a derived class says where its splats are in a pose.
+    """Base class of avatars of splats; a derived class gives the splats of a pose.
 
     Parameters
     ----------

@@ -20,7 +20,8 @@ Item = TypeVar("Item")
 
 
 def evenly(items: Sequence[Item], most: int) -> list[Item]:
-    """At most so many of the items, evenly spread, the first and the last among them where there are two or more."""
+    """Evenly spread items, up to a maximum number, including the first and the last if there are two or
+    more."""
     rows = np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int))
     return [items[row] for row in rows]
 
@@ -47,7 +48,7 @@ class Timeline:
         return max(minimum, self.at(interval), 1)
 
     def fraction(self, iteration: int) -> float:
-        """How far into the run an iteration is, in (0, 1]."""
+        """Relative position of an iteration in the run, in (0, 1]."""
         return iteration / self.total
 
 

@@ -1,4 +1,4 @@
-"""How large an avatar has to be, found by short trainings that are judged on training timesteps they have not seen.
+"""Size of an avatar, chosen by short trainings that are evaluated on unseen training timesteps.
 
 A method names its sizes and what smaller values to try; a smaller one is taken where the held-out frames lose no more than
 a tolerance against the configured sizes. No test frame is looked at.

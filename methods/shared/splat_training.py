@@ -1,4 +1,4 @@
-"""What every training of splats on the images of a clip has in common, whatever places and colours them."""
+"""Training of splats on the images of a clip, common to all ways of placing and colouring them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Initial = Mapping[str, tuple[Tensor, float]]
 
 
 class SplatTrainer:
-    """A `Trainable` but for its loss: images, cameras, optimiser, density and learning rates.
+    """A `Trainable` except for its loss: images, cameras, optimiser, density and learning rates.
 
     A derived class calls `_start` at the end of its initialiser and `_render` in its ``loss``.
     """
@@ -131,7 +131,7 @@ class SplatTrainer:
         self._images.close()
 
     def _position_progress(self, iteration: int) -> float:
-        """How far the learning rate of positions is on its way to the final one; above 1 it stays there."""
+        """Progress of the positions' learning rate towards the final one; it stays there above 1."""
         return self._timeline.fraction(iteration)
 
     def _render(
@@ -191,7 +191,7 @@ class Appearance(Protocol):
 
 
 class Start(NamedTuple):
-    """Where training begins: splats of their triangle's size.
+    """Initial splats of their triangle's size.
 
     Attributes
     ----------

@@ -15,7 +15,7 @@ from ...bench.io.arrays import Member, check_arrays
 from ...bench.io.files import open_regular, reading
 
 MAX_HEADER = 2**24
-"""Bytes of names, shapes and metadata; the largest of ours, a checkpoint's, has some ten thousand."""
+"""Maximum bytes of names, shapes and metadata; the largest, of a checkpoint, has some ten thousand."""
 MAX_MAGNITUDE = 1e6
 """Most that a number of an avatar may be: a network's weight, a feature, a position in the unit of its triangle."""
 MAX_LOGARITHM = 30.0

@@ -1,4 +1,4 @@
-"""How many threads kernels run on, and torch beside them."""
+"""Number of threads of kernels and of torch."""
 
 from __future__ import annotations
 

@@ -22,7 +22,8 @@ KERNEL = Kernel(
 
 
 def instruction_sets() -> dict[str, str]:
-    """What the kernel can be run with here, by backend name, the fastest first; empty where it is missing."""
+    """Available instruction sets of the kernel, by backend name, the fastest first; empty if it is
+    missing."""
     available = KERNEL.instruction_sets
     return {"cpu": available[0], **{f"cpu-{name}": name for name in available}} if available else {}
 

@@ -141,7 +141,7 @@ def toolkit() -> str:
 
 
 def toolkit_remedy() -> str:
-    """How to get what gsplat is compiled with."""
+    """How to install the tools that compile gsplat."""
     version = f" {torch.version.cuda}, with which torch was built," if torch.version.cuda else ""
     return f"Install the CUDA toolkit{version} (nvcc) and a C++ compiler, and set CUDA_HOME to the toolkit's folder."
 

@@ -210,7 +210,7 @@ def _composite_tile(
 ) -> Tensor:
     """Composite depth-sorted splats front to back onto ``pixels`` (P, 2); gives (P, C + 1), alpha last.
 
-    ``absolute`` (M, 2) collects the absolute gradients of the means; ``cut_offs`` are the least alpha and transmittance.
+    ``absolute`` (M, 2) collects the absolute gradients of the means; ``cut_offs`` are the minimum alpha and transmittance.
     """
     image = pixels.new_zeros(len(pixels), colors.shape[1])
     transmittance = pixels.new_ones(len(pixels))

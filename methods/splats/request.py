@@ -1,4 +1,4 @@
-"""What a rendering call asks for and gives, after its arguments were checked."""
+"""Checked arguments and results of a rendering call."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Rendering:
 
 
 class CameraInputs(NamedTuple):
-    """What a request asks of one camera."""
+    """Request for one camera."""
 
     viewmat: Tensor  # (4, 4)
     K: Tensor  # (3, 3)
@@ -94,7 +94,8 @@ class Request:
         return values if self.batched else values[0]
 
     def rendering(self, image: Tensor, alpha: Tensor, find_radii: Callable[[], Tensor]) -> Rendering:
-        """What `rasterize` gives, from an image and an alpha as the caller expects them and a function for (V, N) radii."""
+        """The result of `rasterize` from an image and an alpha as the caller expects them and a function for
+        (V, N) radii."""
 
         def radii() -> Tensor:
             found = self.unstacked(find_radii())

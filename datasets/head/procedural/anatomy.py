@@ -1,4 +1,4 @@
-"""Where things are on the sculpted head: positions, curves and frames shared by the sculptor and the rig.
+"""Anatomy of the sculpted head: positions, curves and frames shared by the sculptor and the rig.
 
 Metres, +y up, +z front, subject's left at +x. Every curve is given for the left half; the right one is its
 mirror image. Proportions follow adult means of Farkas, "Anthropometry of the Head and Face" (1994).

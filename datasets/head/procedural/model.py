@@ -70,7 +70,7 @@ def procedural_head(version: str = "2023") -> HeadArrays:
 
 
 def semantic_to_coefficients(version: str = "2023") -> tuple[FloatArray, FloatArray | None]:
-    """How semantic shapes are played by a version.
+    """Expression coefficients of the semantic shapes in a version.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What shows in the mouth but is not tracked: teeth, gums and tongue of the default head.
+"""Visible but untracked parts of the mouth: teeth, gums and tongue of the default head.
 
 They are rendered into synthetic captures and stand in no head model: as in a real capture, methods have to
 find out about them from the images. The wall of the mouth is part of the skin (region ``mouth_socket``).

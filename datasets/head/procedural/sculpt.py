@@ -40,7 +40,7 @@ LOW, HIGH = (0.0, FLOOR, -0.13), (0.115, 0.15, 0.11)
 
 @dataclass(frozen=True)
 class SculptSettings:
-    """How finely to sculpt.
+    """Settings of the sculptor.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Which vertices a fit looks at, where their targets lie on the source's surface, and the identity they give."""
+"""Vertices that a fit uses, their targets on the source's surface, and the resulting identity."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EYEBALLS = ("left_eyeball", "right_eyeball")
 _LANDMARK_REGIONS = (*EYEBALLS, "lips", "nose")
 
 _ROUNDS = 25
-"""At most so many of closest points and identity in turn, for models of different topology."""
+"""Maximum alternations of closest points and identity, for models of different topology."""
 
 _SETTLED = 1e-5
 """Metres; the rounds end when the fitted face moves less than this on average."""
@@ -173,7 +173,7 @@ _FIRST_CANDIDATES = 12
 
 
 class ClosestPoints(NamedTuple):
-    """Where n points meet a surface."""
+    """Closest points of n points on a surface."""
 
     face: IntArray
     """(n,) triangle."""

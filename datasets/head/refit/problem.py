@@ -38,7 +38,7 @@ _MILLIMETRES = 1e3
 
 
 class FrameTerms(NamedTuple):
-    """What a timestep contributes: products of its target with the bases, and the neck's rotation."""
+    """Terms of a timestep: products of its target with the bases, and the neck's rotation."""
 
     products: FloatArray  # (1 + 9 M, N), mm^2
     square: float  # mean squared length of the target, mm^2
@@ -233,7 +233,7 @@ class FitProblem:
         return _MILLIMETRES * unposed, _MILLIMETRES * lid_part, _MILLIMETRES * pivots
 
     def _angle_scale(self) -> FloatArray:
-        """(9,) radians per unit of a well-scaled search: one over the lever arm of what a joint turns."""
+        """(9,) radians per unit of a well-scaled search: the inverse of the lever arm of each joint."""
         arms = np.ones(len(SEARCHED))
         for joint, (rows, turned) in zip(self._turning, self._turned):
             if joint in SEARCHED:
@@ -357,7 +357,7 @@ class Solution(NamedTuple):
     angles: FloatArray
     """(9,) jaw, left eye, right eye; axis-angle, radians."""
     value: float
-    """Of the objective, mm^2."""
+    """Value of the objective, mm^2."""
     evaluations: int
 
 

@@ -139,7 +139,7 @@ def _check_lengths(where: Path, track: BenchmarkTrack, counts: dict[Video, int])
 
 
 class Encoded(NamedTuple):
-    """What encoding did to a video: mean squared error of some frames after decoding, of 255 squared."""
+    """Encoding error of a video: mean squared error of some frames after decoding, of 255 squared."""
 
     video: Video
     frames: int
@@ -215,7 +215,7 @@ def after_encoding(psnr: float, error: float) -> float:
 
 @dataclass
 class Issues:
-    """What is wrong with a submission: what the server refuses, and what else should be seen to."""
+    """Faults of a submission: those that the server refuses, and further ones to fix."""
 
     refused: list[str] = field(default_factory=list)
     noted: list[str] = field(default_factory=list)

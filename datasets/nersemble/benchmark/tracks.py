@@ -1,4 +1,4 @@
-"""What the NeRSemble benchmark asks for: which videos of which people, their size, rate and length.
+"""Videos that the NeRSemble benchmark requests: participants, sequences, size, rate and length.
 
 Source: the documentation and constants of nersemble-benchmark (commit e15f204, 2026-04).
 """
@@ -102,7 +102,8 @@ TRACKS: Mapping[TrackName, BenchmarkTrack] = {track.name: track for track in (NV
 
 
 def tracking_file(data: Path, participant: str, sequence: str) -> Path:
-    """Tracking of a sequence in the benchmark's folder. Raises `InputError` where there is none, or that of version 1."""
+    """Tracking of a sequence in the benchmark's folder. Raises `InputError` if it is missing or of version
+    1."""
     folder = data / "mono_flame_avatar" / participant / "sequences" / sequence / "tracking"
     path = folder / TRACKING_FILE
     if not path.is_file():
@@ -129,5 +130,5 @@ MEMBERS = {
 
 
 def tracked_frames(path: Path) -> int:
-    """Timesteps of a tracking file. Raises `InputError` for what is none."""
+    """Timesteps of a tracking file. Raises `InputError` for other files."""
     return len(read_arrays(path, MEMBERS)["expression"])

@@ -1,4 +1,5 @@
-"""What covers lips and chin and is not the subject's own: evidence in every pixel of the mouth's map.
+"""Evidence that something other than the subject's lips and chin covers them, in every pixel of the mouth's
+map.
 
 The cue is pigment. Melanin, which colours skin and (less) lips, takes more blue than green; blood takes both alike.
 The tongue has blood and no melanin, so its green to blue ratio is below that of the skin around it, whereas blush,
@@ -47,7 +48,7 @@ _LIMIT = 6.0  # standard deviations beyond which more is no better
 
 @dataclass(frozen=True, eq=False)
 class MouthEvidence:
-    """What was found in T timesteps.
+    """Evidence in T timesteps.
 
     Attributes
     ----------
@@ -88,7 +89,7 @@ def find_evidence(colours: MouthColours, atlas: MouthAtlas) -> MouthEvidence:
 def mouth_patch(strength: FloatArray, atlas: MouthAtlas) -> np.ndarray:
     """(H, W) the largest connected patch of covered pixels that begins at the mouth's opening.
 
-    What lies between the patch and the opening belongs to it: a tongue comes out of the mouth.
+    The region between the patch and the opening belongs to it, since a tongue comes out of the mouth.
     """
     labels, count = ndimage.label((strength > LOOKS) & atlas.below, np.ones((3, 3)))
     opening = atlas.below & (atlas.height > -CONNECTED) & (atlas.lips & atlas.below).any(axis=0)
@@ -105,7 +106,8 @@ def mouth_patch(strength: FloatArray, atlas: MouthAtlas) -> np.ndarray:
 def _camera_strength(
     colours: ByteArray, seen: np.ndarray, atlas: MouthAtlas
 ) -> tuple[FloatArray, np.ndarray]:
-    """(T, H, W) standard deviations by which one camera sees each pixel covered, and where it can tell."""
+    """(T, H, W) standard deviations by which each pixel looks covered to one camera, and whether it is
+    visible."""
     known = seen & (seen.mean(axis=0) > _LEAST_SEEN)
     rows = known.any(axis=(1, 2))
     strength = np.zeros(known.shape, np.float32)

@@ -33,7 +33,7 @@ from ...head.subject import PosedSubject
 from ...mesh_pictures import rasterize_mesh
 
 PITCH = 0.0015
-"""Edge of a pixel of the map, metres: about half the height of what a tongue's tip shows first."""
+"""Edge length of a pixel of the map, metres: about half the height of the first visible part of a tongue."""
 
 _SIDE, _ABOVE, _BELOW = 0.75, 0.30, 1.0  # of the mouth's width, from its middle
 _REACH = 2.4  # widths of the mouth; what lies farther away cannot hide it from a camera in front

@@ -36,7 +36,7 @@ coder packs zeros ten thousand times smaller."""
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """What such a file holds: arrays of the types of `packing.DTYPES`, texts and steps by name."""
+    """Content of such a file: arrays of the types of `packing.DTYPES`, texts and steps by name."""
 
     arrays: Mapping[str, np.ndarray]
     text: Mapping[str, str] = field(default_factory=dict)
@@ -78,7 +78,7 @@ def read_content(path: Path) -> Content:
 
 
 def _layout(path: Path, metadata: Mapping[str, str], packed: int) -> dict[str, Any]:
-    """The checked JSON of the metadata of a file with so many packed bytes."""
+    """The checked JSON metadata of a file with this number of packed bytes."""
     layout = parse_json(metadata.get(KEY, "{}"), path, KEY)
     if layout.get("version") != VERSION:
         raise InputError(path, KEY, f"the layout of a compact avatar, version {VERSION}", "none or another")
@@ -116,7 +116,7 @@ _FILTERS: list[dict[str, Any]] = [
 ]
 
 DTYPES = {name: np.dtype(f"<{name}") for name in ("u1", "u2", "u4", "f2", "f4")}
-"""What can be packed, little-endian."""
+"""Types that can be packed, little-endian."""
 
 
 def pack(values: np.ndarray) -> bytes:
@@ -196,7 +196,7 @@ class Arrays:
         return values.astype(np.float32)
 
     def decoded(self, name: str, step: FloatArray | float, *shape: int | None) -> FloatArray:
-        """What `coded` was given, up to rounding, as float32."""
+        """Inverse of `coded` up to rounding, as float32."""
         if name in self._left and self._left[name].dtype.kind == "f":
             return self.floats(name, *shape)
         return dequantise(self.integers(name, *shape), step)

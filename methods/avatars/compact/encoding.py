@@ -1,4 +1,4 @@
-"""A field's tensors as arrays rounded by what shows, and back."""
+"""Encode a field's tensors as arrays rounded by their visible effect, and decode them."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ SIMPLIFIED, WHOLE = "left out", "all"
 
 
 def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) -> Findings:
-    """Store an avatar of ours, and measure it and its quality; see the settings.
+    """Store an avatar of the method "ours", and measure its size and quality; see the settings.
 
     Raises `InputError` for a folder without the exact file of an avatar of ours, and for the capture of another
     subject.
@@ -101,7 +101,7 @@ def _costs(
 
 
 def _plain(quality: Quality) -> dict[str, float | None]:
-    """As JSON knows it: None for what is not a number or infinite."""
+    """The value for JSON: None if it is not a number or infinite."""
     return {name: value if math.isfinite(value) else None for name, value in quality._asdict().items()}
 
 
@@ -153,10 +153,10 @@ def _row(
 
 
 class Quality(NamedTuple):
-    """Of an avatar's pictures."""
+    """Quality of an avatar's pictures."""
 
     psnr: float
-    """dB against the truth, mean over frames; NaN where there is none."""
+    """dB against the ground truth, mean over frames; NaN without one."""
     ssim: float
     """Against the truth, likewise; by the training's own window."""
     psnr_exact: float

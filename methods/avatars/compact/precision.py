@@ -1,4 +1,4 @@
-"""How finely a compact avatar is stored. Light to import: options of ``headbench export compact``."""
+"""Precision of a compact avatar. Light to import: options of ``headbench export compact``."""
 
 from __future__ import annotations
 
@@ -15,36 +15,36 @@ class Precision:
     """
 
     positions: float = 0.08
-    """Of local positions, in the splat's own size (geometric mean of its three standard deviations)."""
+    """Step of local positions, in the splat's own size (geometric mean of its three standard deviations)."""
 
     scales: float = 0.06
-    """Of log-scales: 0.06 is an error of at most 3 %."""
+    """Step of log-scales: 0.06 is an error of at most 3 %."""
 
     rotations: float = 0.02
-    """Of the three smaller components of unit quaternions: 0.02 is an error of about 1 degree."""
+    """Step of the three smaller components of unit quaternions: 0.02 is an error of about 1 degree."""
 
     opacities: float = 0.1
-    """Of opacity logits: an opacity is off by 0.0125 at most."""
+    """Step of opacity logits: an opacity is off by 0.0125 at most."""
 
     harmonics: float = 0.02
-    """Of spherical-harmonics coefficients, where they hold the colour: 0.0056 of colour in degree 0."""
+    """Step of spherical-harmonics coefficients, if they hold the colour: 0.0056 of colour in degree 0."""
 
     colors: float = 0.02
-    """Of the colours of their own that splats have beside that of the planes."""
+    """Step of the separate colours of splats, added to those of the planes."""
 
     planes: float = 0.005
-    """Of the colour that one plane channel contributes, in [0, 1], as the colour network weighs it."""
+    """Step of the colour contribution of one plane channel, in [0, 1], as weighted by the colour network."""
 
     lines: float = 0.001
-    """Of the offset (logits) that one channel of one line contributes at coefficient 1, as the offset network weighs
-    it. Small, since the errors of thousands of channels add up: at 0.003 a trained avatar lost 0.13 dB, at 0.001
+    """Step of the offset (logits) by one channel of one line at coefficient 1, as weighted by the offset network.
+    Small, since the errors of thousands of channels add up: at 0.003 a trained avatar lost 0.13 dB, at 0.001
     nothing, for 16 kB more."""
 
     networks: float = 0.01
-    """Of network weights, in the largest weight of the same row: 1/127 would be 8 bits."""
+    """Step of network weights, relative to the largest weight of the same row: 1/127 would be 8 bits."""
 
     subject: float = 2e-6
-    """Of the subject's static offset, metres."""
+    """Step of the subject's static offset, metres."""
 
     def __post_init__(self) -> None:
         for part in fields(self):

@@ -1,4 +1,4 @@
-"""What can be derived from a trained avatar of GaussianAvatars."""
+"""Variants of a trained avatar of GaussianAvatars."""
 
 from __future__ import annotations
 
@@ -79,7 +79,8 @@ def _make(whole: GAAvatar, head: HeadAsset, rows: Tensor, recipe: Recipe, device
 
 
 def _content(splats: dict[str, Tensor], binding: Tensor, subject: Subject) -> Content:
-    """As "ours" stores splats with harmonics: sorted by triangle, stably, as those of one depth are drawn in order."""
+    """Store splats with harmonics as "ours" does: sorted by triangle, stably, since equal depths are drawn in
+    order."""
     order = torch.argsort(binding, stable=True)
     columns = {**splats, "opacities": splats["opacities"][:, None], TRIANGLES: binding[:, None].float()}
     table = torch.cat([columns[name] for name in SPLAT_WIDTHS], dim=1)

@@ -1,4 +1,4 @@
-"""What can be derived from a trained avatar of ours."""
+"""Variants of a trained avatar of "ours"."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which variants of a trained avatar are derived: each change alone, then several together."""
+"""Derived variants of a trained avatar: each change alone, then several together."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Recipe:
 
     @property
     def summary(self) -> str:
-        """What was changed, in words."""
+        """Description of the change."""
         cutoffs = f"alpha from {self.cutoffs.alpha_min:.3f}, light from {self.cutoffs.transmittance_min:g} on"
         parts = [
             f"the {self.splats:.0%} of splats that contribute most" if self.splats < 1 else "",
@@ -144,7 +144,7 @@ def write_reduced(path: Path, tensors: Mapping[str, Tensor], kind: Kind, exact: 
 
 
 def read_reduced(path: Path) -> dict[str, Tensor]:
-    """What `write_reduced` wrote, as float32 up to rounding; exact tensors as they were."""
+    """Read the output of `write_reduced`: float32 up to rounding, exact tensors unchanged."""
     stored, _ = read_safetensors(path)
     result: dict[str, Tensor] = {}
     for name, value in stored.items():

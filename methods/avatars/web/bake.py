@@ -167,7 +167,7 @@ def _change(
     few: Sequence[Camera],
     colors: Sequence[FloatArray],
 ) -> dict[str, FloatArray]:
-    """What a slider at a step changes before skinning."""
+    """Change before skinning by a slider at a step."""
     pose = source.pose([slider], [step])
     seen = source.seen(pose)
     linear, shift = blended(weights, slider_motions((slider,), np.array([step]), source.joints))

@@ -22,7 +22,7 @@ from ...shared.avatar_files import read_shared_head
 from ...shared.rendering import view_of
 from ...splats import rasterize
 from ..export import neutral_pose, open_splats
-from ..views import direction_of, look
+from ..views import direction_of, orbit_camera
 from .bake import Source, bake
 from .model import JOINTS, Moved, Slider, WebAvatar
 from .payload import decode, encode, quaternions
@@ -149,7 +149,9 @@ def measure_losses(
     for done, (group, values) in enumerate(trials):
         pose = source.pose(page.sliders, values)
         for azimuth, elevation in VIEWS:
-            camera = look(direction_of(azimuth, elevation), view["distance"], np.array(view["target"]), SIZE)
+            camera = orbit_camera(
+                direction_of(azimuth, elevation), view["distance"], np.array(view["target"]), SIZE
+            )
             wanted = source.avatar.render(source.camera(camera), pose).rgb
             error = float(np.square(draw(page.moved(values, camera.center), camera) - wanted).mean())
             losses[group] = min(losses.get(group, np.inf), -10 * float(np.log10(max(error, 1e-12))))

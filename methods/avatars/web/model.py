@@ -55,7 +55,7 @@ class Moved(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class WebAvatar:
-    """What a page holds, as float arrays. N splats, M sliders.
+    """Content of a page as float arrays. N splats, M sliders.
 
     Attributes
     ----------

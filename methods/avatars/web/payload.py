@@ -110,7 +110,7 @@ def encode(avatar: WebAvatar, view: Mapping[str, Any]) -> bytes:
 
 
 def decode(content: bytes) -> WebAvatar:
-    """What a page makes of the bytes: the reference for its script."""
+    """Decode the bytes as a page does: the reference for its script."""
     whole = zlib.decompress(content, -15)
     (length,) = struct.unpack_from("<I", whole)
     header = json.loads(whole[4 : 4 + length])

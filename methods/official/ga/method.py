@@ -80,7 +80,7 @@ THEIR_NAMES = {
 
 
 class GALayoutMethod(OfficialMethod[Config]):
-    """What the repositories with GaussianAvatars' loader and head model have in common."""
+    """Common code for the repositories with GaussianAvatars' loader and head model."""
 
     shimmed = "bound splats"
 
@@ -191,7 +191,7 @@ class GALayoutMethod(OfficialMethod[Config]):
         return work.model / "test" / "ours_1" / RENDERS
 
     def render_name(self, number: int) -> str:
-        """By the place in the JSON of the split."""
+        """Render by the frame's position in the JSON of the split."""
         return f"{number:05d}.png"
 
     def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
@@ -200,7 +200,7 @@ class GALayoutMethod(OfficialMethod[Config]):
         return opaque(read_window(frame, path))
 
     def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """What a reader of results has to know."""
+        """Notes for readers of results."""
         differences = ["the capture has no held-out frames in it; cameras and timesteps are numbered anew"]
         moved = [
             c
@@ -228,7 +228,7 @@ class GALayoutMethod(OfficialMethod[Config]):
         return (PLY_FILE,)
 
     def _more_parameters(self, count: int, offset: FloatArray) -> Mapping[str, FloatArray]:
-        """Further arrays of their parameter file, for so many timesteps."""
+        """Further arrays of their parameter file, for a number of timesteps."""
         return {}
 
     @staticmethod
@@ -283,7 +283,7 @@ def rendered(line: str) -> int | None:
 
 
 def free_port() -> int:
-    """A port that nobody listens on now; their training opens one for a viewer."""
+    """A free port; their training opens one for a viewer."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         return int(listener.getsockname()[1])
@@ -314,7 +314,7 @@ def _white(background: Sequence[float] | FloatArray, where: str) -> bool:
 
 
 def copy_file(source: Path, target: Path) -> None:
-    """Copy a file, whole or not at all. Raises `InputError` where there is none."""
+    """Copy a file atomically. Raises `InputError` if it is missing."""
     if not source.is_file() or not source.stat().st_size:
         raise InputError(source, "", "a file that the program writes", "none")
     with atomic_path(target) as temporary:

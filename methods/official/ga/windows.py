@@ -17,7 +17,8 @@ from ....bench.errors import InputError
 Image = TypeVar("Image", ByteArray, FloatArray)
 
 LARGEST_ERROR = 0.1
-"""Pixels by which a projection may be off at the image's border, where pixels are not quite square or have a skew."""
+"""Tolerance of a projection at the image's border in pixels, if pixels are not quite square or have a
+skew."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,7 @@ class Window:
     top: int
 
     def cut(self, image: ByteArray) -> ByteArray:
-        """What an image of the camera has inside the box, which lies inside of it."""
+        """Content of a camera's image inside the box."""
         rows = slice(self.top, self.top + self.camera.height)
         return np.ascontiguousarray(image[rows, self.left : self.left + self.camera.width])
 

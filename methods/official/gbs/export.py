@@ -54,7 +54,7 @@ GRIDS = {"WeightID_256.pt": "grid_id", "Weight5node_256.pt": "tar_feature"}
 
 
 def held_out(checkout: Checkout) -> int:
-    """How many frames at the end of every video their loader takes for a test."""
+    """Number of last frames of every video that their loader uses as a test."""
     return int(checkout.constant(LOADER, r"self\.n_seg = (\d+)", "n_seg"))
 
 
@@ -109,7 +109,7 @@ class VideoHead:
             write_text(folder / "offset.txt", "{:.9g} {:.9g} {:.9g}\n".format(*self._offset))
 
     def frame(self, camera: Camera, pose: HeadPose) -> dict[str, dict[str, np.ndarray]]:
-        """What a frame's file says, of a camera in the head's frame: arrays with a leading axis of one."""
+        """Content of a frame's file, of a camera in the head's frame: arrays with a leading axis of one."""
         world, K = np.asarray(camera.world_to_camera, np.float64), np.asarray(camera.K, np.float64)
         eyelids = np.zeros(2) if pose.eyelids is None else pose.eyelids
         flame: dict[str, FloatArray] = {
@@ -242,6 +242,6 @@ def write_torch(path: Path, content: Mapping[str, Any]) -> None:
 
 
 class _ArrayPickles:
-    """What ``torch.save`` takes from a pickle module."""
+    """The part of a pickle module that ``torch.save`` uses."""
 
     Pickler = ArrayPickler

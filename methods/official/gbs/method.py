@@ -145,7 +145,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         return trained(line)
 
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
-        """What their renderer opens."""
+        """Files that their renderer opens."""
         for name, ours in FILES.items():
             copy_file(work.model / f"{name}{fit.budget.iterations}{Path(ours).suffix}", fit.out / ours)
         return {}
@@ -194,7 +194,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         return work.model / "seq" / "split_1"
 
     def render_name(self, number: int) -> str:
-        """By the frame's number."""
+        """Render by the frame's number."""
         return f"pred_{number:05d}.png"
 
     def is_render(self, name: str) -> bool:
@@ -217,7 +217,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         return Frame(np.clip(rgb + (1 - alpha[..., None]) * ground, 0, 1), alpha)
 
     def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """What a reader of results has to know."""
+        """Notes for readers of results."""
         differences = [
             "frames are numbered anew; those at the end, which their code holds out, are placeholders of one pixel",
             "the background is taken out of half-covered pixels, and the static offset is part of the template",

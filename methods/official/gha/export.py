@@ -49,7 +49,7 @@ class GHATracking:
 
     @classmethod
     def of(cls, head: HeadAsset, subject: Subject) -> GHATracking:
-        """Of a subject. Raises `InputError` for a head model without a face or lips."""
+        """Landmarks of a subject. Raises `InputError` for a head model without a face or lips."""
         if not len(head.regions.get("lips", ())):
             known = ", ".join(sorted(head.regions)) or "no regions"
             raise InputError(f"head model {head.version!r}", "regions", "a region 'lips'", known)
@@ -192,7 +192,7 @@ def whole_timesteps(clip: Clip) -> dict[int, dict[str, FrameKey]]:
 
 
 def _images(clip: Clip, key: FrameKey, window: Window) -> dict[str, ByteArray]:
-    """What their loaders read of a frame, by the first part of the name.
+    """Files of a frame that their loaders read, by the first part of the name.
 
     The mask of the second stage is white: it serves to lay images on white, which they lie on already.
     """

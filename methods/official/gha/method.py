@@ -214,11 +214,11 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
         return None if match is None else int(match[1])
 
     def render_folder(self, folder: Path, work: Workplace) -> Path:
-        """Where the launcher puts them."""
+        """Folder that the launcher writes them to."""
         return work.model / "renders"
 
     def render_name(self, number: int) -> str:
-        """By the number that the plan gives to each frame of a camera."""
+        """Render by the number that the plan gives to each frame of a camera."""
         return f"{number:06d}.png"
 
     def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
@@ -228,7 +228,7 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
         return opaque_colours(render)
 
     def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """What a reader of results has to know."""
+        """Notes for readers of results."""
         side = training_side(clip)
         codes = code_size(clip.head)
         differences = [

@@ -230,7 +230,7 @@ def write_training(clip: Clip, head: VideoMesh, work: Workplace, progress: Progr
 
 
 class _Surfaces:
-    """What pixels of a clip's frames show of the mesh."""
+    """Parts of the mesh that pixels of a clip's frames show."""
 
     def __init__(self, head: VideoMesh):
         self._posed = head.posed

@@ -28,7 +28,7 @@ from ...shared.avatar_files import (
     read_subject,
 )
 from ...shared.loop import Fit
-from ..checkout import Checkout, Environment, Repository, look_at_program
+from ..checkout import Checkout, Environment, Repository, inspect_program
 from ..config import INSTAOfficialConfig
 from ..ga.method import copy_file
 from ..method import Listed, OfficialMethod, Workplace
@@ -55,7 +55,7 @@ RECORDED = Path("headbench/debug")
 SNAPSHOT, BACKGROUND_FILE, RENDERS = "snapshot.msgpack", "background.json", "renders"
 PLAN, LAUNCHER = "parts.json", Path(__file__).with_name("parts.py")
 LAST_SIZE = 16
-"""Side of the one render that ends a training, and that nobody looks at."""
+"""Side of the final render of a training, which is not used."""
 MOST_CONFIG = 1 << 16
 _ITERATION = re.compile(r"iteration=(\d+) loss=([-+.\de]+|-?nan|inf)")
 _DRAWN = re.compile(r"^headbench: drawn (\d+)")
@@ -74,9 +74,9 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
     name, version = INSTA_OFFICIAL.name, INSTA_OFFICIAL.version
     config_class, repository = INSTAOfficialConfig, INSTA_REPOSITORY
 
-    def look_at_environment(self) -> Environment:
+    def inspect_environment(self) -> Environment:
         """Their program, and a GPU."""
-        return look_at_program(self.name, self.config, self.repository)
+        return inspect_program(self.name, self.config, self.repository)
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
         """Refuse a clip without masks, a skewed camera, and a head that is not where their scene is."""
@@ -154,11 +154,11 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
         return None if match is None else int(match[1])
 
     def render_folder(self, folder: Path, work: Workplace) -> Path:
-        """Where the launcher puts them."""
+        """Folder that the launcher writes them to."""
         return work.model / RENDERS
 
     def render_name(self, number: int) -> str:
-        """By the number that the plan gives to each frame of a list."""
+        """Render by the number that the plan gives to each frame of a list."""
         return f"{number:06d}.png"
 
     def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
@@ -172,7 +172,7 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
         return Frame(np.clip(rgb + (1 - alpha[..., None]) * ground, 0, 1), np.ascontiguousarray(alpha))
 
     def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """What a reader of results has to know."""
+        """Notes for readers of results."""
         differences = [
             "frames are numbered anew; the test split that their program renders in the end is a placeholder of one pixel",
             "depths and classes of pixels (mouth, skin, hair) are those of the head model's mesh, not of a depth map of the "
@@ -209,6 +209,6 @@ def _copy_main(checkout: Checkout, work: Workplace) -> None:
 
 
 def _write_config(work: Workplace, **changes: Any) -> None:
-    """Their published settings but for what is given, and no further videos."""
+    """Their published settings with the given changes, and no further videos."""
     fixed = {"parent": MAIN, "use_dataset_cache": False, "render_novel_trajectory": False}
     write_json(work.program / CONFIGS / OURS, {"render_from_snapshot": False, **fixed, **changes})

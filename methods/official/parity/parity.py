@@ -61,7 +61,7 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class Difference:
-    """Of one metric in one task, official minus native, over orders.
+    """Difference of one metric in one task, official minus native, over orders.
 
     Attributes
     ----------

@@ -1,4 +1,5 @@
-"""What lets official code written for CUDA run on a CPU: our renderer in place of theirs, and stand-ins for the rest.
+"""Runs official CUDA code on a CPU: the renderer of this package replaces theirs, and stand-ins replace the
+rest.
 
 Installed into the interpreter that runs their scripts, before them (`launch`). Their files are not touched. What they then
 compute is not their method on their rasteriser: results carry the label "(cpu-shim)".

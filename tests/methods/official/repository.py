@@ -44,7 +44,7 @@ def workplace(folder):
 def export(method, clip, folder):
     """Export the clip's training frames: the place, and the images in it by key."""
     work = workplace(folder)
-    return work, method.export(TrainingView(clip), method.look(), work, no_progress)
+    return work, method.export(TrainingView(clip), method.inspect(), work, no_progress)
 
 
 LINES_BEGIN = 12

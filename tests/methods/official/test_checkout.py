@@ -10,7 +10,7 @@ import pytest
 from headbench.bench.configuration import deciding_settings
 from headbench.bench.errors import InputError
 from headbench.methods.official import needs
-from headbench.methods.official.checkout import Repository, look
+from headbench.methods.official.checkout import Repository, inspect_checkout
 from headbench.methods.official.config import GAOfficialConfig
 from headbench.methods.official.ga.method import GAOfficial
 from headbench.methods.official.tga.method import TGAOfficial
@@ -21,13 +21,13 @@ REPOSITORY = Repository("https://example.org/code", "0" * 40, ("train.py", "rend
 
 
 def test_a_checkout_as_it_should_be_is_recorded(repository):
-    found = look("ga-official", settings(*repository), REPOSITORY)
+    found = inspect_checkout("ga-official", settings(*repository), REPOSITORY)
     assert found.folder == repository[0].resolve()
     assert found.record["commit"] == repository[1]
     assert found.record["changed"] == []
     assert found.record["python"] == sys.version.split()[0]
     (repository[0] / "train.py").write_text("changed")
-    changed = look("ga-official", settings(repository[0], repository[1][:8]), REPOSITORY).record
+    changed = inspect_checkout("ga-official", settings(repository[0], repository[1][:8]), REPOSITORY).record
     assert changed["changed"] == ["train.py"]
     assert len(changed["difference"]) == 64
 
@@ -50,7 +50,7 @@ def test_a_checkout_as_it_should_be_is_recorded(repository):
 def test_faults_of_settings_name_the_next_step(repository, tmp_path, monkeypatch, changes, key, step):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as raised:
-        look("ga-official", replace(settings(*repository), **changes), REPOSITORY)
+        inspect_checkout("ga-official", replace(settings(*repository), **changes), REPOSITORY)
     assert key in str(raised.value)
     assert step in str(raised.value)
 
@@ -58,13 +58,13 @@ def test_faults_of_settings_name_the_next_step(repository, tmp_path, monkeypatch
 def test_modules_that_are_missing_are_named(repository):
     lacking = replace(REPOSITORY, modules=("json", "no_such_module"))
     with pytest.raises(InputError, match="no_such_module: ModuleNotFoundError"):
-        look("ga-official", settings(*repository), lacking)
+        inspect_checkout("ga-official", settings(*repository), lacking)
 
 
 def test_a_trial_that_fails_says_what_to_do(repository):
     trying = replace(REPOSITORY, trial="import json; json.loads('{')", trial_remedy="Install another.")
     with pytest.raises(InputError, match=r"JSONDecodeError.*Install another\."):
-        look("ga-official", settings(*repository), trying)
+        inspect_checkout("ga-official", settings(*repository), trying)
     for method in (GAOfficial, TGAOfficial):
         compile(method.repository.trial, "trial", "exec")
 
@@ -85,12 +85,12 @@ def test_a_folder_without_git_needs_an_empty_commit(repository, tmp_path):
     for name in ("train.py", "render.py"):
         (folder / name).write_text("")
     with pytest.raises(InputError, match="a folder that git does not know"):
-        look("ga-official", settings(folder, repository[1]), REPOSITORY)
-    assert look("ga-official", settings(folder, ""), REPOSITORY).record["commit"] == ""
+        inspect_checkout("ga-official", settings(folder, repository[1]), REPOSITORY)
+    assert inspect_checkout("ga-official", settings(folder, ""), REPOSITORY).record["commit"] == ""
 
 
 def test_a_command_of_several_words_is_an_interpreter(repository):
-    found = look("ga-official", settings(*repository, python=f"env {sys.executable}"), REPOSITORY)
+    found = inspect_checkout("ga-official", settings(*repository, python=f"env {sys.executable}"), REPOSITORY)
     assert found.python[1:] == (sys.executable,)
 
 
@@ -101,7 +101,7 @@ def test_nothing_that_the_checkout_configures_is_run(repository, tmp_path):
     for name in ("core.fsmonitor", "diff.external"):
         subprocess.run(["git", "-C", str(folder), "config", name, str(folder / "hook.sh")], check=True)
     (folder / "train.py").write_text("changed")
-    look("ga-official", settings(folder, commit), REPOSITORY)
+    inspect_checkout("ga-official", settings(folder, commit), REPOSITORY)
     assert not (tmp_path / "ran").exists()
 
 

@@ -222,7 +222,7 @@ def test_grids_that_nobody_reads_have_one_node(method, official_clip, tmp_path):
     work = workplace(tmp_path / "work")
     listed = [next(iter(views(official_clip, "novel_view").values()))]
     frames = [Listed(0, official_clip.splits["novel_view"][0], *listed[0])]
-    method.write_list(tmp_path / "a", frames, (1, 1, 1), method.look(), work)
+    method.write_list(tmp_path / "a", frames, (1, 1, 1), method.inspect(), work)
     for file, name in GRIDS.items():
         assert torch.load(work.input / file, weights_only=True)[name].numel() == 1
     assert (work.model / "fix_chkpnt1.pth").resolve() == avatar.files()[0].resolve()

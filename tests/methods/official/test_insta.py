@@ -164,7 +164,7 @@ def test_settings_without_a_meaning_are_refused(change):
 
 def test_words_may_start_the_program(method, repository):
     program = f"env A=1 '{repository[0]}/build/rta'"
-    found = INSTAOfficial(replace(method.config, program=program)).look()
+    found = INSTAOfficial(replace(method.config, program=program)).inspect()
     assert found.python[1:] == ("A=1", f"{repository[0]}/build/rta")
 
 
@@ -256,7 +256,7 @@ def test_a_head_of_flames_topology_keeps_their_triangles(official_clip, tmp_path
     text = "v 0 0 0 1 0 0\n" * count + "f 1//1 2//2 3//3\n"
     commit = make_insta_repository(tmp_path / "repository", text)
     method = INSTAOfficial(INSTAOfficialConfig(str(tmp_path / "repository"), commit=commit))
-    mesh = VideoMesh.of(Subject.of(official_clip), official_clip.head, method.look())
+    mesh = VideoMesh.of(Subject.of(official_clip), official_clip.head, method.inspect())
     assert mesh.is_flames
     assert mesh.faces.tolist() == [[0, 1, 2]]
     mesh.write_masks(tmp_path)
@@ -265,7 +265,7 @@ def test_a_head_of_flames_topology_keeps_their_triangles(official_clip, tmp_path
 
 def test_regions_of_another_head_are_red_vertices(method, official_clip, tmp_path):
     head = official_clip.head
-    mesh = VideoMesh.of(Subject.of(official_clip), head, method.look())
+    mesh = VideoMesh.of(Subject.of(official_clip), head, method.inspect())
     assert not mesh.is_flames
     mesh.write_masks(tmp_path)
     seen = np.zeros(len(head.template), int)
@@ -280,7 +280,7 @@ def test_regions_of_another_head_are_red_vertices(method, official_clip, tmp_pat
 
 def test_a_list_has_focal_lengths_for_images_of_a_pixel(method, official_clip, tmp_path):
     work = workplace(tmp_path / "work")
-    mesh = VideoMesh.of(Subject.of(official_clip), official_clip.head, method.look())
+    mesh = VideoMesh.of(Subject.of(official_clip), official_clip.head, method.inspect())
     wanted = views(official_clip, "novel_view", "train")
     frames = [Listed(7 + i, key, *view) for i, (key, view) in enumerate(wanted.items())]
     (part,) = export.write_list(frames, mesh, work)

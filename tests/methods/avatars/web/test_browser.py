@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from headbench.methods.avatars.views import direction_of, look
+from headbench.methods.avatars.views import direction_of, orbit_camera
 from headbench.methods.avatars.web.export import draw
 from headbench.methods.avatars.web.payload import decode, encode
 
@@ -53,7 +53,7 @@ def test_webgl_draws_what_the_renderer_draws(exported, opened):
         (0.5, {"neck turn": 0.3, "jaw open": 0.3, "expression 1": 0.1, "eyes sideways": 0.2}),
     ):
         values = np.array([moved.get(slider.name, 0.0) for slider in page.sliders])
-        camera = look(direction_of(azimuth, 0.0), view["distance"], np.array(view["target"]), SIDE)
+        camera = orbit_camera(direction_of(azimuth, 0.0), view["distance"], np.array(view["target"]), SIDE)
         wanted = draw(page.moved(values, camera.center), camera)
         assert wanted.std() > 0.02
         assert cv2.PSNR(pixels(tab, values, azimuth), wanted.astype(np.float64), 1.0) > 40
