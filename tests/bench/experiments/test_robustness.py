@@ -48,7 +48,7 @@ def test_worker_processes_leave_the_same(ball_run, command):
             assert path.read_bytes().replace(b"inline", b"tasks") == left[1][name].read_bytes(), name
 
 
-def test_what_is_done_is_kept_and_what_is_damaged_or_retrained_is_not(ball_run, command, renders):
+def test_what_is_done_is_kept_unless_damaged_or_retrained(ball_run, command, renders):
     folder = ball_run("BALL")
     out = folder / "out"
     assert driven(command, folder, out=str(out)).passed
