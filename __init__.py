@@ -46,12 +46,12 @@ if _TYPE_CHECKING:
         TrainingMetric,
         Variant,
     )
+    from .bench.engine.adaptation import AdaptedClip, MethodNeeds
+    from .bench.engine.config import resolve_method
+    from .bench.engine.stored import load_avatar
     from .bench.errors import HeadbenchError, InputError, UnavailableError
     from .bench.options import DependentOptions
     from .bench.rows import ALL
-    from .bench.runner.adaptation import AdaptedClip, MethodNeeds
-    from .bench.runner.config import resolve_method
-    from .bench.runner.stored import load_avatar
     from .bench.specs import (
         BenchmarkSpec,
         CommandSpec,
@@ -141,15 +141,15 @@ __all__ = [
 
 _HOMES = {
     "bench.api": ("evaluate", "list_methods", "open_clip", "run", "train"),
-    "bench.runner.adaptation": ("AdaptedClip", "MethodNeeds"),
+    "bench.engine.adaptation": ("AdaptedClip", "MethodNeeds"),
     "bench.condition": ("PLAIN", "Condition", "Named"),
     "bench.conformance.methods": ("check_method",),
     "bench.conformance.metrics": ("check_metric",),
     "bench.conformance.readers": ("check_clip", "check_reader"),
     "bench.options": ("DependentOptions",),
     "bench.errors": ("HeadbenchError", "InputError", "UnavailableError"),
-    "bench.runner.config": ("resolve_method",),
-    "bench.runner.stored": ("load_avatar",),
+    "bench.engine.config": ("resolve_method",),
+    "bench.engine.stored": ("load_avatar",),
     "bench.rows": ("ALL",),
     "bench.specs": tuple(name for name in __all__ if name.endswith("Spec"))
     + ("Findings", "Need", "ResolutionRule"),

@@ -12,6 +12,14 @@ import pandas as pd
 
 from .condition import PLAIN
 from .contracts import Avatar, ByteArray, Clip, FrameKey, TaskName
+from .engine import run as runner
+from .engine.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
+from .engine.captures import capture_configuration, open_clips, reader_of
+from .engine.config import ResolvedMethod, build_run_config, default_names, resolve_methods
+from .engine.scoring import ScoredFrames, check_regions, score_frames
+from .engine.steps import Job, fit
+from .engine.store import RunFolder
+from .engine.stored import open_avatar
 from .errors import InputError
 from .io.files import check_output_folder
 from .io.images import quantise
@@ -19,14 +27,6 @@ from .io.lock import locked
 from .machine import check_device
 from .protocol import Protocol, make_protocols
 from .registry import discover, get, unknown
-from .runner import run as runner
-from .runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
-from .runner.captures import capture_configuration, open_clips, reader_of
-from .runner.config import ResolvedMethod, build_run_config, default_names, resolve_methods
-from .runner.scoring import ScoredFrames, check_regions, score_frames
-from .runner.steps import Job, fit
-from .runner.store import RunFolder
-from .runner.stored import open_avatar
 from .specs import MethodSpec, MetricSpec
 
 TASKS: tuple[TaskName, ...] = get_args(TaskName)

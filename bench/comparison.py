@@ -15,6 +15,14 @@ import tyro
 
 from .configuration import build, merge, parse_assignments, with_homes
 from .contracts import Progress
+from .engine.config import (
+    DemoConfig,
+    RunConfig,
+    build_run_config,
+    demo_run_config,
+    resolve_methods,
+    resolve_metrics,
+)
 from .errors import HeadbenchError, InputError
 from .executors.options import chosen_execution
 from .executors.settings import Execution, ExecutorName
@@ -31,14 +39,6 @@ from .options import DependentOptions
 from .progress import log_to_file
 from .progress import progress as show_progress
 from .registry import get, resolve
-from .runner.config import (
-    DemoConfig,
-    RunConfig,
-    build_run_config,
-    demo_run_config,
-    resolve_methods,
-    resolve_metrics,
-)
 from .specs import Findings
 
 Preset = Literal["smoke", "demo", "fast", "paper"]
@@ -149,7 +149,7 @@ def run(settings: RunSettings, progress: Progress) -> Findings:
     assigned = parse_assignments(settings.set)
     values = merge(values, assigned)
     if "reader" not in values and isinstance(values["data"], str):
-        from .runner.captures import reader_of  # which takes long to import
+        from .engine.captures import reader_of  # which takes long to import
 
         values["reader"] = reader_of(values["data"])
     execution = chosen_execution(
@@ -162,8 +162,8 @@ def run(settings: RunSettings, progress: Progress) -> Findings:
     config = build_run_config(values, source)
     check_kind(Path(config.out), "a run")  # before the log is written there
     if settings.dry_run:
-        from .runner.forecast import forecast
-        from .runner.run import planned_jobs
+        from .engine.forecast import forecast
+        from .engine.run import planned_jobs
 
         known = [Path(config.out), *([Path(settings.estimates)] if settings.estimates else [])]
         return forecast(planned_jobs(config), known)
@@ -172,7 +172,7 @@ def run(settings: RunSettings, progress: Progress) -> Findings:
 
 
 def _run(config: RunConfig, execution: Execution | None = None, **record: Any) -> Findings:
-    from .runner.run import run as run_comparison
+    from .engine.run import run as run_comparison
 
     rows = run_comparison(config, execution, **record)
     text = f"{_table([config.out])}\n\nPictures, tables and everything else: {config.out}"

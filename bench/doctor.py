@@ -60,10 +60,10 @@ def doctor(settings: DoctorSettings, progress: Progress) -> Findings:
     Raises `InputError` for unknown methods and settings, and for an invalid device.
     """
     from .configuration import parse_assignments
+    from .engine.config import RunConfig
     from .errors import InputError
     from .machine import machine_record
     from .registry import discover, get, unknown
-    from .runner.config import RunConfig
 
     own = parse_assignments(settings.set)
     stray = set(own) - {"settings"}
@@ -146,8 +146,8 @@ def _slurm() -> Iterator[Need]:
 def _method(
     name: str, named: bool, all_defaults: bool, device: str, chosen: Mapping[str, Mapping[str, Any]]
 ) -> PluginStatus:
+    from .engine.config import resolve_method
     from .registry import discover, get, resolve
-    from .runner.config import resolve_method
 
     plugin = discover("methods").get(name)
     if plugin is not None and plugin.spec is None:

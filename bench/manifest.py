@@ -13,11 +13,11 @@ from typing import Any, Literal
 
 from .condition import label_of
 from .contracts import FrameKey
+from .engine.config import RunConfig
 from .errors import InputError
 from .io.documents import checked, read_json, shown
 from .io.files import check_name, digest, write_json, write_text
 from .protocol import Protocol
-from .runner.config import RunConfig
 from .specs import LABEL, MetricSpec, is_label
 from .upgrade import upgraded_manifest
 

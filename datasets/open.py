@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from ..bench.contracts import Progress, no_progress
+from ..bench.engine.captures import finds, found_captures, readers
 from ..bench.errors import InputError
 from ..bench.registry import get, resolve
-from ..bench.runner.captures import finds, found_captures, readers
 from ..bench.specs import DatasetSpec
 from .clip import CaptureClip, as_capture
 from .foreign import describe

@@ -7,8 +7,8 @@ from typing import Literal
 
 import pandas as pd
 
+from ..bench.engine.scoring import FULL
 from ..bench.rows import ALL, FRAME, Rows
-from ..bench.runner.scoring import FULL
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,12 @@ from pathlib import Path
 import cv2
 
 from ..bench.audit.bundle import without_paths
+from ..bench.engine.scoring import FULL
+from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
 from ..bench.io.files import write_bytes, write_text
 from ..bench.io.images import encode_image, read_png
 from ..bench.rows import ALL, Rows
-from ..bench.runner.scoring import FULL
-from ..bench.runner.store import RunFolder
 from .runs import RunSet
 from .suite.suite import suite_report
 from .table_report import table_of, table_text

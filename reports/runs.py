@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..bench.contracts import ByteArray, Clip, FrameKey
+from ..bench.engine.captures import open_run_clips
+from ..bench.engine.config import RunOptions
+from ..bench.engine.scoring import FULL
+from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
 from ..bench.manifest import Manifest, MethodRecord
 from ..bench.protocol import missing_tasks
 from ..bench.rows import ALL, Rows
-from ..bench.runner.captures import open_run_clips
-from ..bench.runner.config import RunOptions
-from ..bench.runner.scoring import FULL
-from ..bench.runner.store import RunFolder
 from ..bench.specs import MetricSpec
 
 Item = TypeVar("Item")

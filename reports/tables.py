@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from ..bench.contracts import FrameKey
+from ..bench.engine.scoring import FULL
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
-from ..bench.runner.scoring import FULL
 from ..bench.specs import MetricSpec
 from .aggregate import Aggregate, subject_means, summarise, whole_images
 from .conditions import conditions, marks, measured_on

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from headbench.bench import cli
-from headbench.bench.runner import config
+from headbench.bench.engine import config
 
 from .methods import pretended
 from .test_end_to_end import CASES, OTHERS, timed_in_few_frames

@@ -6,9 +6,9 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from headbench.bench.runner import run as runner
-from headbench.bench.runner.config import RunConfig
-from headbench.bench.runner.store import RunFolder
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.config import RunConfig
+from headbench.bench.engine.store import RunFolder
 
 from .datasets.head.toy import toy_head
 from .datasets.tiny_capture import make_plan, write_tiny_capture

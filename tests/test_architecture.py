@@ -228,7 +228,7 @@ def test_packages_of_few_uses_are_imported_in_functions():
     assert found == []
 
 
-NOT_CONVERTED = ("bench/runner/", "bench/executors/", "bench/audit/", "reports/")
+NOT_CONVERTED = ("bench/engine/", "bench/executors/", "bench/audit/", "reports/")
 """Folders whose docstrings still have the form ``name : description``."""
 ENTRIES = re.compile(r"^( *)(?:Parameters|Attributes)\n\1-+\n((?:\1 *(?!\"\"\")\S.*\n)+)", re.MULTILINE)
 

@@ -19,10 +19,10 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.engine.config import RunConfig, resolve_metrics
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.io.documents import read_json
 from headbench.bench.registry import SPEC_TYPES, discover
-from headbench.bench.runner.config import RunConfig, resolve_metrics
-from headbench.bench.runner.store import RunFolder
 from headbench.metrics import speed
 
 from .datasets.flat_renderer import flat_pictures

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from headbench.bench import cli
-from headbench.bench.runner import run as runner
+from headbench.bench.engine import run as runner
 from headbench.datasets.ga.layout import DECLARATION_FILE, HEAD_FILE
 from headbench.datasets.head.loaders import EYELID_FILES, MASKS_FILE, load_head
 from headbench.datasets.head.teeth import with_teeth

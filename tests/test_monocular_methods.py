@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from headbench.bench.runner.captures import reader_of
+from headbench.bench.engine.captures import reader_of
 from headbench.datasets.ga.reader import read_capture
 from headbench.reports.table_report import table_text
 

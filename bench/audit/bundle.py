@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Literal
 
 from ..contracts import Progress, no_progress
+from ..engine.steps import DIGESTS
+from ..engine.store import STAGES, RunFolder
 from ..errors import InputError
 from ..io.archives import open_archive
 from ..io.documents import MAX_JSON_BYTES, checked, parse_json
@@ -20,8 +22,6 @@ from ..io.files import atomic_path, check_writable, digest_file, write_json
 from ..io.provenance import RENDER, source_type
 from ..manifest import PROTOCOLS, Manifest, protocol_path
 from ..rows import Rows
-from ..runner.steps import DIGESTS
-from ..runner.store import STAGES, RunFolder
 from ..specs import Findings
 from .settings import BundleSettings, check_shown
 

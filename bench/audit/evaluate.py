@@ -10,6 +10,12 @@ from pathlib import Path
 
 from ..condition import PLAIN
 from ..contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
+from ..engine.captures import capture_configuration, open_clips, open_run_clips
+from ..engine.config import ResolvedMethod, RunConfig, RunOptions, default_names, resolve_metrics
+from ..engine.run import run_locked
+from ..engine.steps import DIGESTS, Job, measure, render
+from ..engine.store import Cell, RunFolder
+from ..engine.stored import avatar_digest, open_avatar
 from ..errors import HeadbenchError, InputError
 from ..io.files import (
     atomic_path,
@@ -25,12 +31,6 @@ from ..io.lock import locked
 from ..protocol import Protocol, make_protocols
 from ..registry import discover, get, resolve
 from ..rows import Rows
-from ..runner.captures import capture_configuration, open_clips, open_run_clips
-from ..runner.config import ResolvedMethod, RunConfig, RunOptions, default_names, resolve_metrics
-from ..runner.run import run_locked
-from ..runner.steps import DIGESTS, Job, measure, render
-from ..runner.store import Cell, RunFolder
-from ..runner.stored import avatar_digest, open_avatar
 from ..specs import Findings, MethodSpec, MetricSpec
 from .background import check_background
 from .naming import Render, check_truth, composited, named_renders

@@ -8,13 +8,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from ..contracts import Clip, FrameKey, Progress, no_progress
+from ..engine.captures import capture_configuration, found_captures, open_clips, open_run_clips
+from ..engine.config import RunConfig
+from ..engine.store import RunFolder
 from ..errors import InputError
 from ..io.files import check_output_folder, write_text
 from ..protocol import make_protocols
 from ..registry import get, resolve
-from ..runner.captures import capture_configuration, found_captures, open_clips, open_run_clips
-from ..runner.config import RunConfig
-from ..runner.store import RunFolder
 from ..specs import DatasetSpec, Findings
 from .naming import MAP_COLUMNS, image_name
 from .settings import FramesSettings

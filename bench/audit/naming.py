@@ -11,14 +11,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ..contracts import ByteArray, Clip, FrameKey
+from ..engine.captures import found_captures
+from ..engine.config import RunConfig
+from ..engine.store import Cell
 from ..errors import InputError
 from ..io.documents import read_text
 from ..io.files import reading, with_slashes
 from ..io.images import read_pixels, read_png
 from ..registry import discover, get, resolve, unknown
-from ..runner.captures import found_captures
-from ..runner.config import RunConfig
-from ..runner.store import Cell
 from ..specs import DatasetSpec
 
 MAP = "a list of names, MAP.csv"

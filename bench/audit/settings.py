@@ -9,9 +9,9 @@ from typing import Any
 import tyro
 
 from ..contracts import TaskName
+from ..engine.config import RunOptions
 from ..errors import InputError
 from ..options import DependentOptions
-from ..runner.config import RunOptions
 from ..specs import LABEL, is_label
 
 

@@ -13,6 +13,11 @@ import pandas as pd
 
 from ..condition import Condition
 from ..contracts import Avatar, Clip, FrameKey, Progress, no_progress
+from ..engine.captures import Plugins, open_run_clips, synthesis_arguments
+from ..engine.config import resolve_cells, resolve_metrics
+from ..engine.jobs import load, make_jobs
+from ..engine.steps import DIGESTS, Job, measure, recorded_frames
+from ..engine.store import Cell, RunFolder
 from ..errors import ExitCode, HeadbenchError, InputError
 from ..io.files import digest, digest_file
 from ..io.images import read_png
@@ -20,11 +25,6 @@ from ..manifest import Manifest, ProtocolRecord
 from ..protocol import Protocol, make_protocols
 from ..registry import get, resolve
 from ..rows import ALL, FRAME, Rows
-from ..runner.captures import Plugins, open_run_clips, synthesis_arguments
-from ..runner.config import resolve_cells, resolve_metrics
-from ..runner.jobs import load, make_jobs
-from ..runner.steps import DIGESTS, Job, measure, recorded_frames
-from ..runner.store import Cell, RunFolder
 from ..specs import Findings, MetricSpec
 from .bundle import read_bundle
 from .evaluate import NoAvatar, images_method

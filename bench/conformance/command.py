@@ -11,12 +11,12 @@ import tyro
 
 from ..configuration import parse_assignments
 from ..contracts import Clip, Progress, no_progress
+from ..engine.adaptation import MethodNeeds, carry_out, plan
+from ..engine.config import DemoConfig, ResolvedMethod, RunConfig, resolve_method
 from ..errors import InputError
 from ..machine import check_device
 from ..options import DependentOptions
 from ..registry import SPEC_TYPES, Group, discover, get, resolve
-from ..runner.adaptation import MethodNeeds, carry_out, plan
-from ..runner.config import DemoConfig, ResolvedMethod, RunConfig, resolve_method
 from ..specs import DatasetSpec, Findings, MethodSpec, MetricSpec
 from .methods import attempt, check_method
 from .metrics import check_metric
@@ -123,7 +123,7 @@ def _check_method(
 
 
 def _clip(settings: CheckPluginSettings, folder: Path, progress: Progress) -> Clip:
-    from ..runner import captures  # which takes long to import
+    from ..engine import captures  # which takes long to import
 
     data = settings.data
     if data is None:

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from ..contracts import Avatar, Clip, Frame, HeadPose, no_progress
+from ..engine.adaptation import TrainingView
+from ..engine.config import ResolvedMethod
 from ..errors import InputError, UnavailableError
 from ..io.files import digest_file
-from ..runner.adaptation import TrainingView
-from ..runner.config import ResolvedMethod
 
 
 @contextmanager

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from ..contracts import ByteArray, Camera, Frame, HeadPose, Measurement
+from ..engine.scoring import make_metric
 from ..errors import UnavailableError
 from ..io.files import check_name
-from ..runner.scoring import make_metric
 from ..specs import MetricSpec
 from .methods import attempt, refusal
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from ..configuration import build_arguments
 from ..contracts import Camera, Clip, FrameKey, HeadAsset, HeadPose, TaskName, no_progress
+from ..engine.captures import HARNESS, found_captures
 from ..errors import InputError
 from ..io.files import check_name, plain
 from ..registry import resolve
-from ..runner.captures import HARNESS, found_captures
 from ..specs import DatasetSpec
 from .methods import attempt, refusal
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import tyro
 
 from ..contracts import Progress
-from ..runner.config import RunOptions
-from ..runner.disk import Deletable
+from ..engine.config import RunOptions
+from ..engine.disk import Deletable
 from ..specs import Findings
 
 
@@ -27,7 +27,7 @@ class StatusSettings:
 
 def status(settings: StatusSettings, progress: Progress) -> Findings:
     """Show which cells of a run are waiting, running, done or failed, and the time left."""
-    from ..runner.disk import clean, shown, usage
+    from ..engine.disk import clean, shown, usage
     from .status import run_status
 
     run = Path(settings.run)
@@ -56,6 +56,6 @@ class SpeedSettings(RunOptions):
 
 def speed(settings: SpeedSettings, progress: Progress) -> Findings:
     """Measure the speed of a finished run's avatars again, without training, and update its tables and report."""
-    from ..runner.speed import measure_speed_again
+    from ..engine.speed import measure_speed_again
 
     return measure_speed_again(Path(settings.run), settings, settings.methods, progress)

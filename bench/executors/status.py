@@ -12,12 +12,12 @@ from itertools import product
 from pathlib import Path
 from typing import Literal
 
+from ..engine.store import RunFolder
 from ..errors import HeadbenchError
 from ..io.lock import is_locked
 from ..manifest import Manifest
 from ..progress import duration
 from ..rows import ALL
-from ..runner.store import RunFolder
 from ..specs import Findings
 from .outcome import TaskOutcome, read_outcome
 from .settings import is_speed

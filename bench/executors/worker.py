@@ -33,12 +33,12 @@ def execute_task(task: Task) -> None:
     InputError : another process works on it.
     OSError : the disk is full or read-only.
     """
+    from ..engine.steps import reason_of
     from ..io.files import output_inside
     from ..io.lock import locked
     from ..machine import check_device
     from ..progress import log_to_file
     from ..registry import resolve
-    from ..runner.steps import reason_of
     from .outcome import read_outcome, write_outcome
 
     folder = task.folder

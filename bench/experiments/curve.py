@@ -11,14 +11,14 @@ from pathlib import Path
 
 from ..condition import Condition, Named
 from ..contracts import Budget, Clip, Progress, no_progress
+from ..engine.captures import open_run_clips, run_configuration
+from ..engine.config import ResolvedMethod, resolve_methods
+from ..engine.run import run_locked
+from ..engine.store import RunFolder
 from ..errors import InputError
 from ..io.files import check_kind, output_inside
 from ..io.lock import locked
 from ..registry import get, resolve
-from ..runner.captures import open_run_clips, run_configuration
-from ..runner.config import ResolvedMethod, resolve_methods
-from ..runner.run import run_locked
-from ..runner.store import RunFolder
 from ..specs import Findings
 from .curve_settings import CurveSettings
 from .held_out import CAMERA, TIMESTEPS, count_of

@@ -8,9 +8,9 @@ from typing import Literal
 
 import tyro
 
+from ..engine.config import RunOptions
 from ..executors.options import ExecutionOptions
 from ..options import DependentOptions
-from ..runner.config import RunOptions
 
 MOST_TRACKING_ERROR = 4.0
 """What `headbench synth` takes at most."""

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 
 from ..contracts import Avatar, Clip, FloatArray, FrameKey, HeadPose, Progress
+from ..engine.steps import Job
 from ..io.files import digest
 from ..protocol import Protocol
 from ..rows import Rows
-from ..runner.steps import Job
 from .stability import (
     EXPRESSION_LIMITS,
     VIEW_LIMITS,

@@ -21,9 +21,9 @@ from ..contracts import (
     StepRecord,
     TaskName,
 )
+from ..engine.config import RunConfig
 from ..errors import HeadbenchError, InputError
 from ..io.files import digest
-from ..runner.config import RunConfig
 
 CAMERA: TaskName = "novel_view"
 TIMESTEPS: TaskName = "self_reenactment"

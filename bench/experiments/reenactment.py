@@ -12,15 +12,15 @@ import numpy as np
 
 from ..condition import PLAIN
 from ..contracts import Avatar, Camera, Clip, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
+from ..engine.captures import open_clips
+from ..engine.jobs import make_jobs
+from ..engine.steps import Job
+from ..engine.store import RunFolder
 from ..errors import InputError
 from ..io.files import digest
 from ..io.images import write_png
 from ..protocol import Protocol, evenly
 from ..rows import Row, Rows
-from ..runner.captures import open_clips
-from ..runner.jobs import make_jobs
-from ..runner.steps import Job
-from ..runner.store import RunFolder
 from .extremes import training_poses
 from .identity import RecordedAppearance, identity, mean_known, of_recording
 from .stability import (

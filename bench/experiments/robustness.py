@@ -9,14 +9,14 @@ from typing import Any
 
 from ..condition import Condition, Named
 from ..contracts import Progress, no_progress
+from ..engine.jobs import trained
+from ..engine.run import run_locked
+from ..engine.store import RunFolder
 from ..executors.settings import check_executor
 from ..io.files import check_kind, output_inside, write_json
 from ..io.lock import locked
 from ..registry import get, resolve
 from ..rows import ALL, Rows
-from ..runner.jobs import trained
-from ..runner.run import run_locked
-from ..runner.store import RunFolder
 from ..specs import Findings
 from .robustness_settings import ExtremesSettings, ReenactSettings
 

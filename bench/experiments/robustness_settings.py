@@ -7,8 +7,8 @@ from typing import Any
 
 import tyro
 
+from ..engine.config import RunOptions
 from ..executors.options import ExecutionOptions
-from ..runner.config import RunOptions
 
 
 @dataclass(frozen=True)

@@ -26,14 +26,14 @@ from ..contracts import (
     SplatAvatar,
     Splats,
 )
+from ..engine.adaptation import MethodNeeds
+from ..engine.scoring import FULL
+from ..engine.steps import Job
 from ..errors import UnavailableError
 from ..io.images import quantise, write_png
 from ..io.provenance import RENDER
 from ..protocol import Protocol, TaskWithoutTruth, make_protocol_without_truth, protocol_name
 from ..rows import Row
-from ..runner.adaptation import MethodNeeds
-from ..runner.scoring import FULL
-from ..runner.steps import Job
 
 log = logging.getLogger(__name__)
 COVERED, SOLID = 0.05, 0.95

@@ -6,12 +6,12 @@ from pathlib import Path
 
 from ..condition import PLAIN, Condition
 from ..contracts import Progress, no_progress
+from ..engine.config import RunConfig, parse_size, resolve_cells, resolve_metrics
+from ..engine.run import check_settings, run
 from ..errors import InputError
 from ..executors.settings import check_executor
 from ..io.files import write_text
 from ..registry import discover, get, resolve
-from ..runner.config import RunConfig, parse_size, resolve_cells, resolve_metrics
-from ..runner.run import check_settings, run
 from ..specs import Findings
 from .suite_settings import ABLATIONS, SEED, SuiteSettings
 

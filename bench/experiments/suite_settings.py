@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from ..engine.config import parse_size
 from ..errors import InputError
 from ..executors.options import ExecutionOptions
 from ..listing import presets_of_methods
-from ..runner.config import parse_size
 
 SEED = 26_000
 """Of the suite's captures. Settings of methods are chosen on captures of seeds below 10,000 (`README.md`)."""

@@ -8,14 +8,14 @@ from pathlib import Path
 
 from ..condition import PLAIN, Condition, Named
 from ..contracts import Avatar, Clip, Progress, no_progress
+from ..engine.config import default_names
+from ..engine.jobs import trained
+from ..engine.run import run_locked
+from ..engine.store import RunFolder
 from ..errors import InputError
 from ..io.files import check_kind, check_name, output_inside
 from ..io.lock import locked
 from ..registry import get, resolve
-from ..runner.config import default_names
-from ..runner.jobs import trained
-from ..runner.run import run_locked
-from ..runner.store import RunFolder
 from ..specs import Findings, MethodSpec
 from .sweep_settings import SweepSettings
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import tyro
 
+from ..engine.config import RunOptions
 from ..executors.options import ExecutionOptions
-from ..runner.config import RunOptions
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from ..contracts import Clip
+from ..engine.captures import open_clips, synthesis_arguments
+from ..engine.config import RunConfig
 from ..errors import InputError
 from ..progress import progress
 from ..registry import get, resolve
-from ..runner.captures import open_clips, synthesis_arguments
-from ..runner.config import RunConfig
 
 
 def tracking_error(steps: Sequence[Mapping[str, Any]]) -> float | None:

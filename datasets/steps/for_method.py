@@ -1,6 +1,6 @@
 """A clip in the form that a method needs: the steps that lead there, in order, and the way back.
 
-Found by the harness as the entry point of `headbench.adaptation`, see `headbench.bench.runner.adaptation`.
+Found by the harness as the entry point of `headbench.adaptation`, see `headbench.bench.engine.adaptation`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...bench.contracts import Clip, FloatArray, FrameKey, Progress
+from ...bench.engine.adaptation import Adaptation, AdaptedClip, MethodNeeds
 from ...bench.errors import InputError
-from ...bench.runner.adaptation import Adaptation, AdaptedClip, MethodNeeds
 from ..clip import CaptureClip, as_capture
 from ..ga.tracking import find_head
 from ..head.arrays import HeadArrays

@@ -7,6 +7,9 @@ from pathlib import Path
 from typing import Literal
 
 from ...bench.contracts import Progress
+from ...bench.engine.config import (
+    parse_size,
+)
 from ...bench.executors.options import ExecutionOptions
 from ...bench.executors.settings import check_executor
 from ...bench.io.files import (
@@ -14,9 +17,6 @@ from ...bench.io.files import (
     check_output_folder,
 )
 from ...bench.io.lock import locked
-from ...bench.runner.config import (
-    parse_size,
-)
 from ...bench.specs import Findings
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from ...bench.contracts import HeadAsset, HeadPose, Progress, SplatAvatar, no_progress
+from ...bench.engine.stored import StoredAvatar, open_avatar
 from ...bench.errors import InputError
 from ...bench.io.files import check_writable
-from ...bench.runner.stored import StoredAvatar, open_avatar
 from ...bench.specs import Findings
 from ..ops.harmonics import harmonic_colors
 from ..shared.avatar_files import read_shared_head

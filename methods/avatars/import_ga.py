@@ -9,11 +9,11 @@ import numpy as np
 
 from ...bench.configuration import build, parse_assignments
 from ...bench.contracts import Budget, Progress, no_progress
+from ...bench.engine.config import ResolvedMethod
+from ...bench.engine.stored import AVATAR_FILE, SAME_SHAPE, write_avatar_record
 from ...bench.errors import InputError
 from ...bench.io.files import check_name, digest_file, user_files
 from ...bench.io.lock import LOCK_FILE
-from ...bench.runner.config import ResolvedMethod
-from ...bench.runner.stored import AVATAR_FILE, SAME_SHAPE, write_avatar_record
 from ...bench.specs import Findings
 from ...datasets.clip import CaptureClip
 from ...datasets.ga.tracking import TeethPolicy, Tracking, find_head, read_animation

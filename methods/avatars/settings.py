@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import tyro
 
+from ...bench.engine.config import AvatarFolder
 from ...bench.options import DependentOptions
-from ...bench.runner.config import AvatarFolder
 from ...datasets.options import CaptureOptions
 
 

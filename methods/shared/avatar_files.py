@@ -11,11 +11,11 @@ import numpy as np
 
 from ...bench.configuration import deciding_settings
 from ...bench.contracts import Budget, Clip, FloatArray, HeadAsset, HeadPose
+from ...bench.engine.stored import HEAD_FILE, SUBJECT_FILE, TRAINING_FILE
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.documents import read_json
 from ...bench.io.files import atomic_path, digest, write_json
-from ...bench.runner.stored import HEAD_FILE, SUBJECT_FILE, TRAINING_FILE
 from ...datasets.head.arrays import STORED, HeadArrays, read_head, save_head
 from .loop import Fit, Outcome
 

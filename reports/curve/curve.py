@@ -9,10 +9,10 @@ from typing import Any
 
 from ...bench.condition import Condition
 from ...bench.contracts import Budget
+from ...bench.engine.scoring import FULL
 from ...bench.io.files import write_text
 from ...bench.manifest import ClipRecord, MethodRecord
 from ...bench.rows import ALL, Rows
-from ...bench.runner.scoring import FULL
 from ...bench.specs import Findings, MetricSpec
 from ..aggregate import subject_means
 from ..runs import RunData

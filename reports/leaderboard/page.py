@@ -9,10 +9,10 @@ from pathlib import Path
 
 from ...bench.audit.bundle import Bundle, read_bundle
 from ...bench.contracts import Progress
+from ...bench.engine.store import RunFolder
 from ...bench.errors import InputError
 from ...bench.io.files import digest_file, entries, write_text
 from ...bench.manifest import Manifest
-from ...bench.runner.store import RunFolder
 from ...bench.specs import Findings
 from ..runs import RunSet
 from ..table_report import table_of

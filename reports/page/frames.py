@@ -15,10 +15,10 @@ from typing import NamedTuple
 import cv2
 
 from ...bench.contracts import ByteArray, Clip, FrameKey, Progress
+from ...bench.engine.captures import open_run_clips
+from ...bench.engine.config import RunOptions
 from ...bench.errors import HeadbenchError, InputError
 from ...bench.io.images import encode_image
-from ...bench.runner.captures import open_run_clips
-from ...bench.runner.config import RunOptions
 from ...bench.specs import MetricSpec
 from ..runs import RunSet
 

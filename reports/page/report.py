@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.engine.config import RunOptions
+from ...bench.engine.scoring import FULL
+from ...bench.engine.store import RunFolder
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_text
 from ...bench.io.provenance import COMPOSITE, source_type, tool
 from ...bench.protocol import TASK_TITLES
-from ...bench.runner.config import RunOptions
-from ...bench.runner.scoring import FULL
-from ...bench.runner.store import RunFolder
 from ...bench.specs import Findings, MetricSpec
 from ..aggregate import summarise
 from ..drawing import colour_map

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import tyro
 
-from ...bench.runner.config import RunOptions
+from ...bench.engine.config import RunOptions
 
 MAX_MB, MAX_SPLIT_MB = 20.0, 500.0
 

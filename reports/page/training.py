@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from ...bench.engine.stored import training_losses
 from ...bench.errors import InputError
-from ...bench.runner.stored import training_losses
 from ..runs import RunSet
 
 Curve = list[tuple[int, float]]

@@ -10,6 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, HeadPose, Progress, no_progress
+from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
+from ...bench.engine.captures import open_clips, reader_of
+from ...bench.engine.config import RunConfig
+from ...bench.engine.store import Cell
+from ...bench.engine.stored import open_avatar
 from ...bench.errors import InputError
 from ...bench.experiments.extremes import head_center
 from ...bench.experiments.viewpoints import turntable
@@ -17,11 +22,6 @@ from ...bench.io.files import grouped_writes
 from ...bench.io.images import quantise, read_png, write_png
 from ...bench.io.provenance import COMPOSITE, RENDER
 from ...bench.io.video import webm_writer, write_webm
-from ...bench.runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
-from ...bench.runner.captures import open_clips, reader_of
-from ...bench.runner.config import RunConfig
-from ...bench.runner.store import Cell
-from ...bench.runner.stored import open_avatar
 from ...bench.specs import Findings
 from .settings import RenderSettings
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from ...bench.engine.config import AvatarFolder
 from ...bench.options import DependentOptions
-from ...bench.runner.config import AvatarFolder
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import product
 from pathlib import Path
 
-from ...bench.runner.scoring import FULL
+from ...bench.engine.scoring import FULL
 from ..runs import Part, RunSet
 from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import table_of

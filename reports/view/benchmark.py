@@ -15,9 +15,9 @@ import numpy as np
 
 from ...bench.benchmarks import Row, findings
 from ...bench.contracts import Progress
+from ...bench.engine.adaptation import AdaptedClip
 from ...bench.io.images import encode_image
 from ...bench.registry import resolve
-from ...bench.runner.adaptation import AdaptedClip
 from ...bench.specs import Findings
 from .drawing import draw, splats_of
 from .scene import Scene, ShownAvatar

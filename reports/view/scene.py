@@ -12,15 +12,15 @@ import numpy as np
 
 from ...bench.condition import PLAIN
 from ...bench.contracts import Avatar, Camera, Clip, FloatArray, FrameKey, HeadPose
+from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
+from ...bench.engine.captures import open_clips, open_run_clips, reader_of, run_configuration
+from ...bench.engine.config import ResolvedMethod, RunConfig, resolve_methods
+from ...bench.engine.jobs import load, make_jobs
+from ...bench.engine.store import RunFolder
+from ...bench.engine.stored import avatar_folder, open_avatar
 from ...bench.errors import HeadbenchError, InputError
 from ...bench.experiments.extremes import head_center, training_poses
 from ...bench.experiments.reenactment import RigidMean, check_heads, retarget
-from ...bench.runner.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
-from ...bench.runner.captures import open_clips, open_run_clips, reader_of, run_configuration
-from ...bench.runner.config import ResolvedMethod, RunConfig, resolve_methods
-from ...bench.runner.jobs import load, make_jobs
-from ...bench.runner.store import RunFolder
-from ...bench.runner.stored import avatar_folder, open_avatar
 from .settings import ViewSettings
 
 log = logging.getLogger(__name__)

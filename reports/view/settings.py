@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import tyro
 
-from ...bench.runner.config import RunOptions
+from ...bench.engine.config import RunOptions
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from headbench.bench.runner import run as runner
-from headbench.bench.runner.config import RunConfig
-from headbench.bench.runner.store import RunFolder
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.config import RunConfig
+from headbench.bench.engine.store import RunFolder
 
 
 @pytest.fixture

@@ -14,10 +14,10 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli, comparison
+from headbench.bench.engine import captures
+from headbench.bench.engine.config import DemoConfig, parse_size
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.registry import Plugin, discover
-from headbench.bench.runner import captures
-from headbench.bench.runner.config import DemoConfig, parse_size
 from headbench.bench.specs import Findings
 from headbench.datasets.synthetic import capture
 

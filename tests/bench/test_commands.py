@@ -12,9 +12,9 @@ from typing import get_type_hints
 import pytest
 
 from headbench.bench import cli, commands, parsing, registry, specs
+from headbench.bench.engine.config import AvatarFolder
 from headbench.bench.io.files import KINDS
 from headbench.bench.io.lock import locked
-from headbench.bench.runner.config import AvatarFolder
 
 TOY = '''
 from dataclasses import dataclass

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from headbench.bench.engine.store import Cell
 from headbench.bench.errors import InputError
 from headbench.bench.manifest import PROTOCOLS, Manifest, protocol_path
-from headbench.bench.runner.store import Cell
 from headbench.methods.ga.spec import GA
 from headbench.metrics.psnr import PSNR
 

@@ -8,8 +8,8 @@ import sys
 import pytest
 
 from headbench.bench import progress as module
+from headbench.bench.engine import run as runner
 from headbench.bench.progress import RunProgress, TimeLeft, duration, progress, run_progress
-from headbench.bench.runner import run as runner
 
 
 class Clock:

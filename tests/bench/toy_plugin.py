@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from headbench.bench.contracts import Camera, Frame, FrameKey, HeadPose, Measurement, StepRecord, Variant
+from headbench.bench.engine.adaptation import AdaptedClip
 from headbench.bench.errors import InputError, UnavailableError
-from headbench.bench.runner.adaptation import AdaptedClip
 from headbench.bench.specs import DatasetSpec, MethodSpec, MetricSpec
 
 SIZE = (8, 6)  # width, height

@@ -7,8 +7,8 @@ import pytest
 
 from headbench.bench import registry
 from headbench.bench.contracts import no_progress
+from headbench.bench.engine.adaptation import MethodNeeds, adapter
 from headbench.bench.errors import InputError
-from headbench.bench.runner.adaptation import MethodNeeds, adapter
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.clip import as_capture
 from headbench.datasets.ga.reader import read_capture
@@ -54,7 +54,7 @@ def test_readers_of_plug_ins_beside_the_one_that_fits(pristine_capture, monkeypa
     def offer(**changes):
         twin = replace(known["ga"], name="other", spec=replace(known["ga"].spec, name="other", **changes))
         monkeypatch.setattr(
-            "headbench.bench.runner.captures.discover", lambda group: {**known, "other": twin}
+            "headbench.bench.engine.captures.discover", lambda group: {**known, "other": twin}
         )
 
     offer()

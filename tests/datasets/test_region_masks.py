@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import HeadPose, RegionalClip
-from headbench.bench.runner.scoring import check_regions
+from headbench.bench.engine.scoring import check_regions
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import HeadArrays
 from headbench.datasets.region_masks import HeadRegions, select

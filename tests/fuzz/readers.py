@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from headbench.bench import cli
+from headbench.bench.engine.config import resolve_method
 from headbench.bench.io.arrays import read_npy, read_npz
 from headbench.bench.io.documents import read_json, read_yaml
 from headbench.bench.io.images import read_pixels
 from headbench.bench.io.unpickle import read_pickle
 from headbench.bench.registry import get
 from headbench.bench.rows import Rows
-from headbench.bench.runner.config import resolve_method
 from headbench.datasets.colmap.model import read_model
 from headbench.datasets.colmap.reader import model_cameras
 from headbench.datasets.ga.reader import read_capture

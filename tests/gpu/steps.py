@@ -16,12 +16,12 @@ from torch import Tensor
 from headbench.bench import cli
 from headbench.bench.benchmarks import take_turns
 from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.engine.config import RunOptions
+from headbench.bench.engine.jobs import load, trained
+from headbench.bench.engine.steps import Job
 from headbench.bench.machine import use_device
 from headbench.bench.registry import discover
 from headbench.bench.rows import ALL, Rows
-from headbench.bench.runner.config import RunOptions
-from headbench.bench.runner.jobs import load, trained
-from headbench.bench.runner.steps import Job
 from headbench.methods.benchmarks.scenes import SplatScene, head_shell, relative_error
 from headbench.methods.shared.loop import CHECKPOINT, synchroniser
 from headbench.methods.splats import cuda, rasterize

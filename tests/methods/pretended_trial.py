@@ -14,8 +14,8 @@ from unittest.mock import patch
 import numpy as np
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.bench.runner.config import RunOptions
-from headbench.bench.runner.jobs import trained
+from headbench.bench.engine.config import RunOptions
+from headbench.bench.engine.jobs import trained
 
 from ..small_run import small_run
 from . import pretended

@@ -1,9 +1,9 @@
 """Avatars of methods that a test trains by itself, recorded as the runner does."""
 
 from headbench.bench.contracts import Budget
+from headbench.bench.engine.config import ResolvedMethod
+from headbench.bench.engine.stored import write_avatar_record
 from headbench.bench.registry import get, resolve
-from headbench.bench.runner.config import ResolvedMethod
-from headbench.bench.runner.stored import write_avatar_record
 
 
 def recorded(folder, method, clip, config=None):

@@ -8,11 +8,11 @@ import pytest
 from headbench.bench.configuration import merge
 from headbench.bench.conformance.methods import check_method
 from headbench.bench.contracts import no_progress
+from headbench.bench.engine.config import resolve_method
+from headbench.bench.engine.stored import TRAINING_FILE
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest_file
 from headbench.bench.registry import discover
-from headbench.bench.runner.config import resolve_method
-from headbench.bench.runner.stored import TRAINING_FILE
 from headbench.bench.specs import MethodSpec
 
 from .insta.small import SMALL as SMALL_INSTA

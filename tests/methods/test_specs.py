@@ -6,15 +6,15 @@ import pytest
 
 from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget
-from headbench.bench.errors import InputError
-from headbench.bench.registry import resolve
-from headbench.bench.runner.config import (
+from headbench.bench.engine.config import (
     DemoConfig,
     RunConfig,
     demo_run_config,
     resolve_method,
     resolve_methods,
 )
+from headbench.bench.errors import InputError
+from headbench.bench.registry import resolve
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.spec import GA
 from headbench.methods.gbs.config import GBSConfig

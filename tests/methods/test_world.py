@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.bench.runner import adaptation
-from headbench.bench.runner.adaptation import MethodNeeds
-from headbench.bench.runner.config import resolve_method
+from headbench.bench.engine import adaptation
+from headbench.bench.engine.adaptation import MethodNeeds
+from headbench.bench.engine.config import resolve_method
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.methods.ga.spec import GA

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import STAGES, HeadPose
+from headbench.bench.engine.config import default_names
 from headbench.bench.registry import discover, resolve
-from headbench.bench.runner.config import default_names
 
 SPECS = [
     p.spec for p in discover("metrics").values() if p.spec and p.spec.implementation.startswith("headbench.")

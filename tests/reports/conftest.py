@@ -6,10 +6,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from headbench.bench.engine.config import RunConfig
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.manifest import Manifest, MethodRecord, ProtocolRecord
 from headbench.bench.rows import Rows
-from headbench.bench.runner.config import RunConfig
-from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
 
 from ..small_run import run_on

@@ -3,9 +3,9 @@ import json
 import pandas as pd
 import pytest
 
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.rows import Rows
-from headbench.bench.runner.store import RunFolder
 from headbench.reports.runs import RunSet
 from headbench.reports.table_report import published_rows, table_of, table_text
 

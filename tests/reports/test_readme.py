@@ -1,7 +1,7 @@
 """What is published of a suite: its run without this machine's folders."""
 
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.manifest import PROTOCOLS
-from headbench.bench.runner.store import RunFolder
 from headbench.reports import readme
 
 

@@ -3,10 +3,10 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.registry import resolve
 from headbench.bench.rows import Rows
-from headbench.bench.runner.store import RunFolder
 from headbench.reports import specs
 from headbench.reports.contact_sheet import write_contact_sheet
 from headbench.reports.runs import RunData, RunSet, evenly_spaced

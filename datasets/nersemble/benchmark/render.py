@@ -6,10 +6,10 @@ import logging
 from pathlib import Path
 
 from ....bench.contracts import Progress, no_progress
+from ....bench.engine.stored import AVATAR_FILE, HEAD_FILE, open_avatar
 from ....bench.errors import InputError
 from ....bench.io.files import grouped_writes
 from ....bench.io.images import quantise, write_png
-from ....bench.runner.stored import AVATAR_FILE, HEAD_FILE, open_avatar
 from ....bench.specs import Findings
 from ...head.arrays import HeadArrays, read_head
 from ...head.loaders import load_head

@@ -7,7 +7,7 @@ from typing import Literal
 
 import tyro
 
-from ....bench.runner.config import AvatarFolder
+from ....bench.engine.config import AvatarFolder
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ....bench.contracts import ByteArray, Clip, HeadAsset, Progress, no_progress
+from ....bench.engine.stored import avatar_digest, open_avatar, write_avatar_record
 from ....bench.errors import InputError
 from ....bench.io.images import quantise
-from ....bench.runner.stored import avatar_digest, open_avatar, write_avatar_record
 from ....bench.specs import Findings
 from ...ours.avatar import OursAvatar
 from ...ours.storage import Field

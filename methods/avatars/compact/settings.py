@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from ....bench.engine.config import AvatarFolder
 from ....bench.options import DependentOptions
-from ....bench.runner.config import AvatarFolder
 from ....datasets.options import CaptureOptions
 from .precision import Precision
 

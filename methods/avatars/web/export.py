@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from ....bench.contracts import Camera, FloatArray, HeadPose, Progress, no_progress
+from ....bench.engine.stored import AVATAR_FILE, HEAD_FILE
 from ....bench.errors import InputError
 from ....bench.io.files import check_writable, write_text
 from ....bench.io.provenance import RENDER, note, source_type, tool
-from ....bench.runner.stored import AVATAR_FILE, HEAD_FILE
 from ....bench.specs import Findings
 from ...shared.avatar_files import read_shared_head
 from ...shared.rendering import view_of

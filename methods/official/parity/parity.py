@@ -16,6 +16,11 @@ from ....bench.benchmarks import table as aligned
 from ....bench.condition import PLAIN
 from ....bench.configuration import build
 from ....bench.contracts import Progress, no_progress
+from ....bench.engine.config import RunConfig, parse_size, resolve_methods
+from ....bench.engine.run import check_settings, run
+from ....bench.engine.scoring import FULL
+from ....bench.engine.store import RunFolder
+from ....bench.engine.stored import TRAINING_FILE
 from ....bench.executors.settings import check_executor
 from ....bench.io.documents import read_json
 from ....bench.io.files import write_json, write_text
@@ -23,11 +28,6 @@ from ....bench.io.lock import locked
 from ....bench.progress import log_to_file
 from ....bench.registry import get
 from ....bench.rows import Rows
-from ....bench.runner.config import RunConfig, parse_size, resolve_methods
-from ....bench.runner.run import check_settings, run
-from ....bench.runner.scoring import FULL
-from ....bench.runner.store import RunFolder
-from ....bench.runner.stored import TRAINING_FILE
 from ....bench.specs import Findings
 from ....bench.streams import on_terminal
 from ...shared.config import PAPER_ITERATIONS, SplatTraining

@@ -7,9 +7,9 @@ from typing import Literal
 
 import tyro
 
+from ....bench.engine.config import parse_size
 from ....bench.executors.options import ExecutionOptions
 from ....bench.options import DependentOptions
-from ....bench.runner.config import parse_size
 
 
 @dataclass(frozen=True)

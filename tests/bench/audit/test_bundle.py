@@ -9,9 +9,9 @@ import pytest
 from headbench.bench import cli
 from headbench.bench.audit.bundle import INDEX, read_bundle
 from headbench.bench.audit.settings import BundleSettings
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
-from headbench.bench.runner.store import RunFolder
 
 
 def bundle(run, out, *options):

@@ -15,10 +15,10 @@ from headbench.bench.audit.evaluate import evaluate_folder
 from headbench.bench.audit.naming import Render, check_truth, composited
 from headbench.bench.audit.settings import EvaluateSettings
 from headbench.bench.contracts import FrameKey
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_png, write_png
 from headbench.bench.rows import ALL, COLUMNS
-from headbench.bench.runner.store import RunFolder
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.contracts import FrameKey
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.io.images import write_png
-from headbench.bench.runner.store import RunFolder
 
 
 def listed(path):

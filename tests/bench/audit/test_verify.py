@@ -10,14 +10,14 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.captures import run_configuration
+from headbench.bench.engine.config import RunOptions
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest_file, write_json
 from headbench.bench.io.images import read_png, write_png
 from headbench.bench.rows import Rows
-from headbench.bench.runner import run as runner
-from headbench.bench.runner.captures import run_configuration
-from headbench.bench.runner.config import RunOptions
-from headbench.bench.runner.store import RunFolder
 
 
 def verify(run, *options):

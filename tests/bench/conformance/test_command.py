@@ -11,7 +11,7 @@ import pytest
 import headbench
 from headbench.bench import cli, contracts, errors, registry, specs
 from headbench.bench.conformance import command
-from headbench.bench.runner import captures
+from headbench.bench.engine import captures
 
 PLUGINS = ("grey:SPEC", "outside_reader:SPEC", "mae:MAE") + tuple(
     f"outside_metric:{name}" for name in ("ERROR", "JUMP", "FILES", "HOURS")

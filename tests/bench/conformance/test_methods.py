@@ -5,8 +5,8 @@ import pytest
 
 from headbench.bench.conformance.methods import check_method
 from headbench.bench.contracts import Frame
+from headbench.bench.engine.config import resolve_method
 from headbench.bench.errors import HeadbenchError
-from headbench.bench.runner.config import resolve_method
 
 
 @pytest.fixture

@@ -10,6 +10,9 @@ import psutil
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.store import RunFolder
+from headbench.bench.engine.tasks import _Run, machine_of
 from headbench.bench.errors import InputError
 from headbench.bench.executors.outcome import read_outcome, write_outcome
 from headbench.bench.executors.processes import Processes
@@ -20,9 +23,6 @@ from headbench.bench.executors.task import Task
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import is_locked
-from headbench.bench.runner import run as runner
-from headbench.bench.runner.store import RunFolder
-from headbench.bench.runner.tasks import _Run, machine_of
 
 TWO = Execution("processes", workers=2, threads=1)
 OPTIONS = ("--executor", "processes", "--workers", "1", "--set", "execution.threads=1")

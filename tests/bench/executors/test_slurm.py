@@ -12,11 +12,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.executors.outcome import read_outcome
 from headbench.bench.executors.settings import Execution, SlurmSettings
 from headbench.bench.executors.slurm import queue, read_submitted, submitted_path
-from headbench.bench.runner.store import RunFolder
 from headbench.tests.bench.executors import cluster
 
 ABSENT = cluster.missing()

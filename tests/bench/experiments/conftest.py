@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from headbench.bench.runner import run as runner
+from headbench.bench.engine import run as runner
 
 from ...small_run import run_on
 

@@ -13,13 +13,13 @@ from PIL import Image
 
 from headbench.bench import cli
 from headbench.bench.contracts import Budget
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import ExitCode, HeadbenchError, InputError
 from headbench.bench.experiments import curve as module
 from headbench.bench.experiments.curve import curve_run
 from headbench.bench.experiments.curve_settings import CurveSettings
 from headbench.bench.experiments.held_out import hold_out
-from headbench.bench.runner import run as runner
-from headbench.bench.runner.store import RunFolder
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.reports.curve.points import MEASURED, half_width
 

@@ -5,10 +5,10 @@ import json
 import pandas as pd
 import pytest
 
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.experiments.robustness import extremes_run, reenact_run
 from headbench.bench.experiments.robustness_settings import ExtremesSettings, ReenactSettings
 from headbench.bench.registry import get
-from headbench.bench.runner.store import RunFolder
 
 CELLS = {
     f"{subject}/{method}/seed-0" for subject in ("ball-a", "ball-bee") for method in ("bursting", "listed")

@@ -5,10 +5,10 @@ import re
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.engine.config import resolve_method
 from headbench.bench.experiments import suite as module
 from headbench.bench.experiments.suite_settings import ABLATIONS
 from headbench.bench.registry import get
-from headbench.bench.runner.config import resolve_method
 
 SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16x16")
 

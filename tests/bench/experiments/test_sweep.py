@@ -2,14 +2,14 @@
 
 import pytest
 
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.experiments import sweep as module
 from headbench.bench.experiments.sweep import sweep_run
 from headbench.bench.experiments.sweep_settings import SweepSettings
 from headbench.bench.io.documents import read_json
 from headbench.bench.rows import ALL, Rows
-from headbench.bench.runner import run as runner
-from headbench.bench.runner.store import RunFolder
 
 from ...small_run import run_on
 

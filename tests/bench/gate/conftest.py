@@ -5,9 +5,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.io.images import read_png, write_png
-from headbench.bench.runner import run as runner
-from headbench.bench.runner.store import RunFolder
 
 
 @pytest.fixture

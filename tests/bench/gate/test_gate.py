@@ -10,11 +10,11 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.rows import Rows
-from headbench.bench.runner import run as runner
-from headbench.bench.runner.store import RunFolder
 
 
 @pytest.fixture

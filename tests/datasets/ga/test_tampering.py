@@ -8,8 +8,8 @@ import zlib
 
 import pytest
 
-from headbench.bench.runner.captures import open_clips
-from headbench.bench.runner.config import RunConfig
+from headbench.bench.engine.captures import open_clips
+from headbench.bench.engine.config import RunConfig
 from headbench.datasets.ga import content_digests
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.lint.command import lint

@@ -13,10 +13,10 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.contracts import Frame, no_progress
+from headbench.bench.engine.stored import StoredAvatar, avatar_folder
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.images import write_png
 from headbench.bench.io.video import write_video
-from headbench.bench.runner.stored import StoredAvatar, avatar_folder
 from headbench.bench.specs import MethodSpec, ResolutionRule
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.subject import PosedSubject

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import no_progress
+from headbench.bench.engine.adaptation import MethodNeeds, plan
 from headbench.bench.errors import InputError
-from headbench.bench.runner.adaptation import MethodNeeds, plan
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.refit.refit import BlockFitter

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 from scipy.spatial import cKDTree
 
+from headbench.bench.engine.stored import avatar_folder, load_avatar
 from headbench.bench.errors import UnavailableError
-from headbench.bench.runner.stored import avatar_folder, load_avatar
 from headbench.methods.avatars.export import export_glb, export_ply, export_sog, neutral_pose
 from headbench.methods.avatars.formats import FORMATS
 from headbench.methods.avatars.settings import ExportGlbSettings, ExportPlySettings, ExportSogSettings

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from headbench.bench.engine.stored import load_avatar
 from headbench.bench.errors import InputError
-from headbench.bench.runner.stored import load_avatar
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.methods.avatars.import_ga import import_avatar

@@ -11,9 +11,9 @@ from safetensors.torch import load_file, save_file
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.engine.stored import TRAINING_FILE
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
-from headbench.bench.runner.stored import TRAINING_FILE
 from headbench.methods.gha import mesh_training as mesh_phase
 from headbench.methods.gha import method
 from headbench.methods.gha.avatar import AVATAR_FILE, DRIVING_FILE, GHAAvatar

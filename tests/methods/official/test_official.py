@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Budget, ListedFrames, SharingAvatar, no_progress
+from headbench.bench.engine.adaptation import TrainingView
+from headbench.bench.engine.stored import avatar_digest
 from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest_file, grouped_writes
 from headbench.bench.io.images import read_png
-from headbench.bench.runner.adaptation import TrainingView
-from headbench.bench.runner.stored import avatar_digest
 from headbench.methods.official.ga.windows import inside
 from headbench.methods.official.method import (
     RENDERING,

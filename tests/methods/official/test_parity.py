@@ -10,10 +10,10 @@ import pytest
 from headbench.bench import cli
 from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget
+from headbench.bench.engine import run as runner
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.rows import Row, Rows
-from headbench.bench.runner import run as runner
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.official.config import GHAOfficialConfig
 from headbench.methods.official.gha.method import GHAOfficial

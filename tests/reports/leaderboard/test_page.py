@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import pytest
 
 from headbench.bench import cli
-from headbench.bench.runner.store import RunFolder
+from headbench.bench.engine.store import RunFolder
 
 
 class Text(HTMLParser):

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from headbench.bench.contracts import FrameKey
-from headbench.bench.runner.store import RunFolder
+from headbench.bench.engine.store import RunFolder
 from headbench.reports.page import split
 from headbench.reports.page.report import write_report
 from headbench.reports.page.settings import PageSettings

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import FrameKey
+from headbench.bench.engine.config import RunOptions
 from headbench.bench.errors import InputError
 from headbench.bench.rows import ALL, Rows
-from headbench.bench.runner.config import RunOptions
 from headbench.reports.page import frames, split
 from headbench.reports.page.frames import ShownFrame, choose_pictures, spread
 from headbench.reports.page.report import write_page, write_report

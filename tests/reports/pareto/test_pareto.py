@@ -16,10 +16,10 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
 
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.io.files import plain
 from headbench.bench.rows import Row, Rows
-from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
 from headbench.reports.pareto.command import COSTS, pareto_runs
 from headbench.reports.pareto.plot import label_points, write_plot

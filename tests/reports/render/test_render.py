@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.io.files import digest_file
 from headbench.bench.io.images import read_png
-from headbench.bench.runner.store import RunFolder
 from headbench.reports.render import render as module
 from headbench.reports.render.render import render_avatar
 from headbench.reports.render.settings import RenderSettings

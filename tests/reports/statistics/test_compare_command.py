@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.rows import Rows
-from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import MetricSpec
 from headbench.reports.statistics.command import CompareSettings, compare_runs
 

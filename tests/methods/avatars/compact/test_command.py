@@ -5,8 +5,8 @@ import re
 import pytest
 
 from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.engine.stored import load_avatar
 from headbench.bench.errors import InputError
-from headbench.bench.runner.stored import load_avatar
 from headbench.datasets.ga.reader import read_capture
 from headbench.methods.avatars.compact.measure import compact_avatar
 from headbench.methods.avatars.compact.settings import CompactSettings

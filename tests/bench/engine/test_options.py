@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.captures import open_run_clips, run_configuration
+from headbench.bench.engine.config import RunOptions
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
-from headbench.bench.runner import run as runner
-from headbench.bench.runner.captures import open_run_clips, run_configuration
-from headbench.bench.runner.config import RunOptions
-from headbench.bench.runner.store import RunFolder
 from headbench.reports.page.frames import open_truth
 
 TRUSTED = RunOptions(trust=True)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Camera
+from headbench.bench.engine.captures import open_clips, synthesis_arguments
+from headbench.bench.engine.config import RunConfig
 from headbench.bench.errors import InputError
-from headbench.bench.runner.captures import open_clips, synthesis_arguments
-from headbench.bench.runner.config import RunConfig
 
 
 @pytest.fixture

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import FrameKey
+from headbench.bench.engine import scoring
+from headbench.bench.engine.config import RunConfig, resolve_metrics
+from headbench.bench.engine.scoring import ScoredFrames, check_regions, score_frames
 from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
-from headbench.bench.runner import scoring
-from headbench.bench.runner.config import RunConfig, resolve_metrics
-from headbench.bench.runner.scoring import ScoredFrames, check_regions, score_frames
 from headbench.bench.specs import MetricSpec
 
 KEYS = [FrameKey("s", sequence, t, "a") for sequence, t in [("EMO", 0), ("EMO", 1), ("EMO", 2), ("FREE", 7)]]

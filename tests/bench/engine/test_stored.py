@@ -6,8 +6,8 @@ import shutil
 import numpy as np
 import pytest
 
+from headbench.bench.engine.stored import AVATAR_FILE, HEAD_FILE, load_avatar, open_avatar
 from headbench.bench.errors import InputError
-from headbench.bench.runner.stored import AVATAR_FILE, HEAD_FILE, load_avatar, open_avatar
 from headbench.methods.ga.method import GAAvatar
 
 from ...small_run import small_run

@@ -8,16 +8,16 @@ import pytest
 
 from headbench.bench import cli, machine
 from headbench.bench.contracts import no_progress
+from headbench.bench.engine import run as runner
+from headbench.bench.engine import speed
+from headbench.bench.engine.config import RunOptions
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.executors.settings import Execution
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked
 from headbench.bench.rows import ALL, Rows
-from headbench.bench.runner import run as runner
-from headbench.bench.runner import speed
-from headbench.bench.runner.config import RunOptions
-from headbench.bench.runner.store import RunFolder
 
 CLOCKS = ("clock", "clock_half")
 

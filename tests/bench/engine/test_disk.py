@@ -10,12 +10,12 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.disk import clean, usage
+from headbench.bench.engine.forecast import forecast
+from headbench.bench.engine.run import planned_jobs
+from headbench.bench.engine.steps import reason_of
 from headbench.bench.io.files import write_json
-from headbench.bench.runner import run as runner
-from headbench.bench.runner.disk import clean, usage
-from headbench.bench.runner.forecast import forecast
-from headbench.bench.runner.run import planned_jobs
-from headbench.bench.runner.steps import reason_of
 
 
 def total(run):

@@ -300,7 +300,7 @@ AVATAR_FOLDER = (
 AvatarFolder = Annotated[
     tyro.conf.Positional[str], tyro.conf.arg(help=f"{AVATAR_FOLDER[0].upper()}{AVATAR_FOLDER[1:]}.")
 ]
-"""Argument of every command that takes a stored avatar; `bench.runner.stored.avatar_folder` resolves it."""
+"""Argument of every command that takes a stored avatar; `bench.engine.stored.avatar_folder` resolves it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,16 +16,16 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.condition import PLAIN, Condition
+from headbench.bench.engine import adaptation, steps
+from headbench.bench.engine import config as runner_config
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.config import RunConfig
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked
 from headbench.bench.registry import Plugin
-from headbench.bench.runner import adaptation, steps
-from headbench.bench.runner import config as runner_config
-from headbench.bench.runner import run as runner
-from headbench.bench.runner.config import RunConfig
-from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import ReportSpec
 
 

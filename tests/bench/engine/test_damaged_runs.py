@@ -7,13 +7,13 @@ import cv2
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.engine import run as runner
+from headbench.bench.engine import steps
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest_file, write_json
 from headbench.bench.io.images import read_png, write_png
 from headbench.bench.rows import Rows
-from headbench.bench.runner import run as runner
-from headbench.bench.runner import steps
 
 FRAME = "renders/novel_view/EMO_00001_b.png"
 AVATAR = "avatar/level.txt"

@@ -8,17 +8,17 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.contracts import Camera
+from headbench.bench.engine import adaptation
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.adaptation import MethodNeeds, plan
+from headbench.bench.engine.captures import open_clips
+from headbench.bench.engine.config import RunConfig, RunOptions
+from headbench.bench.engine.jobs import trained
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest, write_text
 from headbench.bench.io.images import read_png
-from headbench.bench.runner import adaptation
-from headbench.bench.runner import run as runner
-from headbench.bench.runner.adaptation import MethodNeeds, plan
-from headbench.bench.runner.captures import open_clips
-from headbench.bench.runner.config import RunConfig, RunOptions
-from headbench.bench.runner.jobs import trained
-from headbench.bench.runner.store import RunFolder
 from headbench.bench.specs import ResolutionRule
 
 TWICE = ResolutionRule(size=(16, 12), speed_size=(32, 24))
