@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from enum import Enum
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -19,6 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from .condition import label_of
+from .contracts import IntArray
 from .errors import InputError, is_damage, shortened
 from .io.files import atomic_path, open_regular, reading
 from .specs import LABEL, is_label
@@ -169,16 +171,26 @@ class Rows:
         ``task`` "" is for metrics of the avatar as a whole, whose region is the full image. ``condition`` "" is the plain
         comparison.
         """
+        wanted = {"method": method, "metric": metric, "task": task, "region": region, "condition": condition}
         table = self._table
-        wanted = {"method": method, "metric": metric, "task": task, "region": region, "subject": subject}
-        wanted["condition"] = condition
+        if ALL not in wanted.values():
+            # One group of the table, which is sought once for all queries: a report makes thousands.
+            table = table.take(self._places.get(tuple(wanted.values()), np.empty(0, int)))
+            wanted = {}
+        wanted["subject"] = subject
         chosen = np.ones(len(table), dtype=bool)
         for column, value in wanted.items():
             if value is not ALL:
                 chosen &= (table[column] == value).to_numpy()
         if seeds is not ALL:
             chosen &= table["seed"].isin(list(seeds)).to_numpy()
-        return table[chosen]
+        return table if chosen.all() else table[chosen]
+
+    @cached_property
+    def _places(self) -> dict[tuple[Any, ...], IntArray]:
+        """Places of the rows of each method, metric, task, region and condition, in their order."""
+        columns = ["method", "metric", "task", "region", "condition"]
+        return self._table.groupby(columns, sort=False).indices if len(self._table) else {}  # type: ignore[return-value]
 
     @property
     def failed(self) -> list[str]:
@@ -213,7 +225,13 @@ class Rows:
 
     def seeds(self, method: str | All) -> set[int]:
         """Seeds of a method."""
-        return set(map(int, self._of(method)["seed"].unique()))
+        known = self._seeds
+        return set().union(*known.values()) if method is ALL else set(known.get(str(method), ()))
+
+    @cached_property
+    def _seeds(self) -> dict[str, set[int]]:
+        seeds = self._table.groupby("method")["seed"].unique()
+        return {str(method): set(map(int, each)) for method, each in seeds.items()}
 
     def versions(self, method: str) -> list[str]:
         """Versions of a method, sorted."""
@@ -225,6 +243,15 @@ class Rows:
 
     def frames(self, task: str, region: str) -> set[tuple[str, str, int, str]]:
         """Frames of a task: those that any method has a row for in a region."""
+        if (task, region) not in self._frames:
+            self._frames[task, region] = self._sought_frames(task, region)
+        return self._frames[task, region]
+
+    @cached_property
+    def _frames(self) -> dict[tuple[str, str], set[tuple[str, str, int, str]]]:
+        return {}
+
+    def _sought_frames(self, task: str, region: str) -> set[tuple[str, str, int, str]]:
         own = self.select(method=ALL, condition=ALL, metric=ALL, task=task, region=region, seeds=ALL)
         own = own[own["timestep"] >= 0]
         return set(own[FRAME].drop_duplicates().itertuples(index=False, name=None))
