@@ -40,7 +40,7 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Find
         For a folder that is no finished run, a method that the run does not have or that has no budget, a capture that is
         not the run's or has too few frames to hold some out, and a folder with trainings of other settings.
     """
-    source = RunFolder(Path(settings.run))
+    execution, source = settings.execution, RunFolder(Path(settings.run))
     manifest = source.read_manifest()
     manifest.check_done(source.manifest)  # before a folder is made in what is no run
     if manifest.configuration.clip or manifest.configuration.source:
@@ -69,7 +69,7 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Find
         tasks = tuple(task for task in (CAMERA, TIMESTEPS) if all(task in clip.splits for clip in clips))
         config = replace(config, tasks=tasks, conditions=tuple(conditions(settings, wanted, clips)))
         _drop_interrupted(out)
-        run_locked(config, settings.execution, trust=settings.trust, clips=clips, reports=False)
+        run_locked(config, execution, trust=settings.trust, clips=clips, reports=False)
         found: Findings = resolve(get("reports", "curve").implementation)(out, settings.over)
         return found
 

@@ -31,7 +31,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
     InputError
         For a folder that is no finished run, a method that derives nothing, a variant that none of them has.
     """
-    source = RunFolder(Path(settings.run))
+    execution, source = settings.execution, RunFolder(Path(settings.run))
     source.read_manifest()  # before a folder is made in what is no run
     out = Path(settings.out) if settings.out else source.root / "sweep"
     check_kind(out, "a run")
@@ -70,7 +70,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
             source=settings.run,
         )
         clips = list({job.clip.subject: job.clip for job in able}.values())
-        run_locked(config, settings.execution, trust=settings.trust, clips=clips, reports=False)
+        run_locked(config, execution, trust=settings.trust, clips=clips, reports=False)
         shown: Findings = resolve(get("reports", "pareto").implementation)(
             (str(out),), out, settings.task, settings.metric, settings.time
         )
