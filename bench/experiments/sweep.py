@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..condition import PLAIN, Condition, Named
 from ..contracts import Avatar, Clip, Progress, no_progress
+from ..engine.adaptation import TrainingView
 from ..engine.config import default_names
 from ..engine.jobs import trained
 from ..engine.run import run_locked
@@ -45,7 +46,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
         methods: dict[str, dict[str, None]] = {}
         for job in able:
             derive = resolve(job.method.spec.variants)
-            for variant in derive(job.cell.avatar, job.form.clip, job.device):
+            for variant in derive(job.cell.avatar, TrainingView(job.form.clip), job.device):
                 name = check_name(variant.name, job.method.spec.variants, "name of a variant")
                 methods.setdefault(name, {})[job.method.spec.name] = None
         for name in settings.variants:
