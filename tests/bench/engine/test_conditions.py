@@ -77,7 +77,7 @@ def test_an_avatar_of_other_settings_is_no_source(config, toy):
         runner.run(replace(driven, out=f"{config.out}-3", settings=settings))
 
 
-def test_a_method_that_is_named_again_has_the_settings_of_this_call(config):
+def test_a_method_named_again_has_the_settings_of_the_call(config):
     runner.run(replace(config, settings={"toy": {"level": 0.1}}))
     with pytest.raises(InputError, match="fingerprint"):
         runner.run(config)
