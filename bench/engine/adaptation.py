@@ -70,10 +70,13 @@ class AdaptedClip:
 
     Attributes
     ----------
-    clip : what the method is trained on. Its cameras and poses are those to render.
-    key : a frame's key in ``clip``, given its key in the protocol.
-    restore : takes a protocol key and the (H, W, 3) float render of that frame as ``clip`` has it, and returns
-        the render at the protocol's size, not yet quantised.
+    clip : Clip
+        Clip that the method is trained on; its cameras and poses are rendered.
+    key : Callable
+        Maps a frame key of the protocol to its key in ``clip``.
+    restore : Callable
+        Maps a protocol key and the (H, W, 3) float render of that frame in ``clip`` to the render at
+        the protocol's size, before quantisation.
     """
 
     clip: Clip
@@ -103,7 +106,7 @@ def plan(clip: Clip, needs: MethodNeeds, heads: Mapping[str, str]) -> Adaptation
     Raises
     ------
     InputError
-        Where the clip lacks what the method needs and there is no way there.
+        The clip lacks what the method needs, and no registered step provides it.
     """
     fits = not needs.head_models or clip.head.version in needs.head_models
     if fits and needs.resolution.native and not needs.monocular:

@@ -118,8 +118,10 @@ def capture_configuration(
 
     Parameters
     ----------
-    reader : name of the dataset reader; "" for `reader_of`.
-    head : file of the head model, for captures that bring none.
+    reader : str
+        Name of the dataset reader; "" selects it with `reader_of`.
+    head : str | None
+        Head model file, for captures without one.
     """
     return RunConfig(
         data=data,
@@ -164,8 +166,8 @@ def run_configuration(run: Path, options: RunOptions) -> RunConfig:
     Raises
     ------
     InputError
-        For a folder that is not a run's, plug-ins that only `RunOptions.trust` loads, and a capture or another file
-        that is neither at its recorded place relative to the run folder nor where the settings name it.
+        The folder is not a run, plug-ins require `RunOptions.trust`, or a capture or another file is
+        neither at its recorded path relative to the run folder nor at the path in the settings.
     """
     return next(_configurations(run, options))
 
@@ -184,16 +186,23 @@ def open_run_clips(
 
     Parameters
     ----------
-    out : becomes ``out`` of the settings, where opening may keep what took long; None: the run, whose lock is held.
-    altered : return what is there even if it is not what the run was made from.
-    remembered, only : see `open_clips`.
-    used : which plug-ins the caller resolves from the returned settings. Names that would import a module are refused
-        for these and for the reader alone, since opening captures needs no method and no metric.
+    out : Path | None
+        Replaces ``out`` of the settings, where results of slow steps may be stored. Default: the run
+        folder, which the caller must have locked.
+    altered : bool
+        Return captures even if they differ from those of the run.
+    remembered, only : bool, int or None
+        See `open_clips`.
+    used : tuple[Plugins, ...]
+        Plug-ins that the caller resolves from the returned settings. Names that would import a module
+        are refused only for these and for the reader, since opening captures needs neither methods
+        nor metrics.
 
     Raises
     ------
     InputError
-        As `run_configuration` and `open_clips` do, and unless ``altered`` for a capture of another fingerprint.
+        A capture's fingerprint differs from the run's, unless ``altered``. Also raised by
+        `run_configuration` and `open_clips`.
     """
     recorded = {clip.subject: clip.fingerprint for clip in RunFolder(run).read_manifest().clips}
     found: list[tuple[RunConfig, list[Clip]]] = []

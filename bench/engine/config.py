@@ -40,27 +40,46 @@ class RunConfig:
 
     Attributes
     ----------
-    data : capture folder, or a folder with several.
-    out : folder for everything the run makes.
-    methods : names of registered methods, or "package.module:SPEC".
-    preset : settings by name: smoke, demo, fast, paper, or another that each method has.
-    seeds : one avatar is trained for each.
-    tasks, metrics : what is measured.
-    metric_profiles : sets of definitions to take the metrics by, see ``headbench list profiles``.
-    regions : parts of the frame to measure beside the whole of it, where a metric can; None: the face, where the
-        capture's reader knows it.
-    reader : which dataset reader opens the captures.
-    reader_settings : passed to it (for example ``head``: path of the head model).
-    frames_per_task : score at most so many frames per subject and task, evenly spaced; None: all.
-    device : "cpu", "cuda", ...
-    settings : per method, over the preset; the key ``budget`` holds iterations and seconds.
-    divide : reduce all images by this factor, by area means, before anything else: the size that metrics are
-        taken at is then that of the reduced images.
-    heads : files of further head models by version, for methods that want another than a capture was tracked
-        with; their tracking is refitted.
-    conditions : what is changed against the plain comparison, each a set of cells of its own; see `Condition`.
-    clip : registered change of every capture, of the scored frames as well, such as other held-out frames.
-    source : folder of a finished run whose avatars are taken instead of training; "" for none.
+    data : str
+        Folder of one capture or of several.
+    out : str
+        Output folder of the run.
+    methods : tuple[str, ...]
+        Names of registered methods, or "package.module:SPEC".
+    preset : str
+        Name of the settings: smoke, demo, fast, paper, or another that every method defines.
+    seeds : tuple[int, ...]
+        One avatar is trained for each seed.
+    tasks, metrics : tuple[TaskName, ...] or tuple[str, ...]
+        Tasks and metrics to evaluate.
+    metric_profiles : tuple[str, ...]
+        Sets of metric definitions, see ``headbench list profiles``.
+    regions : tuple[str, ...] | None
+        Regions to evaluate besides the whole frame, for metrics that support them. Default: the face,
+        if the capture's reader provides it.
+    reader : str
+        Dataset reader that opens the captures.
+    reader_settings : dict[str, Any]
+        Settings of the reader (for example ``head``: path of the head model).
+    frames_per_task : int | None
+        Maximum number of scored frames per subject and task, evenly spaced. Default: all.
+    device : str
+        "cpu", "cuda", ...
+    settings : dict[str, dict[str, Any]]
+        Settings by method that override the preset; the key ``budget`` holds iterations and seconds.
+    divide : int
+        Factor by which all images are reduced first, by area means. Metrics are computed at the
+        reduced size.
+    heads : dict[str, str]
+        Files of further head models by version, for methods that need another model than the one used
+        for tracking; the tracking is refitted.
+    conditions : tuple[Condition, ...]
+        Variations of the comparison; each adds its own cells, see `Condition`.
+    clip : Named
+        Registered change of every capture, including the scored frames, such as other held-out
+        frames.
+    source : str
+        Folder of a finished run whose avatars are used instead of training; "" trains.
     """
 
     data: str
@@ -265,7 +284,8 @@ def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
 
     Raises
     ------
-    InputError : an unknown metric or profile, a metric that none of the profiles asked for defines.
+    InputError
+        A metric or profile is unknown, or no requested profile defines a metric.
     """
     forget_code()
     if config.drive:

@@ -39,8 +39,8 @@ def forecast(jobs: Sequence[Job], runs: Sequence[Path]) -> Findings:
 
     Parameters
     ----------
-    runs : sequence of Path
-        Folders of earlier runs, on a machine like this one; the run's own among them.
+    runs : Sequence[Path]
+        Folders of earlier runs on a similar machine, including the run's own folder.
     """
     known = [each for run in runs for each in _trained(run)]
     lines, cells = [], []

@@ -36,18 +36,18 @@ def make_jobs(
 
     Parameters
     ----------
-    cells : sequence of (ResolvedMethod, Condition)
+    cells : Sequence[tuple[ResolvedMethod, Condition]]
         See `resolve_cells`.
     folder : RunFolder
         Run folder of the cells.
     out : Path, optional
-        Where to keep what took long in adapting clips, its lock is held; what ``folder`` kept is copied there first, since
-        nothing is written in a run by what looks at it. Default: ``folder`` itself.
+        Locked folder for results of slow adaptations of clips; those stored in ``folder`` are copied
+        there first, since commands that read a run do not write to it. Default: ``folder`` itself.
 
     Raises
     ------
     InputError
-        For a region that a clip does not know, and for a form that a clip cannot be brought into.
+        A clip has no such region or cannot be adapted to a method.
     """
     regions = {clip.subject: check_regions(clip, config.regions) if protocols else () for clip in clips}
     forms = _Forms(config, folder, RunFolder(out or folder.root))
@@ -149,17 +149,22 @@ def trained(
 
     Parameters
     ----------
-    run : folder of the run.
-    methods : names of those wanted; empty: all but the trivial baselines, which nothing can drive to extremes.
-    options : where the run's files are now.
-    out : folder to keep clips in that methods need in another form; its lock is held. It becomes ``out`` of the settings.
-    only : see `open_clips`.
+    run : Path
+        Run folder.
+    methods : Sequence[str]
+        Names of methods; empty: all except trivial baselines, which cannot show extreme poses.
+    options : RunOptions
+        Current locations of the run's files.
+    out : Path
+        Locked folder for adapted clips; replaces ``out`` of the settings.
+    only : int | None
+        See `open_clips`.
 
     Raises
     ------
     InputError
-        For a method that the run does not have, a capture that is not the one trained on, an avatar that is not
-        there or whose training did not end, and a run without any avatar to look at.
+        The run has no such method or no avatar, a capture differs from the one used for training, or
+        an avatar is missing or its training did not finish.
     """
     folder = RunFolder(run)
     resolved = [cell for cell in resolve_cells(run_configuration(run, options)) if not cell[1].name]

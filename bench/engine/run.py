@@ -59,15 +59,16 @@ def run(
     Parameters
     ----------
     execution : Execution, optional
-        Where the cells are executed. Default: one after another in this process.
+        How to execute the cells. Default: sequentially in this process.
     unchecked : bool
-        Train although a capture has an error that makes results meaningless (see `DatasetSpec.errors`).
-    clips : sequence of Clip, optional
-        The captures of the configuration, if they are open already.
+        Train although a capture has an error that makes results meaningless (see
+        `DatasetSpec.errors`).
+    clips : Sequence[Clip], optional
+        Captures of the configuration, if they are already open.
     reports : bool
         Write the registered reports at the end.
     record : Any
-        Added to the manifest.
+        Values to add to the manifest.
     """
     check_kind(Path(config.out), "a run")
     check_output_folder(Path(config.out))
@@ -93,9 +94,9 @@ def run_locked(
     Parameters
     ----------
     cells, metrics : sequence, optional
-        What the configuration resolves to, where it does not name them; then ``each`` is to be given.
+        Resolved cells and metrics, if the configuration does not name them; they require ``each``.
     each : callable, optional
-        Does the work of a cell in this process, in place of `run_cell`.
+        Executes a cell in this process, instead of `run_cell`.
     trust : bool
         Import modules and run programs that only a run in the folder names.
     """

@@ -83,13 +83,17 @@ def score_frames(
 
     Parameters
     ----------
-    regions : beside the whole frame, for metrics that know regions. A frame in which a region has no pixel has no
-        score there: what is seen is a property of the truth, so that it is missing alike for every method.
-    device : of the run; see `make_metric`.
+    regions : Sequence[str]
+        Regions besides the whole frame, for metrics that support them. A frame in which a region has
+        no pixels has no score there. Regions come from the ground truth, so that such scores are
+        missing for every method alike.
+    device : str
+        Device of the run; see `make_metric`.
 
     Raises
     ------
-    HeadbenchError : a value that is not finite.
+    HeadbenchError
+        A value is not finite.
     """
     scored: dict[str, list[Score]] = {}
     metrics = {spec.name: make_metric(spec, device) for spec in specs}

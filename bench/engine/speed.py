@@ -65,12 +65,15 @@ def measure_speed_again(
 
     Parameters
     ----------
-    methods : names of those to measure; empty: all of the run.
+    methods : Sequence[str]
+        Names of methods to measure; empty: all of the run.
 
     Raises
     ------
-    InputError : a run that did not end, that another process works on or that has no metric of speed; a method that it does
-        not have; an avatar or a capture that is missing or is not the recorded one. Nothing has been measured then.
+    InputError
+        The run is unfinished, in use by another process or without a speed metric, it has no such
+        method, or an avatar or a capture is missing or differs from the recorded one. Nothing has
+        been measured then.
     """
     folder = RunFolder(run)
     folder.read_manifest().check_done(folder.manifest)

@@ -460,10 +460,14 @@ def measure(
 
     Parameters
     ----------
-    again : those of ``metrics``, all of the avatar as a whole, that are measured again, and no others that were measured or
-        tried. Their former values stay in the record of the measurements, under ``earlier``.
+    again : Sequence[MetricSpec]
+        Metrics to measure again, a subset of ``metrics`` that concern the avatar as a whole; others that were already
+        measured or tried are not. Former values stay in the record of the measurements, under ``earlier``.
 
-    Raises `UnavailableError` where one of ``again`` has a value but cannot be measured any more; nothing is changed then.
+    Raises
+    ------
+    UnavailableError
+        A metric in ``again`` has a value but can no longer be measured; nothing is changed then.
     """
     known, details, old = _measured_before(job)
     repeated = {spec.implementation for spec in again}

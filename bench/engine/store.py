@@ -45,16 +45,27 @@ class StepState(TypedDict, total=False):
 
     Attributes
     ----------
-    fingerprint : digest of everything that its result depends on.
-    files : SHA-256 of the files that it left, by their place in the cell's folder.
-    rows : SHA-256 of ``rows.parquet``.
-    fingerprints, details : of the measurements, by metric.
-    seconds, processor_seconds, interruptions, peak_memory_bytes, memory_before_bytes, method : of the training.
-    finished_at : when the training ended, in seconds since 1970 (UTC).
-    peak_device_memory_bytes, device_memory_before_bytes, tf32 : likewise, of a CUDA device; see `PeakMemory`.
-    load : machine, threads and cores of the training, and cores that others kept busy meanwhile; see `ProcessorLoad`.
-    earlier : values that were measured again since, each time with when, on which machine and under which load.
-    derived_from : digest of the trained avatar that this one was derived from without training.
+    fingerprint : Required[str]
+        Digest of everything that determines the step's result.
+    files : dict[str, str]
+        SHA-256 of the files that the step wrote, by their path in the cell's folder.
+    rows : str
+        SHA-256 of ``rows.parquet``.
+    fingerprints, details : dict[str, str] or dict[str, dict[str, Any]]
+        Fingerprints and details of the measurements, by metric.
+    seconds, processor_seconds, interruptions, peak_memory_bytes, memory_before_bytes, method : float, int or dict[str, Any]
+        Statistics of the training.
+    finished_at : float
+        End of the training, in seconds since 1970 (UTC).
+    peak_device_memory_bytes, device_memory_before_bytes, tf32 : int or bool
+        Memory and arithmetic of the training on a CUDA device; see `PeakMemory`.
+    load : dict[str, Any]
+        Machine, threads and cores of the training, and cores used by other processes; see
+        `ProcessorLoad`.
+    earlier : list[dict[str, Any]]
+        Values before a repeated measurement, each with its time, machine and load.
+    derived_from : str
+        Digest of the trained avatar from which this one was derived without training.
     """
 
     fingerprint: Required[str]

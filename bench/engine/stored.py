@@ -44,15 +44,26 @@ class AvatarRecord(TypedDict):
 
     Attributes
     ----------
-    format : of this file.
-    method : registered name of the method that reads the avatar. ``version`` is that of the method that wrote it.
-    settings : the method's whole configuration; None for a method without any.
-    resolution : the image size that the method works at with these settings.
-    subject, shape : name and (S,) identity coefficients of whom the avatar shows.
-    head_model : version of the head model whose poses drive it.
-    head_digest : SHA-256 of `HEAD_FILE` beside it; "" where there is none.
-    made_by : "training", "import" of another program's file, "compact" storage, or derived as a "variant".
-    origin : what that started from: seed, budget and fingerprint of the capture, digest of the file or avatar.
+    format : Literal[1]
+        Format of this file.
+    method : str
+        Registered name of the method that reads the avatar. ``version`` is that of the method that
+        wrote it.
+    settings : dict[str, Any] | None
+        Complete configuration of the method; None for a method without settings.
+    resolution : ResolutionRule
+        Image size that the method uses with these settings.
+    subject, shape : str or list[float]
+        Name and (S,) identity coefficients of the subject.
+    head_model : str
+        Version of the head model whose poses animate the avatar.
+    head_digest : str
+        SHA-256 of `HEAD_FILE` in the same folder; "" without one.
+    made_by : Maker
+        "training", "import" of another program's file, "compact" storage, or derived as a "variant".
+    origin : dict[str, Any]
+        Inputs of the avatar: seed, budget and fingerprint of the capture, or digest of the file or
+        avatar.
     """
 
     format: Literal[1]
@@ -164,13 +175,14 @@ def open_avatar(folder: Path, method: str = "") -> StoredAvatar:
 
     Parameters
     ----------
-    method : "module:SPEC" of a method that is not registered; "" for the one of the name that ``avatar.json`` states.
+    method : str
+        "module:SPEC" of a method that is not registered; "" uses the name in ``avatar.json``.
 
     Raises
     ------
     InputError
-        Where there is no ``avatar.json``, or one that does not fit, for a method that is not known, settings that it does
-        not have, and an avatar that was derived as a variant.
+        ``avatar.json`` is missing or invalid, the method or its settings are unknown, or the avatar
+        was derived as a variant.
     """
     home = avatar_folder(folder)
     path = home / AVATAR_FILE
@@ -216,14 +228,17 @@ def load_avatar(folder: Path | str, *, device: str = "cpu", method: str = "") ->
 
     Parameters
     ----------
-    folder : with ``avatar.json``, or the cell of a run (``RUN/SUBJECT/METHOD/seed-N``).
-    device : where it renders.
-    method : "module:SPEC" of a method that is not registered; "" for the one that ``avatar.json`` states.
+    folder : Path | str
+        Folder with ``avatar.json``, or the cell of a run (``RUN/SUBJECT/METHOD/seed-N``).
+    device : str
+        Rendering device.
+    method : str
+        "module:SPEC" of a method that is not registered; "" uses the name in ``avatar.json``.
 
     Raises
     ------
     InputError
-        As `open_avatar` and `StoredAvatar.load` do.
+        Raised by `open_avatar` and `StoredAvatar.load`.
     """
     return open_avatar(Path(folder), method).load(device)
 
