@@ -32,12 +32,19 @@ def chosen_execution(
 
     Parameters
     ----------
-    settings : all of ``execution``, those in ``assigned`` included.
-    assigned : what ``--set`` gives of ``execution``.
-    executor, workers : None where not given.
-    source : file or option that the settings came from, for the error.
+    settings : Mapping[str, Any]
+        All settings of ``execution``, including those in ``assigned``.
+    assigned : Mapping[str, Any]
+        Settings of ``execution`` given with ``--set``.
+    executor, workers : ExecutorName, int or None
+        Values of the options; None if not given.
+    source : str
+        File or option of the settings, for error messages.
 
-    Raises `InputError` for invalid settings, and for given ones that have no effect with the executor.
+    Raises
+    ------
+    InputError
+        Settings are invalid, or given settings have no effect with the executor.
     """
     options = {"executor": executor, "workers": workers}
     options = {key: value for key, value in options.items() if value is not None}

@@ -34,8 +34,10 @@ class Processes:
 
     Parameters
     ----------
-    workers : at most so many at once.
-    threads : of each, None for as many as this process has.
+    workers : int
+        Maximum number of concurrent workers.
+    threads : int | None
+        Threads of each worker; None uses the number of this process.
     """
 
     def __init__(self, workers: int, threads: int | None):

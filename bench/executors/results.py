@@ -13,8 +13,10 @@ class TaskResult(NamedTuple):
 
     Attributes
     ----------
-    lost : why there may be no outcome file; "" for a regular end.
-    again : whether to start the task again if there is no outcome.
+    lost : str
+        Reason why the outcome file may be missing; "" after a regular end.
+    again : bool
+        Whether to restart the task if there is no outcome.
     """
 
     task: Task

@@ -29,10 +29,14 @@ class Schedule:
 
     Attributes
     ----------
-    label : what they are called together, for the progress.
-    is_done : whether the results of a task whose outcome says so are there and whole.
-    execution : by which executor, any but "inline".
-    speed : whether they measure speed, one at a time with all threads, see `Task.speed`.
+    label : str
+        Common name of the tasks in progress messages.
+    is_done : Callable
+        Whether the results of a task with a successful outcome exist and are complete.
+    execution : Execution
+        Execution settings; any executor except "inline".
+    speed : bool
+        Whether the tasks measure speed, one at a time with all threads, see `Task.speed`.
     """
 
     label: str
@@ -45,8 +49,10 @@ class Schedule:
 
         Raises
         ------
-        InputError : Slurm refuses jobs.
-        OSError : the disk is full or read-only; no task is failed by that.
+        InputError
+            Slurm refuses jobs.
+        OSError
+            The disk is full or read-only; no task is marked as failed.
         """
         failures: Failures = {}
         if not tasks:

@@ -38,8 +38,10 @@ class CellState:
 
     Attributes
     ----------
-    note : what it is doing or waits for, why it failed.
-    seconds : worked on it until now, None where that is not known.
+    note : str
+        Current activity, reason for waiting, or reason of the failure.
+    seconds : float | None
+        Time spent so far; None if unknown.
     """
 
     subject: str

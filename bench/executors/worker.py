@@ -30,8 +30,10 @@ def execute_task(task: Task) -> None:
 
     Raises
     ------
-    InputError : another process works on it.
-    OSError : the disk is full or read-only.
+    InputError
+        Another process executes the task.
+    OSError
+        The disk is full or read-only.
     """
     from ..engine.steps import reason_of
     from ..io.files import output_inside
