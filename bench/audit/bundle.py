@@ -45,11 +45,16 @@ class Bundle:
 
     Attributes
     ----------
-    by, link, comment : who submits it, where to read more, anything else; as given.
-    headbench : the version that wrote it.
-    renders : whether the scored frames are in it.
-    files : SHA-256 of every other file, by its place.
-    digital_source_type : what the frames are, see `headbench.bench.io.provenance`; "" without them.
+    by, link, comment : str
+        Author, address of further information, and remarks, as given.
+    headbench : str
+        Version that wrote the bundle.
+    renders : bool
+        Whether the scored frames are included.
+    files : dict[str, str]
+        SHA-256 of every other file, by its path in the bundle.
+    digital_source_type : str
+        Source type of the frames, see `headbench.bench.io.provenance`; "" without frames.
     """
 
     by: str
@@ -170,8 +175,8 @@ def read_bundle(path: Path, into: Path) -> Bundle:
     Raises
     ------
     InputError
-        For what is no bundle, files that are not as listed or that no bundle has, and content that is larger or of
-        more files than a bundle may have.
+        The file is not a bundle, files differ from their list or do not belong to a bundle, or the
+        content exceeds the size or number of files allowed in a bundle.
     """
     bounds = {"members": MAX_FILES, "spare_bytes": 0, "per_byte": MAX_RATIO}
     with open_archive(path, "a bundle of `headbench bundle`", **bounds) as archive:

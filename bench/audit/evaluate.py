@@ -191,14 +191,17 @@ def find_images(
 
     Parameters
     ----------
-    names : how images are named, see `named_renders`; "" for by key.
-    config : by which the captures were opened; needed with ``names``.
+    names : str
+        Naming scheme of the images, see `named_renders`; "" names them by frame key.
+    config : RunConfig | None
+        Configuration that opened the captures; required with ``names``.
 
     Raises
     ------
     InputError
-        For a folder that is not there, images that are missing (how many, and where the first was looked for), one
-        that is not 8-bit RGB, not of the truth's size, or not fully opaque, and as `named_renders` does.
+        The folder or images are missing (with their number and the first expected path), or an image
+        is not 8-bit RGB, not fully opaque, or differs in size from the ground truth. Also raised by
+        `named_renders`.
     """
     if not folder.is_dir():
         raise InputError(folder, "", "a folder of images", "no such folder")

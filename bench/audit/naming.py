@@ -51,8 +51,9 @@ def named_renders(names: str, folder: Path, config: RunConfig, clips: Sequence[C
     Raises
     ------
     InputError
-        For an unknown name, a list that does not fit the captures, a count of images that is not that of the frames, and
-        images whose ground truth, as the repository wrote it beside them, is another than that of their frames.
+        The name is unknown, the list does not fit the captures, the number of images differs from
+        that of the frames, or the ground truth stored with the images differs from that of their
+        frames.
     """
     if names.endswith(".csv"):
         return _listed(Path(names), folder, clips)
