@@ -37,8 +37,9 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Find
     Raises
     ------
     InputError
-        For a folder that is no finished run, a method that the run does not have or that has no budget, a capture that is
-        not the run's or has too few frames to hold some out, and a folder with trainings of other settings.
+        The folder is not a finished run or has trainings with other settings, the run has no such
+        method or the method has no budget, or a capture differs from the run's or has too few frames
+        to hold some out.
     """
     source = RunFolder(Path(settings.run))
     manifest = source.read_manifest()

@@ -74,14 +74,15 @@ def hold_out(clip: Clip, config: RunConfig | None = None, *, camera: str = "", e
     Parameters
     ----------
     camera : str
-        Its name; "": the training camera nearest to the mean position of all, none where there is only one.
+        Name of the camera; "" selects the training camera nearest to the mean position, or none if
+        there is only one.
     every : int
-        The middle one of every so many training timesteps, counted in their order, is held out.
+        The middle one of each group of ``every`` consecutive training timesteps is held out.
 
     Raises
     ------
     InputError
-        For a camera that is not one of training, and where no frame is left to train with or to measure on.
+        The camera is not a training camera, or no frame remains for training or for evaluation.
     """
     train = clip.splits["train"]
     where = f"clip {clip.subject}"

@@ -28,7 +28,7 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> Findings
     Raises
     ------
     InputError
-        For methods, presets and sizes that do not fit, before the first capture is made.
+        Methods, presets and sizes do not match; raised before the first capture is created.
     """
     out, execution = Path(settings.out), settings.execution
     methods = settings.methods or tuple(

@@ -29,7 +29,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
     Raises
     ------
     InputError
-        For a folder that is no finished run, a method that derives nothing, a variant that none of them has.
+        The folder is not a finished run, a method derives no variants, or no method has the variant.
     """
     source = RunFolder(Path(settings.run))
     source.read_manifest()  # before a folder is made in what is no run
