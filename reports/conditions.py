@@ -25,9 +25,12 @@ class Conditions:
 
     Attributes
     ----------
-    places : pairs of machine and number of threads; empty where they were not recorded.
-    others : the most cores that other processes kept busy, 0 where no load was recorded.
-    known : whether the load was recorded for all of them.
+    places : frozenset[tuple[str, int]]
+        Pairs of machine and number of threads; empty if they were not recorded.
+    others : float
+        Maximum number of cores used by other processes, 0 if no load was recorded.
+    known : bool
+        Whether the load was recorded for all of them.
     """
 
     places: frozenset[tuple[str, int]]

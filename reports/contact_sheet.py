@@ -102,10 +102,13 @@ def contact_sheet(
 
     Parameters
     ----------
-    frames : at least one; those of one section are neighbours.
-    methods : columns, in order.
-    scaled_by : methods whose errors set the scale (default: all), so that a trivial baseline does not darken the
-        rest.
+    frames : Sequence[ComparedFrame]
+        Frames, at least one; frames of a section are consecutive.
+    methods : Sequence[str]
+        Columns, in order.
+    scaled_by : Sequence[str]
+        Methods whose errors set the scale (default: all), so that a trivial baseline does not darken
+        the others.
     """
     if not frames:
         raise InputError("contact sheet", "rows", "at least one frame", "none")

@@ -142,10 +142,14 @@ def write_sheet(
 
     Parameters
     ----------
-    marks : legend of the colours around images: meaning by colour.
-    error_scale : level of the brightest colour of error maps and what follows it, for a colour bar.
-    pairs : keep columns 1 and 2, 3 and 4, ... closer together.
-    label_width : pixels for the labels left of the rows.
+    marks : Mapping[str, str] | None
+        Legend of the colours around images: meaning by colour.
+    error_scale : tuple[int, str] | None
+        Value of the brightest colour of error maps and the text after it, for a colour bar.
+    pairs : bool
+        Reduce the gap between columns 1 and 2, 3 and 4, ...
+    label_width : int
+        Width of the row labels on the left, pixels.
     """
     tiles = [tile for section in sections for row in section.rows for tile in row.tiles]
     width = max((t.picture.shape[1] for t in tiles if not isinstance(t.picture, str)), default=label_width)

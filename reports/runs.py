@@ -188,8 +188,9 @@ class RunSet:
 
         Raises
         ------
-        InputError : runs that do not score the same frames by the same protocol, define a metric differently, or hold
-            the same training twice; faulty rows; a region or a sequence that they do not have.
+        InputError
+            Runs score different frames or protocols, define a metric differently, or contain the
+            same training twice; rows are invalid; or a region or a sequence is missing.
         """
         if not folders:
             raise InputError("runs", "", "at least one folder", "none")

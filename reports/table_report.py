@@ -64,12 +64,13 @@ def read_runs(folders: Path | str | Sequence[Path | str]) -> ComparedRuns:
 
     Parameters
     ----------
-    folders : of the runs, or of one. The same method with the same settings and other seeds is one method with more seeds.
+    folders : Path | str | Sequence[Path | str]
+        One run folder or several. Seeds of the same method with the same settings are merged.
 
     Raises
     ------
     InputError
-        For a folder that is no finished run, and for runs that do not score the same frames by the same protocol.
+        A folder is not a finished run, or the runs score different frames or protocols.
     """
     several = [folders] if isinstance(folders, (str, Path)) else folders
     return cast(ComparedRuns, ComparedRuns.read([Path(folder) for folder in several]))

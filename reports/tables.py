@@ -209,19 +209,30 @@ def build_table(
 
     Parameters
     ----------
-    metrics : columns of the table, in order; those per frame appear once in each task, the others last.
-    methods : in order; one without rows is shown as not measured.
-    trivial : those of ``methods`` that are trivial baselines: listed apart, not ranked.
-    changed : likewise those under conditions that change them, see `RunSet.changed`.
-    keys : frames of each task, where more are scored than there are rows of.
-    protocol_ids : readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` (where the rows do not
-        tell on which one speed was measured), ``part`` and the sentences of ``missing``.
-    avatar_title : heading of the columns that are of no task.
-    name : of the layout.
+    metrics : Sequence[MetricSpec]
+        Columns of the table, in order; metrics of frames appear once in each task, the others last.
+    methods : Sequence[str]
+        Rows, in order; a method without results is shown as not measured.
+    trivial : Sequence[str]
+        Those of ``methods`` that are trivial baselines: listed separately and not ranked.
+    changed : Sequence[str]
+        Those of ``methods`` under conditions that change them, see `RunSet.changed`; also listed
+        separately and not ranked.
+    keys : Mapping[str, Collection[FrameKey]] | None
+        Frames of each task, if more are scored than have rows.
+    protocol_ids : Mapping[str, str]
+        Readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` (if
+        the rows do not record the machine that measured speed), ``part`` and the sentences of
+        ``missing``.
+    avatar_title : str
+        Heading of the columns that belong to no task.
+    name : str
+        Name of the layout.
 
     Raises
     ------
-    InputError : rows that repeat a frame, or mix versions of a method or protocols in a task.
+    InputError
+        Rows repeat a frame, or mix versions of a method or protocols in a task.
     """
     rows.check()
     rows.check_protocols("rows")

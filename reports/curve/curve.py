@@ -33,12 +33,13 @@ def curve_report(out: Path, over: str) -> Findings:
     Parameters
     ----------
     over : str
-        What the trainings were given parts of: "budget", "cameras", "timesteps" or "tracking_error".
+        Quantity that varies between the trainings: "budget", "cameras", "timesteps" or
+        "tracking_error".
 
     Raises
     ------
     InputError
-        For a folder that is not the run of a curve.
+        The folder is not the run of a curve.
     """
     run = RunData.read(out)
     config = run.manifest.configuration

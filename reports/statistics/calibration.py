@@ -22,11 +22,17 @@ class Population:
 
     Attributes
     ----------
-    mean : of the difference over the population: what an interval should cover. 0 is the null.
-    subject_sd, sequence_sd, frame_sd : standard deviation at each level.
-    correlation : of neighbouring frames (a stationary autoregressive series of order 1).
-    seeds, seed_sd : trainings of each method and subject, and how much a training moves the mean of a subject.
-    skewed : the subjects' differences are exponential less their mean instead of normal.
+    mean : float
+        Mean difference over the population, which an interval should cover. 0 is the null hypothesis.
+    subject_sd, sequence_sd, frame_sd : float
+        Standard deviation at each level.
+    correlation : float
+        Correlation of consecutive frames (a stationary autoregressive series of order 1).
+    seeds, seed_sd : int or float
+        Number of trainings of each method and subject, and standard deviation of a subject's mean
+        between trainings.
+    skewed : bool
+        Whether the subjects' differences are centred exponential instead of normal.
     """
 
     subjects: int
@@ -116,9 +122,10 @@ def calibrate(population: Population, trials: int, seed: int = 0) -> Row:
     Returns
     -------
     Row
-        In %: how often the sign-flip test rejects (None where so few subjects cannot be tested), how often the interval
-        covers, and how often a paired t-test over frames rejects; and a verdict on what was promised. The test's exactness
-        assumes differences that are symmetric about their mean.
+        In %: how often the sign-flip test rejects (None if there are too few subjects to test), how
+        often the interval covers the mean, and how often a paired t-test over frames rejects; and a
+        verdict on these rates. The exactness of the test assumes differences that are symmetric about
+        their mean.
     """
     generator = np.random.default_rng(seed)
     rejected = covered = frame_test = 0

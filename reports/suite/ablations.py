@@ -22,7 +22,7 @@ def ablation_table(runs: RunSet, method: str) -> Table:
     Parameters
     ----------
     runs : RunSet
-        A run with ``method`` as it is and under the conditions that are its ablations, and with nothing else.
+        A run with only ``method`` itself and the conditions that are its ablations.
     """
     ablations = [label for label, record in runs.records.items() if record.condition]
     table = table_of(runs)

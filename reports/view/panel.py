@@ -21,7 +21,8 @@ class ControlPanel:
 
     Attributes
     ----------
-    screenshot, turntable, sequence : buttons, for whoever does it.
+    screenshot, turntable, sequence : button
+        Buttons, whose actions the caller sets.
     """
 
     def __init__(

@@ -40,8 +40,10 @@ class ShownAvatar:
 
     Attributes
     ----------
-    label : says which it is; unique.
-    sources : clips of other subjects in the form of its method, by subject.
+    label : str
+        Unique name.
+    sources : Mapping[str, AdaptedClip]
+        Clips of other subjects, adapted to its method, by subject.
     """
 
     label: str
@@ -114,7 +116,8 @@ class Scene:
 
     Attributes
     ----------
-    missing : avatars of the runs that are not there, each with the reason.
+    missing : Sequence[str]
+        Avatars of the runs that are missing, each with the reason.
     """
 
     shown: Sequence[ShownAvatar]

@@ -47,7 +47,8 @@ class Session:
 
     Attributes
     ----------
-    updates : images or sets of splats sent so far.
+    updates : int
+        Number of images or sets of splats sent so far.
     """
 
     def __init__(self, client: Any, scene: Scene, expressions: int, lock: threading.Lock):

@@ -17,8 +17,12 @@ class Sliders:
 
     Attributes
     ----------
-    expressions : leading coefficients by head model, in the model's own units.
-    jaw, neck : (3,) about x, y and z. eyes : (2,) about x and y, of both.
+    expressions : Mapping[str, tuple[float, ...]]
+        Leading coefficients by head model, in the model's units.
+    jaw, neck : tuple[float, ...]
+        (3,) rotations about x, y and z.
+    eyes : tuple[float, ...]
+        (2,) rotations of both eyes about x and y.
     """
 
     expressions: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -74,10 +78,15 @@ class State:
 
     Attributes
     ----------
-    recording, timestep : which sequence drives and where it is; `NEUTRAL`, 0 for none.
-    camera : of the capture, drawn as metrics see it, with the captured image beside; "" for the free view.
-    background : each channel from 0 to 1.
-    splats : whether browsers draw splats themselves.
+    recording, timestep : str or int
+        Sequence that animates the avatar and its timestep; `NEUTRAL` and 0 for none.
+    camera : str
+        Camera of the capture, drawn as for metrics, with the captured image next to it; "" for the
+        free view.
+    background : tuple[float, float, float]
+        RGB, each in [0, 1].
+    splats : bool
+        Whether browsers render the splats.
     """
 
     sliders: Sliders = field(default_factory=Sliders)
