@@ -1,4 +1,4 @@
-"""What a comparison is asked to do, resolved and checked whole before any work."""
+"""Configuration of a comparison, resolved and checked completely before execution."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from .adaptation import MethodNeeds
 CANONICAL = "canonical"
 """The metric profile that bare metric names belong to."""
 DEVICES = r"(cpu|cuda|mps|xpu)(:\d+)?"
-"""What a device may be called."""
+"""Valid device names."""
 
 
 def default_names(group: Literal["methods", "metrics"]) -> tuple[str, ...]:
-    """Names of the registered methods or metrics that a run takes which names none, in the registry's order."""
+    """Names of the methods or metrics that a run uses by default, in the registry's order."""
     return tuple(name for name, plugin in discover(group).items() if plugin.spec and plugin.spec.default)
 
 
@@ -103,7 +103,7 @@ class RunConfig:
     source: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse what could only fail later."""
+        """Refuse invalid settings early."""
         names = [condition.name for condition in self.conditions]
         if not names or len(set(names)) != len(names):
             raise ValueError(f"conditions: at least one, each name once; found {', '.join(names) or 'none'}")
@@ -136,7 +136,7 @@ class RunConfig:
 
     @property
     def drive(self) -> Named:
-        """What renders in place of the scored frames; tasks and metrics are then those of this change."""
+        """Registered change that replaces the scored frames, tasks and metrics."""
         return self.conditions[0].drive
 
 
@@ -179,7 +179,7 @@ class ResolvedMethod:
         return implementation() if self.config is None else implementation(self.config)
 
     def record(self) -> dict[str, Any]:
-        """Everything that decides what this method does, for the manifest."""
+        """Everything that determines the method's behaviour, for the manifest."""
         needs = MethodNeeds.of(self.spec)
         code = code_digest(self.spec.implementation) if self.spec.implementation else ""
         return {
@@ -194,7 +194,7 @@ class ResolvedMethod:
         }
 
     def identity(self) -> dict[str, Any]:
-        """The same for fingerprints, without settings that say where something lies on this machine.
+        """The same for fingerprints, without settings that are paths on this machine.
 
         The code of a method of this package is left out: its version says whether results change.
         """
@@ -277,10 +277,11 @@ def resolve_method(spec: MethodSpec, preset: str, settings: Mapping[str, Any]) -
 
 
 def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
-    """Resolve the metrics of a run by name, in every profile asked for that defines them.
+    """Resolve the metrics of a run by name, in every requested profile that defines them.
 
-    Metrics of the avatar as a whole, and those that no profile defines, are taken as they are registered. The first
-    profile's stand in the comparison table, each further profile's in a table of its name.
+    Metrics of the avatar as a whole, and those that no profile defines, keep their registered definition. The
+    metrics of the first profile are in the comparison table, those of each further profile in a table named
+    after it.
 
     Raises
     ------
@@ -325,7 +326,7 @@ AvatarFolder = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """Where a run's files are now, and what may be loaded."""
+    """Current locations of a run's files, and permission to import modules."""
 
     data: str | None = None
     """The run's capture, if it is no longer where the run found it."""
@@ -349,7 +350,7 @@ class DemoConfig:
     out: str = "demo-output"
     preset: str = "demo"
     seed: int = 0  # of the training
-    subject_seed: int = 14  # of the capture: who is recorded and what they do
+    subject_seed: int = 14  # of the capture: determines the subject and the performance
     cameras: int = 12
     timesteps: int = 28
     size: str = "144x208"

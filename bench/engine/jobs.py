@@ -1,4 +1,4 @@
-"""The cells of a run with all they need: made here for runs, workers, and everything that looks at a run's avatars."""
+"""The cells of a run with their inputs, for runs, workers and commands that read a run's avatars."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def make_jobs(
     folder: RunFolder,
     out: Path | None = None,
 ) -> list[Job]:
-    """Make the cells of a run, each clip in the form that its method and condition need.
+    """Make the cells of a run, with clips adapted to each method and condition.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def make_jobs(
 
 
 class _Forms:
-    """Clips in the forms that methods and conditions need, each made once."""
+    """Clips adapted to methods and conditions, each adapted once."""
 
     def __init__(self, config: RunConfig, run: RunFolder, out: RunFolder):
         self._config, self._run, self._out = config, run, out
@@ -88,7 +88,7 @@ class _Forms:
         self._made: dict[tuple[str, MethodNeeds], AdaptedClip] = {}
 
     def plan(self, cells: Sequence[tuple[Clip, ResolvedMethod, Condition]]) -> None:
-        """Check that every form can be had, then make them."""
+        """Check that all clips can be adapted, then adapt them."""
         planned = {}
         for clip, method, condition in cells:
             changed, needs = self._clip(clip, condition), MethodNeeds.of(method.spec)
@@ -105,7 +105,7 @@ class _Forms:
                     self._made[fingerprint, needs] = adaptation.carry_out(step, needs, folder, label)
 
     def of(self, clip: Clip, method: ResolvedMethod, condition: Condition) -> AdaptedClip | None:
-        """The form of a clip; None where it is the clip itself."""
+        """The adapted clip; None if no adaptation is needed."""
         changed = self._clip(clip, condition)
         made = self._made.get((changed.fingerprint, MethodNeeds.of(method.spec)))
         return made or (None if changed is clip else AdaptedClip(changed))
@@ -118,7 +118,7 @@ class _Forms:
 
 
 def _copy_kept(source: Path, folder: Path) -> None:
-    """Copy the files that are not in ``folder`` yet; never what a link leads to, for the run may come from anybody."""
+    """Copy the files missing from ``folder``; links are not followed, since the run may be untrusted."""
     if source.is_symlink() or source.parent.is_symlink():
         return
     for path in sorted(source.rglob("*")):
@@ -129,9 +129,9 @@ def _copy_kept(source: Path, folder: Path) -> None:
 
 
 def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
-    """Train or derive the avatar of a cell, render its frames and measure them; each stage continues where it was.
+    """Train or derive the avatar of a cell, render its frames and measure them; each stage resumes.
 
-    A cell whose condition drives the avatar is rendered and judged by that change in place of the last two.
+    If the cell's condition animates the avatar, that change replaces the last two stages.
     """
     if job.condition.drive and (kept := stored_rows(job, metrics, retry=True)) is not None:
         return kept

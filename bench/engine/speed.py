@@ -31,9 +31,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Change:
-    """A metric of an avatar before and after it was measured again; ``None`` for a number that is not known.
+    """A metric of an avatar before and after it was measured again; ``None`` for an unknown number.
 
-    ``load`` is the cores that other processes kept busy meanwhile.
+    ``load`` is the number of cores used by other processes during the measurement.
     """
 
     subject: str
@@ -122,7 +122,7 @@ def measure_speed_again(
 def _jobs(
     folder: RunFolder, options: RunOptions, methods: Sequence[str]
 ) -> tuple[list[Job], list[MetricSpec]]:
-    """The cells whose speed is asked for and the metrics of the run, checked."""
+    """The selected cells and the metrics of the run, checked."""
     manifest = folder.read_manifest()
     config, clips = open_run_clips(folder.root, options)
     check_device(config.device)

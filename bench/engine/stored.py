@@ -1,4 +1,4 @@
-"""Stored avatars: what ``avatar.json`` says of the one in its folder, and `load_avatar`, which reads any of them."""
+"""Stored avatars: ``avatar.json``, which describes the avatar in its folder, and `load_avatar`."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from .store import avatar_files
 log = logging.getLogger(__name__)
 
 AVATAR_FILE = "avatar.json"
-"""Stands in the folder of every avatar, see `AvatarRecord`."""
+"""File in the folder of every avatar, see `AvatarRecord`."""
 HEAD_FILE = "head_model.npz"
-"""The head model beside an avatar, which all native methods store."""
+"""Head model file in an avatar's folder, which all native methods store."""
 SUBJECT_FILE = "subject.npz"
 """Shape and static offset of the subject, which most methods store."""
 TRAINING_FILE = "training.json"
-"""Where methods record how a training went. Its "losses", if any, are pairs of an iteration and the loss up to there."""
+"""Training record of methods; optional "losses" are pairs of an iteration and the loss up to there."""
 SAME_SHAPE = 1e-4
 """Largest difference of two shape coefficients of one subject; files hold float32."""
 
@@ -113,7 +113,7 @@ def shown_by(clip: Clip) -> tuple[str, FloatArray, str]:
 
 
 def registered_name(method: ResolvedMethod) -> str:
-    """Name of a method without what its settings add to it."""
+    """Name of a method without the suffix of its settings."""
     label, name = getattr(method.config, "label", ""), method.spec.name
     return name.removesuffix(f" ({label})") if label else name
 
@@ -149,18 +149,18 @@ class StoredAvatar:
 
     @property
     def heads(self) -> dict[str, str]:
-        """File of the head model beside the avatar, by its version: what `adaptation.plan` refits a capture to."""
+        """Head model file of the avatar by version, to which `adaptation.plan` refits a capture."""
         return {self.record["head_model"]: str(self.folder / HEAD_FILE)} if self.record["head_digest"] else {}
 
     def check_subject(self, clip: Clip) -> None:
-        """Raise `InputError` where the avatar shows another subject than a clip."""
+        """Raise `InputError` if the avatar shows another subject than a clip."""
         shown = self.shows_another(*shown_by(clip))
         if shown:
             expected = f"an avatar of {clip.subject}, whom the capture shows"
             raise InputError(self.folder, "subject", expected, f"one of {shown}")
 
     def shows_another(self, subject: str, shape: FloatArray, head_model: str) -> str:
-        """The name of the subject that the avatar shows, if that is another than the one given; else "".
+        """The name of the subject that the avatar shows, if it differs from the given one; otherwise "".
 
         Another subject has another name and another shape; shapes of two head models do not compare.
         """
@@ -244,7 +244,7 @@ def load_avatar(folder: Path | str, *, device: str = "cpu", method: str = "") ->
 
 
 def training_losses(folder: Path) -> list[tuple[int, float]]:
-    """The losses that an avatar's training recorded; none where it recorded none. Raises `InputError` for a damaged record."""
+    """Recorded losses of an avatar's training, possibly none. Raises `InputError` for a damaged record."""
     path = folder / TRAINING_FILE
     if not path.is_file():
         return []
