@@ -1,4 +1,4 @@
-"""Results of tasks, and what an executor of tasks does."""
+"""Results of tasks, and the interface of executors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .task import Task
 
 
 class TaskResult(NamedTuple):
-    """A task whose process or job has ended; how it ended is in its outcome file, if it wrote one.
+    """A task whose process or job has ended; its outcome file, if any, records how.
 
     Attributes
     ----------

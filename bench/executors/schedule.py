@@ -20,7 +20,7 @@ from .task import TASK_LOG, Task
 log = logging.getLogger(__name__)
 DAMAGED = "its results are missing or damaged"
 Failures = dict[str, str]
-"""Why tasks failed, by their place."""
+"""Reasons of failed tasks, by their folder."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Schedule:
     speed: bool = False
 
     def run_all(self, tasks: Sequence[Task]) -> Failures:
-        """Run the tasks, all of one root, whose lock is held; return which failed and why.
+        """Run the tasks, all of one root folder that the caller has locked; return the failures by folder.
 
         Raises
         ------
@@ -82,7 +82,7 @@ class Schedule:
         return Processes(workers, self.execution.threads or max(1, cores // workers))
 
     def _again(self, ended: TaskResult, failures: Failures) -> Task | None:
-        """What to submit again of a task that ended; None where it is done, or failed, which is recorded."""
+        """The task to submit again after one ended; None if it is done, or failed and recorded as such."""
         task = ended.task
         outcome = read_outcome(task.folder)
         reason = ""

@@ -17,7 +17,7 @@ ExecutorName = Literal["inline", "processes", "slurm"]
 
 @dataclass(frozen=True)
 class SlurmSettings:
-    """What a job of Slurm asks for; each works on one cell.
+    """Resources of a Slurm job; each executes one cell.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class SlurmSettings:
     parameters: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what no job can ask for."""
+        """Refuse invalid settings."""
         if self.gpus < 0 or self.cpus < 1 or self.memory_gb <= 0 or self.parallel < 1:
             raise ValueError("gpus is at least 0, cpus and parallel are at least 1, memory_gb is above 0")
         if self.hours < 1 / 60:
@@ -92,7 +92,7 @@ class Execution:
 
 
 def is_speed(metric: MetricSpec) -> bool:
-    """Whether neighbours on the machine would change what a metric of an avatar measures."""
+    """Whether concurrent jobs on the machine would bias a metric of an avatar."""
     return metric.machine_bound and metric.kind == "avatar"
 
 

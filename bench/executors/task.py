@@ -1,4 +1,4 @@
-"""A task: a function by its name with arguments, and a folder that its outcome and its log go to."""
+"""A task: the name and arguments of a function, and a folder for its outcome and log."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TASK_LOG = "job.log"
 
 @dataclass(frozen=True)
 class Task:
-    """One piece of work, what a process or a job is given.
+    """Unit of work of a process or job.
 
     Attributes
     ----------
@@ -54,5 +54,5 @@ class Task:
 
     @property
     def folder(self) -> Path:
-        """Where its outcome and its log lie."""
+        """Folder of its outcome and log."""
         return Path(self.root) / self.place
