@@ -1,4 +1,4 @@
-"""Bundles: the results of a run in one file, as a leaderboard takes them and others can check them."""
+"""Bundles: the results of a run in one file, for a leaderboard and for verification by others."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> 
 
 
 def without_paths(manifest: Manifest, methods: tuple[str, ...]) -> Manifest:
-    """The record of some methods of a run, without folders of the machine that made it."""
+    """The record of some methods of a run, without local paths."""
     config = manifest.configuration
 
     def named(path: object) -> str:
@@ -151,7 +151,7 @@ def without_paths(manifest: Manifest, methods: tuple[str, ...]) -> Manifest:
 def _cell_files(
     folder: RunFolder, manifest: Manifest, methods: tuple[str, ...], *, renders: bool
 ) -> dict[str, Path]:
-    """Records of the cells, and their frames if asked for, by their place in the run."""
+    """Records of the cells, and their frames if requested, by their path in the run."""
     files: dict[str, Path] = {}
     labels = [method.label for method in manifest.methods if method.name in methods]
     for clip, label, seed in product(manifest.clips, labels, manifest.configuration.seeds):
