@@ -69,7 +69,7 @@ class HeldOutClip:
 
 
 def hold_out(clip: Clip, config: RunConfig | None = None, *, camera: str = "", every: int = 8) -> HeldOutClip:
-    """Hold out a camera and every n-th timestep of a clip's training split, so that no test frame is looked at.
+    """Hold out a camera and every n-th timestep of a clip's training split, so that no test frame is used.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def fewer_timesteps(clip: Clip, config: RunConfig | None = None, *, part: str) -
 
 
 def count_of(whole: int, part: str) -> int:
-    """How many a part of so many is, one at least."""
+    """Number of items in a part of a total, at least one."""
     return max(1, round(whole * Fraction(part)))
 
 

@@ -17,7 +17,7 @@ from .suite_settings import ABLATIONS, SEED, SuiteSettings
 
 OURS = "ours"
 REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
-"""Parts of the frame that have tables of their own."""
+"""Regions of the frame with separate tables."""
 
 
 def suite(settings: SuiteSettings, progress: Progress = no_progress) -> Findings:
