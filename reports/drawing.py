@@ -34,7 +34,7 @@ WHITE: ByteArray = np.full((12, 12, 3), 255, np.uint8)
 
 @dataclass(frozen=True)
 class Tile:
-    """An (H, W, 3) 8-bit image at the size it is shown, or the reason why there is none.
+    """An (H, W, 3) 8-bit image at the size it is shown, or the reason why it is missing.
 
     ``mark`` is the colour of a broad line around it; "" for a hairline (white images need an edge on white paper).
     """
@@ -63,7 +63,7 @@ class SheetSection:
 
 @dataclass
 class _Paper:
-    """White paper of fixed width that is written on downwards from the height ``y``; coordinates are pixels."""
+    """White page of fixed width, filled downwards from the height ``y``; coordinates are pixels."""
 
     width: int
     y: int = MARGIN
@@ -126,7 +126,7 @@ class _Paper:
         write_png(path, np.ascontiguousarray(pixels), COMPOSITE)
 
 
-@style.context("default")  # whatever the user's matplotlibrc says, such as text.usetex
+@style.context("default")  # independent of the user's matplotlibrc, such as text.usetex
 def write_sheet(
     path: Path,
     sections: Sequence[SheetSection],
@@ -208,7 +208,7 @@ def _colour_bar(paper: _Paper, top: int, more: str) -> None:
 
 
 def _characters(width: int, size: int) -> int:
-    """About how many characters of a text size go into a width, both pixels."""
+    """Approximate number of characters of a text size that fit into a width, both in pixels."""
     return max(2, int(width / (0.6 * size)))
 
 

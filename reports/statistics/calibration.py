@@ -18,7 +18,7 @@ from .comparisons import LEVEL, best_set, least_p, sign_flip_p
 
 @dataclass(frozen=True)
 class Population:
-    """Subjects with sequences with frames whose errors follow each other, and seeds beside them; in dB, say.
+    """Subjects with sequences of frames with correlated errors, and seeds; for example in dB.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Population:
 TRIALS, QUICK_TRIALS = 2_000, 100
 REPLICATES = 1_000
 RANGE = (0.03, 0.07)
-"""What counts as 5 %, give or take two standard errors of the simulation."""
+"""Range around 5 % of two standard errors of the simulation."""
 
 CASES: Mapping[str, Population] = {
     "3 subjects": Population(3),
@@ -92,7 +92,7 @@ CASES: Mapping[str, Population] = {
 
 
 def stress(quick: bool, progress: Progress) -> Findings:
-    """Calibrate every case of `CASES` and the sets of the best; passed where the level is kept as promised."""
+    """Calibrate every case of `CASES` and the sets of the best; passed if the level is kept as specified."""
     trials = QUICK_TRIALS if quick else TRIALS
     cases: list[Row] = []
     for index, (case, population) in enumerate(CASES.items()):
@@ -156,7 +156,7 @@ def standard_error(trials: int) -> float:
 
 
 def frame_t_test_p(subjects: tuple[SubjectPairs, ...]) -> float:
-    """P-value of a paired t-test that takes frames for independent: here only to show what it does."""
+    """P-value of a paired t-test that treats frames as independent, for comparison only."""
     sequences = [sequence for subject in subjects for sequence in subject.sequences]
     frames = [(each.first.mean(axis=0) - each.second.mean(axis=0)) / each.cameras for each in sequences]
     return float(stats.ttest_1samp(np.concatenate(frames), 0.0).pvalue)

@@ -1,4 +1,4 @@
-"""What leaving out a part of a method changes: paired differences of its runs from the method as it is."""
+"""Ablations: paired differences between variants of a method and the full method."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a viewer shows: avatars with the captures they were made from, and the recordings that drive them."""
+"""Scene of a viewer: avatars with their captures, and the recordings that animate them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .settings import ViewSettings
 
 log = logging.getLogger(__name__)
 NEUTRAL = "neutral"
-"""What drives where no recording does."""
+"""Name of the neutral pose, without a recording."""
 MOST_SHOWN = 12
 """Avatars at once; more would be drawn too small to see."""
 
@@ -77,7 +77,7 @@ class ShownAvatar:
         return head_center(self.clip)
 
     def pose(self, key: FrameKey | None) -> HeadPose:
-        """The pose that was recorded with a frame: of its own subject as it is, of another retargeted; None: neutral."""
+        """The recorded pose of a frame, retargeted if it is of another subject; None: neutral."""
         if key is None:
             return self.neutral
         if key.subject == self.clip.subject:
@@ -89,7 +89,7 @@ class ShownAvatar:
     def camera(self, view: Camera, key: FrameKey | None) -> Camera:
         """A camera of the world of `clip` as the method sees the world at a timestep.
 
-        A method that wants one video has the head stand still and the camera move.
+        For a method with one video, the head is fixed and the camera moves.
         """
         own = key if key is not None and key.subject == self.clip.subject else self._first
         seen = self.form.clip.cameras[self.form.key(own).camera].world_to_camera
@@ -130,7 +130,7 @@ class Scene:
         return self.shown[0]
 
     def heads(self) -> dict[str, FloatArray]:
-        """How far the sliders of each head model go, by its version."""
+        """Ranges of the sliders of each head model, by its version."""
         reach: dict[str, FloatArray] = {}
         for shown in self.shown:
             known = reach.get(shown.version)
@@ -139,9 +139,9 @@ class Scene:
 
 
 def open_scene(settings: ViewSettings, kept: Path) -> Scene:
-    """Load the avatars that are asked for; ``kept`` is a folder for tracking that has to be refitted.
+    """Load the requested avatars; ``kept`` is a folder for tracking that has to be refitted.
 
-    Raises `InputError` where there is nothing to show, or more than `MOST_SHOWN`.
+    Raises `InputError` without avatars, or with more than `MOST_SHOWN`.
     """
     missing: list[str] = []
     shown: list[ShownAvatar] = []
@@ -204,7 +204,7 @@ def _opened(path: Path, settings: ViewSettings, kept: Path, missing: list[str]) 
 
 
 def _run_of(path: Path) -> tuple[Path | None, tuple[str, str, int] | None]:
-    """The run that a folder is, or lies in with subject, method and seed; None for an avatar of no run."""
+    """The run of a folder, with subject, method and seed of a cell; None for an avatar outside of runs."""
     if (path / "run.json").is_file():
         return path, None
     home = avatar_folder(path).resolve()

@@ -1,4 +1,4 @@
-"""What one browser asks to see: the pose that sliders and recordings make, and the camera."""
+"""View requested by a browser: the pose from sliders and recordings, and the camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .scene import NEUTRAL
 
 @dataclass(frozen=True)
 class Sliders:
-    """What is added to a pose. Angles in radians, added to axis-angle vectors.
+    """Offsets added to a pose. Angles in radians, added to axis-angle vectors.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class FreeView:
 
 @dataclass(frozen=True)
 class State:
-    """Everything that decides the image.
+    """Everything that determines the image.
 
     Attributes
     ----------
