@@ -105,8 +105,7 @@ def _verify_bundle(settings: VerifySettings, scratch: Path, progress: Progress) 
 
 
 def _captured_again(manifest: Manifest, out: Path, limit: int, progress: Progress) -> Path:
-    """Regenerate the synthetic captures of a run from the records of their clips; ``limit`` bounds their
-    pixels.
+    """Regenerate the synthetic captures of a run from their clips; ``limit`` bounds their pixels.
 
     Raises `InputError` for a capture that is not synthetic, not of the procedural head, or larger.
     """

@@ -462,8 +462,8 @@ def measure(
     Parameters
     ----------
     again : Sequence[MetricSpec]
-        Metrics to measure again, a subset of ``metrics`` that concern the avatar as a whole; others that were already
-        measured or tried are not. Former values stay in the record of the measurements, under ``earlier``.
+        Metrics to measure again, a subset of ``metrics`` that concern the avatar as a whole; others that
+        were already measured or tried are not. Former values stay in the record of the measurements, under ``earlier``.
 
     Raises
     ------

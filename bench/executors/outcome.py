@@ -13,17 +13,28 @@ from ..io.files import write_json
 
 
 class TaskOutcome(TypedDict, total=False):
-    """Attributes.
+    """Content of ``outcome.json``.
 
-    status : state of the task; a job that no longer exists while it is "running" was killed.
-    speed : whether speed is measured, in a separate pass over a run's cells, see `bench.executors.run`.
-    reason : reason of the failure, as in the rows of a cell.
-    doing, since : current step, and the time of its start (ISO 8601, UTC).
-    seconds : duration.
-    restarts : number of restarts.
-    job : job of the cluster, "" for a process of ``host``.
-    threads : value of OMP_NUM_THREADS, "" for the number of cores.
-    machine : see `machine_record`.
+    Attributes
+    ----------
+    status : Literal["running", "done", "failed"]
+        State of the task; a job that no longer exists while it is "running" was killed.
+    speed : bool
+        Whether speed is measured, in a separate pass over a run's cells, see `bench.executors.run`.
+    reason : str
+        Reason of the failure, as in the rows of a cell.
+    doing, since : str
+        Current step, and the time of its start (ISO 8601, UTC).
+    seconds : float
+        Time that the task took.
+    restarts : int
+        Number of restarts.
+    job : str
+        Job of the cluster, "" for a process of ``host``.
+    threads : str
+        Value of OMP_NUM_THREADS, "" for the number of cores.
+    machine : dict[str, Any]
+        See `machine_record`.
     """
 
     status: Required[Literal["running", "done", "failed"]]

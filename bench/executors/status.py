@@ -87,8 +87,9 @@ def run_status(run: Path) -> Findings:
 
 
 def time_left(cells: Sequence[CellState]) -> tuple[float | None, bool]:
-    """Estimated seconds until all cells are done, from finished cells of each method, and whether it is a
-    lower bound.
+    """Estimated seconds until all cells are done, and whether this is a lower bound.
+
+    The estimate uses the finished cells of each method.
 
     The time to measure speed is not known in advance.
 

@@ -78,8 +78,7 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Find
 def conditions(
     settings: CurveSettings, methods: Sequence[ResolvedMethod], clips: Sequence[Clip]
 ) -> Iterator[Condition]:
-    """Conditions of the trainings, the full one first, where the start-up time, such as imports, weighs
-    least.
+    """Conditions of the trainings, the full one first, which start-up time, such as imports, affects least.
 
     Of parts with the same amount, only the largest is used.
     """

@@ -51,7 +51,7 @@ class CurveSettings(RunOptions, ExecutionOptions):
     """Hold out one of this number of consecutive training timesteps."""
 
     frames: int = 100
-    """Maximum number of scored frames of each subject, per held-out camera and timesteps."""
+    """Maximum number of scored frames of each subject, for the held-out camera and timesteps separately."""
 
     dependent = (
         DependentOptions(("levels",), "over", ("tracking_error",)),
