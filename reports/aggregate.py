@@ -85,4 +85,7 @@ def _subject_means(rows: pd.DataFrame) -> dict[int, dict[str, float]]:
 def _reason(rows: pd.DataFrame) -> str:
     """The reason of the first row in a fixed order, as one line."""
     first = rows.sort_values(["seed", *FRAME]).iloc[0]
-    return " ".join(str(first["reason"]).split()) or f"The rows say {first['status']} and give no reason."
+    return (
+        " ".join(str(first["reason"]).split())
+        or f"The rows have the status {first['status']} without a reason."
+    )

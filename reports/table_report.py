@@ -158,7 +158,9 @@ class PaperLayout:
 PAPER: Mapping[str, PaperLayout] = {
     "paper-1": PaperLayout("every method: both tasks' quality, storage, speed"),
     "paper-3": PaperLayout("INSTA and ours: both tasks' quality, storage, speed", methods=("insta", "ours")),
-    "paper-4": PaperLayout("settings of ours, one run each: both tasks' quality", QUALITY, ("ours",)),
+    "paper-4": PaperLayout(
+        "settings of the method ours, one run each: both tasks' quality", QUALITY, ("ours",)
+    ),
 }
 
 

@@ -162,7 +162,7 @@ def _cell_files(
             recorded = {} if state is None else state.get("files", {})
             damaged = cell.damage(recorded)
             for name, why in damaged.items():
-                remedy = "Start the run again; it renders what is damaged."
+                remedy = "Restart the run; it renders damaged frames again."
                 raise InputError(cell.folder / name, "", "the frame that was rendered", f"it {why}", remedy)
             paths += [cell.folder / name for name in recorded]
         files |= {path.relative_to(folder.root).as_posix(): path for path in paths}

@@ -143,7 +143,7 @@ class EvaluateSettings:
     def __post_init__(self) -> None:
         """Refuse settings without a reference for the evaluation."""
         if self.clip is None and self.like is None:
-            raise ValueError("say what to score against: --clip CAPTURE, or --like RUN")
+            raise ValueError("state the reference: --clip CAPTURE or --like RUN")
 
 
 @dataclass(frozen=True)

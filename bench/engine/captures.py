@@ -25,7 +25,7 @@ from .store import RunFolder
 log = logging.getLogger(__name__)
 Plugins = Literal["methods", "metrics"]
 HARNESS = ("progress", "remembered")
-"""Keywords of a reader that are set by the harness instead of by settings, see `DatasetSpec`."""
+"""Keywords of a reader that are set by the harness, not by settings, see `DatasetSpec`."""
 
 
 def open_clips(config: RunConfig, *, remembered: bool = True, only: int | None = None) -> list[Clip]:

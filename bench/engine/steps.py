@@ -463,7 +463,8 @@ def measure(
     ----------
     again : Sequence[MetricSpec]
         Metrics to measure again, a subset of ``metrics`` that concern the avatar as a whole; others that
-        were already measured or tried are not. Former values stay in the record of the measurements, under ``earlier``.
+        were already measured or tried are not. Former values stay in the record of the measurements,
+        under ``earlier``.
 
     Raises
     ------

@@ -189,7 +189,7 @@ def open_avatar(folder: Path, method: str = "") -> StoredAvatar:
     if not path.is_file():
         remedy = "It is written when a training, an import or `headbench export compact` ends."
         if (folder / "run.json").is_file():
-            remedy = "The avatars of a run lie in SUBJECT/METHOD/seed-N/avatar inside its folder."
+            remedy = "The avatars of a run are in SUBJECT/METHOD/seed-N/avatar in its folder."
         raise InputError(
             folder, AVATAR_FILE, f"the {AVATAR_FOLDER}", f"a folder without {AVATAR_FILE}", remedy
         )

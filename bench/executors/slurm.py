@@ -284,7 +284,7 @@ def _ask(*command: str) -> str:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=ANSWER_S, check=True)
     except subprocess.CalledProcessError as error:
-        hint = "`scontrol ping` tells whether Slurm answers here."
+        hint = "`scontrol ping` shows whether Slurm responds."
         raise HeadbenchError(f"{command[0]}: {' '.join(error.stderr.split())}. {hint}") from error
     except (OSError, subprocess.TimeoutExpired) as error:
         raise HeadbenchError(f"{command[0]}: {error}") from error

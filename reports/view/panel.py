@@ -58,7 +58,7 @@ class ControlPanel:
             self._camera = gui.add_dropdown(
                 *("Camera", (FREE, *cameras)),
                 initial_value=FREE,
-                hint="A camera of the capture shows the captured image beside, where there is one.",
+                hint="A camera of the capture shows the captured image next to it, if there is one.",
             )
         self._recording.on_update(lambda _: self._recording_chosen())
         self._camera.on_update(lambda _: jumped("" if self._camera.value == FREE else self._camera.value))

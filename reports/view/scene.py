@@ -233,7 +233,7 @@ def _imported(path: Path, settings: ViewSettings, kept: Path) -> ShownAvatar:
     method = stored.method
     if settings.data is None:
         expected = "the capture that the avatar was made from, with its cameras and poses"
-        raise InputError("command line", "--data", expected, "none, and the avatar lies in no run")
+        raise InputError("command line", "--data", expected, "none, and the avatar belongs to no run")
     config = _config(settings.data, settings, kept)
     clips = open_clips(config)
     if len(clips) > 1:
