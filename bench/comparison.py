@@ -165,7 +165,8 @@ def run(settings: RunSettings, progress: Progress) -> Findings:
         from .engine.forecast import forecast
         from .engine.run import planned_jobs
 
-        known = [Path(config.out), *([Path(settings.estimates)] if settings.estimates else [])]
+        own = [Path(config.out)] if (Path(config.out) / "run.json").is_file() else []
+        known = [*own, *([Path(settings.estimates)] if settings.estimates else [])]
         return forecast(planned_jobs(config), known)
     with _log_file(Path(config.out)):
         return _run(config, execution, unchecked=settings.unchecked)

@@ -6,6 +6,7 @@ what it changes. What it names is registered as a plug-in of the group ``headben
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
@@ -19,6 +20,17 @@ CONDITION_MARK = "+"
 def label_of(method: str, condition: str) -> str:
     """Name of a method under a condition, as tables and folders show it: "ours", or "ours+cameras-4"."""
     return f"{method}{CONDITION_MARK}{condition}" if condition else method
+
+
+def part_of_text(text: str, name: str) -> Fraction:
+    """A part as a number. Raises `ValueError` for text that is not a part above 0 and at most 1."""
+    # Bounded, since a long exponent would keep `Fraction` busy for hours.
+    known = re.fullmatch(r"\d{1,6}(\.\d{1,12})?(/\d{1,6})?", text)
+    parts = text.split("/") if known else ["0"]
+    value = Fraction(parts[0]) / (int(parts[1]) if len(parts) > 1 and int(parts[1]) else 1)
+    if not 0 < value <= 1 or (len(parts) > 1 and not int(parts[1])):
+        raise ValueError(f"{name} is {text[:40]!r}; a part above 0 and at most 1, such as 1/4 or 0.25")
+    return value
 
 
 @dataclass(frozen=True)
@@ -72,17 +84,12 @@ class Condition:
 
     def __post_init__(self) -> None:
         """Refuse a budget that is not a part."""
-        try:
-            part = Fraction(self.budget)
-        except (ValueError, ZeroDivisionError):
-            part = Fraction(0)
-        if not 0 < part <= 1:
-            raise ValueError(f"budget is {self.budget!r}; a part above 0 and at most 1, such as 1/4 or 0.25")
+        part_of_text(self.budget, "budget")
 
     @property
     def part(self) -> Fraction:
         """Part of the budget as a number."""
-        return Fraction(self.budget)
+        return part_of_text(self.budget, "budget")
 
     def part_of(self, whole: Budget) -> Budget:
         """The part of a budget, an iteration at least."""
@@ -91,24 +98,9 @@ class Condition:
             None if whole.seconds is None else whole.seconds * float(self.part),
         )
 
-    @property
-    def summary(self) -> str:
-        """What is changed, in words."""
-        named = (("clip", self.clip), ("derived", self.derive), ("driven", self.drive))
-        changes = [f"{what}: {_text(change.name, change.parameters)}" for what, change in named if change]
-        if self.part != 1:
-            changes.insert(0, f"budget: {self.budget}")
-        if self.settings:
-            changes.insert(0, _text("settings", self.settings))
-        return "; ".join(changes)
-
     def applies_to(self, method: str) -> bool:
         """Whether a method has this condition."""
         return not self.methods or method in self.methods
-
-
-def _text(name: str, values: Any) -> str:
-    return " ".join([name, *(f"{key}={value}" for key, value in values.items())])
 
 
 PLAIN = Condition()

@@ -27,7 +27,7 @@ class MethodRecord:
     """A method as it ran under a condition; see `ResolvedMethod.record`.
 
     ``needs`` are those of a form other than the clip's own. ``code`` is the digest of its code, see `bench.source`; None for a
-    folder of images, which has none. ``change`` says in words what a condition changed in an avatar, "" for nothing.
+    folder of images, which has none.
     """
 
     name: str
@@ -39,7 +39,6 @@ class MethodRecord:
     needs: dict[str, Any] | None = None
     code: str | None = None
     condition: str = ""
-    change: str = ""
 
     @property
     def label(self) -> str:
@@ -223,7 +222,7 @@ class Manifest:
         record = {name: value for name, value in asdict(own).items() if value is not None}
         record[PROTOCOLS] = {task: protocol.hash for task, protocol in self.protocols.items()}
         for method in record["methods"]:
-            for name in ("needs", "code", "condition", "change"):
+            for name in ("needs", "code", "condition"):
                 if not method[name]:
                     del method[name]
         for metric in record["metrics"]:

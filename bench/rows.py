@@ -266,11 +266,15 @@ class Rows:
         labels = [label_of(str(m), str(c)) for m, c in zip(table["method"], table["condition"])]
         return Rows(table.assign(method=pd.Series(labels, table.index, dtype="str"), condition=""))
 
-    def without(self, other: Rows) -> Rows:
-        """The rows of cells (subject, method, condition, seed) that ``other`` has no rows of."""
-        cell = ["subject", "method", "condition", "seed"]
-        own, theirs = (pd.MultiIndex.from_frame(rows._table[cell]) for rows in (self, other))
-        return Rows(self._table[~own.isin(theirs)])
+    def split(self, labels: Mapping[str, tuple[str, str]]) -> Rows:
+        """The same rows, a method that is named by its label under its name and condition, as version 1 named it."""
+        table = self._table
+        parts = [labels.get(str(m), (str(m), str(c))) for m, c in zip(table["method"], table["condition"])]
+        columns = {
+            name: pd.Series([part[index] for part in parts], table.index, dtype="str")
+            for index, name in enumerate(("method", "condition"))
+        }
+        return Rows(table.assign(**columns))
 
     def in_single_precision(self) -> Rows:
         """The same rows, values to the 24 bits of float32 (7 digits, more than tables show): half the bytes of a file."""
@@ -366,10 +370,6 @@ class Rows:
         for column, values in planned.items():
             named = list(map(str, values))
             known = set(map(str, self._table[column].unique())) - {""}
-            if column == "protocol" and known - set(named):
-                expected = f"{', '.join(sorted(known))}, that of its results"
-                found = f"{', '.join(named)}: other frames or settings make another protocol"
-                raise InputError(path, column, expected, found, DISCARD)
             if lost := sorted(known - set(named)):
                 expected = f"all that it has results for ({', '.join(sorted(known))}), and optionally more"
                 found = f"{', '.join(named)} without {', '.join(lost)}"

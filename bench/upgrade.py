@@ -14,12 +14,8 @@ from .condition import CONDITION_MARK
 
 
 def upgraded_rows(table: pd.DataFrame) -> pd.DataFrame:
-    """Rows with a column ``condition``, which version 1 has in the column ``method``."""
-    if "condition" in table:
-        return table
-    parts = [str(name).partition(CONDITION_MARK) for name in table["method"]]
-    method, condition = (pd.Series([part[i] for part in parts], table.index, dtype="str") for i in (0, 2))
-    return table.assign(method=method, condition=condition)
+    """Rows with a column ``condition``, which version 1 lacks; see `Rows.split`."""
+    return table if "condition" in table else table.assign(condition="")
 
 
 def upgraded_manifest(record: dict[str, Any]) -> dict[str, Any]:
@@ -38,7 +34,9 @@ def upgraded_manifest(record: dict[str, Any]) -> dict[str, Any]:
         entry = dict(entry)
         derived = entry.pop("derived", None) or {}
         name, _, condition = str(entry.get("name")).partition(CONDITION_MARK)
-        entry |= {"name": name, "condition": condition, "change": str(derived.get("change", ""))}
+        if not (source or curve):  # the mark is part of a name
+            name, condition = str(entry.get("name")), ""
+        entry |= {"name": name, "condition": condition}
         methods.append(entry)
         known = conditions.setdefault(condition, {"name": condition, "methods": []})
         known["methods"].append(name)

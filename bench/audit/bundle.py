@@ -21,7 +21,6 @@ from ..io.documents import MAX_JSON_BYTES, checked, parse_json
 from ..io.files import atomic_path, check_writable, digest_file, write_json
 from ..io.provenance import RENDER, source_type
 from ..manifest import PROTOCOLS, Manifest, protocol_path
-from ..rows import Rows
 from ..specs import Findings
 from .settings import BundleSettings, check_shown
 
@@ -78,7 +77,7 @@ def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> 
     manifest = folder.read_manifest()
     manifest.check_done(folder.manifest)
     folder.read_rows(manifest)
-    rows = Rows.read(folder.rows)
+    rows = folder.rows_by_condition(manifest)
     known = tuple(dict.fromkeys(method.name for method in manifest.methods))
     for name in settings.methods:
         if name not in known:

@@ -141,7 +141,7 @@ def _verify(
         folder.root, settings, out=scratch, altered=True, remembered=False, used=used
     )
     folder.read_rows(manifest)
-    rows = Rows.read(folder.rows)
+    rows = folder.rows_by_condition(manifest)
     images = [(images_method(m.name, m.version), Condition(m.condition)) for m in manifest.methods]
     cells = resolve_cells(config) if avatars else images
     metrics = [metric for metric in resolve_metrics(config) if metric.per_frame or avatars]

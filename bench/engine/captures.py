@@ -17,9 +17,9 @@ from ..errors import HeadbenchError, InputError
 from ..io.files import check_name
 from ..progress import progress
 from ..registry import discover, get, resolve
-from ..specs import LABEL, ConditionSpec, DatasetSpec, ResolutionRule, is_label
+from ..specs import LABEL, DatasetSpec, ResolutionRule, is_label
 from .adaptation import MethodNeeds, carry_out, plan
-from .config import RunConfig, RunOptions
+from .config import RunConfig, RunOptions, resolve_change
 from .store import RunFolder
 
 log = logging.getLogger(__name__)
@@ -310,16 +310,8 @@ def _check_registered(config: RunConfig, manifest: Path, used: tuple[Plugins, ..
 
 
 def changed(clip: Clip, change: Named, config: RunConfig) -> Clip:
-    """The clip after a registered change; the clip itself for none.
-
-    Raises `InputError` for a change that is not registered, or that is not of clips.
-    """
-    if not change:
-        return clip
-    spec: ConditionSpec = get("conditions", change.name)
-    if spec.kind != "clip":
-        raise InputError("conditions", change.name, "a change of clips", f"one of kind {spec.kind!r}")
-    result: Clip = resolve(spec.implementation)(clip, config, **change.parameters)
+    """The clip after a registered change; the clip itself for none. Raises `InputError` as `resolve_change` does."""
+    result: Clip = resolve_change(change, "clip")(clip, config)
     return result
 
 

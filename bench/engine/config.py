@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from difflib import get_close_matches
 from functools import partial
@@ -13,14 +14,14 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from ..condition import PLAIN, Condition, Named
-from ..configuration import build, deciding_settings, merge, setting_paths
+from ..condition import PLAIN, Condition, Named, label_of
+from ..configuration import build, build_arguments, deciding_settings, merge, setting_paths
 from ..contracts import Budget, TaskName
 from ..errors import InputError
 from ..io.files import check_name
 from ..registry import discover, get, resolve, unknown
 from ..source import code_digest, forget_code, is_outside
-from ..specs import MethodSpec, MetricSpec, ProfileSpec
+from ..specs import ConditionSpec, MethodSpec, MetricSpec, ProfileSpec
 from .adaptation import MethodNeeds
 
 CANONICAL = "canonical"
@@ -115,6 +116,9 @@ class RunConfig:
                 raise ValueError(
                     f"conditions: {condition.name} derives avatars; source has to name their run"
                 )
+            if self.source and (condition.settings or condition.clip or condition.part != 1):
+                expected = "nothing is trained with a source; derive or drive alone"
+                raise ValueError(f"conditions, {condition.name}: {expected}")
         if len({condition.drive.name for condition in self.conditions}) > 1:
             raise ValueError(
                 "conditions: all are driven by one registered change, or none is; found a mixture"
@@ -233,12 +237,16 @@ def resolve_cells(config: RunConfig) -> list[tuple[ResolvedMethod, Condition]]:
     """
     methods = resolve_methods(config)
     names = [method.spec.name for method in methods]
+    for change, kind in (
+        (config.clip, "clip"),
+        *((getattr(c, k), k) for c in config.conditions for k in KINDS),
+    ):
+        resolve_change(change, kind)
     for condition in config.conditions:
-        check_name(condition.name or "plain", "settings", "name of a condition")
         for name in condition.methods:
             if name not in names:
                 raise unknown("settings", f"conditions, methods of {condition.name}", name, names)
-    cells = []
+    cells, labels = [], set()
     for asked, method in zip(config.methods, methods):
         for condition in config.conditions:
             if not condition.applies_to(method.spec.name):
@@ -249,8 +257,42 @@ def resolve_cells(config: RunConfig) -> list[tuple[ResolvedMethod, Condition]]:
                 settings = merge(config.settings.get(spec.name, {}), condition.settings)
                 changed = resolve_method(spec, config.preset, settings)
                 changed = replace(changed, spec=replace(changed.spec, name=method.spec.name))
+            label = check_name(label_of(method.spec.name, condition.name), "settings", "method and condition")
+            if label in labels:
+                raise InputError("settings", "conditions", "another name for a method or a condition", label)
+            labels.add(label)
             cells.append((replace(changed, budget=condition.part_of(changed.budget)), condition))
     return cells
+
+
+KINDS = ("clip", "derive", "drive")
+
+
+def resolve_change(change: Named, kind: str) -> Callable[..., Any]:
+    """The function of a registered change with its parameters, the identity for no change.
+
+    Raises `InputError` for a change that is not registered or of another kind, and for parameters that it does not take.
+    """
+    if not change:
+        return lambda value, *others: value
+    where = f"conditions, {change.name}"
+    spec: ConditionSpec = get("conditions", change.name)
+    if spec.kind != kind:
+        raise InputError(where, "kind", f"a change of kind {kind!r}", f"one of kind {spec.kind!r}")
+    function = resolve(spec.implementation)
+    signature = inspect.signature(function).parameters.values()
+    given = [parameter.name for parameter in signature if parameter.kind != parameter.KEYWORD_ONLY]
+    arguments = build_arguments(function, change.parameters, where, harness=given)
+    lacking = [
+        parameter.name
+        for parameter in signature
+        if parameter.kind == parameter.KEYWORD_ONLY
+        and parameter.default is parameter.empty
+        and parameter.name not in arguments
+    ]
+    if lacking:
+        raise InputError(where, f"parameters.{lacking[0]}", "a value", "nothing")
+    return partial(function, **arguments)
 
 
 def resolve_method(spec: MethodSpec, preset: str, settings: Mapping[str, Any]) -> ResolvedMethod:

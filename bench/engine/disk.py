@@ -7,9 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
+from ..errors import InputError
 from ..io.files import output_inside, refuse_links
-from ..io.lock import locked
-from .store import RunFolder
+from ..io.lock import LOCK_FILE, is_locked, locked
+from .store import Cell, RunFolder
 
 Kind = Literal["avatars", "renders", "checkpoints", "damaged", "logs", "other"]
 Deletable = Literal["renders", "checkpoints", "damaged", "logs"]
@@ -42,6 +43,10 @@ def clean(run: Path, kinds: Sequence[Deletable]) -> int:
     freed = 0
     with locked(run), output_inside(run):
         refuse_links(run)
+        for lock in sorted(run.rglob(LOCK_FILE)):
+            if lock.parent != run and is_locked(lock.parent):
+                expected = "a folder that no other process works in"
+                raise InputError(lock, "", expected, "a lock", "Wait for it to end.")
         for path, kind in list(_files(run)):
             if kind in kinds:
                 freed += path.lstat().st_size
@@ -60,25 +65,28 @@ def clean(run: Path, kinds: Sequence[Deletable]) -> int:
 
 
 def _files(run: Path) -> Iterator[tuple[Path, Kind]]:
+    """Files of a run and their kinds; those of runs inside it, such as a sweep, are of the kind "other"."""
+    inner = {path.parent for path in run.rglob("run.json")} - {run}
     for path in sorted(run.rglob("*")):
         if path.is_file() and not path.is_symlink():
-            yield path, _kind(path.relative_to(run))
+            yield path, "other" if inner & {*path.parents} else _kind(run, path.relative_to(run))
 
 
-def _kind(place: Path) -> Kind:
+def _kind(run: Path, place: Path) -> Kind:
     # SUBJECT/METHOD/seed-N/..., see `store`.
-    inside = place.parts[3:] if len(place.parts) > 3 and place.parts[2].startswith("seed-") else ()
-    if place.suffix == ".log" or place.parts[0] == "jobs":
-        return "logs"
-    if not inside:
-        return "other"
-    if inside[0] == "renders":
-        return "renders"
-    if inside[0].startswith("avatar-damaged-"):
-        return "damaged"
-    if place.name.startswith("checkpoint"):
-        return "checkpoints"
-    return "avatars" if inside[0] == "avatar" else "other"
+    if len(place.parts) > 3 and place.parts[2].startswith("seed-"):
+        inside = place.parts[3:]
+        if place.suffix == ".log":
+            return "logs"
+        if inside[0] == "renders":
+            return "renders"
+        if inside[0].startswith("avatar-damaged-"):
+            return "damaged"
+        trained = Cell(run.joinpath(*place.parts[:3])).ended("fit")
+        if place.name.startswith("checkpoint") and not trained:
+            return "checkpoints"
+        return "avatars" if inside[0] == "avatar" else "other"
+    return "logs" if place.suffix == ".log" or place.parts[0] == "jobs" else "other"
 
 
 def shown(size: float) -> str:

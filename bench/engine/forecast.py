@@ -48,6 +48,7 @@ def forecast(jobs: Sequence[Job], runs: Sequence[Path]) -> Findings:
     for job in jobs:
         trained = job.cell.is_done("fit", job.fit_fingerprint)
         state = "done" if trained and job.cell.ended("measure") else "trained" if trained else "to train"
+        trained = trained or job.source is not None
         cost = Cost(0.0, 0.0, 0.0) if state == "done" else _estimate(job, known, trained)
         total = Cost(_sum(total.seconds, cost.seconds), _sum(total.disk, cost.disk), _most(total, cost))
         lines.append(f"{job.name:<40} {state:<9} {_text(cost)}")
@@ -60,8 +61,6 @@ def forecast(jobs: Sequence[Job], runs: Sequence[Path]) -> Findings:
 
 def _trained(run: Path) -> Iterator[_Known]:
     folder = RunFolder(run)
-    if not folder.manifest.is_file():
-        return
     manifest: Manifest = folder.read_manifest()
     frames = sum(len(protocol.keys) for protocol in manifest.protocols.values())
     for record in manifest.methods:

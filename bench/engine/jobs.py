@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..io.files import atomic_path, digest, output_inside
 from ..protocol import Protocol, protocol_name
 from ..rows import Rows
-from ..specs import MetricSpec
+from ..specs import MethodSpec, MetricSpec
 from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
 from .captures import changed, open_run_clips, run_configuration
@@ -133,13 +133,22 @@ def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
 
     If the cell's condition animates the avatar, that change replaces the last two stages.
     """
-    if job.condition.drive and (kept := stored_rows(job, metrics, retry=True)) is not None:
+    if job.source is not None and (kept := stored_rows(job, metrics, retry=True)) is not None:
         return kept
     avatar = fit(job) if job.source is None else derive(job)
     if job.condition.drive:
         return drive(job, avatar)
     render(job, avatar)
     return measure(job, avatar, metrics)
+
+
+def check_programs(folder: RunFolder, methods: Sequence[MethodSpec], *, trust: bool) -> None:
+    """Refuse methods that run a program which a run folder names, unless the caller trusts who made the run."""
+    programs = [method.name for method in methods if not method.native]
+    if programs and not trust:
+        expected = "methods that run no program which the run folder names"
+        remedy = "Give --trust to run it, if you trust who made the run; or name other methods."
+        raise InputError(folder.manifest, "configuration.settings", expected, ", ".join(programs), remedy)
 
 
 def trained(
@@ -175,6 +184,7 @@ def trained(
     wanted = [(m, c) for m, c in resolved if (m.spec.name in methods if methods else not m.spec.trivial)]
     if not wanted:
         raise InputError(folder.manifest, "methods", "a method that is no trivial baseline", ", ".join(names))
+    check_programs(folder, [method.spec for method, _ in wanted], trust=options.trust)
     config, clips = open_run_clips(run, options, out=out, only=only)
     jobs = make_jobs(config, wanted, clips, {}, folder, out)
     for job in jobs:

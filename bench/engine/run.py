@@ -173,7 +173,7 @@ def _planned(
         if not all(folder.cell(subject, label, seed).ended("measure") for subject, seed in places):
             check_settings([(method, condition)])
     if config.drive:
-        driven = make_jobs(config, cells, clips, {}, folder)
+        driven = make_jobs(config, cells, clips, {}, folder, out)
         spec: ConditionSpec = get("conditions", config.drive.name)
         protocols: dict[str, Protocol] = resolve(spec.protocols)(driven, **config.drive.parameters)
     else:
@@ -194,7 +194,8 @@ def planned_jobs(config: RunConfig) -> list[Job]:
     with TemporaryDirectory() as scratch:
         clips = open_clips(replace(config, out=scratch))
         metrics = resolve_metrics(config)
-        return _planned(config, resolve_cells(config), metrics, folder, clips, Path(scratch))[2]
+        forms = replace(config, out=scratch)
+        return _planned(forms, resolve_cells(config), metrics, folder, clips, Path(scratch))[2]
 
 
 def grown(config: RunConfig, folder: RunFolder, *, trust: bool = False) -> RunConfig:
@@ -219,9 +220,11 @@ def grown(config: RunConfig, folder: RunFolder, *, trust: bool = False) -> RunCo
     if more := sorted({*every} - {*before} - {*asked}):
         text = ", ".join(f"{method} seed {seed}" for method, seed in more)
         log.warning("A run has every method with every seed; this one gets %s, too.", text)
-    for name in ("preset", "device", "divide", "clip", "source"):
+    source = (folder.read_manifest().paths or {}).get("source")
+    places = [earlier.source, *([] if source is None else [str(folder.root / source)])]
+    for name in ("preset", "device", "divide", "clip", "source", "drive"):
         then, now = getattr(earlier, name), getattr(config, name)
-        if then != now and not (name == "source" and _same_place(then, now)):
+        if then != now and not (name == "source" and any(_same_place(place, now) for place in places)):
             raise InputError(
                 folder.manifest, f"configuration.{name}", f"{then}, as in this run", str(now), DISCARD
             )
@@ -235,12 +238,15 @@ def grown(config: RunConfig, folder: RunFolder, *, trust: bool = False) -> RunCo
         if before_methods is not None:
             both = () if () in (before_methods, condition.methods) else (*before_methods, *condition.methods)
             named[condition.name] = replace(condition, methods=tuple(dict.fromkeys(both)))
+    # What is named in this call has the settings of this call: they may be those of programs.
+    asked_names = {get("methods", name).name for name in config.methods}
+    others = {name: values for name, values in earlier.settings.items() if name not in asked_names}
     frames = (earlier.frames_per_task, config.frames_per_task)
     return replace(
         config,
         **union,
         conditions=tuple(named.values()),
-        settings={**earlier.settings, **config.settings},
+        settings={**others, **config.settings},
         frames_per_task=None if None in frames else max(frames),  # type: ignore[type-var]
     )
 
@@ -361,8 +367,7 @@ def describe(
         configuration=config,
         paths=relative_paths(config),
         methods=tuple(
-            MethodRecord(**method.record(), condition=condition.name, change=condition.summary)
-            for method, condition in cells
+            MethodRecord(**method.record(), condition=condition.name) for method, condition in cells
         ),
         metrics=tuple(metrics),
         clips=tuple(

@@ -80,7 +80,7 @@ def measure_speed_again(
     with locked(folder.root), log_to_file(folder.root / "run.log"):
         jobs, metrics = _jobs(folder, options, methods)
         folder.read_rows(folder.read_manifest())
-        rows = Rows.read(folder.rows)
+        rows = folder.rows_by_condition(folder.read_manifest())
         changes: list[Change] = []
         failures: dict[str, str] = {}
         left_out = [job.name for job in jobs if _failed(rows, job)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import math
 import time
@@ -29,20 +30,21 @@ from ..contracts import (
     Progress,
 )
 from ..errors import HeadbenchError, InputError, UnavailableError, is_damage
+from ..io.documents import read_json
 from ..io.files import digest, digest_file, grouped_writes, refuse_links, write_text
 from ..io.images import quantise, read_png, write_png
 from ..machine import PeakMemory, ProcessorLoad, machine_name, processor_seconds, use_device
 from ..progress import RunProgress, duration, progress
 from ..protocol import Protocol
-from ..registry import get, resolve
+from ..registry import get
 from ..rows import ALL, Row, Rows
 from ..source import code_digest, is_outside
 from ..specs import ConditionSpec, MetricSpec
 from .adaptation import AdaptedClip, TrainingView
-from .config import ResolvedMethod, RunConfig
+from .config import ResolvedMethod, RunConfig, resolve_change
 from .scoring import FULL, ScoredFrames, make_metric, score_frames
 from .store import Cell, StepState, avatar_files
-from .stored import shown_by, training_losses, write_avatar_record
+from .stored import AVATAR_FILE, shown_by, training_losses, write_avatar_record
 
 log = logging.getLogger(__name__)
 RESULT_FORMAT = 1  # raise when the output of a step changes
@@ -130,6 +132,8 @@ class Job:
         """
         refuse_links(self.cell.folder)
         self.cell.drop_damaged_records()
+        if self.source is not None:
+            source_digest(self)
         state = self.cell.step("fit")
         if state is None or state.get("fingerprint") == self.fit_fingerprint:
             return
@@ -253,22 +257,41 @@ def write_losses(job: Job) -> None:
             writer.add_scalar("loss", loss, iteration)
 
 
+def source_digest(job: Job) -> str:
+    """Digest of the trained avatar of the job's ``source``.
+
+    Raises `InputError` where there is none, and for one that was trained with other settings or on another capture.
+    """
+    assert job.source is not None
+    state, path = job.source.step("fit"), job.source.folder / "fit.json"
+    if state is None or state["status"] != "done":
+        found = "none" if state is None else "one whose training did not end"
+        raise InputError(path, "", "a trained avatar", found, "Start the run again.")
+    own = json.loads(json.dumps(job.method.record()["config"]))
+    if "config" in state.get("method", {}) and state["method"]["config"] != own:
+        expected = "an avatar of the settings of this run"
+        raise InputError(
+            path, "method.config", expected, "one of other settings", "Give the settings of the source."
+        )
+    record = job.source.avatar / AVATAR_FILE
+    capture = read_json(record).get("origin", {}).get("capture") if record.is_file() else None
+    if capture not in (None, job.form.clip.fingerprint):
+        raise InputError(record, "origin.capture", "an avatar of this capture", "one of another")
+    return digest(state["fingerprint"], state.get("files"))
+
+
 def derive(job: Job) -> Avatar:
     """Use the avatar of the job's ``source``, or the one that the condition derives from it without training.
 
     Raises `InputError` if the source has no trained avatar.
     """
     assert job.source is not None
-    state = job.source.step("fit")
-    if state is None or state["status"] != "done":
-        found = "none" if state is None else "one whose training did not end"
-        raise InputError(job.source.folder, "fit.json", "a trained avatar", found, "Start the run again.")
-    derived_from = digest(state["fingerprint"], state.get("files"))
+    derived_from = source_digest(job)
     change, clip = job.condition.derive, job.form.clip
     if change:
-        spec: ConditionSpec = get("conditions", change.name)
-        avatar: Avatar = resolve(spec.implementation)(
-            job.method.spec, job.source.avatar, job.cell.avatar, clip, job.device, **change.parameters
+        make = resolve_change(change, "derive")
+        avatar: Avatar = make(
+            job.method.spec, job.source.avatar, job.cell.avatar, TrainingView(clip), job.device
         )
         origin = {"variant": job.condition.name, "of": derived_from}
         write_avatar_record(job.cell.avatar, job.method, *shown_by(clip), "variant", origin)
@@ -285,9 +308,8 @@ def drive(job: Job, avatar: Avatar) -> Rows:
     The record has the details of the change, and digests of its files by their place in the run folder.
     """
     change = job.condition.drive
-    spec: ConditionSpec = get("conditions", change.name)
     with job.progress(RENDERING) as report:
-        rows, details, files = resolve(spec.implementation)(job, avatar, report, **change.parameters)
+        rows, details, files = resolve_change(change, "drive")(job, avatar, report)
     rows.write(job.cell.rows)
     job.cell.finish(
         "measure",
@@ -552,6 +574,8 @@ def stored_rows(job: Job, metrics: Sequence[MetricSpec], *, retry: bool = False)
         return _driven_before(job, retry)
     fitted = job.cell.step("fit")
     made_of = digest(job.fit_fingerprint, _avatar_record(job))
+    if job.source is not None and fitted is not None and fitted.get("derived_from") != source_digest(job):
+        return None
     if fitted is None or not job.cell.is_done("fit", job.fit_fingerprint):
         return None
     if not job.cell.is_done(DIGESTS, made_of) or job.cell.damage(fitted.get("files", {})):

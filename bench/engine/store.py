@@ -261,9 +261,9 @@ class RunFolder:
         earlier = earlier_rows(self.rows)
         if earlier is None:
             return
-        earlier.check_kept(
+        earlier.labelled().check_kept(
             self.rows,
-            method=dict.fromkeys(method.name for method in planned.methods),
+            method=[method.label for method in planned.methods],
             seed=planned.configuration.seeds,
             metric=[metric.name for metric in planned.metrics],
         )
@@ -288,6 +288,11 @@ class RunFolder:
         if not self.manifest.exists():
             raise InputError(self.root, "run.json", "the folder of a run", "no run.json")
         return Manifest.read(self.manifest)
+
+    def rows_by_condition(self, manifest: Manifest) -> Rows:
+        """Read ``rows.parquet`` with methods and conditions in columns of their own."""
+        changed = {m.label: (m.name, m.condition) for m in manifest.methods if m.condition}
+        return Rows.read(self.rows).split(changed)
 
     def read_rows(self, manifest: Manifest) -> Rows:
         """Read ``rows.parquet``, each method under a condition by its label, see `Rows.labelled`.

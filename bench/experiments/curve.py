@@ -13,10 +13,11 @@ from ..condition import Condition, Named
 from ..contracts import Budget, Clip, Progress, no_progress
 from ..engine.captures import open_run_clips, run_configuration
 from ..engine.config import ResolvedMethod, resolve_methods
+from ..engine.jobs import check_programs
 from ..engine.run import run_locked
-from ..engine.store import RunFolder
+from ..engine.store import Cell, RunFolder
 from ..errors import InputError
-from ..io.files import check_kind, output_inside
+from ..io.files import check_kind, output_inside, refuse_links
 from ..io.lock import locked
 from ..registry import get, resolve
 from ..specs import Findings
@@ -41,7 +42,7 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Find
         method or the method has no budget, or a capture differs from the run's or has too few frames
         to hold some out.
     """
-    source = RunFolder(Path(settings.run))
+    execution, source = settings.execution, RunFolder(Path(settings.run))
     manifest = source.read_manifest()
     manifest.check_done(source.manifest)  # before a folder is created
     if manifest.configuration.clip or manifest.configuration.source:
@@ -69,8 +70,9 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Find
         clips: list[Clip] = [hold_out(clip, config, **held.parameters) for clip in opened]
         tasks = tuple(task for task in (CAMERA, TIMESTEPS) if all(task in clip.splits for clip in clips))
         config = replace(config, tasks=tasks, conditions=tuple(conditions(settings, wanted, clips)))
+        refuse_links(out)
         _drop_interrupted(out)
-        run_locked(config, settings.execution, trust=settings.trust, clips=clips, reports=False)
+        run_locked(config, execution, trust=settings.trust, clips=clips, reports=False)
         found: Findings = resolve(get("reports", "curve").implementation)(out, settings.over)
         return found
 
@@ -106,7 +108,7 @@ def conditions(
         count = tuple(count_of(whole, text) for whole in wholes)
         if count not in counts:
             counts.add(count)
-            yield Condition(_named(text), clip=Named(settings.over, {"part": text}))
+            yield Condition(f"{settings.over}-{_named(text)}", clip=Named(settings.over, {"part": text}))
 
 
 def _named(text: str) -> str:
@@ -142,19 +144,14 @@ def _wanted(settings: CurveSettings, source: RunFolder) -> list[ResolvedMethod]:
             key, expected = f"budget of {method.spec.name}", "iterations or seconds, to train with a part of"
             remedy = "Name other methods with --methods."
             raise InputError(source.manifest, key, expected, "none", remedy)
-    programs = [method.spec.name for method in wanted if not method.spec.native]
-    if programs and not settings.trust:
-        expected = "methods that run no program which the run folder names"
-        remedy = "Give --trust to run it, if you trust who made the run; or name other methods."
-        raise InputError(source.manifest, "configuration.settings", expected, ", ".join(programs), remedy)
+    check_programs(source, [m.spec for m in wanted], trust=settings.trust)
     return wanted
 
 
 def _drop_interrupted(out: Path) -> None:
     """Remove files of interrupted trainings, so that they start over and their time is known."""
     for record in sorted(out.glob("*/*/seed-*/fit.json")):
-        cell = RunFolder(out).cell(record.parents[2].name, record.parents[1].name, 0)
-        cell = replace(cell, folder=record.parent)
+        cell = Cell(record.parent)
         state = cell.step("fit")
         if state is not None and state["status"] != "done":
             if cell.avatar.exists():

@@ -8,6 +8,7 @@ from typing import Literal
 
 import tyro
 
+from ..condition import part_of_text
 from ..engine.config import RunOptions
 from ..executors.options import ExecutionOptions
 from ..options import DependentOptions
@@ -83,10 +84,4 @@ class CurveSettings(RunOptions, ExecutionOptions):
 
 
 def _part(text: str) -> Fraction:
-    try:
-        part = Fraction(text)
-    except (ValueError, ZeroDivisionError):
-        part = Fraction(0)
-    if not 0 < part <= 1:
-        raise ValueError(f"fractions: {text!r} is no number above 0 and at most 1, such as 1/4 or 0.25")
-    return part
+    return part_of_text(text, "fractions")

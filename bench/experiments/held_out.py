@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from fractions import Fraction
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from ..condition import part_of_text
 from ..contracts import (
     ByteArray,
     Camera,
@@ -86,6 +86,8 @@ def hold_out(clip: Clip, config: RunConfig | None = None, *, camera: str = "", e
     """
     train = clip.splits["train"]
     where = f"clip {clip.subject}"
+    if every < 2:
+        raise InputError(where, "every", "a whole number from 2", str(every))
     cameras = sorted({key.camera for key in train})
     if camera and camera not in cameras:
         raise InputError(where, "camera", f"a training camera: {', '.join(cameras)}", repr(camera))
@@ -137,7 +139,10 @@ def fewer_timesteps(clip: Clip, config: RunConfig | None = None, *, part: str) -
 
 def count_of(whole: int, part: str) -> int:
     """Number of items in a part of a total, at least one."""
-    return max(1, round(whole * Fraction(part)))
+    try:
+        return max(1, round(whole * part_of_text(part, "part")))
+    except ValueError as error:
+        raise InputError("conditions", "part", "a part above 0 and at most 1", str(error)) from error
 
 
 def _reduced(clip: Clip, what: str, chosen: Sequence[Any]) -> Clip:

@@ -45,13 +45,13 @@ def reenact_run(settings: ReenactSettings, progress: Progress = no_progress) -> 
 
 def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) -> Findings:
     """Run the plan in the folder of the task; write the record and the report."""
-    source = RunFolder(Path(settings.run))
+    execution, source = settings.execution, RunFolder(Path(settings.run))
     source.read_manifest()  # before a folder is created
     out = Path(settings.out) if settings.out else source.root / task
     check_kind(out, "a run")
     with nullcontext() if settings.out else output_inside(source.root), locked(out):
         config, jobs = trained(source.root, settings.methods, settings, out)
-        check_executor(settings.execution, config.device)
+        check_executor(execution, config.device)
         names = {job.method.spec.name for job in jobs}
         config = replace(
             config,
@@ -62,7 +62,7 @@ def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) ->
             source=settings.run,
         )
         clips = list({job.clip.subject: job.clip for job in jobs}.values())
-        rows = run_locked(config, settings.execution, trust=settings.trust, clips=clips, reports=False)
+        rows = run_locked(config, execution, trust=settings.trust, clips=clips, reports=False)
         _write_record(out, drive, rows, settings.others)
         shown: Findings = resolve(get("reports", "robustness").implementation)(out)
         return shown

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..condition import PLAIN, Condition, Named
 from ..contracts import Avatar, Clip, Progress, no_progress
+from ..engine.adaptation import TrainingView
 from ..engine.config import default_names
 from ..engine.jobs import trained
 from ..engine.run import run_locked
@@ -32,7 +33,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
     InputError
         The folder is not a finished run, a method derives no variants, or no method has the variant.
     """
-    source = RunFolder(Path(settings.run))
+    execution, source = settings.execution, RunFolder(Path(settings.run))
     source.read_manifest()  # before a folder is created
     out = Path(settings.out) if settings.out else source.root / "sweep"
     check_kind(out, "a run")
@@ -46,7 +47,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
         methods: dict[str, dict[str, None]] = {}
         for job in able:
             derive = resolve(job.method.spec.variants)
-            for variant in derive(job.cell.avatar, job.form.clip, job.device):
+            for variant in derive(job.cell.avatar, TrainingView(job.form.clip), job.device):
                 name = check_name(variant.name, job.method.spec.variants, "name of a variant")
                 methods.setdefault(name, {})[job.method.spec.name] = None
         for name in settings.variants:
@@ -71,7 +72,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
             source=settings.run,
         )
         clips = list({job.clip.subject: job.clip for job in able}.values())
-        run_locked(config, settings.execution, trust=settings.trust, clips=clips, reports=False)
+        run_locked(config, execution, trust=settings.trust, clips=clips, reports=False)
         shown: Findings = resolve(get("reports", "pareto").implementation)(
             (str(out),), out, settings.task, settings.metric, settings.time
         )

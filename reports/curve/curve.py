@@ -49,6 +49,7 @@ def curve_report(out: Path, over: str) -> Findings:
         _point(run, record, conditions[record.condition], clip)
         for record in run.manifest.methods
         for clip in run.manifest.clips
+        if conditions[record.condition].clip.name == ("" if over == "budget" else over.replace("_", "-"))
     ]
     names = list(dict.fromkeys(point.method for point in points))
     order = [clip.subject for clip in run.manifest.clips]

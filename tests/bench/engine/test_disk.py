@@ -15,7 +15,10 @@ from headbench.bench.engine.disk import clean, usage
 from headbench.bench.engine.forecast import forecast
 from headbench.bench.engine.run import planned_jobs
 from headbench.bench.engine.steps import reason_of
+from headbench.bench.errors import InputError
+from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
+from headbench.bench.io.lock import locked
 
 
 def total(run):
@@ -45,9 +48,26 @@ def test_avatars_set_aside_and_checkpoints_are_deleted(config):
     (cell / "avatar-damaged-1").mkdir()
     (cell / "avatar-damaged-1" / "level.txt").write_text("0.5")
     (cell / "avatar" / "checkpoint.safetensors").write_bytes(b"12345")
-    assert clean(run, ("damaged", "checkpoints")) == 8
+    assert clean(run, ("damaged", "checkpoints")) == 3  # a finished avatar keeps what its method wrote
     assert not (cell / "avatar-damaged-1").exists()
     assert (cell / "avatar" / "level.txt").exists()
+    write_json(cell / "fit.json", {**read_json(cell / "fit.json"), "status": "started"})
+    assert clean(run, ("checkpoints",)) == 5
+
+
+def test_a_subject_called_jobs_and_runs_inside_are_no_logs(config, tmp_path):
+    run = Path(config.out)
+    runner.run(config)
+    (subject,) = {path.parents[2].name for path in run.glob("*/toy/seed-0/fit.json")}
+    (run / subject).rename(run / "jobs")
+    inner = run / "sweep" / "subject1" / "toy" / "seed-0"
+    inner.mkdir(parents=True)
+    (run / "sweep" / "run.json").write_text("{}")
+    (inner / "job.log").write_text("log")
+    assert clean(run, ("logs",)) == 0
+    assert (run / "jobs" / "toy" / "seed-0" / "fit.json").exists()
+    with locked(run / "sweep"), pytest.raises(InputError, match="no other process works in"):
+        clean(run, ("logs",))
 
 
 def test_status_shows_the_disk_and_cleans(config, capsys):

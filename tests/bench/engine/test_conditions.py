@@ -1,0 +1,124 @@
+"""Conditions of a run: what is refused before any work, and what a later call may take from a run folder."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from headbench.bench.condition import PLAIN, Condition, Named
+from headbench.bench.configuration import build
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.config import RunConfig, resolve_cells
+from headbench.bench.engine.store import RunFolder
+from headbench.bench.errors import InputError
+from headbench.bench.io.documents import read_json
+from headbench.bench.io.files import write_json
+
+
+def clip(name, /, **parameters):
+    return Condition("c", clip=Named(name, parameters))
+
+
+@pytest.mark.parametrize(
+    ("condition", "match"),
+    [
+        (clip("cameras"), "conditions, cameras, parameters.part: expected a value"),
+        (clip("cameras", part=[1]), "part: expected text"),
+        (clip("cameras", prt="1/2"), "Did you mean 'part'"),
+        (clip("cameras", config="x"), "config"),
+        (clip("variant", name="x"), "expected a change of kind 'clip', found one of kind 'derive'"),
+        (clip("camera", part="1/2"), "Did you mean 'cameras'"),
+        (Condition("c", methods=("other",)), "methods of c"),
+        (Condition("a/b"), "without slashes"),
+        (Condition("x" * 118), "of 1 to"),
+        (Condition("c", settings={"levle": 1}), "Did you mean 'level'"),
+    ],
+)
+def test_a_condition_that_cannot_be_had_is_refused(config, toy, condition, match):
+    with pytest.raises(InputError, match=match):
+        runner.run(replace(config, conditions=(PLAIN, condition)))
+    assert toy.FITS == []
+    assert not Path(config.out).exists()
+
+
+@pytest.mark.parametrize(
+    ("values", "match"),
+    [
+        ({"conditions": []}, "at least one"),
+        ({"conditions": [{}, {}]}, "each name once"),
+        ({"conditions": [{"budget": "1/2"}]}, "a name for each"),
+        ({"conditions": [{"name": "c", "budget": "2"}]}, "above 0 and at most 1"),
+        ({"conditions": [{"name": "c", "budget": "1/0"}]}, "above 0 and at most 1"),
+        ({"conditions": [{"name": "c", "budget": "1e-999999999"}]}, "above 0 and at most 1"),
+        ({"conditions": [{"name": "c", "derive": {"name": "variant"}}]}, "source has to name"),
+        ({"conditions": [{"name": "c", "budget": "1/2"}], "source": "run"}, "nothing is trained"),
+        ({"conditions": [{"name": "c", "clip": {"name": "cameras"}}], "source": "run"}, "nothing is trained"),
+        ({"conditions": "c"}, "a group of settings"),
+    ],
+)
+def test_conditions_that_are_none_are_refused(values, match):
+    with pytest.raises(InputError, match=match):
+        build(RunConfig, {"data": "d", "out": "o", **values}, "file.yaml")
+
+
+def test_a_part_of_the_clip_out_of_range_fails_its_cell(config):
+    rows = runner.run(replace(config, conditions=(PLAIN, clip("hold-out", every=8))))
+    assert rows.failed == []
+    with pytest.raises(InputError, match="every: expected a whole number from 2"):
+        runner.run(replace(config, out=f"{config.out}-2", conditions=(clip("hold-out", every=0),)))
+
+
+def test_an_avatar_of_other_settings_is_no_source(config, toy):
+    runner.run(config)
+    driven = replace(config, out=f"{config.out}-2", source=config.out)
+    assert runner.run(driven).failed == []
+    settings = {"toy": {"level": 0.9}}
+    with pytest.raises(InputError, match="expected an avatar of the settings of this run"):
+        runner.run(replace(driven, out=f"{config.out}-3", settings=settings))
+
+
+def test_a_method_that_is_named_again_has_the_settings_of_this_call(config):
+    runner.run(replace(config, settings={"toy": {"level": 0.1}}))
+    with pytest.raises(InputError, match="fingerprint"):
+        runner.run(config)
+
+
+def test_labels_of_methods_and_conditions_do_not_collide(config, toy, monkeypatch):
+    plus = replace(toy.MIRROR, name="toy+dim")
+    monkeypatch.setattr(toy, "MIRROR", plus)
+    both = replace(config, methods=("toy_plugin:METHOD", "toy_plugin:MIRROR"))
+    with pytest.raises(InputError, match="another name for a method or a condition"):
+        resolve_cells(replace(both, conditions=(PLAIN, Condition("dim", ("toy",), {"level": 0.1}))))
+
+
+def test_conditions_are_not_lost_with_a_damaged_record(config, toy):
+    dim = Condition("dim", ("toy",), {"level": 0.1})
+    runner.run(replace(config, conditions=(PLAIN, dim)))
+    folder = RunFolder(Path(config.out))
+    rows = folder.rows.read_bytes()
+    folder.manifest.write_text("")
+    toy.FITS.clear()
+    with pytest.raises(InputError, match=r"without toy\+dim"):
+        runner.run(config)
+    assert toy.FITS == []
+    assert folder.rows.read_bytes() == rows
+
+
+def test_rows_and_record_of_version_1_are_read_by_their_labels(config):
+    """Names with a mark are methods where the record says nothing of a sweep or a curve."""
+    runner.run(replace(config, conditions=(PLAIN, Condition("dim", ("toy",), {"level": 0.1}))))
+    folder = RunFolder(Path(config.out))
+    new = folder.read_manifest()
+    record = read_json(folder.manifest)
+    for method in record["methods"]:
+        method["name"] += f"+{method.pop('condition')}" if "condition" in method else ""
+    del (
+        record["configuration"]["conditions"],
+        record["configuration"]["clip"],
+        record["configuration"]["source"],
+    )
+    write_json(folder.manifest, {**record, "format": 1, "curve_of": "somewhere"})
+    assert folder.read_manifest().methods == new.methods
+    write_json(folder.manifest, {**record, "format": 1})
+    assert [method.label for method in folder.read_manifest().methods] == ["toy", "toy+dim"]
+    assert {method.condition for method in folder.read_manifest().methods} == {""}
