@@ -1,4 +1,4 @@
-"""From rows to one number per method, task and metric, or the reason why there is none."""
+"""Aggregates rows to one number per method, task and metric, or the reason why it is missing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..bench.rows import ALL, FRAME, Rows
 
 @dataclass(frozen=True)
 class Aggregate:
-    """A mean, or why there is none (``value`` None, ``reason`` says it).
+    """A mean; if it is missing, ``value`` is None and ``reason`` states why.
 
     ``spread`` is the standard deviation of the mean from seed to seed; None with one seed.
     """
@@ -31,7 +31,7 @@ def whole_images(rows: Rows, method: str, metric: str, task: str) -> pd.DataFram
 
 
 def summarise(rows: Rows, method: str, metric: str, task: str) -> Aggregate:
-    """Aggregate `whole_images`; ``rows`` of all methods say which frames (for ``task`` "": subjects) have to be there."""
+    """Aggregate `whole_images`; ``rows`` of all methods determine the frames (``task`` "": subjects)."""
     mine = whole_images(rows, method, metric, task)
     if mine.empty:
         own = rows.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
@@ -85,4 +85,7 @@ def _subject_means(rows: pd.DataFrame) -> dict[int, dict[str, float]]:
 def _reason(rows: pd.DataFrame) -> str:
     """The reason of the first row in a fixed order, as one line."""
     first = rows.sort_values(["seed", *FRAME]).iloc[0]
-    return " ".join(str(first["reason"]).split()) or f"The rows say {first['status']} and give no reason."
+    return (
+        " ".join(str(first["reason"]).split())
+        or f"The rows have the status {first['status']} without a reason."
+    )

@@ -1,4 +1,4 @@
-"""How busy the machine was, which it was and how many threads there were when the times of a table were measured."""
+"""Load, machine and number of threads during the measurement of the times in a table."""
 
 from __future__ import annotations
 
@@ -12,22 +12,25 @@ from ..bench.specs import MetricSpec
 from .aggregate import whole_images
 
 OTHERS_LIMIT = 0.1
-"""Cores that others may keep busy, all together, before a time is marked.
+"""Cores used by other processes in total above which a time is marked.
 
 A frame whose threads wait for each other takes at most a tenth longer where one of their cores is busy for a tenth of the time.
-As much lies between speeds that are measured one after another on an idle machine.
+Consecutive measurements on an idle machine differ as much.
 """
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Of the times of one method.
+    """Conditions under which the times of one method were measured.
 
     Attributes
     ----------
-    places : pairs of machine and number of threads; empty where they were not recorded.
-    others : the most cores that other processes kept busy, 0 where no load was recorded.
-    known : whether the load was recorded for all of them.
+    places : frozenset[tuple[str, int]]
+        Pairs of machine and number of threads; empty if they were not recorded.
+    others : float
+        Maximum number of cores used by other processes, 0 if no load was recorded.
+    known : bool
+        Whether the load was recorded for all of them.
     """
 
     places: frozenset[tuple[str, int]]
@@ -72,7 +75,7 @@ def conditions(
 def marks(
     found: Mapping[str, Mapping[str, Conditions]], trivial: Sequence[str]
 ) -> dict[tuple[str, str], str]:
-    """The note for each metric and method whose time does not compare with the others of its column."""
+    """The note for each metric and method whose time is not comparable with the others of its column."""
     notes = {}
     for metric, by_method in found.items():
         places = [each.places for method, each in by_method.items() if method not in trivial and each.places]
@@ -89,7 +92,7 @@ def marks(
 
 
 def note_of(by_method: Mapping[str, Conditions]) -> str:
-    """One line on times of methods that do not compare with each other, by `marks`; "" where all do."""
+    """One line on times of methods that are not comparable, by `marks`; "" if all are."""
     methods: dict[str, list[str]] = {}
     for (_, method), note in marks({"": by_method}, ()).items():
         methods.setdefault(note, []).append(method)

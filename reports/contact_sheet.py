@@ -44,12 +44,12 @@ def write_contact_sheet(run_folder: Path, frames_per_task: int = FRAMES_PER_TASK
 
 @dataclass(frozen=True)
 class ComparedFrame:
-    """One frame at the size it is shown, ``section`` being the heading under which it stands."""
+    """One frame at the size it is shown, ``section`` is its heading."""
 
     section: str
-    labels: Sequence[str]  # short lines beside it (sequence, timestep, camera)
+    labels: Sequence[str]  # short lines to its left (sequence, timestep, camera)
     ground_truth: ByteArray  # (H, W, 3) 8-bit
-    renders: Mapping[str, ByteArray | str]  # by method, of that size, or the reason why there is none
+    renders: Mapping[str, ByteArray | str]  # by method, of the same size, or the reason why it is missing
     errors: Mapping[
         str, FloatArray
     ]  # by method, (H, W) absolute difference in levels, mean over the channels
@@ -65,8 +65,9 @@ class ComparedFrame:
         captions: Mapping[str, str],
         width: int = PANEL_WIDTH,
     ) -> ComparedFrame:
-        """Bring images to a width: wider ones are reduced to it (by area), narrower ones enlarged by a whole factor as
-        far as they fit, each pixel a square. Raises `InputError` for a render that has not the size of the ground truth.
+        """Resize images to a width: wider ones are reduced to it (by area), narrower ones enlarged by a whole
+        factor as far as they fit, each pixel a square. Raises `InputError` for a render that has not the size
+        of the ground truth.
         """
         height, own = ground_truth.shape[:2]
         factor = width // own or width / own
@@ -98,14 +99,17 @@ def contact_sheet(
     """Draw the sheet and write it as a PNG, atomically: ground truth, then a render and an error map for each method.
 
     Error maps are on one scale for the whole sheet: a round number at or above the 99th percentile of the errors.
-    Larger errors take the top colour.
+    Larger errors have the top colour.
 
     Parameters
     ----------
-    frames : at least one; those of one section are neighbours.
-    methods : columns, in order.
-    scaled_by : methods whose errors set the scale (default: all), so that a trivial baseline does not darken the
-        rest.
+    frames : Sequence[ComparedFrame]
+        Frames, at least one; frames of a section are consecutive.
+    methods : Sequence[str]
+        Columns, in order.
+    scaled_by : Sequence[str]
+        Methods whose errors set the scale (default: all), so that a trivial baseline does not darken
+        the others.
     """
     if not frames:
         raise InputError("contact sheet", "rows", "at least one frame", "none")

@@ -34,7 +34,7 @@ WHITE: ByteArray = np.full((12, 12, 3), 255, np.uint8)
 
 @dataclass(frozen=True)
 class Tile:
-    """An (H, W, 3) 8-bit image at the size it is shown, or the reason why there is none.
+    """An (H, W, 3) 8-bit image at the size it is shown, or the reason why it is missing.
 
     ``mark`` is the colour of a broad line around it; "" for a hairline (white images need an edge on white paper).
     """
@@ -63,7 +63,7 @@ class SheetSection:
 
 @dataclass
 class _Paper:
-    """White paper of fixed width that is written on downwards from the height ``y``; coordinates are pixels."""
+    """White page of fixed width, filled downwards from the height ``y``; coordinates are pixels."""
 
     width: int
     y: int = MARGIN
@@ -126,7 +126,7 @@ class _Paper:
         write_png(path, np.ascontiguousarray(pixels), COMPOSITE)
 
 
-@style.context("default")  # whatever the user's matplotlibrc says, such as text.usetex
+@style.context("default")  # independent of the user's matplotlibrc, such as text.usetex
 def write_sheet(
     path: Path,
     sections: Sequence[SheetSection],
@@ -142,10 +142,14 @@ def write_sheet(
 
     Parameters
     ----------
-    marks : legend of the colours around images: meaning by colour.
-    error_scale : level of the brightest colour of error maps and what follows it, for a colour bar.
-    pairs : keep columns 1 and 2, 3 and 4, ... closer together.
-    label_width : pixels for the labels left of the rows.
+    marks : Mapping[str, str] | None
+        Legend of the colours around images: meaning by colour.
+    error_scale : tuple[int, str] | None
+        Value of the brightest colour of error maps and the text after it, for a colour bar.
+    pairs : bool
+        Reduce the gap between columns 1 and 2, 3 and 4, ...
+    label_width : int
+        Width of the row labels on the left, pixels.
     """
     tiles = [tile for section in sections for row in section.rows for tile in row.tiles]
     width = max((t.picture.shape[1] for t in tiles if not isinstance(t.picture, str)), default=label_width)
@@ -204,7 +208,7 @@ def _colour_bar(paper: _Paper, top: int, more: str) -> None:
 
 
 def _characters(width: int, size: int) -> int:
-    """About how many characters of a text size go into a width, both pixels."""
+    """Approximate number of characters of a text size that fit into a width, both in pixels."""
     return max(2, int(width / (0.6 * size)))
 
 

@@ -1,4 +1,4 @@
-"""What plots of quality over a cost have in common: colours, legend, a note below and a logarithmic axis."""
+"""Shared elements of plots of quality over a cost: colours, legend, a note below and a logarithmic axis."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from matplotlib.ticker import LogLocator, NullLocator
 from ..bench.io.files import atomic_path
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's, which any colour vision separates."""
+"""Colours by Okabe and Ito, distinguishable with colour vision deficiency."""
 GREY, LIGHT_GREY = "#6e6e6e", "#cdcdcd"
 SMALL = 8
-"""Size of text beside plots, in points."""
+"""Size of text next to plots, in points."""
 
 
 @contextmanager
@@ -55,7 +55,7 @@ def start_axes(axes: Axes, title: str) -> None:
 
 
 def show_missing(axes: Axes, text: str) -> None:
-    """Say why a plot is empty."""
+    """Write the reason of an empty plot."""
     axes.text(0.5, 0.5, text, color=GREY, ha="center", va="center", transform=axes.transAxes)
     axes.set(xticks=[], yticks=[])
 

@@ -1,4 +1,4 @@
-"""Puts results into the README: the tables, the demo's picture, and the rows they are views of.
+"""Writes results into the README: the tables, the demo's picture, and their rows.
 
 python -m headbench.reports.readme demo demo-output README.md
 python -m headbench.reports.readme suite suite-output README.md
@@ -31,7 +31,7 @@ OURS = "ours"
 
 
 def publish_demo(out: Path, readme: Path) -> None:
-    """Copy manifest, rows and contact sheet of a run beside the README, and write the block made of them."""
+    """Copy manifest, rows and contact sheet of a run to the README's folder, and write its block."""
     target = RunFolder(readme.parent / GALLERY)
     _copy(RunFolder(out), target)
     # A page's picture, not a measurement: a lossy copy a third the size.
@@ -41,7 +41,7 @@ def publish_demo(out: Path, readme: Path) -> None:
 
 
 def publish_suite(out: Path, readme: Path) -> None:
-    """Copy manifest and rows of a suite's run beside the README, and write its tables and the block made of them."""
+    """Copy manifest and rows of a suite's run to the README's folder, and write its tables and block."""
     target = readme.parent / SUITE
     _copy(RunFolder(out / "run"), RunFolder(target / "run"))
     write_text(target / RESULTS, suite_results(target))
@@ -59,7 +59,7 @@ def _copy(source: RunFolder, target: RunFolder) -> None:
 
 
 def marks(name: str) -> tuple[str, str]:
-    """What stands before and after a block of the README."""
+    """Text before and after a block of the README."""
     return f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
 
 
@@ -94,7 +94,7 @@ def demo_block(gallery: Path) -> str:
 def _minutes(run_folder: Path) -> list[tuple[str, float | None]]:
     """Minutes of training of every method and subject that was trained; None of one that was interrupted.
 
-    Not the run's own length: of one that was continued it is that of its last part.
+    This is not the run's duration, which after a restart is that of its last part.
     """
     rows = Rows.read(RunFolder(run_folder).rows)
     trained = rows.select(method=ALL, condition=ALL, metric="training_time", task="", region=FULL, seeds=ALL)

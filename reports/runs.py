@@ -1,4 +1,4 @@
-"""Reads what reports show from a run folder, checked: rows, metrics, methods, protocols, renders, captured images."""
+"""Reads and checks run folders for reports: rows, metrics, methods, protocols, renders, images."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class RunData:
-    """A finished run, read; names in the order of its configuration. Images are read when asked for."""
+    """A finished run, read; names in the order of its configuration. Images are read on demand."""
 
     folder: RunFolder
     manifest: Manifest
@@ -40,7 +40,7 @@ class RunData:
 
     @property
     def metrics(self) -> tuple[MetricSpec, ...]:
-        """What was measured."""
+        """Metrics of the run."""
         return self.manifest.metrics
 
     @property
@@ -66,7 +66,7 @@ class RunData:
         return processor if device == "cpu" else f"{device}, {processor}"
 
     def keys(self, task: str) -> Sequence[FrameKey]:
-        """Frames of a task, sorted; none of a task that was not scored."""
+        """Frames of a task, sorted; empty for a task that was not scored."""
         return sorted(self.manifest.protocols[task].keys) if task in self.manifest.protocols else []
 
     @property
@@ -75,12 +75,12 @@ class RunData:
         return self.manifest.configuration.seeds[0]
 
     def render_path(self, method: str, task: str, key: FrameKey) -> Path | None:
-        """Where that seed's render of a frame lies, or None where there is none."""
+        """Path of that seed's render of a frame, or None if it is missing."""
         path = self.folder.cell(key.subject, method, self.seed).render(task, key)
         return path if path.is_file() else None
 
     def render(self, method: str, task: str, key: FrameKey) -> ByteArray | None:
-        """Read that render, (H, W, 3) 8-bit, or return None where there is none."""
+        """Read that render, (H, W, 3) 8-bit, or return None if it is missing."""
         from ..bench.io.images import read_png
 
         path = self.render_path(method, task, key)
@@ -91,7 +91,7 @@ class RunData:
         return self._clips[key.subject].image(key)
 
     def reason(self, method: str, task: str, key: FrameKey) -> str:
-        """Why a method has no render of a frame, as far as the rows know."""
+        """Reason why a method has no render of a frame, as far as it is recorded in the rows."""
         seeds = (self.seed,)
         own = self.rows.select(
             method=method, metric=ALL, task=task, region=FULL, seeds=seeds, subject=key.subject
@@ -100,12 +100,12 @@ class RunData:
         return "not rendered" if failed.empty else str(failed.iloc[0]["reason"])
 
     def value(self, metric: str, method: str, task: str, key: FrameKey) -> float | None:
-        """Return a metric of the whole image shown, or None where it was not measured."""
+        """Return a metric of the whole image shown, or None if it was not measured."""
         return self._by_frame.get((metric, method, task, *key))
 
     @property
     def image_size(self) -> str:
-        """Size of the rendered images, "width x height", or the range where they differ; "" without renders."""
+        """Size of the rendered images, "width x height", or the range if they differ; "" without renders."""
         from ..bench.io.images import probe_image
 
         first_of_camera = {
@@ -128,7 +128,7 @@ class RunData:
 
     @cached_property
     def _clips(self) -> dict[str, Clip]:
-        # Pictures are drawn by the run itself, in the process that loaded its plug-ins.
+        # The run itself draws pictures, in the process that loaded its plug-ins.
         config, opened = open_run_clips(self.folder.root, RunOptions(trust=True))
         clips = {clip.subject: clip for clip in opened}
         for entry in self.manifest.clips:
@@ -164,9 +164,10 @@ WHOLE = Part()
 class RunSet:
     """Runs on the same frames, in the order given. The methods in their ``rows`` are named by labels.
 
-    ``part`` says in words which part of the frames the rows are of, "" for all. ``records`` says by label what the method was, as in the manifest; ``trivial`` has labels of trivial baselines.
-    ``keys`` has the frames of each task by the protocol, those included that no method has a value of. ``shown`` has by
-    label the first run of the method and its name there, whose renders are shown.
+    ``part`` describes the part of the frames in the rows, "" for all. ``records`` has the method's entry of
+    the manifest by label; ``trivial`` has labels of trivial baselines. ``keys`` has the frames of each task
+    in the protocol, including those without values. ``shown`` has, by label, the first run of the method and
+    its name there, whose renders are shown.
     """
 
     runs: tuple[RunData, ...]
@@ -181,15 +182,17 @@ class RunSet:
 
     @classmethod
     def read(cls, folders: Sequence[Path], part: Part = WHOLE) -> RunSet:
-        """Read runs, or a part of their frames. The same method with the same settings and other seeds is one method with more seeds.
+        """Read runs, or a part of their frames.
 
-        With other settings it is another, named after the settings that differ ("ours (dynamic=opacity)"), or after
-        the folders where that would be too long.
+        Seeds of the same method with the same settings are merged. A method with other
+        settings is a separate one, named after the settings that differ ("ours (dynamic=opacity)"), or after
+        the folders if that is too long.
 
         Raises
         ------
-        InputError : runs that do not score the same frames by the same protocol, define a metric differently, or hold
-            the same training twice; faulty rows; a region or a sequence that they do not have.
+        InputError
+            Runs score different frames or protocols, define a metric differently, or contain the
+            same training twice; rows are invalid; or a region or a sequence is missing.
         """
         if not folders:
             raise InputError("runs", "", "at least one folder", "none")
@@ -244,7 +247,7 @@ class RunSet:
 
     @property
     def changed(self) -> tuple[str, ...]:
-        """Labels of methods under a condition; none where all are, as in a curve."""
+        """Labels of methods under a condition; empty if all are, as in a curve."""
         changed = tuple(label for label, record in self.records.items() if record.condition)
         return changed if len(changed) + len(self.trivial) < len(self.records) else ()
 
@@ -255,7 +258,7 @@ class RunSet:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """A sentence for each task that was asked for and that no run could measure."""
+        """A sentence for each requested task that no run could measure."""
         done = {task for run in self.runs for task in run.tasks}
         asked = dict.fromkeys(task for run in self.runs for task in run.manifest.configuration.tasks)
         return tuple(missing_tasks([*asked], done).values())
@@ -288,7 +291,7 @@ def _check_protocols(runs: Sequence[RunData]) -> None:
 
 
 def check_same_protocol(first: RunData, run: RunData, task: str) -> None:
-    """Raise `InputError` where two runs do not score the same frames of a task by the same protocol."""
+    """Raise `InputError` if two runs score different frames of a task or use different protocols."""
     expected, found = (one.manifest.protocols[task].hash for one in (first, run))
     if expected != found:
         known = f"protocol {expected}, that of {first.folder.root}"
@@ -296,7 +299,7 @@ def check_same_protocol(first: RunData, run: RunData, task: str) -> None:
 
 
 def _metrics(runs: Sequence[RunData]) -> tuple[MetricSpec, ...]:
-    # What makes values of a metric comparable; its words and digits may change.
+    # Definition of comparable values of a metric; its texts and digits may differ.
     meaning = attrgetter("unit", "higher_is_better", "implementation", "detail")
     metrics: dict[str, MetricSpec] = {}
     for run in runs:
@@ -339,7 +342,7 @@ def _labels(runs: Sequence[RunData]) -> list[dict[str, str]]:
 
 
 def _names(name: str, records: Sequence[MethodRecord], folders: Sequence[Path]) -> list[str]:
-    """A name for each training of a method: by what differs in their settings, else by their folders."""
+    """A name for each training of a method, from differing settings or else from their folders."""
     if len(records) == 1:
         return [name]
     flat = [_flat(asdict(record)) for record in records]

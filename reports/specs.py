@@ -1,4 +1,4 @@
-"""The reports offered, and benchmarks; light to import."""
+"""Specs of reports and benchmarks, without heavy imports."""
 
 from __future__ import annotations
 

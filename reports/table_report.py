@@ -1,4 +1,4 @@
-"""Tables by name: those that a run's metrics ask for, and the layouts of the paper's tables.
+"""Tables by name: those for a run's metrics, and the layouts of the paper's tables.
 
 The paper is "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations"
 (CVPR 2025, arXiv 2504.14967).
@@ -33,7 +33,7 @@ NAMES = {
     "ga": "GaussianAvatars",
     "ours": "Ours",
 }
-"""Methods as papers write them, in the order of their tables."""
+"""Names of methods in papers, in the order of their tables."""
 
 TASKS = ("novel_view", "self_reenactment")
 QUALITY = {"psnr": 2, "ssim": 3, "lpips": 3}
@@ -64,12 +64,13 @@ def read_runs(folders: Path | str | Sequence[Path | str]) -> ComparedRuns:
 
     Parameters
     ----------
-    folders : of the runs, or of one. The same method with the same settings and other seeds is one method with more seeds.
+    folders : Path | str | Sequence[Path | str]
+        One run folder or several. Seeds of the same method with the same settings are merged.
 
     Raises
     ------
     InputError
-        For a folder that is no finished run, and for runs that do not score the same frames by the same protocol.
+        A folder is not a finished run, or the runs score different frames or protocols.
     """
     several = [folders] if isinstance(folders, (str, Path)) else folders
     return cast(ComparedRuns, ComparedRuns.read([Path(folder) for folder in several]))
@@ -77,7 +78,7 @@ def read_runs(folders: Path | str | Sequence[Path | str]) -> ComparedRuns:
 
 @dataclass(frozen=True)
 class Columns:
-    """What a table shows of its layout: metrics and tasks by ``names`` (none of a kind named: all of it), and digits.
+    """Selection of a layout's metrics and tasks by ``names`` (none of a kind named: all of it), and digits.
 
     ``digits`` are numbers of decimals, as "3" for every metric and "psnr=1" for one.
     """
@@ -86,7 +87,7 @@ class Columns:
     digits: tuple[str, ...] = ()
 
     def of(self, offered: Iterable[str]) -> tuple[str, ...]:
-        """Those of the ``offered`` names that are asked for, in the order asked for."""
+        """The requested names among ``offered``, in the requested order."""
         names = tuple(offered)
         return tuple(dict.fromkeys(name for name in self.names if name in names)) or names
 
@@ -101,7 +102,7 @@ class Columns:
                 raise unknown("command line", "--digits", metric, metrics)
 
     def shown(self, spec: MetricSpec) -> MetricSpec:
-        """A metric with the digits asked for."""
+        """A metric with the requested digits."""
         decimals = self._decimals
         return replace(spec, digits=decimals.get(spec.name, decimals.get("", spec.digits)))
 
@@ -129,7 +130,7 @@ class PaperLayout:
     methods: tuple[str, ...] = ()
 
     def metrics(self, runs: RunSet, name: str, columns: Columns) -> tuple[MetricSpec, ...]:
-        """The metrics shown. Raises `InputError` for a metric or a task of the layout that is asked for and the runs lack."""
+        """The metrics shown. Raises `InputError` if the runs lack a requested metric or task."""
         known = {spec.name: spec for spec in runs.metrics}
         digits = {metric: self.digits[metric] for metric in columns.of(self.digits)}
         for what, wanted, there in (("metrics", digits, known), ("tasks", columns.of(TASKS), runs.tasks)):
@@ -157,7 +158,9 @@ class PaperLayout:
 PAPER: Mapping[str, PaperLayout] = {
     "paper-1": PaperLayout("every method: both tasks' quality, storage, speed"),
     "paper-3": PaperLayout("INSTA and ours: both tasks' quality, storage, speed", methods=("insta", "ours")),
-    "paper-4": PaperLayout("settings of ours, one run each: both tasks' quality", QUALITY, ("ours",)),
+    "paper-4": PaperLayout(
+        "settings of the method ours, one run each: both tasks' quality", QUALITY, ("ours",)
+    ),
 }
 
 
@@ -166,7 +169,7 @@ FILE = Path(__file__).with_name("published.json")
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """A row of a paper's table: where it stands, what the figures are of, and the layout that it may stand in.
+    """A row of a paper's table: its source, its data, and the layout that it belongs to.
 
     A measured method is the same with this name and these ``settings``, by dotted name. ``values`` are as printed,
     by ``task/metric``.
@@ -201,9 +204,9 @@ def published_rows() -> tuple[tuple[PublishedRow, str], ...]:
 
 
 def with_published(table: Table, layout: str, records: Mapping[str, MethodRecord]) -> Table:
-    """Put a column "published" behind each measured one that a paper's table of this layout has a figure for.
+    """Add a column "published" after each measured one for which a paper's table of this layout has a value.
 
-    ``records`` has by label of the table's methods what they were, as in a run's manifest.
+    ``records`` has the manifest entries of the table's methods by label.
     """
     notes = list(table.notes)
     figures: dict[str, tuple[Mapping[str, str], int]] = {}
@@ -239,7 +242,7 @@ TITLES = {"speed": "Speed", "cost": "Storage and training"}
 
 
 def write_tables(run_folder: Path) -> list[Path]:
-    """Write every table that a run's metrics ask for, in every format, into its folder of tables; return the files."""
+    """Write every table for a run's metrics, in every format, into its folder of tables; return the files."""
     runs = RunSet.read([run_folder])
     files = []
     for layout in layouts(runs):
@@ -264,7 +267,7 @@ def table_text(
 ) -> str:
     """Return a table of one or more runs as text, in a format of `WRITERS` or as "text", which has aligned columns.
 
-    Without a format it is "text" where standard output is a terminal, else "md".
+    Without a format it is "text" if standard output is a terminal, else "md".
     ``published`` adds columns with the figures that papers printed; ``region`` and ``sequences`` are those of `Part`,
     ``columns`` and ``digits`` those of `Columns`. Raises `InputError` for a format, a layout, columns or runs that do not fit.
     """
@@ -281,7 +284,7 @@ def table_text(
 
 
 def layouts(runs: RunSet) -> tuple[str, ...]:
-    """Names of the tables that the runs' metrics ask for; the comparison is always there, and first."""
+    """Names of the tables for the runs' metrics; the comparison is always included, and first."""
     asked = [table for metric in runs.metrics for table in metric.tables]
     return tuple(dict.fromkeys([COMPARISON, *asked]))
 
@@ -300,7 +303,7 @@ def table_of(
         columns.check(known, runs.tasks if any(metric.per_frame for metric in known.values()) else ())
         metrics = tuple(known[name] for name in columns.of(known))
     metrics = tuple(map(columns.shown, metrics))
-    # A table without frames' metrics is about no task.
+    # A table without metrics of frames has no task.
     tasks = columns.of(runs.tasks) if any(metric.per_frame for metric in metrics) else ()
     if not tasks and set(columns.names) & set(runs.tasks):
         found = ", ".join(columns.names)

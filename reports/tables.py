@@ -1,7 +1,7 @@
-"""The table as a typed model: what the writers lay out, and nothing else.
+"""The table as a typed model, the input of the writers.
 
-A value is a mean of means: frames -> sequence -> subject -> seed, each level weighing its members equally
-(macro), so that a long sequence or a subject with many frames does not outvote the others.
+A value is a mean of means: frames -> sequence -> subject -> seed, with equal weights at each level (macro),
+so that a long sequence or a subject with many frames does not dominate.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .statistics.comparisons import LEVEL, BestSet, best_set, counted
 class Column:
     """One metric of one task (``task`` "" for a metric of the avatar as a whole).
 
-    ``published`` columns hold what a paper printed, beside the measured column before them.
+    ``published`` columns hold the values printed in a paper, after the measured column.
     """
 
     task: str
@@ -38,13 +38,13 @@ class Column:
 
     @property
     def arrow(self) -> str:
-        """Which way is better: an arrow up or down."""
+        """Direction of better values: an arrow up or down."""
         return "↑" if self.higher_is_better else "↓"
 
 
 @dataclass(frozen=True)
 class TableCell:
-    """A value, or why there is none.
+    """A value, or the reason why it is missing.
 
     ``status`` is "ok", "missing" (could not or was not measured), "failed" (the method ended in an error), "published"
     (a paper's figure, not measured) or "none" (no paper's figure). ``rank`` is 1 for all that may be the best, then 2,
@@ -76,7 +76,7 @@ class TableRow:
 
 @dataclass(frozen=True)
 class TaskSummary:
-    """What stands behind a task's columns."""
+    """Data of a task's columns."""
 
     task: str
     title: str
@@ -119,7 +119,7 @@ class Table:
 
     @property
     def caption(self) -> str:
-        """One paragraph: what was measured, on how much, under which protocol, and how it was averaged."""
+        """One paragraph: metrics, amount of data, protocol, and averaging."""
         return " ".join(self.facts)
 
     @property
@@ -144,7 +144,7 @@ class Table:
 
     @property
     def short_caption(self) -> str:
-        """What a paper prints above the table: `caption` without protocols and without how values were averaged."""
+        """Caption for a paper: `caption` without protocols and without how values were averaged."""
         subjects = [counted(task.subjects, "subject") for task in self.tasks]
         same = subjects[0] if len(set(subjects)) == 1 else ""
         tasks = []
@@ -209,19 +209,30 @@ def build_table(
 
     Parameters
     ----------
-    metrics : columns of the table, in order; those per frame appear once in each task, the others last.
-    methods : in order; one without rows is shown as not measured.
-    trivial : those of ``methods`` that are trivial baselines: listed apart, not ranked.
-    changed : likewise those under conditions that change them, see `RunSet.changed`.
-    keys : frames of each task, where more are scored than there are rows of.
-    protocol_ids : readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` (where the rows do not
-        tell on which one speed was measured), ``part`` and the sentences of ``missing``.
-    avatar_title : heading of the columns that are of no task.
-    name : of the layout.
+    metrics : Sequence[MetricSpec]
+        Columns of the table, in order; metrics of frames appear once in each task, the others last.
+    methods : Sequence[str]
+        Rows, in order; a method without results is shown as not measured.
+    trivial : Sequence[str]
+        Those of ``methods`` that are trivial baselines: listed separately and not ranked.
+    changed : Sequence[str]
+        Those of ``methods`` under conditions that change them, see `RunSet.changed`; also listed
+        separately and not ranked.
+    keys : Mapping[str, Collection[FrameKey]] | None
+        Frames of each task, if more are scored than have rows.
+    protocol_ids : Mapping[str, str]
+        Readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` (if
+        the rows do not record the machine that measured speed), ``part`` and the sentences of
+        ``missing``.
+    avatar_title : str
+        Heading of the columns that belong to no task.
+    name : str
+        Name of the layout.
 
     Raises
     ------
-    InputError : rows that repeat a frame, or mix versions of a method or protocols in a task.
+    InputError
+        Rows repeat a frame, or mix versions of a method or protocols in a task.
     """
     rows.check()
     rows.check_protocols("rows")
@@ -299,12 +310,12 @@ def _cell(aggregate: Aggregate, digits: int, notes: list[str], mark: str) -> Tab
 
 
 def _competing(lines: Sequence[TableRow], index: int) -> list[str]:
-    """Methods that have a value in a column; trivial baselines do not compete."""
+    """Methods that have a value in a column; trivial baselines are not ranked."""
     return [line.method for line in lines if not line.trivial and line.cells[index].status == "ok"]
 
 
 def _best(rows: Rows, lines: Sequence[TableRow], index: int, column: Column) -> BestSet | None:
-    """The methods that may be the best of a column; None where fewer than two have values."""
+    """The methods that may be the best of a column; None if fewer than two have values."""
     names = _competing(lines, index)
     if len(names) < 2:
         return None
@@ -336,7 +347,7 @@ def _ranked(
 
 
 def _marking(columns: Sequence[Column], lines: Sequence[TableRow], bests: Sequence[BestSet | None]) -> str:
-    """What the marks of a table mean, and by which test; "" where nothing is ranked."""
+    """Meaning of the marks of a table, and their test; "" if nothing is ranked."""
     ranks = {cell.rank for line in lines for cell in line.cells}
     if not ranks - {None}:
         return ""

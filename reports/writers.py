@@ -44,7 +44,7 @@ def to_markdown(table: Table) -> str:
 
 
 def escape_markdown(text: str) -> str:
-    """Make text stand for itself in Markdown, on one line; an underscore within a word already does."""
+    """Escape text for Markdown, on one line; an underscore within a word needs no escape."""
     return re.sub(r"([\\`*{}\[\]<>|#~&]|(?<!\w)_|_(?!\w))", r"\\\1", " ".join(text.split()))
 
 
@@ -200,7 +200,7 @@ def to_latex(table: Table) -> str:
 
 
 def escape_latex(text: str) -> str:
-    """Make text stand for itself in LaTeX, on one line; what pdfLaTeX's default fonts lack becomes its code point."""
+    """Escape text for LaTeX, on one line; characters that pdfLaTeX's fonts lack become code points."""
 
     def escaped(character: str) -> str:
         known = 32 <= ord(character) < 127 or (192 <= ord(character) < 256 and character.isalpha())
@@ -279,7 +279,7 @@ def csv_text(lines: Iterable[Sequence[object]]) -> str:
 def _without_formula(value: object) -> object:
     if not isinstance(value, str):
         return value
-    value = value.replace("\r", " ")  # which the writer leaves bare, and readers take for the end of the line
+    value = value.replace("\r", " ")  # not quoted by the writer, and read as the end of a line
     if not value.lstrip().startswith(FORMULA_STARTS):
         return value
     try:
@@ -296,7 +296,7 @@ def column_name(column: Column) -> str:
 
 
 def to_json(table: Table) -> str:
-    """Write the typed table as it is."""
+    """Write the typed table unchanged."""
     return json.dumps({**asdict(table), "caption": table.caption}, indent=1, ensure_ascii=False) + "\n"
 
 

@@ -12,7 +12,7 @@ from ..io.images import read_png
 from .naming import Render, composited
 
 SAMPLE = 8
-"""Frames of a subject and task that are looked at, evenly spaced."""
+"""Number of frames checked per subject and task, evenly spaced."""
 TOLERANCE = 24.0
 """Largest difference of the background's colour, of 255 in a channel.
 
@@ -31,9 +31,8 @@ def check_background(clip: Clip, renders: Mapping[FrameKey, Render]) -> None:
     """Compare the background of renders of one task with the clip's, over a sample of their frames.
 
     The colour of a frame's background is the median over the pixels that are certainly background, see
-    `certain_background`; a poor method may miss it in some frames, so that more than half of the sample has to differ.
-
-    Raises `InputError` where it does, by more than `TOLERANCE`.
+    `certain_background`; a poor method may miss it in some frames, so that more than half of the sample must
+    differ. Raises `InputError` if it differs by more than `TOLERANCE`.
     """
     declared = 255 * np.asarray(clip.background, dtype=np.float64)
     keys = sorted(renders)

@@ -1,4 +1,4 @@
-"""Bundles: the results of a run in one file, as a leaderboard takes them and others can check them."""
+"""Bundles: the results of a run in one file, for a leaderboard and for verification by others."""
 
 from __future__ import annotations
 
@@ -44,11 +44,16 @@ class Bundle:
 
     Attributes
     ----------
-    by, link, comment : who submits it, where to read more, anything else; as given.
-    headbench : the version that wrote it.
-    renders : whether the scored frames are in it.
-    files : SHA-256 of every other file, by its place.
-    digital_source_type : what the frames are, see `headbench.bench.io.provenance`; "" without them.
+    by, link, comment : str
+        Author, address of further information, and remarks, as given.
+    headbench : str
+        Version that wrote the bundle.
+    renders : bool
+        Whether the scored frames are included.
+    files : dict[str, str]
+        SHA-256 of every other file, by its path in the bundle.
+    digital_source_type : str
+        Source type of the frames, see `headbench.bench.io.provenance`; "" without frames.
     """
 
     by: str
@@ -107,7 +112,7 @@ def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> 
 
 
 def without_paths(manifest: Manifest, methods: tuple[str, ...]) -> Manifest:
-    """The record of some methods of a run, without folders of the machine that made it."""
+    """The record of some methods of a run, without local paths."""
     config = manifest.configuration
 
     def named(path: object) -> str:
@@ -145,7 +150,7 @@ def without_paths(manifest: Manifest, methods: tuple[str, ...]) -> Manifest:
 def _cell_files(
     folder: RunFolder, manifest: Manifest, methods: tuple[str, ...], *, renders: bool
 ) -> dict[str, Path]:
-    """Records of the cells, and their frames if asked for, by their place in the run."""
+    """Records of the cells, and their frames if requested, by their path in the run."""
     files: dict[str, Path] = {}
     labels = [method.label for method in manifest.methods if method.name in methods]
     for clip, label, seed in product(manifest.clips, labels, manifest.configuration.seeds):
@@ -156,7 +161,7 @@ def _cell_files(
             recorded = {} if state is None else state.get("files", {})
             damaged = cell.damage(recorded)
             for name, why in damaged.items():
-                remedy = "Start the run again; it renders what is damaged."
+                remedy = "Restart the run; it renders damaged frames again."
                 raise InputError(cell.folder / name, "", "the frame that was rendered", f"it {why}", remedy)
             paths += [cell.folder / name for name in recorded]
         files |= {path.relative_to(folder.root).as_posix(): path for path in paths}
@@ -169,8 +174,8 @@ def read_bundle(path: Path, into: Path) -> Bundle:
     Raises
     ------
     InputError
-        For what is no bundle, files that are not as listed or that no bundle has, and content that is larger or of
-        more files than a bundle may have.
+        The file is not a bundle, files differ from their list or do not belong to a bundle, or the
+        content exceeds the size or number of files allowed in a bundle.
     """
     bounds = {"members": MAX_FILES, "spare_bytes": 0, "per_byte": MAX_RATIO}
     with open_archive(path, "a bundle of `headbench bundle`", **bounds) as archive:

@@ -38,7 +38,7 @@ from .settings import EvaluateSettings
 
 
 class NoAvatar:
-    """Placeholder for a run's avatar; images of a folder have none, and no metric of one is taken."""
+    """Placeholder for the avatar, which a folder of images lacks; metrics of avatars are not computed."""
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """There is nothing to render."""
@@ -50,7 +50,7 @@ class NoAvatar:
 
 
 def images_method(label: str, version: str) -> ResolvedMethod:
-    """A method that is nothing but its images; ``version`` is their digest."""
+    """A method that consists of stored images; ``version`` is their digest."""
     return ResolvedMethod(MethodSpec(label, "images of a folder", "", version=version), None, Budget())
 
 
@@ -59,7 +59,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
 
     The text is the table, together with the run named by ``like``.
 
-    Raises `InputError` for whatever is wrong with settings, capture or images, before anything is written.
+    Raises `InputError` for invalid settings, captures or images, before anything is written.
     """
     source = Path(settings.folder)
     stored = open_avatar(source, settings.method) if settings.avatar else None
@@ -118,7 +118,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
 
 
 def _open(settings: EvaluateSettings, heads: Mapping[str, str]) -> tuple[RunConfig, list[Clip]]:
-    """The settings to score by, with the head models beside an avatar, and the captures to score against."""
+    """The settings, with the head models of an avatar, and the captures for the evaluation."""
     label = check_name(settings.label, "command line", "--label")
     if label in discover("methods"):
         expected = "a name that no registered method has"
@@ -164,7 +164,7 @@ def _open(settings: EvaluateSettings, heads: Mapping[str, str]) -> tuple[RunConf
 
 
 def _copy(images: Mapping[tuple[str, FrameKey], Render], job: Job) -> None:
-    """Bring the images of a subject to where a run has its renders."""
+    """Copy the images of a subject to the run's folders of renders."""
     with grouped_writes():
         for (task, key), source in images.items():
             target = job.cell.render(task, key)
@@ -187,18 +187,21 @@ def find_images(
     names: str = "",
     config: RunConfig | None = None,
 ) -> dict[tuple[str, FrameKey], Render]:
-    """Find the image of every frame of every protocol, by task and key, each checked but for its pixels.
+    """Find the image of every frame of every protocol, by task and key, with checks except of the pixels.
 
     Parameters
     ----------
-    names : how images are named, see `named_renders`; "" for by key.
-    config : by which the captures were opened; needed with ``names``.
+    names : str
+        Naming scheme of the images, see `named_renders`; "" names them by frame key.
+    config : RunConfig | None
+        Configuration that opened the captures; required with ``names``.
 
     Raises
     ------
     InputError
-        For a folder that is not there, images that are missing (how many, and where the first was looked for), one
-        that is not 8-bit RGB, not of the truth's size, or not fully opaque, and as `named_renders` does.
+        The folder or images are missing (with their number and the first expected path), or an image
+        is not 8-bit RGB, not fully opaque, or differs in size from the ground truth. Also raised by
+        `named_renders`.
     """
     if not folder.is_dir():
         raise InputError(folder, "", "a folder of images", "no such folder")
@@ -241,7 +244,7 @@ def find_images(
 
 
 def _places(folder: Path, task: str, key: FrameKey, subjects: int) -> list[Path]:
-    """Where the image of a frame may lie, by falling precedence."""
+    """Possible paths of the image of a frame, in descending precedence."""
     name = Cell(folder).render(task, key).name
     roots = [folder / key.subject] + ([folder] if subjects == 1 else [])
     return [place / name for root in roots for place in (root / "renders" / task, root / task, root)]

@@ -29,10 +29,10 @@ COLUMNS = (
 
 
 def write_frames(settings: FramesSettings, progress: Progress = no_progress) -> Findings:
-    """Write `FRAMES_FILE` and `MAP_FILE` for the protocols of a run, or for those that a run on a capture would have.
+    """Write `FRAMES_FILE` and `MAP_FILE` for the protocols of a run, or those of a run on a capture.
 
-    Raises `InputError` for what is neither a run nor a capture, options that only a capture takes, and a `MAP_FILE`
-    that was edited.
+    Raises `InputError` if the path is neither a run nor a capture, for options that require a capture, and
+    for an edited `MAP_FILE`.
     """
     config, clips = _open(settings)
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
@@ -86,7 +86,7 @@ def _open(settings: FramesSettings) -> tuple[RunConfig, list[Clip]]:
 
 
 def _camera(clip: Clip, key: FrameKey) -> Iterable[object]:
-    """Size, background and camera of a frame, as `COLUMNS` has them; numbers as Python prints them, exactly."""
+    """Size, background and camera of a frame, in the order of `COLUMNS`, with exact numbers."""
     camera = clip.cameras[key.camera]
     colour = "#{:02x}{:02x}{:02x}".format(*(round(255 * float(value)) for value in clip.background))
     K = camera.K
@@ -95,7 +95,7 @@ def _camera(clip: Clip, key: FrameKey) -> Iterable[object]:
 
 
 def _pose_files(config: RunConfig, clips: Sequence[Clip]) -> dict[tuple[str, int], Path]:
-    """File with the tracking parameters of each subject and timestep, where the reader knows one."""
+    """File with the tracking parameters of each subject and timestep, if the reader provides one."""
     spec: DatasetSpec = get("datasets", config.reader)
     if not spec.pose_files:
         return {}

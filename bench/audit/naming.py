@@ -1,4 +1,4 @@
-"""Which image of a folder shows which frame, where they are not named by key: a method's program, a list in CSV."""
+"""Maps images that are not named by frame key to frames: by a method's program or a CSV file."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Render(NamedTuple):
 
     image: Path
     alpha: Path | None = None
-    truth: Path | None = None  # what the repository took for the ground truth of this frame
+    truth: Path | None = None  # ground truth of this frame as written by the repository
 
 
 Renders = dict[FrameKey, Render]
@@ -51,8 +51,9 @@ def named_renders(names: str, folder: Path, config: RunConfig, clips: Sequence[C
     Raises
     ------
     InputError
-        For an unknown name, a list that does not fit the captures, a count of images that is not that of the frames, and
-        images whose ground truth, as the repository wrote it beside them, is another than that of their frames.
+        The name is unknown, the list does not fit the captures, the number of images differs from
+        that of the frames, or the ground truth stored with the images differs from that of their
+        frames.
     """
     if names.endswith(".csv"):
         return _listed(Path(names), folder, clips)
@@ -73,14 +74,15 @@ def named_renders(names: str, folder: Path, config: RunConfig, clips: Sequence[C
 
 
 def image_name(task: str, key: FrameKey) -> PurePosixPath:
-    """Where the image of a frame lies by default in a folder of images, whatever the number of subjects."""
+    """Default path of the image of a frame in a folder of images, for any number of subjects."""
     return PurePosixPath(key.subject, task, Cell(Path()).render(task, key).name)
 
 
 def check_truth(clip: Clip, renders: Renders, keys: Iterable[FrameKey], count: int = 8) -> None:
-    """Hold the ground truth that lies beside renders against the clip's, at some frames; on black where renders are.
+    """Compare the ground truth stored with renders with the clip's, at some frames; on black if renders are.
 
-    Raises `InputError` where they differ by more than `TRUTH_RMS`: renders of other frames, or of another background.
+    Raises `InputError` if they differ by more than `TRUTH_RMS`: renders of other frames, or of another
+    background.
     """
     chosen = [key for key in sorted(keys) if key in renders and renders[key].truth is not None]
     for key in chosen[:: max(1, len(chosen) // count)]:
@@ -92,7 +94,7 @@ def check_truth(clip: Clip, renders: Renders, keys: Iterable[FrameKey], count: i
         if renders[key].alpha is not None:
             mask = clip.mask(key)
             if mask is None:
-                continue  # nobody knows what of the image is background
+                continue  # the background of the image is unknown
             ground = 255 * np.asarray(clip.background, np.float32)
             own -= (1 - mask[..., None].astype(np.float32) / 255) * ground
         if truth.shape != own.shape:

@@ -33,7 +33,7 @@ class BundleSettings:
     """Write the results of a finished run to one file that a leaderboard takes and `headbench verify` checks.
 
     It holds the rows and records of a run with the digest of each file, and no folder names of this machine; no images
-    unless asked for. Licensed data stay out: renders of real people only with their consent.
+    unless requested. Licensed data stay out: renders of real people only with their consent.
     """
 
     run: tyro.conf.Positional[str]
@@ -58,7 +58,7 @@ class BundleSettings:
     """Add the scored frames, so that others can recompute the metrics."""
 
     def __post_init__(self) -> None:
-        """Refuse what no leaderboard could show."""
+        """Refuse values that a leaderboard cannot show."""
         check_shown(self, "command line")
 
 
@@ -80,7 +80,7 @@ class EvaluateSettings:
     An image is SEQUENCE_TIMESTEP_CAMERA.png (timestep of five digits), as `headbench run` names its renders: 8-bit RGB
     PNG of the ground truth's size, composited on the capture's background. It lies in FOLDER itself, in a folder named after
     the task, or in renders/TASK; with several subjects, in a folder named after the subject. A cell of a run
-    (SUBJECT/METHOD/seed-N) has this layout, too. Other names are told by --names.
+    (SUBJECT/METHOD/seed-N) has this layout, too. Other names are given with --names.
     """
 
     folder: tyro.conf.Positional[str]
@@ -93,7 +93,7 @@ class EvaluateSettings:
     """Capture to score against (or folder of several); default: that of the run named by --like."""
 
     label: str = "images"
-    """What the method is called in tables; not the name of a registered method."""
+    """Name of the method in tables; not the name of a registered method."""
 
     avatar: bool = False
     """FOLDER holds an avatar: it is rendered, and its storage and speed are measured, too."""
@@ -102,7 +102,7 @@ class EvaluateSettings:
     """With --avatar: its method as package.module:SPEC, where that is not registered."""
 
     device: str = "cpu"
-    """Where metrics are computed that can use a GPU, and with --avatar where to render."""
+    """Device of metrics that can use a GPU, and of rendering with --avatar."""
 
     names: str = ""
     """How the images are named, if not by key: a method whose own program numbers its renders, such as an adapter to an
@@ -141,9 +141,9 @@ class EvaluateSettings:
     )
 
     def __post_init__(self) -> None:
-        """Refuse what leaves open what to score against."""
+        """Refuse settings without a reference for the evaluation."""
         if self.clip is None and self.like is None:
-            raise ValueError("say what to score against: --clip CAPTURE, or --like RUN")
+            raise ValueError("state the reference: --clip CAPTURE or --like RUN")
 
 
 @dataclass(frozen=True)

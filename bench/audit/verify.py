@@ -39,7 +39,7 @@ least."""
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Something that is not what it claims to be."""
+    """A file or value that differs from its record."""
 
     file: Path
     key: str
@@ -53,7 +53,7 @@ class Mismatch:
 
 @dataclass
 class _Report:
-    """What was looked at, and what was found."""
+    """Checks and findings."""
 
     mismatches: list[Mismatch]
     files: int = 0
@@ -62,13 +62,13 @@ class _Report:
 
 
 def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> Findings:
-    """Verify a run; did not pass where anything differs.
+    """Verify a run; not passed if anything differs.
 
-    Recomputed: fingerprints of the captures, hashes of the protocols, fingerprint of what each avatar was made of,
+    Recomputed: fingerprints of the captures, hashes of the protocols, fingerprint of each avatar's inputs,
     digests of frames and avatar files, every metric of frames and those of avatars that are not bound to a machine.
     A value may differ by a tenth of the last digit that tables show, for networks that round otherwise elsewhere.
 
-    A folder that is no finished run, and a capture that cannot be opened, are a finding too, with exit code 3.
+    A folder that is not a finished run, or a capture that cannot be opened, is a finding with exit code 3.
     """
     try:
         with tempfile.TemporaryDirectory() as scratch:
@@ -105,7 +105,7 @@ def _verify_bundle(settings: VerifySettings, scratch: Path, progress: Progress) 
 
 
 def _captured_again(manifest: Manifest, out: Path, limit: int, progress: Progress) -> Path:
-    """Make the synthetic captures of a run again from what their clips record; ``limit`` bounds their pixels.
+    """Regenerate the synthetic captures of a run from their clips; ``limit`` bounds their pixels.
 
     Raises `InputError` for a capture that is not synthetic, not of the procedural head, or larger.
     """
@@ -176,7 +176,7 @@ def _clips(folder: RunFolder, manifest: Manifest, clips: Sequence[Clip]) -> Iter
 def _protocols(
     folder: RunFolder, manifest: Manifest, protocols: Mapping[str, Protocol]
 ) -> Iterator[Mismatch]:
-    """The recorded protocols, field by field, against those that captures and settings give."""
+    """Compare the recorded protocols, field by field, with those from captures and settings."""
     for task, protocol in protocols.items():
         wanted, recorded = ProtocolRecord.of(protocol), manifest.protocols.get(task)
         for name in (field.name for field in fields(wanted)):
@@ -198,7 +198,7 @@ def _verify_cell(job: Job, metrics: Sequence[MetricSpec], rows: Rows, file: Path
     )
     if len(own) and (own["status"] == "failed").all():
         report.unverified += len(own)
-        return  # recorded as failed: there is nothing it claims
+        return  # recorded as failed: no results to check
     state = job.cell.step("fit")
     trained = state is not None and method.implementation
     digests = {**(state.get("files", {}) if state and trained else {}), **recorded_frames(job)}
@@ -251,7 +251,7 @@ def _can_be_scored(job: Job, path: Path, key: FrameKey) -> bool:
 
 
 def _measure_again(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> pd.DataFrame:
-    """Measure the stored frames as if for the first time, beside the run."""
+    """Evaluate the stored frames again, in a separate folder."""
     stable = [metric for metric in metrics if not metric.machine_bound]
     with tempfile.TemporaryDirectory() as name:
         scratch = Cell(Path(name))
@@ -289,7 +289,7 @@ def _values(
 
 
 def _by_place(rows: pd.DataFrame) -> dict[tuple[Any, ...], tuple[str, float, str]]:
-    """Status, value and reason of each row, by what it is of."""
+    """Status, value and reason of each row, by its key."""
     places = rows[KEY].itertuples(index=False, name=None)
     content = rows[["status", "value", "reason"]].itertuples(index=False, name=None)
     return {place: (str(s), float(v), str(r)) for place, (s, v, r) in zip(places, content)}

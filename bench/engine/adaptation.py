@@ -1,12 +1,12 @@
-"""Brings clips into the form that a method declares: head model, image size, one video. Bench knows no steps.
+"""Adapts clips to the needs that a method declares: head model, image size, one video.
 
-One function does it for the clips of every reader, the entry point of the group ``headbench.adaptation``::
+One function adapts the clips of every reader, the entry point of the group ``headbench.adaptation``::
 
     adapt(clip, needs, heads) -> (folder, progress) -> AdaptedClip
 
-The outer call checks whether the needs can be met and raises `InputError` where they cannot, before any long work;
-the call it returns does the work and keeps under ``folder`` whatever took long. ``heads`` are files of head models
-by version.
+The outer call checks whether the needs can be met and raises `InputError` otherwise, before any long work;
+the returned function adapts the clip and stores results of slow steps in ``folder``. ``heads`` are files of
+head models by version.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from ..specs import MethodSpec, ResolutionRule
 
 
 class TrainingView:
-    """A `Clip` that gives images and masks of training frames only; all else is the clip's own.
+    """A `Clip` that gives images and masks of training frames only; everything else is unchanged.
 
-    Cameras and driving signals of held-out frames stay visible: they are no ground truth of how a frame looks.
+    Cameras and driving signals of held-out frames stay visible: they do not reveal the ground truth images.
     """
 
     def __init__(self, clip: Clip):
@@ -66,14 +66,17 @@ class MethodNeeds:
 
 @dataclass(frozen=True, eq=False)
 class AdaptedClip:
-    """A clip in the form that a method needs, and the way back to the frames of the protocol.
+    """A clip adapted to a method, and the mapping back to the frames of the protocol.
 
     Attributes
     ----------
-    clip : what the method is trained on. Its cameras and poses are those to render.
-    key : a frame's key in ``clip``, given its key in the protocol.
-    restore : takes a protocol key and the (H, W, 3) float render of that frame as ``clip`` has it, and returns
-        the render at the protocol's size, not yet quantised.
+    clip : Clip
+        Clip that the method is trained on; its cameras and poses are rendered.
+    key : Callable
+        Maps a frame key of the protocol to its key in ``clip``.
+    restore : Callable
+        Maps a protocol key and the (H, W, 3) float render of that frame in ``clip`` to the render at
+        the protocol's size, before quantisation.
     """
 
     clip: Clip
@@ -95,15 +98,15 @@ def adapter() -> Adapter:
 
 
 def plan(clip: Clip, needs: MethodNeeds, heads: Mapping[str, str]) -> Adaptation | None:
-    """Check that ``clip`` can be brought into the form needed; return what will do it, None where it has it.
+    """Check that ``clip`` can be adapted; return the adaptation, or None if the clip already meets the needs.
 
-    A monocular method gets the clip as the steps make it even where there is one view, since they also move the
-    head's rigid motion into the cameras.
+    For a monocular method the steps are applied even to a single view, since they also move the head's rigid
+    motion into the cameras.
 
     Raises
     ------
     InputError
-        Where the clip lacks what the method needs and there is no way there.
+        The clip lacks what the method needs, and no registered step provides it.
     """
     fits = not needs.head_models or clip.head.version in needs.head_models
     if fits and needs.resolution.native and not needs.monocular:
@@ -112,7 +115,7 @@ def plan(clip: Clip, needs: MethodNeeds, heads: Mapping[str, str]) -> Adaptation
 
 
 def carry_out(adaptation: Adaptation, needs: MethodNeeds, folder: Path, label: str) -> AdaptedClip:
-    """Run a planned adaptation and hold its result to the needs."""
+    """Run a planned adaptation and check that its result meets the needs."""
     with progress(label) as report:
         adapted = adaptation(folder, report)
     check(adapted.clip, needs)
@@ -120,7 +123,7 @@ def carry_out(adaptation: Adaptation, needs: MethodNeeds, folder: Path, label: s
 
 
 def check(clip: Clip, needs: MethodNeeds) -> None:
-    """Raise `InputError` for a head model or further views that a method does not take; sizes are not looked at."""
+    """Raise `InputError` for a head model or number of views that a method does not support."""
     where = f"clip {clip.subject}"
     if needs.head_models and clip.head.version not in needs.head_models:
         expected = f"a capture tracked with {' or '.join(needs.head_models)}"
@@ -133,7 +136,7 @@ def check(clip: Clip, needs: MethodNeeds) -> None:
 
 
 def record(clip: Clip, adapted: AdaptedClip, method: str) -> dict[str, Any]:
-    """What the manifest says of an adapted clip: the steps added and the fingerprint they lead to."""
+    """Entry of the manifest for an adapted clip: the steps added and the resulting fingerprint."""
     added: Sequence[Any] = adapted.clip.steps[len(clip.steps) :]
     return {
         "subject": clip.subject,

@@ -1,4 +1,4 @@
-"""Opens the captures of a run through the reader asked for, and holds what it gives to the contract."""
+"""Opens the captures of a run with the requested reader and checks them against the contract."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from .store import RunFolder
 log = logging.getLogger(__name__)
 Plugins = Literal["methods", "metrics"]
 HARNESS = ("progress", "remembered")
-"""Keywords of a reader that are no settings: the harness gives them, see `DatasetSpec`."""
+"""Keywords of a reader that are set by the harness, not by settings, see `DatasetSpec`."""
 
 
 def open_clips(config: RunConfig, *, remembered: bool = True, only: int | None = None) -> list[Clip]:
-    """Open every capture under ``config.data``, each validated whole by its reader, at the size to be measured at.
+    """Open every capture under ``config.data``, validated by its reader, at the evaluated image size.
 
-    ``remembered`` is False where every byte has to be read, whatever a reader remembers of an earlier time. ``only`` is
+    ``remembered`` is False to read every byte, ignoring the reader's cache. ``only`` is
     the index of a single capture to open, None for all.
 
     Raises `InputError` for a folder without captures, a setting the reader does not know or of the wrong type,
@@ -55,9 +55,9 @@ def open_clips(config: RunConfig, *, remembered: bool = True, only: int | None =
 def found_captures(
     spec: DatasetSpec, root: Path, settings: Mapping[str, Any], *, remembered: bool = True
 ) -> list[tuple[Path, Callable[[Progress], Clip]]]:
-    """Path of each capture that a reader finds under ``root``, and what reads it.
+    """Path of each capture that a reader finds under ``root``, and its reader.
 
-    Raises `InputError` where there is none, for what is no reader, and for settings that it does not know.
+    Raises `InputError` if there is no capture, or if the reader or its settings are unknown.
     """
     if not spec.reads:
         raise InputError("reader", spec.name, "a dataset that is read", "one that makes captures")
@@ -86,7 +86,7 @@ def readers() -> dict[str, DatasetSpec]:
 
 
 def finds(spec: DatasetSpec, root: Path) -> bool:
-    """Whether a reader finds captures; one that cannot be imported or that looks at nothing finds none."""
+    """Whether a reader finds captures; one that cannot be imported or fails finds none."""
     try:
         return bool(spec.find and resolve(spec.find)(root))
     except HeadbenchError:
@@ -97,9 +97,9 @@ def finds(spec: DatasetSpec, root: Path) -> bool:
 
 
 def reader_of(root: str) -> str:
-    """Name of the reader for a run's capture: ga, unless it finds none there and another does.
+    """Name of the reader for a run's capture: ga, unless only another reader finds one.
 
-    Raises `InputError` where several others do.
+    Raises `InputError` if several other readers find one.
     """
     there = Path(root).exists()
     found = [name for name, spec in readers().items() if there and finds(spec, Path(root))]
@@ -114,12 +114,14 @@ def reader_of(root: str) -> str:
 def capture_configuration(
     data: str, out: str, reader: str = "", head: str | None = None, **others: Any
 ) -> RunConfig:
-    """Settings that open a capture as a run on it would; ``others`` are further fields of `RunConfig`.
+    """Settings that open a capture in the same way as a run; ``others`` are further fields of `RunConfig`.
 
     Parameters
     ----------
-    reader : name of the dataset reader; "" for `reader_of`.
-    head : file of the head model, for captures that bring none.
+    reader : str
+        Name of the dataset reader; "" selects it with `reader_of`.
+    head : str | None
+        Head model file, for captures without one.
     """
     return RunConfig(
         data=data,
@@ -131,7 +133,7 @@ def capture_configuration(
 
 
 def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dict[str, Any]:
-    """Settings that make a subject's synthetic capture again, from the steps that its clip records.
+    """Settings that reproduce a subject's synthetic capture, from the steps recorded in its clip.
 
     Raises `InputError` for a capture that is not synthetic, not of the procedural head, or made by settings that are not
     known here.
@@ -159,13 +161,13 @@ def relative_paths(config: RunConfig) -> dict[str, str]:
 
 
 def run_configuration(run: Path, options: RunOptions) -> RunConfig:
-    """Settings of a run, its folder and the files it names being where they are now.
+    """Settings of a run with the current locations of its folder and files.
 
     Raises
     ------
     InputError
-        For a folder that is not a run's, plug-ins that only `RunOptions.trust` loads, and a capture or another file
-        that is neither at its recorded place relative to the run folder nor where the settings name it.
+        The folder is not a run, plug-ins require `RunOptions.trust`, or a capture or another file is
+        neither at its recorded path relative to the run folder nor at the path in the settings.
     """
     return next(_configurations(run, options))
 
@@ -184,16 +186,23 @@ def open_run_clips(
 
     Parameters
     ----------
-    out : becomes ``out`` of the settings, where opening may keep what took long; None: the run, whose lock is held.
-    altered : return what is there even if it is not what the run was made from.
-    remembered, only : see `open_clips`.
-    used : which plug-ins the caller resolves from the returned settings. Names that would import a module are refused
-        for these and for the reader alone, since opening captures needs no method and no metric.
+    out : Path | None
+        Replaces ``out`` of the settings, where results of slow steps may be stored. Default: the run
+        folder, which the caller must have locked.
+    altered : bool
+        Return captures even if they differ from those of the run.
+    remembered, only : bool, int or None
+        See `open_clips`.
+    used : tuple[Plugins, ...]
+        Plug-ins that the caller resolves from the returned settings. Names that would import a module
+        are refused only for these and for the reader, since opening captures needs neither methods
+        nor metrics.
 
     Raises
     ------
     InputError
-        As `run_configuration` and `open_clips` do, and unless ``altered`` for a capture of another fingerprint.
+        A capture's fingerprint differs from the run's, unless ``altered``. Also raised by
+        `run_configuration` and `open_clips`.
     """
     recorded = {clip.subject: clip.fingerprint for clip in RunFolder(run).read_manifest().clips}
     found: list[tuple[RunConfig, list[Clip]]] = []
@@ -226,7 +235,7 @@ def open_run_clips(
 def _configurations(
     run: Path, options: RunOptions, used: tuple[Plugins, ...] = ("methods", "metrics")
 ) -> Iterator[RunConfig]:
-    """The settings of a run with every place where its capture may be; one at least. For ``used`` see `open_run_clips`."""
+    """The settings of a run for each possible location of its capture. For ``used`` see `open_run_clips`."""
     folder = RunFolder(run)
     manifest = folder.read_manifest()
     config = replace(manifest.configuration, out=str(run))
@@ -283,7 +292,7 @@ def _named(config: RunConfig) -> dict[str, str]:
 
 
 def _check_registered(config: RunConfig, manifest: Path, used: tuple[Plugins, ...]) -> None:
-    """Refuse names that would import a module which a run folder names: it may come from anybody."""
+    """Refuse to import modules that a run folder names, since it may be untrusted."""
     named: dict[str, Sequence[str]] = {"reader": (config.reader,)}
     changes = [(c.clip, c.derive, c.drive) for c in config.conditions]
     named["conditions"] = [each.name for change in changes for each in change] + [config.clip.name]
@@ -307,7 +316,7 @@ def changed(clip: Clip, change: Named, config: RunConfig) -> Clip:
 
 
 def _reduced(clip: Clip, config: RunConfig) -> Clip:
-    """The clip at the size that metrics are taken at."""
+    """The clip at the size at which metrics are computed."""
     needs = MethodNeeds(resolution=ResolutionRule(divide=config.divide))
     planned = plan(clip, needs, {})
     if planned is None:

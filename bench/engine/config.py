@@ -1,4 +1,4 @@
-"""What a comparison is asked to do, resolved and checked whole before any work."""
+"""Configuration of a comparison, resolved and checked completely before execution."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from .adaptation import MethodNeeds
 CANONICAL = "canonical"
 """The metric profile that bare metric names belong to."""
 DEVICES = r"(cpu|cuda|mps|xpu)(:\d+)?"
-"""What a device may be called."""
+"""Valid device names."""
 
 
 def default_names(group: Literal["methods", "metrics"]) -> tuple[str, ...]:
-    """Names of the registered methods or metrics that a run takes which names none, in the registry's order."""
+    """Names of the methods or metrics that a run uses by default, in the registry's order."""
     return tuple(name for name, plugin in discover(group).items() if plugin.spec and plugin.spec.default)
 
 
@@ -41,27 +41,46 @@ class RunConfig:
 
     Attributes
     ----------
-    data : capture folder, or a folder with several.
-    out : folder for everything the run makes.
-    methods : names of registered methods, or "package.module:SPEC".
-    preset : settings by name: smoke, demo, fast, paper, or another that each method has.
-    seeds : one avatar is trained for each.
-    tasks, metrics : what is measured.
-    metric_profiles : sets of definitions to take the metrics by, see ``headbench list profiles``.
-    regions : parts of the frame to measure beside the whole of it, where a metric can; None: the face, where the
-        capture's reader knows it.
-    reader : which dataset reader opens the captures.
-    reader_settings : passed to it (for example ``head``: path of the head model).
-    frames_per_task : score at most so many frames per subject and task, evenly spaced; None: all.
-    device : "cpu", "cuda", ...
-    settings : per method, over the preset; the key ``budget`` holds iterations and seconds.
-    divide : reduce all images by this factor, by area means, before anything else: the size that metrics are
-        taken at is then that of the reduced images.
-    heads : files of further head models by version, for methods that want another than a capture was tracked
-        with; their tracking is refitted.
-    conditions : what is changed against the plain comparison, each a set of cells of its own; see `Condition`.
-    clip : registered change of every capture, of the scored frames as well, such as other held-out frames.
-    source : folder of a finished run whose avatars are taken instead of training; "" for none.
+    data : str
+        Folder of one capture or of several.
+    out : str
+        Output folder of the run.
+    methods : tuple[str, ...]
+        Names of registered methods, or "package.module:SPEC".
+    preset : str
+        Name of the settings: smoke, demo, fast, paper, or another that every method defines.
+    seeds : tuple[int, ...]
+        One avatar is trained for each seed.
+    tasks, metrics : tuple[TaskName, ...] or tuple[str, ...]
+        Tasks and metrics to evaluate.
+    metric_profiles : tuple[str, ...]
+        Sets of metric definitions, see ``headbench list profiles``.
+    regions : tuple[str, ...] | None
+        Regions to evaluate besides the whole frame, for metrics that support them. Default: the face,
+        if the capture's reader provides it.
+    reader : str
+        Dataset reader that opens the captures.
+    reader_settings : dict[str, Any]
+        Settings of the reader (for example ``head``: path of the head model).
+    frames_per_task : int | None
+        Maximum number of scored frames per subject and task, evenly spaced. Default: all.
+    device : str
+        "cpu", "cuda", ...
+    settings : dict[str, dict[str, Any]]
+        Settings by method that override the preset; the key ``budget`` holds iterations and seconds.
+    divide : int
+        Factor by which all images are reduced first, by area means. Metrics are computed at the
+        reduced size.
+    heads : dict[str, str]
+        Files of further head models by version, for methods that need another model than the one used
+        for tracking; the tracking is refitted.
+    conditions : tuple[Condition, ...]
+        Variations of the comparison; each adds its own cells, see `Condition`.
+    clip : Named
+        Registered change of every capture, including the scored frames, such as other held-out
+        frames.
+    source : str
+        Folder of a finished run whose avatars are used instead of training; "" trains.
     """
 
     data: str
@@ -85,7 +104,7 @@ class RunConfig:
     source: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse what could only fail later."""
+        """Refuse invalid settings early."""
         names = [condition.name for condition in self.conditions]
         if not names or len(set(names)) != len(names):
             raise ValueError(f"conditions: at least one, each name once; found {', '.join(names) or 'none'}")
@@ -121,7 +140,7 @@ class RunConfig:
 
     @property
     def drive(self) -> Named:
-        """What renders in place of the scored frames; tasks and metrics are then those of this change."""
+        """Registered change that replaces the scored frames, tasks and metrics."""
         return self.conditions[0].drive
 
 
@@ -164,7 +183,7 @@ class ResolvedMethod:
         return implementation() if self.config is None else implementation(self.config)
 
     def record(self) -> dict[str, Any]:
-        """Everything that decides what this method does, for the manifest."""
+        """Everything that determines the method's behaviour, for the manifest."""
         needs = MethodNeeds.of(self.spec)
         code = code_digest(self.spec.implementation) if self.spec.implementation else ""
         return {
@@ -179,7 +198,7 @@ class ResolvedMethod:
         }
 
     def identity(self) -> dict[str, Any]:
-        """The same for fingerprints, without settings that say where something lies on this machine.
+        """The same for fingerprints, without settings that are paths on this machine.
 
         The code of a method of this package is left out: its version says whether results change.
         """
@@ -300,14 +319,16 @@ def resolve_method(spec: MethodSpec, preset: str, settings: Mapping[str, Any]) -
 
 
 def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
-    """Resolve the metrics of a run by name, in every profile asked for that defines them.
+    """Resolve the metrics of a run by name, in every requested profile that defines them.
 
-    Metrics of the avatar as a whole, and those that no profile defines, are taken as they are registered. The first
-    profile's stand in the comparison table, each further profile's in a table of its name.
+    Metrics of the avatar as a whole, and those that no profile defines, keep their registered definition. The
+    metrics of the first profile are in the comparison table, those of each further profile in a table named
+    after it.
 
     Raises
     ------
-    InputError : an unknown metric or profile, a metric that none of the profiles asked for defines.
+    InputError
+        A metric or profile is unknown, or no requested profile defines a metric.
     """
     forget_code()
     if config.drive:
@@ -347,7 +368,7 @@ AvatarFolder = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """Where a run's files are now, and what may be loaded."""
+    """Current locations of a run's files, and permission to import modules."""
 
     data: str | None = None
     """The run's capture, if it is no longer where the run found it."""
@@ -371,7 +392,7 @@ class DemoConfig:
     out: str = "demo-output"
     preset: str = "demo"
     seed: int = 0  # of the training
-    subject_seed: int = 14  # of the capture: who is recorded and what they do
+    subject_seed: int = 14  # of the capture: determines the subject and the performance
     cameras: int = 12
     timesteps: int = 28
     size: str = "144x208"

@@ -1,4 +1,4 @@
-"""What the files of a run take on disk, and the deletion of what can be made again."""
+"""Disk usage of a run, and deletion of files that can be recreated."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LOSSES: Mapping[str, str] = {
     "damaged": "avatars that were set aside because their files were damaged",
     "logs": "what processes and jobs printed",
 }
-"""What deleting each kind of file costs."""
+"""Consequence of deleting each kind of file."""
 
 
 def usage(run: Path) -> dict[Kind, int]:
@@ -34,9 +34,10 @@ def usage(run: Path) -> dict[Kind, int]:
 
 
 def clean(run: Path, kinds: Sequence[Deletable]) -> int:
-    """Delete the files of some kinds from a run, and folders that this leaves empty; return how many bytes they took.
+    """Delete the files of some kinds from a run, and empty folders; return the number of bytes freed.
 
-    Raises `InputError` for a folder that is no run, one that another process works in, and links out of it.
+    Raises `InputError` for a folder that is not a run or is used by another process, and for links that lead
+    out of it.
     """
     RunFolder(run).read_manifest()
     freed = 0
@@ -89,5 +90,5 @@ def _kind(run: Path, place: Path) -> Kind:
 
 
 def shown(size: float) -> str:
-    """A number of bytes for people."""
+    """Format a number of bytes."""
     return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"

@@ -1,4 +1,4 @@
-"""``headbench run --dry-run``: the cells of a run, and what they will probably take, by cells that were run before."""
+"""``headbench run --dry-run``: the cells of a run and their estimated cost, from earlier cells."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .store import Cell, RunFolder
 
 
 class Cost(NamedTuple):
-    """What a cell took, or will take: seconds of training, bytes on disk, bytes of memory; None where not known."""
+    """Cost of a cell: seconds of training, bytes on disk, bytes of memory; None if unknown."""
 
     seconds: float | None
     disk: float | None
@@ -32,15 +32,15 @@ class _Known(NamedTuple):
 
 
 def forecast(jobs: Sequence[Job], runs: Sequence[Path]) -> Findings:
-    """List cells with their state and an estimate of what is left to do of each.
+    """List cells with their state and an estimate of their remaining cost.
 
-    The estimate of a cell is the mean over the trained cells of its method in ``runs``: seconds in proportion to the
-    iterations, disk in proportion to the frames, memory as it is.
+    The estimate of a cell is the mean over the trained cells of its method in ``runs``: seconds are scaled by
+    the iterations, disk usage by the frames, and memory is not scaled.
 
     Parameters
     ----------
-    runs : sequence of Path
-        Folders of earlier runs, on a machine like this one; the run's own among them.
+    runs : Sequence[Path]
+        Folders of earlier runs on a similar machine, including the run's own folder.
     """
     known = [each for run in runs for each in _trained(run)]
     lines, cells = [], []

@@ -1,4 +1,4 @@
-"""The cells of a run with all they need: made here for runs, workers, and everything that looks at a run's avatars."""
+"""The cells of a run with their inputs, for runs, workers and commands that read a run's avatars."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ def make_jobs(
     folder: RunFolder,
     out: Path | None = None,
 ) -> list[Job]:
-    """Make the cells of a run, each clip in the form that its method and condition need.
+    """Make the cells of a run, with clips adapted to each method and condition.
 
     Parameters
     ----------
-    cells : sequence of (ResolvedMethod, Condition)
+    cells : Sequence[tuple[ResolvedMethod, Condition]]
         See `resolve_cells`.
     folder : RunFolder
         Run folder of the cells.
     out : Path, optional
-        Where to keep what took long in adapting clips, its lock is held; what ``folder`` kept is copied there first, since
-        nothing is written in a run by what looks at it. Default: ``folder`` itself.
+        Locked folder for results of slow adaptations of clips; those stored in ``folder`` are copied
+        there first, since commands that read a run do not write to it. Default: ``folder`` itself.
 
     Raises
     ------
     InputError
-        For a region that a clip does not know, and for a form that a clip cannot be brought into.
+        A clip has no such region or cannot be adapted to a method.
     """
     regions = {clip.subject: check_regions(clip, config.regions) if protocols else () for clip in clips}
     forms = _Forms(config, folder, RunFolder(out or folder.root))
@@ -80,7 +80,7 @@ def make_jobs(
 
 
 class _Forms:
-    """Clips in the forms that methods and conditions need, each made once."""
+    """Clips adapted to methods and conditions, each adapted once."""
 
     def __init__(self, config: RunConfig, run: RunFolder, out: RunFolder):
         self._config, self._run, self._out = config, run, out
@@ -88,7 +88,7 @@ class _Forms:
         self._made: dict[tuple[str, MethodNeeds], AdaptedClip] = {}
 
     def plan(self, cells: Sequence[tuple[Clip, ResolvedMethod, Condition]]) -> None:
-        """Check that every form can be had, then make them."""
+        """Check that all clips can be adapted, then adapt them."""
         planned = {}
         for clip, method, condition in cells:
             changed, needs = self._clip(clip, condition), MethodNeeds.of(method.spec)
@@ -105,7 +105,7 @@ class _Forms:
                     self._made[fingerprint, needs] = adaptation.carry_out(step, needs, folder, label)
 
     def of(self, clip: Clip, method: ResolvedMethod, condition: Condition) -> AdaptedClip | None:
-        """The form of a clip; None where it is the clip itself."""
+        """The adapted clip; None if no adaptation is needed."""
         changed = self._clip(clip, condition)
         made = self._made.get((changed.fingerprint, MethodNeeds.of(method.spec)))
         return made or (None if changed is clip else AdaptedClip(changed))
@@ -118,7 +118,7 @@ class _Forms:
 
 
 def _copy_kept(source: Path, folder: Path) -> None:
-    """Copy the files that are not in ``folder`` yet; never what a link leads to, for the run may come from anybody."""
+    """Copy the files missing from ``folder``; links are not followed, since the run may be untrusted."""
     if source.is_symlink() or source.parent.is_symlink():
         return
     for path in sorted(source.rglob("*")):
@@ -129,9 +129,9 @@ def _copy_kept(source: Path, folder: Path) -> None:
 
 
 def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
-    """Train or derive the avatar of a cell, render its frames and measure them; each stage continues where it was.
+    """Train or derive the avatar of a cell, render its frames and measure them; each stage resumes.
 
-    A cell whose condition drives the avatar is rendered and judged by that change in place of the last two.
+    If the cell's condition animates the avatar, that change replaces the last two stages.
     """
     if job.source is not None and (kept := stored_rows(job, metrics, retry=True)) is not None:
         return kept
@@ -158,17 +158,22 @@ def trained(
 
     Parameters
     ----------
-    run : folder of the run.
-    methods : names of those wanted; empty: all but the trivial baselines, which nothing can drive to extremes.
-    options : where the run's files are now.
-    out : folder to keep clips in that methods need in another form; its lock is held. It becomes ``out`` of the settings.
-    only : see `open_clips`.
+    run : Path
+        Run folder.
+    methods : Sequence[str]
+        Names of methods; empty: all except trivial baselines, which cannot show extreme poses.
+    options : RunOptions
+        Current locations of the run's files.
+    out : Path
+        Locked folder for adapted clips; replaces ``out`` of the settings.
+    only : int | None
+        See `open_clips`.
 
     Raises
     ------
     InputError
-        For a method that the run does not have, a capture that is not the one trained on, an avatar that is not
-        there or whose training did not end, and a run without any avatar to look at.
+        The run has no such method or no avatar, a capture differs from the one used for training, or
+        an avatar is missing or its training did not finish.
     """
     folder = RunFolder(run)
     resolved = [cell for cell in resolve_cells(run_configuration(run, options)) if not cell[1].name]

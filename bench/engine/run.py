@@ -51,23 +51,24 @@ def run(
 ) -> Rows:
     """Run the cells of a configuration into ``config.out`` and return the rows of the whole folder.
 
-    Everything that can be checked is checked before the first long step: settings, device, methods, captures, the
-    output folder, and that no other process works in it. A method that fails is recorded as failed and the others
-    go on. Started again with the same configuration after a kill, it keeps what is done and continues what is not. In a
-    folder that has other methods, seeds, metrics, conditions or frames it adds what is new, see `grown`.
+    Everything that can be checked is checked before the first long step: settings, device, methods, captures,
+    the output folder, and that no other process uses it. A method that fails is recorded as failed and the
+    others continue. A restart with the same configuration keeps finished steps and resumes the others. In a
+    folder with other methods, seeds, metrics, conditions or frames it adds the new ones, see `grown`.
 
     Parameters
     ----------
     execution : Execution, optional
-        Where the cells are executed. Default: one after another in this process.
+        How to execute the cells. Default: sequentially in this process.
     unchecked : bool
-        Train although a capture has an error that makes results meaningless (see `DatasetSpec.errors`).
-    clips : sequence of Clip, optional
-        The captures of the configuration, if they are open already.
+        Train although a capture has an error that makes results meaningless (see
+        `DatasetSpec.errors`).
+    clips : Sequence[Clip], optional
+        Captures of the configuration, if they are already open.
     reports : bool
         Write the registered reports at the end.
     record : Any
-        Added to the manifest.
+        Values to add to the manifest.
     """
     check_kind(Path(config.out), "a run")
     check_output_folder(Path(config.out))
@@ -88,14 +89,14 @@ def run_locked(
     reports: bool = True,
     **record: Any,
 ) -> Rows:
-    """Run the cells of a configuration as `run` does, into a folder whose lock is held.
+    """Run the cells of a configuration like `run`, in a folder that the caller has locked.
 
     Parameters
     ----------
     cells, metrics : sequence, optional
-        What the configuration resolves to, where it does not name them; then ``each`` is to be given.
+        Resolved cells and metrics, if the configuration does not name them; they require ``each``.
     each : callable, optional
-        Does the work of a cell in this process, in place of `run_cell`.
+        Executes a cell in this process, instead of `run_cell`.
     trust : bool
         Import modules and run programs that only a run in the folder names.
     """
@@ -187,7 +188,7 @@ def _planned(
 
 
 def planned_jobs(config: RunConfig) -> list[Job]:
-    """The cells that `run` would work on, checked as it checks them; nothing is written into ``config.out``."""
+    """The cells that `run` would execute, with the same checks; nothing is written into ``config.out``."""
     folder = RunFolder(Path(config.out))
     config = grown(config, folder)
     with TemporaryDirectory() as scratch:
@@ -198,9 +199,9 @@ def planned_jobs(config: RunConfig) -> list[Job]:
 
 
 def grown(config: RunConfig, folder: RunFolder, *, trust: bool = False) -> RunConfig:
-    """The configuration together with what the run in the folder has already: methods, seeds, tasks, metrics, conditions.
+    """The configuration extended by methods, seeds, tasks, metrics, conditions of the run in the folder.
 
-    Raises `InputError` where a setting of both, which decides results of all cells, has another value.
+    Raises `InputError` if a setting that determines the results of all cells differs.
     """
     if not folder.rows.is_file() or not folder.manifest.is_file():
         return config
@@ -251,7 +252,7 @@ def grown(config: RunConfig, folder: RunFolder, *, trust: bool = False) -> RunCo
 
 
 def _check_not_foreign(earlier: RunConfig, config: RunConfig, manifest: Path) -> None:
-    """Refuse what would import a module or run a program that only the run folder names: it may come from anybody."""
+    """Refuse to import modules or run programs that only the run folder names, since it may be untrusted."""
     remedy = "Name it in this call, if you trust who made the run; or choose another --out."
     for key in ("methods", "metrics", "metric_profiles"):
         for name in sorted({*getattr(earlier, key)} - {*getattr(config, key)}):
@@ -274,7 +275,7 @@ def _same_place(first: str, second: str) -> bool:
 
 
 def check_settings(cells: Iterable[tuple[ResolvedMethod, Condition]]) -> None:
-    """Create each method of some cells, and let it refuse its settings before anything that takes long.
+    """Create each method of some cells, so that it checks its settings before any long step.
 
     Raises `InputError` for settings that a method refuses, and whatever importing or creating it raises.
     """
@@ -303,14 +304,14 @@ def write_reports(run_folder: Path) -> list[Path]:
 
 
 def run_jobs(jobs: Sequence[Job], metrics: Sequence[MetricSpec], each: RunCell) -> Rows:
-    """Do the work of each cell, under one line of progress; a cell that fails has failed rows."""
+    """Execute each cell, with one progress line; a cell that fails has failed rows."""
     with run_progress({job.name: steps_ahead(job, metrics) for job in jobs}) as line:
         return Rows.joined([_run_inline(replace(job, line=line), metrics, each) for job in jobs])
 
 
 def _run_inline(job: Job, metrics: Sequence[MetricSpec], each: RunCell) -> Rows:
     log.info("%s", job.name)
-    outcome_path(job.cell.folder).unlink(missing_ok=True)  # of a process or a job that worked on it earlier
+    outcome_path(job.cell.folder).unlink(missing_ok=True)  # of an earlier process or job
     try:
         return each(job, metrics)
     except HeadbenchError as error:
@@ -321,11 +322,11 @@ def _run_inline(job: Job, metrics: Sequence[MetricSpec], each: RunCell) -> Rows:
         check_device_answers(job.device)
         return failed_rows(job, metrics, reason_of(error))
     finally:
-        job.created.clear()  # so that a run does not hold every method that it has created
+        job.created.clear()  # so that a run does not keep every method in memory
 
 
 def warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
-    """Say before the training, not after it, which metric cannot be had."""
+    """Report unavailable metrics before the training instead of after it."""
     image = clip.image(clip.splits["train"][0])
     for spec in metrics:
         metric = make_metric(spec)
@@ -361,7 +362,7 @@ def describe(
     clips: Sequence[Clip],
     protocols: Mapping[str, Protocol],
 ) -> Manifest:
-    """The manifest of a run that starts."""
+    """The manifest of a new run."""
     return Manifest(
         configuration=config,
         paths=relative_paths(config),

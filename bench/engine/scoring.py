@@ -1,4 +1,4 @@
-"""Scores frames against the truth: each is read once, by one pool of threads, with bounded memory."""
+"""Scores frames against the ground truth; each is read once, by one thread pool, with bounded memory."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from ..registry import resolve
 from ..specs import MetricSpec
 
 FULL = "full"
-"""The region that every metric is measured over: the whole frame."""
+"""The region over which every metric is computed: the whole frame."""
 
 _AHEAD = 8
-"""Frames decoded ahead of a metric that works through them in order."""
+"""Frames decoded ahead of a metric that processes them in order."""
 
 
 class Score(NamedTuple):
-    """One metric of one frame over one region, or why there is none (status "missing", value not a number)."""
+    """One metric of one frame over one region, or the reason why it is "missing" (value NaN)."""
 
     metric: str
     key: FrameKey
@@ -35,18 +35,19 @@ class Score(NamedTuple):
 
 
 class ScoredFrames(NamedTuple):
-    """Where the frames to score come from."""
+    """Source of the frames to score."""
 
     render: Callable[[FrameKey], ByteArray]
     """Reads a stored frame, (H, W, 3) 8-bit."""
     clip: Clip
-    """Has the truth, and knows the regions if any are asked for."""
+    """Provides the ground truth, and the requested regions."""
 
 
 def make_metric(spec: MetricSpec, device: str = "cpu") -> Any:
-    """Import what a spec names; a class is made without arguments.
+    """Import the object that a spec names; a class is instantiated without arguments.
 
-    On a CUDA device where there is one and the metric can use it; results of a run on another machine are measured on the CPU.
+    Uses a CUDA device if it is available and the metric supports it; results from another machine are
+    evaluated on the CPU.
     """
     implementation = resolve(spec.implementation)
     metric = implementation() if isinstance(implementation, type) else implementation
@@ -55,9 +56,9 @@ def make_metric(spec: MetricSpec, device: str = "cpu") -> Any:
 
 
 def check_regions(clip: Clip, wanted: Sequence[str] | None) -> tuple[str, ...]:
-    """Names of the regions to measure beside the whole frame; None asks for the face where the clip knows it.
+    """Names of the regions to evaluate besides the whole frame; None requests the face if the clip has it.
 
-    Raises `InputError` for one that the clip does not know.
+    Raises `InputError` for regions that the clip does not have.
     """
     known = tuple(clip.region_names) if isinstance(clip, RegionalClip) else ()
     if wanted is None:
@@ -83,13 +84,17 @@ def score_frames(
 
     Parameters
     ----------
-    regions : beside the whole frame, for metrics that know regions. A frame in which a region has no pixel has no
-        score there: what is seen is a property of the truth, so that it is missing alike for every method.
-    device : of the run; see `make_metric`.
+    regions : Sequence[str]
+        Regions besides the whole frame, for metrics that support them. A frame in which a region has
+        no pixels has no score there. Regions come from the ground truth, so that such scores are
+        missing for every method alike.
+    device : str
+        Device of the run; see `make_metric`.
 
     Raises
     ------
-    HeadbenchError : a value that is not finite.
+    HeadbenchError
+        A value is not finite.
     """
     scored: dict[str, list[Score]] = {}
     metrics = {spec.name: make_metric(spec, device) for spec in specs}
@@ -125,7 +130,7 @@ def score_frames(
 def _score_frame(
     frames: ScoredFrames, metrics: Sequence[tuple[MetricSpec, Any]], regions: Sequence[str], key: FrameKey
 ) -> list[Score]:
-    """All metrics that look at one frame at a time, so that it is decoded once."""
+    """All metrics of single frames, so that each frame is decoded once."""
     image, truth = frames.render(key), frames.clip.image(key)
     masks: Mapping[str, Any] = {}
     if regions and any(spec.kind == "regional" for spec, _ in metrics):
@@ -146,7 +151,7 @@ def _score_frame(
 def _batched(
     keys: Sequence[FrameKey], frames: ScoredFrames, spec: MetricSpec, metric: Any, pool: ThreadPoolExecutor
 ) -> Iterator[Score]:
-    """Scores of a metric that takes many frames in one pass, in order."""
+    """Scores of a metric that processes many frames in one pass, in order."""
 
     def pair(key: FrameKey) -> tuple[ByteArray, ByteArray]:
         return frames.render(key), frames.clip.image(key)
@@ -162,9 +167,9 @@ def _batched(
 def _temporal(
     keys: Sequence[FrameKey], frames: ScoredFrames, spec: MetricSpec, metric: Any, pool: ThreadPoolExecutor
 ) -> Iterator[Score]:
-    """Scores of a metric that compares the change between a frame and the neighbour in time before it.
+    """Scores of a metric that compares the change between a frame and the preceding one.
 
-    The first frame after a gap takes the one after it, so that every frame has a value.
+    The first frame after a gap uses the following one, so that every frame has a value.
     """
     known = set(keys)
 

@@ -31,9 +31,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Change:
-    """A metric of an avatar before and after it was measured again; ``None`` for a number that is not known.
+    """A metric of an avatar before and after it was measured again; ``None`` for an unknown number.
 
-    ``load`` is the cores that other processes kept busy meanwhile.
+    ``load`` is the number of cores used by other processes during the measurement.
     """
 
     subject: str
@@ -65,12 +65,15 @@ def measure_speed_again(
 
     Parameters
     ----------
-    methods : names of those to measure; empty: all of the run.
+    methods : Sequence[str]
+        Names of methods to measure; empty: all of the run.
 
     Raises
     ------
-    InputError : a run that did not end, that another process works on or that has no metric of speed; a method that it does
-        not have; an avatar or a capture that is missing or is not the recorded one. Nothing has been measured then.
+    InputError
+        The run is unfinished, in use by another process or without a speed metric, it has no such
+        method, or an avatar or a capture is missing or differs from the recorded one. Nothing has
+        been measured then.
     """
     folder = RunFolder(run)
     folder.read_manifest().check_done(folder.manifest)
@@ -119,7 +122,7 @@ def measure_speed_again(
 def _jobs(
     folder: RunFolder, options: RunOptions, methods: Sequence[str]
 ) -> tuple[list[Job], list[MetricSpec]]:
-    """The cells whose speed is asked for and the metrics of the run, checked."""
+    """The selected cells and the metrics of the run, checked."""
     manifest = folder.read_manifest()
     config, clips = open_run_clips(folder.root, options)
     check_device(config.device)

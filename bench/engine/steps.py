@@ -1,4 +1,4 @@
-"""The steps of one cell (a subject, a method, a seed): fit, render, measure. Each picks up where it was."""
+"""The steps of one cell (a subject, a method, a seed): fit, render, measure. Each can resume."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from .store import Cell, StepState, avatar_files
 from .stored import AVATAR_FILE, shown_by, training_losses, write_avatar_record
 
 log = logging.getLogger(__name__)
-RESULT_FORMAT = 1  # raise when a step changes what it leaves behind
+RESULT_FORMAT = 1  # raise when the output of a step changes
 TRAINING, RENDERING, MEASURING_AVATAR = "training", "rendering", "measuring the avatar"
 DIGESTS = "digests"
 RECORD_EVERY_S = 10.0
@@ -56,11 +56,12 @@ RECORD_EVERY_S = 10.0
 
 @dataclass(frozen=True)
 class Job:
-    """One cell with all it needs.
+    """One cell with its inputs.
 
-    ``clip`` is what is compared: the ground truth of every metric. ``adapted`` is its form for this method and condition, None
-    where that is the clip itself. ``regions`` are measured beside the whole frame. ``source`` is the cell whose avatar is taken
-    instead of training. ``config`` is that of the run. ``kept`` is shared by the cells of a run, for what takes long to read. ``line`` shows the progress of the run.
+    ``clip`` is the ground truth of every metric. ``adapted`` is the clip adapted to this method and
+    condition, None if that is the clip itself. ``regions`` are evaluated besides the whole frame. ``source``
+    is the cell whose avatar is used instead of training. ``config`` is that of the run. ``kept`` is a cache
+    shared by the cells of a run. ``line`` shows the progress of the run.
     """
 
     clip: Clip
@@ -85,12 +86,12 @@ class Job:
         return self.created[0]
 
     def progress(self, step: str) -> AbstractContextManager[Progress]:
-        """The progress of a step: of the run if this is a cell of one, else of its own."""
+        """The progress of a step: of the run if the cell belongs to one, otherwise a separate one."""
         return self.line.step(self.name, step) if self.line else progress(f"{self.name}: {step}")
 
     @property
     def form(self) -> AdaptedClip:
-        """The clip as the method sees it."""
+        """The clip adapted to the method."""
         return self.adapted or AdaptedClip(self.clip)
 
     @property
@@ -104,7 +105,7 @@ class Job:
 
     @property
     def label(self) -> str:
-        """The method with the condition, as tables and folders name it."""
+        """Label of the method and its condition in tables and folder names."""
         return label_of(self.method.spec.name, self.condition.name)
 
     @property
@@ -116,7 +117,7 @@ class Job:
 
     @property
     def frame_paths(self) -> dict[Path, tuple[Protocol, FrameKey]]:
-        """The frames to score, by where their renders lie."""
+        """The frames to score, by the path of their renders."""
         return {
             self.cell.render(protocol.task, key): (protocol, key)
             for protocol in self.protocols.values()
@@ -125,7 +126,7 @@ class Job:
         }
 
     def check(self) -> None:
-        """Refuse a folder that holds an avatar made of something else, or by other code, or links out of it.
+        """Refuse a folder with an avatar from other inputs or other code, or with links that lead out of it.
 
         Damaged records of steps are removed, with a warning.
         """
@@ -153,14 +154,14 @@ class Job:
         )
 
     def check_method(self) -> None:
-        """Let a method that can tell refuse what it could not train or render; not where all is done already."""
+        """Let a method check that it can train and render, unless all steps are done."""
         method = self.create() if self.method.spec.implementation else None
         if isinstance(method, CheckedMethod) and not self.cell.is_done("measure", self.fit_fingerprint):
             method.check(TrainingView(self.form.clip), self.method.budget)
 
 
 def steps_ahead(job: Job, metrics: Sequence[MetricSpec]) -> dict[str, str]:
-    """The steps of a cell that are not done, each with the kind of cells that it takes as long for."""
+    """The unfinished steps of a cell, each with the kind of cells of similar duration."""
     trained = job.cell.is_done("fit", job.fit_fingerprint)
     if trained and job.cell.is_done("measure", job.fit_fingerprint):
         return {}
@@ -177,10 +178,10 @@ def steps_ahead(job: Job, metrics: Sequence[MetricSpec]) -> dict[str, str]:
 
 
 def fit(job: Job) -> Avatar:
-    """Train, or continue, or read what was trained; return the avatar as read back from disk.
+    """Train, resume training or read the trained avatar; return the avatar as read back from disk.
 
-    A method sees the images of the training split alone. The record's seconds are those since the last of ``interruptions``. An avatar
-    with damaged files is trained again, with a warning.
+    A method can only read images of the training split. The recorded seconds start at the last of
+    ``interruptions``. An avatar with damaged files is trained again, with a warning.
     """
     method = job.create()
     earlier = job.cell.step("fit")
@@ -190,7 +191,7 @@ def fit(job: Job) -> Avatar:
             _warn(job, damaged, "it is trained again")
             earlier = None
     if earlier is None and job.cell.avatar.exists():
-        job.cell.set_aside(job.cell.avatar)  # no record says what it was made of, or it is damaged
+        job.cell.set_aside(job.cell.avatar)  # it is damaged, or its inputs are unknown
     if earlier is None or earlier["status"] != "done":
         interruptions = 0 if earlier is None else earlier.get("interruptions", 0) + 1
         record = job.method.record()
@@ -280,9 +281,9 @@ def source_digest(job: Job) -> str:
 
 
 def derive(job: Job) -> Avatar:
-    """Take the avatar of the job's ``source``, or what its condition derives from that without training.
+    """Use the avatar of the job's ``source``, or the one that the condition derives from it without training.
 
-    Raises `InputError` where the source has no trained avatar.
+    Raises `InputError` if the source has no trained avatar.
     """
     assert job.source is not None
     derived_from = source_digest(job)
@@ -302,7 +303,7 @@ def derive(job: Job) -> Avatar:
 
 
 def drive(job: Job, avatar: Avatar) -> Rows:
-    """Have the condition's change render the avatar and judge what it shows; leave the rows and a record in the cell.
+    """Render and evaluate the avatar with the condition's change; write the rows and a record to the cell.
 
     The record has the details of the change, and digests of its files by their place in the run folder.
     """
@@ -322,7 +323,7 @@ def drive(job: Job, avatar: Avatar) -> Rows:
 
 
 def _drive_fingerprint(job: Job) -> str:
-    """Digest of everything that a driven avatar's rows depend on."""
+    """Digest of everything that the rows of an animated avatar depend on."""
     change = job.condition.drive
     spec: ConditionSpec = get("conditions", change.name)
     code = code_digest(spec.implementation) if is_outside(spec.implementation) else ""
@@ -335,7 +336,7 @@ def _drive_fingerprint(job: Job) -> str:
 
 
 def _driven_before(job: Job, retry: bool) -> Rows | None:
-    """Rows of a driven avatar, read back; None where it has to be driven (``retry``: again if nothing could be measured)."""
+    """Stored rows of an animated avatar; None if there are none (``retry``: or no value)."""
     state = job.cell.step("measure")
     if state is None or not job.cell.is_done("fit", job.fit_fingerprint):
         return None
@@ -390,8 +391,8 @@ def _warn(job: Job, damaged: Mapping[str, str], remedy: str) -> None:
 def render(job: Job, avatar: Avatar) -> None:
     """Render every frame of every protocol to 8-bit PNG of the protocol's size.
 
-    Frames of this very avatar are kept if they are as they were written, by their recorded digests; damaged ones are
-    rendered again, with a warning, and those that a kill left without a record.
+    Frames of this avatar are kept if they match their recorded digests. Damaged frames are rendered again,
+    with a warning, as are frames without a record after an interruption.
     """
     cell, form = job.cell, job.form
     made_of = digest(job.fit_fingerprint, _avatar_record(job))
@@ -430,7 +431,7 @@ def render(job: Job, avatar: Avatar) -> None:
 def _drawn(
     job: Job, avatar: Avatar, missing: Mapping[str, tuple[Protocol, FrameKey]], report: Progress
 ) -> Iterator[tuple[str, FloatArray]]:
-    """Place and (H, W, 3) colours of each frame: one by one, or by task where the avatar renders lists."""
+    """Path and (H, W, 3) colours of each frame: one by one, or by task if the avatar renders lists."""
     clip = job.form.clip
     views: dict[str, dict[FrameKey, tuple[str, tuple[Camera, HeadPose], Sequence[float]]]] = {}
     for name, (protocol, key) in missing.items():
@@ -455,13 +456,13 @@ def _drawn(
 
 
 def recorded_frames(job: Job) -> dict[str, str]:
-    """SHA-256 of the frames as they were rendered, by their place in the cell's folder."""
+    """SHA-256 of the rendered frames, by their path in the cell's folder."""
     state = job.cell.step(DIGESTS)
     return {} if state is None else state.get("files", {})
 
 
 def trained_files(job: Job) -> Mapping[str, str]:
-    """SHA-256 of the files of a cell's avatar, by their place in the cell's folder."""
+    """SHA-256 of the files of a cell's avatar, by their path in the cell's folder."""
     return _avatar_record(job)[1]
 
 
@@ -474,18 +475,23 @@ def _avatar_record(job: Job) -> tuple[str, Mapping[str, str]]:
 def measure(
     job: Job, avatar: Avatar, metrics: Sequence[MetricSpec], again: Sequence[MetricSpec] = ()
 ) -> Rows:
-    """Score the stored frames and the avatar as a whole; what was measured already is read back.
+    """Evaluate the stored frames and the avatar as a whole; existing results are read back.
 
-    Metrics of one implementation are one measurement: they are read back, or taken again, together. A measurement that
-    gave any number is read back; one that could not be had is tried again. Damaged rows are measured again, with a
-    warning. Rows of metrics that are not asked for stay in the cell's file, with what they were measured of.
+    Metrics of one implementation are one measurement and are read back or repeated together. A measurement
+    with any value is read back; a failed one is repeated. Damaged rows are measured again, with a warning.
+    Rows of metrics that are not requested stay in the cell's file, with the record of their inputs.
 
     Parameters
     ----------
-    again : those of ``metrics``, all of the avatar as a whole, that are measured again, and no others that were measured or
-        tried. Their former values stay in the record of the measurements, under ``earlier``.
+    again : Sequence[MetricSpec]
+        Metrics to measure again, a subset of ``metrics`` that concern the avatar as a whole; others that
+        were already measured or tried are not. Former values stay in the record of the measurements,
+        under ``earlier``.
 
-    Raises `UnavailableError` where one of ``again`` has a value but cannot be measured any more; nothing is changed then.
+    Raises
+    ------
+    UnavailableError
+        A metric in ``again`` has a value but can no longer be measured; nothing is changed then.
     """
     known, details, old = _measured_before(job)
     repeated = {spec.implementation for spec in again}
@@ -510,7 +516,7 @@ def measure(
                 if isinstance(outcome, UnavailableError) and spec.implementation in repeated & had:
                     raise outcome
                 found = outcome.details.items() if isinstance(outcome, Measurement) else ()
-                # JSON has no others; a metric of one of them has a row of its own.
+                # JSON has only finite numbers; a metric with another value has its own row.
                 details[spec.name] = {k: v for k, v in found if not isinstance(v, float) or math.isfinite(v)}
     replaced = [spec.name for spec in metrics if spec.implementation in repeated & had]
     step = job.cell.step("measure")
@@ -532,9 +538,7 @@ def measure(
             f"The new measurement has no value of {lost[0]}, and the former has one.", "The former is kept."
         )
     others = sorted(old.metrics - fingerprints.keys())
-    job.cell.begin(
-        "measure", job.fit_fingerprint, **record
-    )  # a kill between the rows and their record is no damage
+    job.cell.begin("measure", job.fit_fingerprint, **record)  # interrupted between the rows and their record
     Rows.joined([result, old.of_metrics(others)] if others else [result]).write(job.cell.rows)
     job.cell.finish(
         "measure",
@@ -548,7 +552,7 @@ def measure(
 
 
 def _replaced(rows: Rows) -> dict[str, Any]:
-    """Values of a cell that are about to be replaced, and how they were measured, as its record keeps them."""
+    """Record of the values of a cell before they are replaced, with the conditions of their measurement."""
     table = rows.select(method=ALL, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
     table = table[table["status"] == "ok"]
     first = table.iloc[0]
@@ -562,9 +566,9 @@ def _replaced(rows: Rows) -> dict[str, Any]:
 
 
 def stored_rows(job: Job, metrics: Sequence[MetricSpec], *, retry: bool = False) -> Rows | None:
-    """The rows of a cell that is done, read back; None where something is missing, damaged or made of other inputs.
+    """Stored rows of a finished cell; None if something is missing, damaged or made from other inputs.
 
-    ``retry``: measurements that could not be had count as missing, since they are to be tried again.
+    ``retry``: failed measurements count as missing, so that they are repeated.
     """
     if job.condition.drive:
         return _driven_before(job, retry)
@@ -616,7 +620,7 @@ def _measure_fingerprint(job: Job, spec: MetricSpec, rendered: Mapping[str, str]
 
 
 def reason_of(error: Exception) -> str:
-    """Why a cell failed, as its rows say it; "out of memory" has that name, whoever noticed it."""
+    """Reason of a failed cell for its rows; running out of memory is always "out of memory"."""
     name, text = type(error).__name__, str(error)
     wanted = ("out of memory", "can't allocate memory", "cannot allocate memory")
     if isinstance(error, MemoryError) or name == "OutOfMemoryError" or any(w in text.lower() for w in wanted):
@@ -693,7 +697,7 @@ def _avatar_row(job: Job, spec: MetricSpec, outcome: Measurement | UnavailableEr
 
 
 def _conditions(job: Job, spec: MetricSpec, details: Mapping[str, float]) -> dict[str, Any]:
-    """Columns of a time: which machine, how many threads, how busy others were; none for what is no time."""
+    """Columns of a time: machine, number of threads, load by other processes; empty for other metrics."""
     if not spec.machine_bound or "threads" not in details:
         return {}
     if spec.kind == "training":

@@ -1,4 +1,4 @@
-"""The run folder: what a comparison leaves on disk, and how a killed one finds what is already there.
+"""The run folder: the files of a comparison, and how an interrupted one resumes.
 
 ::
 
@@ -7,15 +7,15 @@
     run.log
     rows.parquet                  one row per method, seed, frame and metric
     <subject>/<method>/seed-<n>/
-        fit.json                  what the avatar was made of, how long it took, digests of its files
-        avatar/                   what the method wrote
+        fit.json                  inputs of the avatar, training time, digests of its files
+        avatar/                   files of the method
         losses.csv, tensorboard/  losses of the training, for methods that record them
         renders/<task>/*.png      8-bit frames, named by key
-        digests.json              digests of the frames as they were rendered
-        rows.parquet              what was measured
-        measure.json              what it was measured of, digest of the rows
-        outcome.json, job.log     of the process or job that worked on it, see `bench.executors`
-    speed.json                    while speed is measured last, see `bench.executors`: cells that failed before
+        digests.json              digests of the rendered frames
+        rows.parquet              results
+        measure.json              inputs of the results, digest of the rows
+        outcome.json, job.log     of the process or job of the cell, see `bench.executors`
+    speed.json                    present while speed is measured at the end: cells that failed before
     adapted/<subject>/            tracking refitted for methods that want another head model
     tables/, contact_sheet.png, report.html    views of the rows
 """
@@ -45,16 +45,27 @@ class StepState(TypedDict, total=False):
 
     Attributes
     ----------
-    fingerprint : digest of everything that its result depends on.
-    files : SHA-256 of the files that it left, by their place in the cell's folder.
-    rows : SHA-256 of ``rows.parquet``.
-    fingerprints, details : of the measurements, by metric.
-    seconds, processor_seconds, interruptions, peak_memory_bytes, memory_before_bytes, method : of the training.
-    finished_at : when the training ended, in seconds since 1970 (UTC).
-    peak_device_memory_bytes, device_memory_before_bytes, tf32 : likewise, of a CUDA device; see `PeakMemory`.
-    load : machine, threads and cores of the training, and cores that others kept busy meanwhile; see `ProcessorLoad`.
-    earlier : values that were measured again since, each time with when, on which machine and under which load.
-    derived_from : digest of the trained avatar that this one was derived from without training.
+    fingerprint : Required[str]
+        Digest of everything that determines the step's result.
+    files : dict[str, str]
+        SHA-256 of the files that the step wrote, by their path in the cell's folder.
+    rows : str
+        SHA-256 of ``rows.parquet``.
+    fingerprints, details : dict[str, str] or dict[str, dict[str, Any]]
+        Fingerprints and details of the measurements, by metric.
+    seconds, processor_seconds, interruptions, peak_memory_bytes, memory_before_bytes, method : float, int or dict[str, Any]
+        Statistics of the training.
+    finished_at : float
+        End of the training, in seconds since 1970 (UTC).
+    peak_device_memory_bytes, device_memory_before_bytes, tf32 : int or bool
+        Memory and arithmetic of the training on a CUDA device; see `PeakMemory`.
+    load : dict[str, Any]
+        Machine, threads and cores of the training, and cores used by other processes; see
+        `ProcessorLoad`.
+    earlier : list[dict[str, Any]]
+        Values before a repeated measurement, each with its time, machine and load.
+    derived_from : str
+        Digest of the trained avatar from which this one was derived without training.
     """
 
     fingerprint: Required[str]
@@ -111,7 +122,7 @@ class Cell:
         return step
 
     def drop_damaged_records(self) -> None:
-        """Remove records of steps that cannot be read, with a warning: what they record is made again."""
+        """Remove records of steps that cannot be read, with a warning; these steps are repeated."""
         for name in STAGES:
             try:
                 self.step(name)
@@ -122,7 +133,7 @@ class Cell:
                 (self.folder / f"{name}.json").unlink()
 
     def set_aside(self, folder: Path) -> None:
-        """Move a folder of the cell whose files cannot be trusted to a name of its own beside it; nothing is deleted."""
+        """Rename a folder of the cell whose files cannot be trusted; nothing is deleted."""
         number = 1
         while (aside := folder.with_name(f"{folder.name}-damaged-{number}")).exists():
             number += 1
@@ -130,25 +141,25 @@ class Cell:
         log.info("%s was moved to %s.", folder, aside.name)
 
     def digests(self, files: Iterable[Path]) -> dict[str, str]:
-        """SHA-256 of files in the cell's folder, by their place in it."""
+        """SHA-256 of files in the cell's folder, by their path in it."""
         return {self.name(path): digest_file(path) for path in sorted(files)}
 
     def name(self, path: Path) -> str:
-        """The place of a file in the cell's folder."""
+        """The path of a file in the cell's folder."""
         return path.relative_to(self.folder).as_posix()
 
     def damage(self, files: Mapping[str, str]) -> dict[str, str]:
-        """Which of the files are not as their digests say, and what is wrong with each."""
+        """Files that do not match their digests, with the reason for each."""
         found = {name: _damage(self.folder / name, known) for name, known in files.items()}
         return {name: why for name, why in found.items() if why}
 
     def is_done(self, name: str, fingerprint: str) -> bool:
-        """Say whether the step ended with exactly these inputs."""
+        """Whether the step ended with exactly these inputs."""
         state = self.step(name)
         return state is not None and state.get("fingerprint") == fingerprint and state.get("status") == "done"
 
     def ended(self, name: str) -> bool:
-        """Say whether the step ended, with whatever inputs; not of a record that cannot be read."""
+        """Whether the step ended, with any inputs; False for a record that cannot be read."""
         try:
             state = self.step(name)
         except InputError:
@@ -156,16 +167,16 @@ class Cell:
         return state is not None and state.get("status") == "done"
 
     def begin(self, name: str, fingerprint: str, *, status: str = "started", **record: Any) -> None:
-        """Record that the step works on these inputs."""
+        """Record the start of the step with these inputs."""
         write_json(self.folder / f"{name}.json", {"fingerprint": fingerprint, "status": status, **record})
 
     def finish(self, name: str, fingerprint: str, **record: Any) -> None:
-        """Record that the step ended, with what it measured."""
+        """Record the end of the step, with its results."""
         self.begin(name, fingerprint, status="done", **record)
 
 
 def _kept_design(manifest: Manifest) -> dict[str, str]:
-    """What may not change when a run is started again, by what error messages call it."""
+    """Fields that must not change when a run is restarted, by their name in error messages."""
     regions = manifest.configuration.regions
     protocols = sorted(manifest.protocols.items())
     return {
@@ -221,7 +232,7 @@ class RunFolder:
 
     @property
     def adapted(self) -> Path:
-        """Folder of what was computed to bring clips into the form that a method needs, by subject."""
+        """Folder with results of adapting clips to methods, by subject."""
         return self.root / "adapted"
 
     @property
@@ -241,7 +252,7 @@ class RunFolder:
         return Cell(self.root / subject / method / f"seed-{seed}")
 
     def check_kept(self, planned: Manifest) -> None:
-        """Make sure that a planned run keeps all rows that the folder has; called before any work.
+        """Check that a planned run keeps all rows of the folder; called before execution.
 
         Methods, seeds and metrics may be added, not left out. Captures, frames, tasks and regions have to be the same.
 
@@ -268,12 +279,12 @@ class RunFolder:
     def write_rows(self, rows: Rows) -> None:
         """Write ``rows.parquet``.
 
-        Raises `InputError`, and leaves the file as it is, where it has values that ``rows`` lack.
+        Raises `InputError`, and does not change the file, if it has values that ``rows`` lack.
         """
         replace_rows(self.rows, rows)
 
     def read_manifest(self) -> Manifest:
-        """Read ``run.json``. Raises `InputError` where there is none, or one of another format."""
+        """Read ``run.json``. Raises `InputError` if it is missing or has another format."""
         if not self.manifest.exists():
             raise InputError(self.root, "run.json", "the folder of a run", "no run.json")
         return Manifest.read(self.manifest)

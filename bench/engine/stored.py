@@ -1,4 +1,4 @@
-"""Stored avatars: what ``avatar.json`` says of the one in its folder, and `load_avatar`, which reads any of them."""
+"""Stored avatars: ``avatar.json``, which describes the avatar in its folder, and `load_avatar`."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from .store import avatar_files
 log = logging.getLogger(__name__)
 
 AVATAR_FILE = "avatar.json"
-"""Stands in the folder of every avatar, see `AvatarRecord`."""
+"""File in the folder of every avatar, see `AvatarRecord`."""
 HEAD_FILE = "head_model.npz"
-"""The head model beside an avatar, which all native methods store."""
+"""Head model file in an avatar's folder, which all native methods store."""
 SUBJECT_FILE = "subject.npz"
 """Shape and static offset of the subject, which most methods store."""
 TRAINING_FILE = "training.json"
-"""Where methods record how a training went. Its "losses", if any, are pairs of an iteration and the loss up to there."""
+"""Training record of methods; optional "losses" are pairs of an iteration and the loss up to there."""
 SAME_SHAPE = 1e-4
 """Largest difference of two shape coefficients of one subject; files hold float32."""
 
@@ -44,15 +44,26 @@ class AvatarRecord(TypedDict):
 
     Attributes
     ----------
-    format : of this file.
-    method : registered name of the method that reads the avatar. ``version`` is that of the method that wrote it.
-    settings : the method's whole configuration; None for a method without any.
-    resolution : the image size that the method works at with these settings.
-    subject, shape : name and (S,) identity coefficients of whom the avatar shows.
-    head_model : version of the head model whose poses drive it.
-    head_digest : SHA-256 of `HEAD_FILE` beside it; "" where there is none.
-    made_by : "training", "import" of another program's file, "compact" storage, or derived as a "variant".
-    origin : what that started from: seed, budget and fingerprint of the capture, digest of the file or avatar.
+    format : Literal[1]
+        Format of this file.
+    method : str
+        Registered name of the method that reads the avatar. ``version`` is that of the method that
+        wrote it.
+    settings : dict[str, Any] | None
+        Complete configuration of the method; None for a method without settings.
+    resolution : ResolutionRule
+        Image size that the method uses with these settings.
+    subject, shape : str or list[float]
+        Name and (S,) identity coefficients of the subject.
+    head_model : str
+        Version of the head model whose poses animate the avatar.
+    head_digest : str
+        SHA-256 of `HEAD_FILE` in the same folder; "" without one.
+    made_by : Maker
+        "training", "import" of another program's file, "compact" storage, or derived as a "variant".
+    origin : dict[str, Any]
+        Inputs of the avatar: seed, budget and fingerprint of the capture, or digest of the file or
+        avatar.
     """
 
     format: Literal[1]
@@ -102,7 +113,7 @@ def shown_by(clip: Clip) -> tuple[str, FloatArray, str]:
 
 
 def registered_name(method: ResolvedMethod) -> str:
-    """Name of a method without what its settings add to it."""
+    """Name of a method without the suffix of its settings."""
     label, name = getattr(method.config, "label", ""), method.spec.name
     return name.removesuffix(f" ({label})") if label else name
 
@@ -138,18 +149,18 @@ class StoredAvatar:
 
     @property
     def heads(self) -> dict[str, str]:
-        """File of the head model beside the avatar, by its version: what `adaptation.plan` refits a capture to."""
+        """Head model file of the avatar by version, to which `adaptation.plan` refits a capture."""
         return {self.record["head_model"]: str(self.folder / HEAD_FILE)} if self.record["head_digest"] else {}
 
     def check_subject(self, clip: Clip) -> None:
-        """Raise `InputError` where the avatar shows another subject than a clip."""
+        """Raise `InputError` if the avatar shows another subject than a clip."""
         shown = self.shows_another(*shown_by(clip))
         if shown:
             expected = f"an avatar of {clip.subject}, whom the capture shows"
             raise InputError(self.folder, "subject", expected, f"one of {shown}")
 
     def shows_another(self, subject: str, shape: FloatArray, head_model: str) -> str:
-        """The name of the subject that the avatar shows, if that is another than the one given; else "".
+        """The name of the subject that the avatar shows, if it differs from the given one; otherwise "".
 
         Another subject has another name and another shape; shapes of two head models do not compare.
         """
@@ -164,20 +175,21 @@ def open_avatar(folder: Path, method: str = "") -> StoredAvatar:
 
     Parameters
     ----------
-    method : "module:SPEC" of a method that is not registered; "" for the one of the name that ``avatar.json`` states.
+    method : str
+        "module:SPEC" of a method that is not registered; "" uses the name in ``avatar.json``.
 
     Raises
     ------
     InputError
-        Where there is no ``avatar.json``, or one that does not fit, for a method that is not known, settings that it does
-        not have, and an avatar that was derived as a variant.
+        ``avatar.json`` is missing or invalid, the method or its settings are unknown, or the avatar
+        was derived as a variant.
     """
     home = avatar_folder(folder)
     path = home / AVATAR_FILE
     if not path.is_file():
         remedy = "It is written when a training, an import or `headbench export compact` ends."
         if (folder / "run.json").is_file():
-            remedy = "The avatars of a run lie in SUBJECT/METHOD/seed-N/avatar inside its folder."
+            remedy = "The avatars of a run are in SUBJECT/METHOD/seed-N/avatar in its folder."
         raise InputError(
             folder, AVATAR_FILE, f"the {AVATAR_FOLDER}", f"a folder without {AVATAR_FILE}", remedy
         )
@@ -216,20 +228,23 @@ def load_avatar(folder: Path | str, *, device: str = "cpu", method: str = "") ->
 
     Parameters
     ----------
-    folder : with ``avatar.json``, or the cell of a run (``RUN/SUBJECT/METHOD/seed-N``).
-    device : where it renders.
-    method : "module:SPEC" of a method that is not registered; "" for the one that ``avatar.json`` states.
+    folder : Path | str
+        Folder with ``avatar.json``, or the cell of a run (``RUN/SUBJECT/METHOD/seed-N``).
+    device : str
+        Rendering device.
+    method : str
+        "module:SPEC" of a method that is not registered; "" uses the name in ``avatar.json``.
 
     Raises
     ------
     InputError
-        As `open_avatar` and `StoredAvatar.load` do.
+        Raised by `open_avatar` and `StoredAvatar.load`.
     """
     return open_avatar(Path(folder), method).load(device)
 
 
 def training_losses(folder: Path) -> list[tuple[int, float]]:
-    """The losses that an avatar's training recorded; none where it recorded none. Raises `InputError` for a damaged record."""
+    """Recorded losses of an avatar's training, possibly none. Raises `InputError` for a damaged record."""
     path = folder / TRAINING_FILE
     if not path.is_file():
         return []

@@ -1,7 +1,7 @@
 """Runs the cells of a run by an executor, in workers or as jobs, and merges their rows.
 
-Two passes: all cells, many at once; then the speed of their avatars, without neighbours that would disturb it. A cell's
-own files decide; only the process here writes those of the run.
+Two passes: all cells in parallel, then the speed of their avatars, without concurrent jobs that would bias
+it. The state of a cell is that of its files; only this process writes the files of the run.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from .store import RunFolder
 
 log = logging.getLogger(__name__)
 REPORT_EVERY_S = 10.0
-"""Seconds between records of how far a cell is."""
+"""Seconds between progress records of a cell."""
 
 
 def execute(
     jobs: Sequence[Job], metrics: Sequence[MetricSpec], folder: RunFolder, execution: Execution
 ) -> Rows:
-    """Work on the cells of a run, whose lock is held and whose record is written; return the rows of all.
+    """Execute the cells of a run, which the caller has locked and recorded; return the rows of all.
 
-    A cell that is done is kept. One whose process or job was lost is started again, `Execution.restarts` times at most. One
-    that fails has failed rows. A run that is started again tries failed cells again, unless it had begun to measure speed:
-    it then goes on with that.
+    Finished cells are kept. A cell whose process or job was lost is restarted, at most `Execution.restarts`
+    times. A cell that fails has failed rows. A restarted run repeats failed cells, unless it had begun to
+    measure speed; it then continues with that.
     """
     captures = {subject: index for index, subject in enumerate(dict.fromkeys(j.clip.subject for j in jobs))}
     tasks = [cell_task(job, captures[job.clip.subject], folder) for job in jobs]
@@ -121,7 +121,7 @@ def cell_task(job: Job, capture: int, folder: RunFolder) -> Task:
 
 
 def execute_cell(task: Task, report: Callable[[str], None]) -> None:
-    """Run a cell by the record of its run; all but its speed, unless the task is to measure that."""
+    """Run a cell according to the record of its run, without its speed unless the task measures speed."""
     job, metrics = _opened.job(Path(task.root), **task.arguments)
     last = time.monotonic()
 
@@ -167,7 +167,7 @@ _opened = _Opened()
 
 @dataclass(frozen=True)
 class _Run:
-    """A run as its record has it."""
+    """A run according to its record."""
 
     folder: RunFolder
     config: RunConfig

@@ -1,4 +1,4 @@
-"""``headbench status``, and the options of commands whose work an executor can do."""
+"""``headbench status`` and ``headbench run speed``."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from ..specs import Findings
 
 @dataclass(frozen=True)
 class StatusSettings:
-    """Shows the progress of a run, or afterwards, and what it takes on disk. Exit code 1: a cell failed."""
+    """Shows the progress of a run, or of a finished run, and its disk usage. Exit code 1: a cell failed."""
 
     run: tyro.conf.Positional[str]
     """Folder of the run."""
 
     clean: tuple[Deletable, ...] = ()
-    """Delete what can be made again: renders (the next start renders them again), checkpoints of trainings that did not end,
-    damaged avatars that were set aside, logs of processes and jobs."""
+    """Delete files that can be recreated: renders (the next start renders them again), checkpoints of
+    trainings that did not end, damaged avatars that were set aside, logs of processes and jobs."""
 
 
 def status(settings: StatusSettings, progress: Progress) -> Findings:
@@ -42,9 +42,10 @@ def status(settings: StatusSettings, progress: Progress) -> Findings:
 
 @dataclass(frozen=True)
 class SpeedSettings(RunOptions):
-    """Loads the stored avatars of a finished run and measures frames per second and times of a frame again, one avatar after
-    another, without training. Only these rows are replaced; the former values stay in measure.json and run.log. Let nothing
-    else run on the machine meanwhile. Exit code 1: an avatar could not be measured and keeps its former speed.
+    """Loads the stored avatars of a finished run and measures frames per second and times of a frame again,
+    one avatar after another, without training. Only these rows are replaced; the former values stay in
+    measure.json and run.log. No other programs should run on the machine. Exit code 1: an avatar could not be
+    measured and keeps its former speed.
     """
 
     run: tyro.conf.Positional[str]

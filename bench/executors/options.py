@@ -1,4 +1,4 @@
-"""Options of commands whose work an executor can do."""
+"""Options of commands that use an executor."""
 
 from __future__ import annotations
 
@@ -32,12 +32,19 @@ def chosen_execution(
 
     Parameters
     ----------
-    settings : all of ``execution``, those in ``assigned`` included.
-    assigned : what ``--set`` gives of ``execution``.
-    executor, workers : None where not given.
-    source : file or option that the settings came from, for the error.
+    settings : Mapping[str, Any]
+        All settings of ``execution``, including those in ``assigned``.
+    assigned : Mapping[str, Any]
+        Settings of ``execution`` given with ``--set``.
+    executor, workers : ExecutorName, int or None
+        Values of the options; None if not given.
+    source : str
+        File or option of the settings, for error messages.
 
-    Raises `InputError` for invalid settings, and for given ones that have no effect with the executor.
+    Raises
+    ------
+    InputError
+        Settings are invalid, or given settings have no effect with the executor.
     """
     options = {"executor": executor, "workers": workers}
     options = {key: value for key, value in options.items() if value is not None}
@@ -50,13 +57,13 @@ def chosen_execution(
 
 @dataclass(frozen=True, kw_only=True)
 class ExecutionOptions:
-    """How the work of a command is done."""
+    """How a command is executed."""
 
     executor: ExecutorName = "inline"
-    """Where it is done, as for `headbench run`."""
+    """Executor, as for `headbench run`."""
 
     workers: int | None = None
-    """How many processes, as for `headbench run`; with `--executor processes` alone."""
+    """Number of processes, as for `headbench run`; only with `--executor processes`."""
 
     set: Annotated[
         tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="execution.KEY=VALUE")
@@ -65,7 +72,7 @@ class ExecutionOptions:
 
     @property
     def execution(self) -> Execution:
-        """How it is done. Raises `InputError` for settings that are none."""
+        """Execution settings. Raises `InputError` for invalid settings."""
         given = parse_assignments(self.set)
         if stray := sorted(given.keys() - {"execution"}):
             raise unknown("command line", "--set", stray[0], ["execution"])
@@ -75,6 +82,6 @@ class ExecutionOptions:
 
     @property
     def others(self) -> dict[str, Any]:
-        """The settings that decide what comes out: all but these."""
+        """All settings except these, which do not affect the results."""
         own = {field.name for field in fields(ExecutionOptions)}
         return {name: value for name, value in asdict(self).items() if name not in own}

@@ -1,4 +1,4 @@
-"""``outcome.json`` of a task: what its process or job is doing, or how it ended."""
+"""``outcome.json`` of a task: current activity of its process or job, or how it ended."""
 
 from __future__ import annotations
 
@@ -13,17 +13,28 @@ from ..io.files import write_json
 
 
 class TaskOutcome(TypedDict, total=False):
-    """Attributes.
+    """Content of ``outcome.json``.
 
-    status : how a task ended; a job that is gone while it says "running" was killed.
-    speed : whether speed is measured, too: a pass of its own over a run's cells, see `bench.executors.run`.
-    reason : why it failed, as in the rows of a cell.
-    doing, since : the step it is at, and the time (ISO 8601, UTC) when it was begun.
-    seconds : that it took.
-    restarts : how often it was started again.
-    job : of the cluster, "" for a process of ``host``.
-    threads : what OMP_NUM_THREADS said, "" for as many as there are cores.
-    machine : see `machine_record`.
+    Attributes
+    ----------
+    status : Literal["running", "done", "failed"]
+        State of the task; a job that no longer exists while it is "running" was killed.
+    speed : bool
+        Whether speed is measured, in a separate pass over a run's cells, see `bench.executors.run`.
+    reason : str
+        Reason of the failure, as in the rows of a cell.
+    doing, since : str
+        Current step, and the time of its start (ISO 8601, UTC).
+    seconds : float
+        Time that the task took.
+    restarts : int
+        Number of restarts.
+    job : str
+        Job of the cluster, "" for a process of ``host``.
+    threads : str
+        Value of OMP_NUM_THREADS, "" for the number of cores.
+    machine : dict[str, Any]
+        See `machine_record`.
     """
 
     status: Required[Literal["running", "done", "failed"]]
@@ -41,12 +52,12 @@ class TaskOutcome(TypedDict, total=False):
 
 
 def outcome_path(task: Path) -> Path:
-    """Where the outcome of the task in a folder lies."""
+    """Path of the outcome of the task in a folder."""
     return task / "outcome.json"
 
 
 def read_outcome(task: Path) -> TaskOutcome | None:
-    """Read the outcome of the task in a folder; None where there is none. Raises `InputError` for a damaged one."""
+    """Read the outcome of a task's folder; None if it is missing. Raises `InputError` for a damaged one."""
     path = outcome_path(task)
     if not path.exists():
         return None
@@ -60,7 +71,7 @@ def write_outcome(task: Path, outcome: TaskOutcome) -> None:
 
 
 def forget_outcome(task: Path, speed: bool) -> None:
-    """Remove the outcome of an earlier pass of the same kind, so that it is not taken for that of one that begins."""
+    """Remove the outcome of an earlier pass of the same kind, so that a new pass does not read it."""
     try:
         outcome = read_outcome(task)
     except InputError:  # damaged

@@ -1,4 +1,4 @@
-"""The executor ``processes``: several workers on this machine, its cores shared out among them."""
+"""The executor ``processes``: several workers on this machine, which share its cores."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .task import Task
 from .worker import execute_task
 
 STOP_S = 5.0
-"""Seconds that a worker has to end in when it is asked to."""
+"""Time for a worker to terminate, seconds."""
 
 
 @dataclass(eq=False)
@@ -30,12 +30,14 @@ class _Process:
 
 
 class Processes:
-    """Workers that take tasks one after another; one that was killed is replaced.
+    """Workers that execute tasks one after another; a killed worker is replaced.
 
     Parameters
     ----------
-    workers : at most so many at once.
-    threads : of each, None for as many as this process has.
+    workers : int
+        Maximum number of concurrent workers.
+    threads : int | None
+        Threads of each worker; None uses the number of this process.
     """
 
     def __init__(self, workers: int, threads: int | None):
@@ -49,7 +51,7 @@ class Processes:
         return sum(process.task is not None for process in self._processes)
 
     def submit(self, tasks: Sequence[Task]) -> None:
-        """Work on these tasks, in order, after those that wait already."""
+        """Execute these tasks, in order, after those already queued."""
         for task in tasks:
             forget_outcome(task.folder, task.speed)
         self._waiting.extend(tasks)
@@ -63,7 +65,7 @@ class Processes:
         return ended
 
     def close(self) -> None:
-        """End all workers; what they were at continues from its checkpoint another time."""
+        """Terminate all workers; their tasks resume from checkpoints when started again."""
         for process in self._processes:
             process.process.terminate()
         for process in self._processes:
@@ -75,7 +77,7 @@ class Processes:
         self._processes = []
 
     def _fill(self) -> None:
-        """Give tasks that wait to workers that have none."""
+        """Assign queued tasks to idle workers."""
         idle = [process for process in self._processes if process.task is None]
         while self._waiting and (idle or len(self._processes) < self._count):
             process = idle.pop() if idle else self._start()
@@ -100,7 +102,7 @@ class Processes:
         return TaskResult(task)
 
     def _replace(self, process: _Process) -> None:
-        """End a worker: after an error of CUDA all that a process asks of the device fails."""
+        """Terminate a worker: after a CUDA error, all further CUDA calls of its process fail."""
         self._processes.remove(process)
         process.connection.close()
         process.process.join(STOP_S)
@@ -120,7 +122,7 @@ class Processes:
 
 
 def _serve(connection: Connection) -> None:
-    """Work on the tasks that come, until nothing comes any more."""
+    """Execute tasks until the connection is closed."""
     end_with_parent()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     while True:

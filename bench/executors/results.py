@@ -1,4 +1,4 @@
-"""Results of tasks, and what an executor of tasks does."""
+"""Results of tasks, and the interface of executors."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from .task import Task
 
 
 class TaskResult(NamedTuple):
-    """A task whose process or job has ended; how it ended is in its outcome file, if it wrote one.
+    """A task whose process or job has ended; its outcome file, if any, records how.
 
     Attributes
     ----------
-    lost : why there may be no outcome file; "" for a regular end.
-    again : whether to start the task again if there is no outcome.
+    lost : str
+        Reason why the outcome file may be missing; "" after a regular end.
+    again : bool
+        Whether to restart the task if there is no outcome.
     """
 
     task: Task

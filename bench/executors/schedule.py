@@ -20,7 +20,7 @@ from .task import TASK_LOG, Task
 log = logging.getLogger(__name__)
 DAMAGED = "its results are missing or damaged"
 Failures = dict[str, str]
-"""Why tasks failed, by their place."""
+"""Reasons of failed tasks, by their folder."""
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,14 @@ class Schedule:
 
     Attributes
     ----------
-    label : what they are called together, for the progress.
-    is_done : whether the results of a task whose outcome says so are there and whole.
-    execution : by which executor, any but "inline".
-    speed : whether they measure speed, one at a time with all threads, see `Task.speed`.
+    label : str
+        Common name of the tasks in progress messages.
+    is_done : Callable
+        Whether the results of a task with a successful outcome exist and are complete.
+    execution : Execution
+        Execution settings; any executor except "inline".
+    speed : bool
+        Whether the tasks measure speed, one at a time with all threads, see `Task.speed`.
     """
 
     label: str
@@ -41,12 +45,14 @@ class Schedule:
     speed: bool = False
 
     def run_all(self, tasks: Sequence[Task]) -> Failures:
-        """Run the tasks, all of one root, whose lock is held; return which failed and why.
+        """Run the tasks, all of one root folder that the caller has locked; return the failures by folder.
 
         Raises
         ------
-        InputError : Slurm refuses jobs.
-        OSError : the disk is full or read-only; no task is failed by that.
+        InputError
+            Slurm refuses jobs.
+        OSError
+            The disk is full or read-only; no task is marked as failed.
         """
         failures: Failures = {}
         if not tasks:
@@ -76,7 +82,7 @@ class Schedule:
         return Processes(workers, self.execution.threads or max(1, cores // workers))
 
     def _again(self, ended: TaskResult, failures: Failures) -> Task | None:
-        """What to submit again of a task that ended; None where it is done, or failed, which is recorded."""
+        """The task to submit again after one ended; None if it is done, or failed and recorded as such."""
         task = ended.task
         outcome = read_outcome(task.folder)
         reason = ""

@@ -17,16 +17,23 @@ ExecutorName = Literal["inline", "processes", "slurm"]
 
 @dataclass(frozen=True)
 class SlurmSettings:
-    """What a job of Slurm asks for; each works on one cell.
+    """Resources of a Slurm job; each executes one cell.
 
     Attributes
     ----------
-    partition : None for the cluster's default.
-    gpus, cpus, memory_gb, hours : of each job. ``cpus`` is also the number of its threads.
-    parallel : most jobs of an array that run at once.
-    exclusive : whether jobs that measure speed take a node of their own. Without it, neighbours disturb them.
-    setup : lines of shell that a job runs first, such as ``module load cuda``.
-    parameters : further options of ``sbatch`` by name, such as ``{"account": "vision", "qos": "long"}``.
+    partition : str | None
+        Partition; None for the cluster's default.
+    gpus, cpus, memory_gb, hours : int or float
+        Resources of each job. ``cpus`` is also its number of threads.
+    parallel : int
+        Maximum number of concurrent jobs of an array.
+    exclusive : bool
+        Whether jobs that measure speed request a whole node. Otherwise, concurrent jobs bias the
+        measurement.
+    setup : tuple[str, ...]
+        Shell commands to run at the start of a job, such as ``module load cuda``.
+    parameters : dict[str, Any]
+        Further options of ``sbatch`` by name, such as ``{"account": "vision", "qos": "long"}``.
     """
 
     partition: str | None = None
@@ -40,7 +47,7 @@ class SlurmSettings:
     parameters: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what no job can ask for."""
+        """Refuse invalid settings."""
         if self.gpus < 0 or self.cpus < 1 or self.memory_gb <= 0 or self.parallel < 1:
             raise ValueError("gpus is at least 0, cpus and parallel are at least 1, memory_gb is above 0")
         if self.hours < 1 / 60:
@@ -53,12 +60,18 @@ class Execution:
 
     Attributes
     ----------
-    executor : ``inline``, one after another in this process; ``processes``, several at once on this machine; ``slurm``, a
-        job for each.
-    workers : of ``processes``; None: one for each core.
-    threads : of each worker; None: the cores shared out. Speed is measured with those of this process.
-    restarts : how often a cell is started again whose process or job was killed, lost or out of time.
-    poll_s : seconds between questions to Slurm.
+    executor : ExecutorName
+        ``inline``, sequentially in this process; ``processes``, in parallel on this machine;
+        ``slurm``, one job per cell.
+    workers : int | None
+        Number of ``processes``; None: one for each core.
+    threads : int | None
+        Threads of each worker; None divides the cores among the workers. Speed is measured with the
+        threads of this process.
+    restarts : int
+        Maximum number of restarts of a cell whose process or job was killed, lost or timed out.
+    poll_s : float
+        Interval between queries to Slurm, seconds.
     """
 
     executor: ExecutorName = "inline"
@@ -79,7 +92,7 @@ class Execution:
 
 
 def is_speed(metric: MetricSpec) -> bool:
-    """Whether neighbours on the machine would change what a metric of an avatar measures."""
+    """Whether concurrent jobs on the machine would bias a metric of an avatar."""
     return metric.machine_bound and metric.kind == "avatar"
 
 
@@ -103,8 +116,11 @@ def check_executor(execution: Execution, device: str) -> None:
 
     Raises
     ------
-    InputError : this machine has no such device. Slurm's jobs look themselves: where they are submitted may be none.
-    UnavailableError : jobs cannot be submitted from here.
+    InputError
+        This machine has no such device. For Slurm, the jobs check it, since the submitting machine
+        may have none.
+    UnavailableError
+        Jobs cannot be submitted from this machine.
     """
     if execution.executor != "slurm":
         check_device(device)

@@ -1,6 +1,6 @@
 """The executor ``slurm``: a job of the cluster for each task, submitted by submitit, followed by squeue and scontrol.
 
-Jobs go on when the process that follows them ends; ``submitted.json`` lists for the next one which task is which job.
+Jobs continue if the process that polls them ends; ``submitted.json`` lists their tasks for the next process.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ log = logging.getLogger(__name__)
 MAX_ARRAY = 1000
 """Jobs of an array; Slurm's own default allows 1001."""
 ANSWER_S = 60
-"""Seconds that Slurm has to answer a question in."""
+"""Timeout of Slurm commands, seconds."""
 POLLS = 3
-"""Polls after which a job that is gone counts as lost: outcome files may appear late on a network file system."""
+"""Polls after which a job that no longer exists counts as lost: network file systems are slow."""
 CANCEL_S = 120.0
-"""Seconds that cancelled jobs have to end in; Slurm kills them after its KillWait, 30 seconds by default."""
+"""Time for cancelled jobs to end, seconds; Slurm kills them after its KillWait, 30 seconds by default."""
 UNANSWERED = 100
-"""Questions in a row that Slurm may leave without an answer, such as while its controller is started again."""
+"""Consecutive queries that may fail, for example while Slurm's controller restarts."""
 FINAL = {
     "CANCELLED": "was cancelled",
     "OUT_OF_MEMORY": "took more memory than execution.slurm.memory_gb",
     "DEADLINE": "missed its deadline",
 }
-"""Ends that would be the same another time, or that somebody wanted."""
+"""Final states for which a restart would not help or is not wanted."""
 STUCK = {"PartitionTimeLimit", "PartitionNodeLimit", "BadConstraints", "JobHeldAdmin", "JobHeldUser"}
-"""Reasons to wait that do not pass."""
+"""Reasons of pending jobs that are permanent."""
 WAITING = "jobs wait for %s, which does not pass. To give them other settings, end them by `scancel --name %s` and start again"
 _THREADS = (
     "export OMP_NUM_THREADS=$SLURM_CPUS_PER_TASK",
@@ -54,19 +54,19 @@ _JOB = re.compile(r"\d+(_\d+)?")
 
 
 class Submitted(TypedDict):
-    """``submitted.json``: the jobs of tasks, by the task's place in the output folder; ``speed`` as in `Task`."""
+    """``submitted.json``: jobs by the task's folder in the output folder; ``speed`` as in `Task`."""
 
     speed: bool
     jobs: dict[str, str]
 
 
 def submitted_path(root: Path) -> Path:
-    """Where the jobs of an output folder are listed."""
+    """Path of the list of jobs of an output folder."""
     return root / "submitted.json"
 
 
 def read_submitted(root: Path) -> Submitted | None:
-    """Read which tasks are which jobs; None where there are none. Raises `InputError` for a damaged list."""
+    """Read the jobs of tasks; None without a list. Raises `InputError` for a damaged list."""
     path = submitted_path(root)
     if not path.exists():
         return None
@@ -82,16 +82,16 @@ class _Job:
     task: Task
     number: str
     polls: int = 0
-    """At how many it was gone without an outcome."""
+    """Number of polls without the job and its outcome."""
     earlier: bool = False
     """Submitted by an earlier process."""
 
 
 class Slurm:
-    """Jobs for tasks; those that ``submitted.json`` lists already are followed instead.
+    """Jobs for tasks; jobs listed in ``submitted.json`` are polled instead of submitted again.
 
-    A process that was killed between submitting jobs and listing them left jobs that nothing is known of but their name,
-    which is the output folder's own: they are cancelled before any are submitted.
+    A process that was killed between submitting and listing jobs leaves unlisted jobs. They are found by
+    their name, which is specific to the output folder, and cancelled before new jobs are submitted.
     """
 
     def __init__(self, root: Path, execution: Execution, speed: bool):
@@ -106,11 +106,11 @@ class Slurm:
 
     @property
     def running(self) -> int:
-        """How many jobs run."""
+        """Number of running jobs."""
         return self._running
 
     def submit(self, tasks: Sequence[Task]) -> None:
-        """Submit jobs. Raises `InputError` where Slurm refuses them, with its words."""
+        """Submit jobs. Raises `InputError` with Slurm's message if it refuses them."""
         left = []
         for task in tasks:
             known = self._known.pop(task.place, None)
@@ -162,7 +162,7 @@ class Slurm:
         return found
 
     def close(self) -> None:
-        """Leave the jobs to the cluster; forget them where all have ended."""
+        """Leave the jobs to the cluster; remove the list if all have ended."""
         if self._jobs:
             log.info(
                 "%d jobs are left to the cluster; `headbench status` shows those of a run, the same command follows them",
@@ -179,7 +179,7 @@ class Slurm:
         if job.polls < POLLS:
             return None
         state, reason, code = end_of(job.number)
-        if state in FINAL and not (job.earlier and state == "CANCELLED"):  # who starts again wants it done
+        if state in FINAL and not (job.earlier and state == "CANCELLED"):  # a restart requests it again
             return TaskResult(job.task, f"job {job.number} {FINAL[state]}", again=False)
         if code in FULL_DISK and not job.earlier:  # there may be room since; see `worker.run_job`
             raise OSError(code, f"{os.strerror(code)} (job {job.number})", str(job.task.folder))
@@ -223,12 +223,12 @@ class Slurm:
 
 
 def job_name(root: Path) -> str:
-    """Name of all jobs for an output folder, and of none for another."""
+    """Name of all jobs of an output folder, unique to it."""
     return f"headbench-{root.name}-{digest(str(root.resolve()))[:8]}"
 
 
 def _cancel_others(name: str, known: set[str]) -> None:
-    """Cancel the jobs of a name that are not known, and wait until they have ended, since they may be at work."""
+    """Cancel unlisted jobs with this name, and wait until they have ended, since they may be running."""
     strays = [number for number, job in queue().items() if job.name == name and number not in known]
     if not strays:
         return
@@ -249,7 +249,7 @@ class _State(NamedTuple):
 
 
 class Queued(NamedTuple):
-    """A job that has not ended: its state, such as RUNNING, why it waits, and what it is called."""
+    """A job that has not ended: its state, such as RUNNING, the reason why it waits, and its name."""
 
     state: str
     reason: str
@@ -280,11 +280,11 @@ def end_of(number: str) -> _State:
 
 
 def _ask(*command: str) -> str:
-    """What a command of Slurm answers. Raises `HeadbenchError` where it fails."""
+    """Output of a Slurm command. Raises `HeadbenchError` if it fails."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=ANSWER_S, check=True)
     except subprocess.CalledProcessError as error:
-        hint = "`scontrol ping` tells whether Slurm answers here."
+        hint = "`scontrol ping` shows whether Slurm responds."
         raise HeadbenchError(f"{command[0]}: {' '.join(error.stderr.split())}. {hint}") from error
     except (OSError, subprocess.TimeoutExpired) as error:
         raise HeadbenchError(f"{command[0]}: {error}") from error

@@ -1,4 +1,4 @@
-"""The state of a run's cells: by their own files, and by Slurm's queue where they are jobs."""
+"""The state of a run's cells, from their files and, for Slurm jobs, from the queue."""
 
 from __future__ import annotations
 
@@ -34,12 +34,14 @@ SHOWN = 30
 
 @dataclass(frozen=True)
 class CellState:
-    """A cell as it is now.
+    """Current state of a cell.
 
     Attributes
     ----------
-    note : what it is doing or waits for, why it failed.
-    seconds : worked on it until now, None where that is not known.
+    note : str
+        Current activity, reason for waiting, or reason of the failure.
+    seconds : float | None
+        Time spent so far; None if unknown.
     """
 
     subject: str
@@ -57,7 +59,7 @@ class CellState:
 
 
 def run_status(run: Path) -> Findings:
-    """Describe the cells of a run. Raises `InputError` for a folder that is none."""
+    """Describe the cells of a run. Raises `InputError` for a folder that is not a run."""
     folder = RunFolder(run)
     cells = cell_states(folder, folder.read_manifest())
     counts = Counter(cell.state for cell in cells)
@@ -85,11 +87,13 @@ def run_status(run: Path) -> Findings:
 
 
 def time_left(cells: Sequence[CellState]) -> tuple[float | None, bool]:
-    """Seconds until all cells are done, by those of each method that are, and whether that is a lower bound alone.
+    """Estimated seconds until all cells are done, and whether this is a lower bound.
 
-    How long speed takes to measure is not known beforehand.
+    The estimate uses the finished cells of each method.
 
-    None where nothing is left, or nothing known of it.
+    The time to measure speed is not known in advance.
+
+    None if nothing is left, or nothing is known.
     """
     took: dict[str, list[float]] = {}
     for cell in cells:
@@ -174,7 +178,7 @@ def _failed(folder: RunFolder, manifest: Manifest) -> Iterator[tuple[tuple[str, 
 
 
 def _queue() -> Mapping[str, Queued] | None:
-    """Slurm's queue; None where it cannot be asked."""
+    """Slurm's queue; None if it cannot be queried."""
     try:
         return queue()
     except HeadbenchError as error:

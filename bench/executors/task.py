@@ -1,4 +1,4 @@
-"""A task: a function by its name with arguments, and a folder that its outcome and its log go to."""
+"""A task: the name and arguments of a function, and a folder for its outcome and log."""
 
 from __future__ import annotations
 
@@ -14,18 +14,26 @@ TASK_LOG = "job.log"
 
 @dataclass(frozen=True)
 class Task:
-    """One piece of work, what a process or a job is given.
+    """Unit of work of a process or job.
 
     Attributes
     ----------
-    root : absolute path of the output folder of the command that asks, which holds its lock.
-    place : of the task in that folder: its own folder, which no other task writes in.
-    function : "module:name" of what does it; called with the task and a function that takes what it is doing, in words.
-    arguments : of the function, values that JSON has.
-    directory, path : working directory and module path of the process that asks, where plug-ins are found.
-    speed : whether it measures speed, which takes a machine without neighbours.
-    restarts : how often it was started again, its earlier process or job being lost.
-    device : what it computes on, for the record of the machine.
+    root : str
+        Absolute path of the output folder of the submitting command, which holds its lock.
+    place : str
+        Folder of the task relative to ``root``; no other task writes to it.
+    function : str
+        "module:name" of the function to call with the task and a callback for progress messages.
+    arguments : Mapping[str, Any]
+        Arguments of the function, as JSON values.
+    directory, path : str or tuple[str, ...]
+        Working directory and module search path of the submitting process, for importing plug-ins.
+    speed : bool
+        Whether the task measures speed and therefore must not share the machine.
+    restarts : int
+        Number of restarts after a lost process or job.
+    device : str
+        Compute device, for the record of the machine.
     """
 
     root: str
@@ -46,5 +54,5 @@ class Task:
 
     @property
     def folder(self) -> Path:
-        """Where its outcome and its log lie."""
+        """Folder of its outcome and log."""
         return Path(self.root) / self.place

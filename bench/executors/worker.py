@@ -1,4 +1,4 @@
-"""What a process or a job does: work on one task and leave its outcome in the task's folder."""
+"""Executes one task in a process or job and writes the outcome to the task's folder."""
 
 from __future__ import annotations
 
@@ -22,16 +22,18 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-"""Errors of the system that no other task would be spared."""
+"""System errors that would affect every other task."""
 
 
 def execute_task(task: Task) -> None:
-    """Do a task. What fails is recorded in ``outcome.json``, with its log in ``job.log``.
+    """Execute a task. Failures are recorded in ``outcome.json``, with its log in ``job.log``.
 
     Raises
     ------
-    InputError : another process works on it.
-    OSError : the disk is full or read-only.
+    InputError
+        Another process executes the task.
+    OSError
+        The disk is full or read-only.
     """
     from ..engine.steps import reason_of
     from ..io.files import output_inside
@@ -76,7 +78,7 @@ def execute_task(task: Task) -> None:
 
 
 def run_job(task: Task) -> None:
-    """Run a task in a job of its own. Raises what a task cannot be recorded as failed for."""
+    """Run a task in a separate job. Raises errors that must not mark the task as failed."""
     os.chdir(task.directory)
     sys.path += [entry for entry in task.path if entry not in sys.path]
     try:
@@ -85,11 +87,11 @@ def run_job(task: Task) -> None:
         if error.errno not in FULL_DISK:
             raise
         print(f"{error.filename}: {error.strerror}", file=sys.stderr, flush=True)
-        os._exit(error.errno)  # neither its outcome nor its log may have found room
+        os._exit(error.errno)  # the disk may be full for its outcome and log
 
 
 def _continued(task: Task) -> Any:
-    """What submitit submits again where a job runs out of time: the same, which continues."""
+    """The job that submitit submits again after a timeout: the same one, which resumes."""
     from submitit.helpers import DelayedSubmission
 
     return DelayedSubmission(run_job, task)
@@ -106,7 +108,7 @@ def _machine(device: str) -> dict[str, Any]:
 
 
 def job_id() -> str:
-    """Number of the job of Slurm that this process is, "" for none."""
+    """Number of this process's Slurm job, "" for none."""
     array, task = (os.environ.get(f"SLURM_ARRAY_{part}") for part in ("JOB_ID", "TASK_ID"))
     return f"{array}_{task}" if array and task else os.environ.get("SLURM_JOB_ID", "")
 

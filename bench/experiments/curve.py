@@ -26,24 +26,25 @@ from .held_out import CAMERA, TIMESTEPS, count_of
 
 log = logging.getLogger(__name__)
 METRICS: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "primitives")
-"""Metrics of a curve, whether the run took them or not, as the canonical profile defines them."""
+"""Metrics of a curve, independent of the run's, as defined by the canonical profile."""
 
 
 def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Findings:
     """Plot quality against training time, cameras, timesteps or tracking error, measured on held-out training frames.
 
-    Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. Started again, it keeps what is done; a
-    training that was interrupted begins again, since its time is asked for.
+    Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. A restart keeps finished
+    trainings; an interrupted training starts over, since its time is measured.
 
     Raises
     ------
     InputError
-        For a folder that is no finished run, a method that the run does not have or that has no budget, a capture that is
-        not the run's or has too few frames to hold some out, and a folder with trainings of other settings.
+        The folder is not a finished run or has trainings with other settings, the run has no such
+        method or the method has no budget, or a capture differs from the run's or has too few frames
+        to hold some out.
     """
     execution, source = settings.execution, RunFolder(Path(settings.run))
     manifest = source.read_manifest()
-    manifest.check_done(source.manifest)  # before a folder is made in what is no run
+    manifest.check_done(source.manifest)  # before a folder is created
     if manifest.configuration.clip or manifest.configuration.source:
         expected = "a run that trained on whole captures"
         raise InputError(source.manifest, "configuration", expected, "one of a curve or of a sweep")
@@ -79,9 +80,9 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Find
 def conditions(
     settings: CurveSettings, methods: Sequence[ResolvedMethod], clips: Sequence[Clip]
 ) -> Iterator[Condition]:
-    """What the trainings are given, the whole first: start-up, such as imports, falls where it weighs least.
+    """Conditions of the trainings, the full one first, which start-up time, such as imports, affects least.
 
-    Parts that come to the same amount are one, the largest of them.
+    Of parts with the same amount, only the largest is used.
     """
     if settings.over == "tracking_error":
         for level in settings.tracking_errors:
@@ -119,7 +120,7 @@ def _names(methods: Sequence[ResolvedMethod]) -> list[str]:
 
 
 def _asked(names: Sequence[str], wanted: Sequence[ResolvedMethod]) -> tuple[str, ...]:
-    """What a configuration calls the wanted methods: a name, or a module and its attribute."""
+    """Names of the selected methods in a configuration: a name, or a module and its attribute."""
     return tuple(name for name in names if get("methods", name).name in _names(wanted))
 
 
@@ -148,7 +149,7 @@ def _wanted(settings: CurveSettings, source: RunFolder) -> list[ResolvedMethod]:
 
 
 def _drop_interrupted(out: Path) -> None:
-    """Remove what killed trainings left, so that they begin again and their time is known."""
+    """Remove files of interrupted trainings, so that they start over and their time is known."""
     for record in sorted(out.glob("*/*/seed-*/fit.json")):
         cell = Cell(record.parent)
         state = cell.step("fit")

@@ -14,7 +14,7 @@ from ..executors.options import ExecutionOptions
 from ..options import DependentOptions
 
 MOST_TRACKING_ERROR = 4.0
-"""What `headbench synth` takes at most."""
+"""Maximum level of `headbench synth`."""
 FRACTIONS = ("1/16", "1/8", "1/4", "1/2", "1")
 LEVELS = (0.0, 1.0, 2.0)
 
@@ -49,10 +49,10 @@ class CurveSettings(RunOptions, ExecutionOptions):
     """Training camera to hold out; default: the one nearest to the mean position of the training cameras."""
 
     every: int = 8
-    """Hold out one of so many training timesteps."""
+    """Hold out one of this number of consecutive training timesteps."""
 
     frames: int = 100
-    """Score at most so many frames of each subject in the held-out camera, and as many of the held-out timesteps."""
+    """Maximum number of scored frames of each subject, for the held-out camera and timesteps separately."""
 
     dependent = (
         DependentOptions(("levels",), "over", ("tracking_error",)),
@@ -74,7 +74,7 @@ class CurveSettings(RunOptions, ExecutionOptions):
 
     @property
     def parts(self) -> tuple[Fraction, ...]:
-        """The fractions as numbers, rising. Raises `ValueError` for what is no number above 0 and at most 1."""
+        """The fractions as numbers, rising. Raises `ValueError` unless they are numbers in (0, 1]."""
         return tuple(sorted(map(_part, self.fractions or FRACTIONS)))
 
     @property

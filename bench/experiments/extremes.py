@@ -36,8 +36,9 @@ NO_VARIATION = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class ExpressionComponents:
-    """Principal components of expression coefficients: (E,) mean, (D, E) unit vectors by falling deviation, and the
-    (D,) standard deviation along each, all positive. D is less than asked for where training holds less."""
+    """Principal components of expression coefficients: (E,) mean, (D, E) unit vectors by falling deviation,
+    and the (D,) standard deviation along each, all positive. D is less than requested if the training data
+    span less."""
 
     mean: FloatArray
     directions: FloatArray
@@ -54,7 +55,7 @@ class ExpressionComponents:
         return cls(mean, directions[kept], deviations[kept])
 
     def at(self, component: int, sigmas: float) -> FloatArray:
-        """(E,) coefficients so many standard deviations along a component, counted from 0."""
+        """(E,) coefficients at a number of standard deviations along a component, counted from 0."""
         return np.asarray(self.mean + sigmas * self.deviations[component] * self.directions[component])
 
 

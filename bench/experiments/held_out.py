@@ -69,19 +69,20 @@ class HeldOutClip:
 
 
 def hold_out(clip: Clip, config: RunConfig | None = None, *, camera: str = "", every: int = 8) -> HeldOutClip:
-    """Hold out a camera and every n-th timestep of a clip's training split, so that no test frame is looked at.
+    """Hold out a camera and every n-th timestep of a clip's training split, so that no test frame is used.
 
     Parameters
     ----------
     camera : str
-        Its name; "": the training camera nearest to the mean position of all, none where there is only one.
+        Name of the camera; "" selects the training camera nearest to the mean position, or none if
+        there is only one.
     every : int
-        The middle one of every so many training timesteps, counted in their order, is held out.
+        The middle one of each group of ``every`` consecutive training timesteps is held out.
 
     Raises
     ------
     InputError
-        For a camera that is not one of training, and where no frame is left to train with or to measure on.
+        The camera is not a training camera, or no frame remains for training or for evaluation.
     """
     train = clip.splits["train"]
     where = f"clip {clip.subject}"
@@ -137,7 +138,7 @@ def fewer_timesteps(clip: Clip, config: RunConfig | None = None, *, part: str) -
 
 
 def count_of(whole: int, part: str) -> int:
-    """How many a part of so many is, one at least."""
+    """Number of items in a part of a total, at least one."""
     try:
         return max(1, round(whole * part_of_text(part, "part")))
     except ValueError as error:

@@ -72,7 +72,7 @@ def retarget(pose: HeadPose, source: RigidMean, target: RigidMean, subject: str)
 
 
 def check_heads(source: HeadAsset, target: HeadAsset, where: str) -> None:
-    """Raise `InputError` where the source's coefficients mean nothing to the target's head model."""
+    """Raise `InputError` if the source's coefficients do not fit the target's head model."""
     ours, theirs = (f"{h.version}, {h.expression_basis.shape[2]} expressions" for h in (target, source))
     if ours != theirs:
         remedy = "Re-fit the source to the target's head model first: headbench prepare refit."
@@ -106,7 +106,7 @@ class Driven:
 
     @property
     def fingerprint(self) -> str:
-        """Digest of what is rendered and how it is judged."""
+        """Digest of the rendered frames and their evaluation."""
         clips = (self.job.form.clip.fingerprint, self.source.form.clip.fingerprint)
         return digest(TASK, 1, clips, self.camera.id, [str(key) for key in self.keys], LIMITS)[:12]
 
@@ -114,8 +114,8 @@ class Driven:
 def protocols(jobs: Sequence[Job], **parameters: Any) -> dict[str, Protocol]:
     """The protocols of the registered change "reenact".
 
-    Raises `InputError` where there is no other subject, one has no held-out performance, the head models differ, or the
-    camera is not there.
+    Raises `InputError` if there is no other subject, one has no held-out performance, the head models differ,
+    or the camera is missing.
     """
     pairs = [driven for job in jobs for driven in _pairs(job, **parameters)]
     if not pairs:
@@ -128,7 +128,7 @@ def protocols(jobs: Sequence[Job], **parameters: Any) -> dict[str, Protocol]:
 def drive(
     job: Job, avatar: Avatar, progress: Progress, **parameters: Any
 ) -> tuple[Rows, dict[str, Any], list[Path]]:
-    """Render and judge the avatar driven by every other subject; the registered change "reenact".
+    """Render and evaluate the avatar animated by every other subject; the registered change "reenact".
 
     The details have the record of each pair. The files are the frames, and those of the source in ``sources``.
     """
@@ -180,7 +180,7 @@ def _judged(
     background = [float(v) for v in clip.background]
     poses = training_poses(clip)
     means = RigidMean.of(training_poses(source.form.clip)), RigidMean.of(poses)
-    # What the avatar shows of its own training poses in this view.
+    # Renders of the avatar's training poses in this view.
     own = [replace(pose, timestep=None) for pose in poses[:: max(1, len(poses) // REFERENCE_FRAMES)]]
     reference = typical([render_measured(avatar, camera, pose, background)[1] for pose in own])
     frames, shown = [], []
@@ -221,7 +221,7 @@ def _identity(
 
 
 def _sources(job: Job, source: str | None) -> Sequence[Job]:
-    """Cells of the job's method whose clips drive: of every capture of the run, or of a capture beside it."""
+    """Cells of the job's method whose clips drive: of every capture of the run, or of a separate capture."""
     config = job.config
     assert config is not None
     if source is not None:

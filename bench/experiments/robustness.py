@@ -21,14 +21,14 @@ from ..specs import Findings
 from .robustness_settings import ExtremesSettings, ReenactSettings
 
 RECORD_FILE = "record.json"
-"""Settings, limits, protocols and what was found of each avatar, beside the rows."""
+"""File with settings, limits, protocols and results of each avatar."""
 
 
 def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -> Findings:
     """Render a run's avatars in views and expressions beyond those of training; check stability limits.
 
-    Does not pass where a limit is broken or an avatar failed. Started again, it keeps what is done. Raises `InputError` for a
-    folder that is no finished run, and for a capture that is not the run's.
+    Does not pass if a limit is broken or an avatar failed. A restart keeps finished work. Raises `InputError`
+    for a folder that is not a finished run, and for a capture that is not the run's.
     """
     return _run(settings, "extremes", "extremes")
 
@@ -36,16 +36,17 @@ def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -
 def reenact_run(settings: ReenactSettings, progress: Progress = no_progress) -> Findings:
     """Drive a run's avatars with another subject's expressions; check stability limits.
 
-    Does not pass where a limit is broken or an avatar failed. Started again, it keeps what is done. Raises `InputError` for a
-    folder that is no finished run, where nobody else is there to drive, and for a source tracked with another head model.
+    Does not pass if a limit is broken or an avatar failed. A restart keeps finished work. Raises `InputError`
+    for a folder that is not a finished run, without another subject, and for a source tracked with another
+    head model.
     """
     return _run(settings, "reenact", "cross_reenactment")
 
 
 def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) -> Findings:
-    """Run the plan in the folder of the task; write the record and have the report drawn."""
+    """Run the plan in the folder of the task; write the record and the report."""
     execution, source = settings.execution, RunFolder(Path(settings.run))
-    source.read_manifest()  # before a folder is made in what is no run
+    source.read_manifest()  # before a folder is created
     out = Path(settings.out) if settings.out else source.root / task
     check_kind(out, "a run")
     with nullcontext() if settings.out else output_inside(source.root), locked(out):
@@ -68,7 +69,7 @@ def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) ->
 
 
 def _write_record(out: Path, drive: str, rows: Rows, settings: dict[str, Any]) -> None:
-    """Write what was found of each avatar, in the order of the run; of those that failed, why."""
+    """Write the results of each avatar, in the order of the run, or the reason of a failure."""
     folder = RunFolder(out)
     manifest = folder.read_manifest()
     table = rows.select(method=ALL, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)

@@ -71,7 +71,7 @@ class ReenactSettings(RunOptions, ExecutionOptions):
     """Camera of the target to render; default: the first held out, or else the first of training."""
 
     frames: int | None = None
-    """Render at most so many timesteps of each source, evenly spaced; default: all."""
+    """Maximum number of rendered timesteps of each source, evenly spaced; default: all."""
 
     def __post_init__(self) -> None:
         if self.frames is not None and self.frames < 1:

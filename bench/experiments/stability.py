@@ -1,4 +1,4 @@
-"""Robustness tests without ground truth: measures of one frame, limits to them, and what a test leaves on disk.
+"""Robustness tests without ground truth: measures of one frame, their limits, and the files of a test.
 
 Every limit is relative to a frame of the same avatar that is not extreme, so that hair, which is translucent, or a
 low resolution, whose edges are, does not count against it.
@@ -97,7 +97,7 @@ class LimitCheck:
 
 
 def measure(frame: Frame, camera: Camera, splats: Splats | None = None) -> Measures:
-    """Measure one frame. ``splats`` has means, scales, quats, opacities as numpy arrays, None where there are none."""
+    """Measure one frame. ``splats`` has means, scales, quats, opacities as numpy arrays, or is None."""
     alpha = np.asarray(frame.alpha, np.float64)
     arrays = [np.asarray(frame.rgb), alpha]
     covered = alpha > COVERED
@@ -166,7 +166,7 @@ def _ratio(value: float | None, reference: float | None) -> float | None:
 
 @dataclass(frozen=True)
 class JudgedFrame:
-    """A rendered frame; ``checks`` stand in the order of `Measures`, further ones after."""
+    """A rendered frame; ``checks`` are in the order of `Measures`, followed by others."""
 
     key: FrameKey
     checks: Sequence[LimitCheck]
@@ -184,7 +184,7 @@ class ShownFrames(NamedTuple):
     clips: Sequence[Clip]
     keys: Sequence[FrameKey]
     sizes: Sequence[tuple[int, int]]  # of the images, (width, height)
-    condition: tuple[str, str]  # what is rendered in words, and a fingerprint of it
+    condition: tuple[str, str]  # description of the rendered frames, and a fingerprint of it
 
 
 def protocols_of(task: TaskWithoutTruth, shown: Sequence[ShownFrames]) -> dict[str, Protocol]:

@@ -17,7 +17,7 @@ from .suite_settings import ABLATIONS, SEED, SuiteSettings
 
 OURS = "ours"
 REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
-"""Parts of the frame that have tables of their own."""
+"""Regions of the frame with separate tables."""
 
 
 def suite(settings: SuiteSettings, progress: Progress = no_progress) -> Findings:
@@ -28,7 +28,7 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> Findings
     Raises
     ------
     InputError
-        For methods, presets and sizes that do not fit, before the first capture is made.
+        Methods, presets and sizes do not match; raised before the first capture is created.
     """
     out, execution = Path(settings.out), settings.execution
     methods = settings.methods or tuple(

@@ -30,7 +30,7 @@ ABLATIONS: Mapping[str, Mapping[str, Any]] = {
         "planes": {"direction_smoothing": 0.0, "residual_lr": 0.0, "move_splats": True},
     },
 }
-"""Settings of ours by the name of what is left out or changed; the first two are the paper's Table 4."""
+"""Settings of the method "ours" by name of the ablation; the first two are the paper's Table 4."""
 
 ALL = "all"
 
@@ -59,8 +59,8 @@ class SuiteSettings(ExecutionOptions):
     """Train ours with these parts left out or changed, too, each as a condition of the run; or "all"."""
 
     subjects: int = 10
-    """How many of the suite's subjects, from the first. To be told apart two methods take 6 of them, five methods 8, ten
-    ablations 9."""
+    """Number of the suite's subjects, from the first. Significant differences require 6 subjects for two
+    methods, 8 for five methods, 9 for ten ablations."""
 
     cameras: int = 8
     """Views of each, the held-out one included."""
@@ -75,7 +75,7 @@ class SuiteSettings(ExecutionOptions):
     """As for `headbench synth`."""
 
     def __post_init__(self) -> None:
-        """Refuse sizes and names that are none."""
+        """Refuse invalid sizes and names."""
         parse_size(self.size)
         unknown = [name for name in self.ablations if name not in (*ABLATIONS, ALL)]
         if unknown:
@@ -83,10 +83,10 @@ class SuiteSettings(ExecutionOptions):
 
     @staticmethod
     def notes() -> str:
-        """What the help says of presets."""
+        """Description of the presets in the help."""
         return presets_of_methods()
 
     @property
     def chosen(self) -> tuple[str, ...]:
-        """Names of the ablations asked for, in the order of `ABLATIONS`."""
+        """Names of the requested ablations, in the order of `ABLATIONS`."""
         return tuple(name for name in ABLATIONS if name in self.ablations or ALL in self.ablations)

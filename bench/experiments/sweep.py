@@ -24,16 +24,17 @@ from .sweep_settings import SweepSettings
 def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Findings:
     """Derive smaller and faster variants of a run's avatars without training; quality against size and frame time.
 
-    The trained avatars are measured again beside their variants, so that frame times were taken in one go. Writes
-    ``points.csv`` and ``pareto.png`` beside the rows. Started again, it keeps what is measured and adds variants.
+    The trained avatars are measured again with their variants, so that frame times are comparable. Writes
+    ``points.csv`` and ``pareto.png`` into the run folder. A restart keeps existing measurements and adds
+    variants.
 
     Raises
     ------
     InputError
-        For a folder that is no finished run, a method that derives nothing, a variant that none of them has.
+        The folder is not a finished run, a method derives no variants, or no method has the variant.
     """
     execution, source = settings.execution, RunFolder(Path(settings.run))
-    source.read_manifest()  # before a folder is made in what is no run
+    source.read_manifest()  # before a folder is created
     out = Path(settings.out) if settings.out else source.root / "sweep"
     check_kind(out, "a run")
     with nullcontext() if settings.out else output_inside(source.root), locked(out):
@@ -58,7 +59,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
             if not settings.variants or name in settings.variants
         ]
         names = {job.method.spec.name for job in able}
-        # What avatars cost, whether the run measured it or not.
+        # Cost of avatars, independent of the run's metrics.
         costs = [name for name in default_names("metrics") if get("metrics", name).kind == "avatar"]
         metrics = dict.fromkeys((*config.metrics, *costs))
         config = replace(
@@ -81,7 +82,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
 def variant(method: MethodSpec, trained: Path, out: Path, clip: Clip, device: str, *, name: str) -> Avatar:
     """Make the variant of a trained avatar that has a name, see `MethodSpec.variants`; the registered change "variant".
 
-    Raises `InputError` where the avatar has no such variant.
+    Raises `InputError` if the avatar has no such variant.
     """
     known = []
     for each in resolve(method.variants)(trained, clip, device):

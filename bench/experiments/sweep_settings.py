@@ -12,7 +12,7 @@ from ..executors.options import ExecutionOptions
 
 @dataclass(frozen=True)
 class SweepSettings(RunOptions, ExecutionOptions):
-    """Quality against size and frame time of what can be derived from a run's avatars without training."""
+    """Quality against size and frame time of variants derived from a run's avatars without training."""
 
     run: tyro.conf.Positional[str]
     """Folder of a finished run."""
@@ -22,13 +22,13 @@ class SweepSettings(RunOptions, ExecutionOptions):
     be added, but none left out."""
 
     methods: tuple[str, ...] = ()
-    """Methods to derive from; default: all that know how."""
+    """Methods to derive from; default: all that provide variants."""
 
     variants: tuple[str, ...] = ()
     """Variants to derive, by name; default: all. The trained avatar itself is always measured."""
 
     frames: int | None = None
-    """Score at most so many frames per subject and task, evenly spaced; default: those of the run."""
+    """Maximum number of scored frames per subject and task, evenly spaced; default: that of the run."""
 
     task: str = "novel_view"
     """Task whose frames give the quality in the plot."""

@@ -39,11 +39,11 @@ def turntable(
     cameras : Sequence[Camera]
         Training cameras, at least one; views have the size of the first.
     center : FloatArray
-        (3,) point to look at, metres.
+        (3,) point that the views face, metres.
     count : int
         Number of views, at least 1.
     beyond_degrees : float
-        How far views go beyond the outermost cameras on either side, in [0, 180).
+        Angle of views beyond the outermost cameras on either side, in [0, 180).
     """
     if not cameras:
         raise InputError("turntable", "cameras", "at least one", "none")

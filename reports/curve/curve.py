@@ -33,12 +33,13 @@ def curve_report(out: Path, over: str) -> Findings:
     Parameters
     ----------
     over : str
-        What the trainings were given parts of: "budget", "cameras", "timesteps" or "tracking_error".
+        Quantity that varies between the trainings: "budget", "cameras", "timesteps" or
+        "tracking_error".
 
     Raises
     ------
     InputError
-        For a folder that is not the run of a curve.
+        The folder is not the run of a curve.
     """
     run = RunData.read(out)
     config = run.manifest.configuration
@@ -127,7 +128,7 @@ def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipR
 
 
 def _step(steps: Sequence[Mapping[str, Any]], name: str) -> Mapping[str, Any]:
-    """Parameters of a processing step, none where it was not done."""
+    """Parameters of a processing step, empty if it was not applied."""
     return next((step["parameters"] for step in steps if step["name"] == name), {})
 
 
@@ -142,7 +143,7 @@ def _number(value: object) -> float | None:
 
 
 def _reason(rows: Rows, spec: MetricSpec) -> str:
-    """Why a metric was not measured; "" where it was, or where trainings failed."""
+    """Reason why a metric was not measured; "" if it was, or if trainings failed."""
     own = rows.select(method=ALL, metric=spec.name, task=ALL, region=FULL, seeds=ALL)
     reasons = own.loc[own["status"] == "missing", "reason"]
     return " ".join(str(reasons.iloc[0]).split()) if len(reasons) else ""
@@ -151,7 +152,7 @@ def _reason(rows: Rows, spec: MetricSpec) -> str:
 def _panel(
     points: Sequence[CurvePoint], spec: MetricSpec, task: str, axis: str, missing: Mapping[str, str]
 ) -> CurvePanel:
-    """Quality over what the horizontal axis has: a field of `CurvePoint` or a cost."""
+    """Quality over the horizontal axis: a field of `CurvePoint` or a cost."""
     lines: dict[str, list[tuple[float, float, float]]] = {}
     for point in points:
         cost = point.cost[axis] if axis in point.cost else getattr(point, axis)

@@ -1,4 +1,4 @@
-"""Lines of quality over what trainings were given, a panel for each metric."""
+"""Plots quality over training conditions, with one panel per metric."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..plots import SMALL, cost_axis, plot_file, show_missing, start_axes
 
 @dataclass(frozen=True)
 class CurvePanel:
-    """One plot: (cost, quality, half the interval's width) of each method's points; ``reason`` why there are none."""
+    """One plot: (cost, quality, half the interval's width) of each method; ``reason`` if empty."""
 
     title: str
     lines: Mapping[str, Sequence[tuple[float, float, float]]]

@@ -15,19 +15,20 @@ from ...bench.contracts import Budget
 from ...bench.specs import MetricSpec
 
 HELD_OUT: Mapping[str, str] = {"novel_view": "camera", "self_reenactment": "timesteps"}
-"""What is held out, by the task that it is measured as."""
+"""Held-out data by task."""
 MEASURED = ("processor_seconds", "seconds", "peak_memory_bytes")
-"""What the record of a training says of its cost."""
+"""Costs in the record of a training."""
 
 
 @dataclass(frozen=True)
 class CurvePoint:
     """A method trained with a part of its budget or of the frames, or with a level of tracking error.
 
-    Means over seeds of one subject, or over subjects (""). ``cameras`` and ``timesteps`` count what it was trained on.
-    ``tracking_error`` is the level of a synthetic capture, None for a recording. ``cost`` is `MEASURED` by name, ``values``
-    are the metrics by name and what was held out, such as "psnr_camera"; None: not measured. ``halves`` are half the widths
-    of the 95 % intervals of means over subjects, by the same names, where there are at least two subjects.
+    Means over seeds of one subject, or over subjects (""). ``cameras`` and ``timesteps`` count the training
+    data. ``tracking_error`` is the level of a synthetic capture, None for a recording. ``cost`` is `MEASURED`
+    by name, ``values`` are the metrics by name and held-out data, such as "psnr_camera"; None: not measured.
+    ``halves`` are half the widths of the 95 % intervals of means over subjects, by the same names, where
+    there are at least two subjects.
     """
 
     method: str
@@ -73,7 +74,7 @@ def half_width(values: Sequence[float | None]) -> float | None:
 
 
 def mean_point(points: Sequence[CurvePoint]) -> CurvePoint:
-    """The mean over subjects of points that differ in nothing else."""
+    """The mean over subjects of points that are otherwise equal."""
     first = points[0]
     by_name = {key: [point.values[key] for point in points] for key in first.values}
     cameras, timesteps = (
@@ -103,7 +104,7 @@ def points_text(
     missing: Mapping[str, str],
     failed: Sequence[str],
 ) -> str:
-    """Means over subjects as a table, what was held out, and what is missing."""
+    """Means over subjects as a table, with the held-out data and the missing values."""
     wide = max(8, *(len(point.method) + 2 for point in points))
     frame = [spec for spec in metrics if spec.per_frame]
     avatar = [spec for spec in metrics if not spec.per_frame]

@@ -13,7 +13,7 @@ from ...bench.specs import Findings
 
 @dataclass(frozen=True)
 class LeaderboardSettings:
-    """Make a page of all result bundles in a folder: a table for each set of frames, and who submitted what.
+    """Make a page of all result bundles in a folder: a table for each set of frames, and their submitters.
 
     Bundles whose rows are of the same frames by the same protocol share a table, with the marks and tests of `headbench
     table`. Every bundle's digests are checked; `headbench verify BUNDLE` recomputes its values.

@@ -1,4 +1,4 @@
-"""The leaderboard: bundles read and grouped by what they measured, each group a table of its own."""
+"""The leaderboard: bundles grouped by protocol, with one table per group."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class Submission:
 
     @property
     def measured(self) -> tuple[tuple[str, str], ...]:
-        """The protocol's hash of each task: what results have to share to stand in one table."""
+        """The protocol's hash of each task; results in one table have equal hashes."""
         return tuple(sorted((task, record.hash) for task, record in self.manifest.protocols.items()))
 
     @property
     def line(self) -> tuple[str, ...]:
-        """What the list of submissions shows, as `HEADS`."""
+        """Fields of the list of submissions, in the order of `HEADS`."""
         return (
             self.file.name,
             self.bundle.by,

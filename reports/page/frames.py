@@ -1,4 +1,4 @@
-"""Which frames a page shows as pictures, and the pictures: WebP in data URIs, within a number of bytes."""
+"""Selects the frames of a page and encodes them: WebP in data URIs, with a maximum total size."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ class ShownFrame(NamedTuple):
 class Pictures:
     """Pictures of frames: of each the ground truth's first, then each method's, as the base64 of a WebP or a reason.
 
-    ``lossless`` are frames whose pictures keep every pixel. ``truth`` says why there is no ground truth; "" where there is.
+    ``lossless`` are frames whose pictures keep every pixel. ``truth`` states why the ground truth is missing,
+    else "".
     """
 
     shown: dict[ShownFrame, list[str | None]] = field(default_factory=dict)
@@ -73,8 +74,10 @@ def frame_values(runs: RunSet, metrics: Sequence[MetricSpec]) -> dict[tuple[str,
 def worst_frames(
     values: Mapping[tuple[str, str, ShownFrame], float], runs: RunSet, spec: MetricSpec, count: int = WORST
 ) -> list[ShownFrame]:
-    """The worst frames of each method that is no trivial baseline (all, where there is no other) and each task by a metric,
-    one for each timestep."""
+    """The worst frames by a metric of each task and method, one per timestep.
+
+    Trivial baselines are skipped unless there are no other methods.
+    """
     found: dict[ShownFrame, None] = {}
     sign = 1 if spec.higher_is_better else -1
     for label in runs.ranked or runs.methods:
@@ -108,12 +111,12 @@ def _refined(items: Sequence[ShownFrame]) -> list[ShownFrame]:
 
 
 def without_folders(text: str) -> str:
-    """One line in which absolute paths are cut to their last part: a page is sent to others."""
+    """One line in which absolute paths are cut to their last part: pages are shared."""
     return re.sub(r"(?<![\w./])(?:/[^\s/:,'\"]+)+/([^\s/:,'\"]+)", r"\1", " ".join(text.split()))
 
 
 def open_truth(runs: RunSet, options: RunOptions) -> tuple[dict[str, Clip], str]:
-    """The captures by subject, and why there are none: the first run's whose capture can be opened."""
+    """The captures by subject of the first run that can be opened, or the reason if none can."""
     reasons = []
     for run in runs.runs:
         try:
@@ -134,7 +137,7 @@ def choose_pictures(
 ) -> Pictures:
     """Encode the worst frames, then others while they fit in ``budget`` bytes of base64.
 
-    Raises `InputError` where the worst ones do not fit.
+    Raises `InputError` if the worst ones do not fit.
     """
     clips, why = open_truth(runs, options)
     pictures = Pictures(truth=why)
@@ -208,7 +211,7 @@ class _Source:
         if key.subject not in self.clips:
             return None, self.why or "no capture of this subject"
         try:
-            with self.lock:  # a clip keeps what it decoded, for one thread at a time
+            with self.lock:  # a clip caches decoded frames and is not thread-safe
                 return self.clips[key.subject].image(key), ""
         except (HeadbenchError, OSError) as error:
             return None, without_folders(str(error))

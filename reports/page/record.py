@@ -1,4 +1,4 @@
-"""What made a run's numbers: protocols, captures, versions, settings, excluded frames, failures, as text."""
+"""Provenance of a run's results as text: protocols, captures, versions, settings, failures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def name_of(run: RunData) -> str:
 
 
 def record_of(run: RunData) -> dict[str, Any]:
-    """What made a run's numbers, as text; without names of folders of the machine."""
+    """Provenance of a run's results, as text; without local paths."""
     manifest = run.manifest
     excluded = {
         (*key, why): None for protocol in manifest.protocols.values() for key, why in protocol.excluded

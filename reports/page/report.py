@@ -1,4 +1,4 @@
-"""The HTML page of runs: what stands on it, and the file."""
+"""The HTML page of runs: its contents and file."""
 
 from __future__ import annotations
 
@@ -101,9 +101,9 @@ def page_text(
     *,
     apart: bool = False,
 ) -> tuple[str, Pictures, list[PictureFile]]:
-    """The page, the pictures that belong to it, and the files that they lie in where they are not on the page itself.
+    """The page, its pictures, and the files of those that are not embedded in the page.
 
-    Raises `InputError` where ``max_mb`` does not suffice.
+    Raises `InputError` if ``max_mb`` does not suffice.
     """
     metrics = [spec for spec in runs.metrics if spec.per_frame and COMPARISON in spec.tables]
     values = frame_values(runs, metrics)
@@ -131,11 +131,11 @@ def page_text(
     room -= (
         ENTRY_BYTES * (1 + 2 * limit // FILE_BYTES) if apart else 0
     )  # two files together have more than that
-    entry = 8 * (len(runs.methods) + 2)  # bytes of a frame's entry in the list, beside its pictures
+    entry = 8 * (len(runs.methods) + 2)  # bytes of a frame's entry in the list, without its pictures
     pictures = choose_pictures(runs, worst, room - entry * len(data["frames"]), options, progress)
     images: list[str] = []
     entries = dict(zip(_frames(runs), data["frames"]))
-    for frame in sorted(pictures.shown, key=lambda f: (f.group, f.key.timestep)):  # as they are looked at
+    for frame in sorted(pictures.shown, key=lambda f: (f.group, f.key.timestep)):  # in viewing order
         entries[frame]["p"] = _places(frame, pictures, images, data["reasons"])
         entries[frame]["l"] = int(frame in pictures.lossless)
     files = split(images) if apart else []
@@ -148,7 +148,7 @@ def page_text(
 
 
 def _places(frame: ShownFrame, pictures: Pictures, images: list[str], reasons: list[str]) -> list[int]:
-    """Index of each picture of a frame among ``images``, -1 - index of its reason where there is none."""
+    """Index of each picture of a frame among ``images``, -1 - index of its reason if it is missing."""
     places = []
     for image, reason in zip(pictures.shown[frame], pictures.reasons[frame]):
         if image is not None:
@@ -169,7 +169,7 @@ def _filled(
     *,
     apart: bool = False,
 ) -> str:
-    # Opened from a disk, a page has no origin of its own, and 'self' names nothing.
+    # A page opened from a disk has no origin, so that 'self' matches nothing.
     beside = " 'self' file:" if apart else ""
     policy = "; ".join(
         [
@@ -194,12 +194,12 @@ def _filled(
 
 
 def _digest(text: str) -> str:
-    """As a content security policy names a script or a style."""
+    """Source expression of a script or a style in a content security policy."""
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 
 
 def _json(value: Any) -> str:
-    """JSON that may stand in a script element: it has no "<"."""
+    """JSON for a script element: it contains no "<"."""
     return json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":")).replace(
         "<", r"\u003c"
     )
@@ -212,7 +212,7 @@ def _frames(runs: RunSet) -> list[ShownFrame]:
 def _data(
     runs: RunSet, metrics: Sequence[MetricSpec], values: dict[tuple[str, str, ShownFrame], float]
 ) -> dict[str, Any]:
-    """What the script reads: names once, frames by index into them, values by metric and method."""
+    """Data of the script: names once, frames by index into them, values by metric and method."""
     frames = _frames(runs)
     subjects, sequences, cameras = (
         sorted({getattr(frame.key, part) for frame in frames}) for part in ("subject", "sequence", "camera")
@@ -268,7 +268,7 @@ def _parts(runs: RunSet) -> list[Shown]:
 
 
 def _plots(runs: RunSet, metrics: Sequence[MetricSpec]) -> list[dict[str, Any]]:
-    """Quality by the first metric against size and frame time, with the front; none where there is nothing to draw."""
+    """Quality by the first metric against size and frame time, with the front; empty without points."""
     plots = []
     for task in runs.tasks if metrics else ():
         for cost, words in (("megabytes", "Size (MB)"), ("milliseconds", "Frame time (ms)")):
@@ -294,7 +294,7 @@ def _plots(runs: RunSet, metrics: Sequence[MetricSpec]) -> list[dict[str, Any]]:
 
 
 def _cost(runs: RunSet, label: str, cost: str) -> float | None:
-    """Size, or the median time of a frame, or that of the mean rate where there is no median, as in `Point`."""
+    """Size or median frame time, or the inverse of the mean rate if there is no median, as in `Point`."""
     if cost == "megabytes":
         return summarise(runs.rows, label, SIZE, "").value
     milliseconds, rate = (summarise(runs.rows, label, name, "").value for name in (LATENCY, SPEED))
@@ -302,7 +302,7 @@ def _cost(runs: RunSet, label: str, cost: str) -> float | None:
 
 
 def _comparisons(runs: RunSet) -> dict[str, Any]:
-    """Paired differences by task and metric, or why there are none."""
+    """Paired differences by task and metric, or the reason why they are missing."""
     if len(runs.ranked) < 2:
         return {"reason": "A comparison takes two methods that are no trivial baselines.", "groups": []}
     specs = {spec.name: spec for spec in runs.metrics}

@@ -13,11 +13,11 @@ MAX_MB, MAX_SPLIT_MB = 20.0, 500.0
 
 @dataclass(frozen=True)
 class PageSettings(RunOptions):
-    """Write one HTML file that shows finished runs: tables, frames of all methods side by side, curves, the record.
+    """Write finished runs to one HTML file: tables, frames of all methods side by side, curves, provenance.
 
-    It needs no network and no other file. Pictures are chosen to fit in --max-mb: the worst frames of each method and task
-    always, the others evenly over time. With --split it is a folder whose index.html loads pictures when they are looked at,
-    for large runs.
+    It needs no network and no other file. Pictures are chosen to fit in --max-mb: the worst frames of each
+    method and task always, the others evenly over time. With --split it is a folder whose index.html loads
+    pictures when they are viewed, for large runs.
     """
 
     runs: tyro.conf.Positional[tuple[str, ...]]
@@ -27,10 +27,10 @@ class PageSettings(RunOptions):
     """File to write, with --split a folder that is new or holds an earlier report. By default report.html or report."""
 
     split: bool = False
-    """Whether pictures lie in files of their own, in a folder with the page."""
+    """Whether pictures are in separate files, in a folder with the page."""
 
     max_mb: float | None = None
-    """Megabytes (10^6 bytes) that it may have. By default 20, with --split 500."""
+    """Maximum size in megabytes (10^6 bytes). By default 20, with --split 500."""
 
     def __post_init__(self) -> None:
         if not self.runs:

@@ -1,7 +1,8 @@
-"""The pictures of a page in files beside it, each loaded when one of its pictures is looked at.
+"""The pictures of a page in separate files, each loaded when one of its pictures is viewed.
 
-A page opened from a disk may not read the pixels of images beside it, but it may run scripts; so the files are scripts that
-hand over their pictures. They are named by their content: a page never finds those of another.
+A page opened from a disk may not read the pixels of image files, but it may run scripts, so the files are
+scripts that pass their pictures to the page. They are named by their content, so that a page never loads
+those of another.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from ...bench.io.files import check_inside, entries, write_text
 
 INDEX, FOLDER = "index.html", "pictures"
 FILE_BYTES = 2 * 10**6
-"""Of a file about: one that a slow disk or network brings in a moment."""
+"""Target size of a file, such that it loads quickly from a slow disk or network."""
 ENTRY_BYTES = 100
-"""Of a file at most, beside its pictures: its name on the page and the call in it."""
+"""Maximum overhead of a file: its name on the page and the call in it."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def check_folder(folder: Path) -> None:
 
 
 def write_pictures(folder: Path, files: Sequence[PictureFile]) -> None:
-    """Write the files that are not there yet; those of an earlier page stay until `remove_others`."""
+    """Write the missing files; those of an earlier page stay until `remove_others`."""
     check_inside(folder / FOLDER)
     for file in files:
         write_text(folder / file.name, file.text)

@@ -1,4 +1,4 @@
-"""What avatars recorded of their training, as curves."""
+"""Training losses recorded with avatars, as curves."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ Curve = list[tuple[int, float]]
 
 
 def loss_curves(runs: RunSet) -> list[dict[str, Any]]:
-    """Of each method that recorded positive losses: its place among the methods, and iterations with losses.
+    """Of each method that recorded positive losses: its index among the methods, and iterations with losses.
 
     Losses are divided by the first recorded one, and averaged over the subjects that recorded the same iterations as the
-    first; seeds are those of the pictures. A record that is damaged counts as none.
+    first; seeds are those of the pictures. Damaged records are ignored.
     """
     found = []
     for index, label in enumerate(runs.methods):

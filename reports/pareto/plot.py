@@ -15,7 +15,7 @@ from .points import Point, front_of
 MARKER = 7.0
 """Diameter of a point, in points of 1/72 inch."""
 BESIDE = ((7, -8, "left"), (-7, 3, "right"), (7, 3, "left"), (-7, -8, "right"))
-"""Where a label may stand: offset of its lower edge from the point, in points, and its alignment."""
+"""Positions of a label: offset of its lower edge from the point, in points, and its alignment."""
 
 
 def write_plot(
@@ -44,7 +44,7 @@ def write_plot(
             ]
             fronts[cost] = ends
             _draw(axes, points, cost, dict(zip(colours, ends[1:])), ends[0], colours)
-        figure.draw_without_rendering()  # the layout, before labels look for room in it
+        figure.draw_without_rendering()  # compute the layout before placing labels
         for axes, cost in plots:
             label_points(axes, points, cost, list(itertools.chain(*fronts[cost])))
 
@@ -80,8 +80,7 @@ def _draw(
 
 
 def label_points(axes: Axes, points: Sequence[Point], cost: str, order: Sequence[int]) -> None:
-    """Write the names of variants beside their points, in an order of their indices, where they touch neither points
-    nor each other."""
+    """Write the names of variants next to their points, in an order of their indices, without overlaps."""
     scale = axes.get_figure(root=True).dpi / 72  # type: ignore[union-attr]
     costs = {i: getattr(point, cost) for i, point in enumerate(points)}
     places = {i: (value, points[i].quality) for i, value in costs.items() if value is not None}

@@ -35,9 +35,9 @@ SIZE, SPEED, LATENCY = "storage", "fps", "latency_p50"
 class Point:
     """One method of one run, means over frames, subjects and seeds.
 
-    ``megabytes`` and ``milliseconds`` are None where the run did not measure them. Milliseconds are the median time of
-    a frame, or those of the mean rate where a run has no median. ``derived_from`` and ``variant`` are "" for a trained
-    avatar.
+    ``megabytes`` and ``milliseconds`` are None where the run did not measure them. Milliseconds are the
+    median frame time, or the inverse of the mean rate if a run has no median. ``derived_from`` and
+    ``variant`` are "" for a trained avatar.
     """
 
     run: str
@@ -51,7 +51,7 @@ class Point:
 
     @property
     def series(self) -> str:
-        """The method whose training it comes from."""
+        """The method that was trained."""
         return self.derived_from or self.method
 
 
@@ -69,12 +69,12 @@ def front_of(
 def read_points(
     folders: Sequence[Path], task: str, metric: str, time: str = ""
 ) -> tuple[list[Point], list[str], MetricSpec, str]:
-    """Read every method of every run that is no trivial baseline; return points, what was left out and why, the metric,
-    and a note on frame times that do not compare ("": all do).
+    """Read every method of every run except trivial baselines; return points, omitted methods with reasons,
+    the metric, and a note on frame times that are not comparable ("": all are).
 
-    ``metric`` "" is the first of frames that the runs have; ``time`` names the metric of milliseconds; "" the median
-    latency, or what the frames per second give. Raises `InputError` where runs were not scored on the same frames by
-    the same protocol, where one lacks the task or the metric, and where nothing is left to show.
+    ``metric`` "" is the first of frames that the runs have; ``time`` names the metric of milliseconds; "" the
+    median latency, or the inverse of the frames per second. Raises `InputError` if runs were scored on
+    different frames or protocols, if one lacks the task or the metric, and if no point remains.
     """
     points: list[Point] = []
     left_out: list[str] = []

@@ -24,7 +24,7 @@ class ParetoSettings:
     """Metric of quality; default: the first of frames that the runs have."""
 
     time: str = ""
-    """Metric of frame time, in ms: latency_p50 (default, or what frames per second give), processor_time, ..."""
+    """Metric of frame time, in ms: latency_p50 (default, or 1 / frames per second), processor_time, ..."""
 
     def __post_init__(self) -> None:
         if not self.runs:

@@ -29,7 +29,7 @@ ORBIT = "orbit"
 
 
 class Shot(NamedTuple):
-    """A frame to render: its file, what it is of, the way to the size it is written at, and its captured image, if any."""
+    """A frame to render: its file, key, resizing and captured image, if any."""
 
     path: Path
     video: Path
@@ -42,8 +42,8 @@ class Shot(NamedTuple):
 def render_avatar(settings: RenderSettings, progress: Progress = no_progress) -> Findings:
     """Render a stored avatar; see the settings.
 
-    Raises `InputError` for what is no avatar, a capture that the method cannot take, and for cameras and timesteps
-    that the capture lacks.
+    Raises `InputError` for an invalid avatar, a capture that the method does not support, and cameras and
+    timesteps that the capture lacks.
     """
     if settings.video:
         webm_writer()
@@ -133,7 +133,7 @@ def _known(option: str, asked: Sequence[int | str], known: Iterable[int | str], 
 
 
 def _videos(shots: Sequence[Shot], settings: RenderSettings) -> list[Path]:
-    """Write the frames of each video in order of their names, which is that of time."""
+    """Write the frames of each video in the order of their names, which is chronological."""
     parts: dict[Path, list[Shot]] = {}
     for shot in shots:
         parts.setdefault(shot.video, []).append(shot)
@@ -144,6 +144,6 @@ def _videos(shots: Sequence[Shot], settings: RenderSettings) -> list[Path]:
 
 
 def _pictured(shot: Shot, beside: bool) -> ByteArray:
-    """The frame as a video has it: as it was written, with the captured image on its left if asked for."""
+    """The frame as a video has it: as it was written, with the captured image on its left if requested."""
     image = read_png(shot.path)
     return np.hstack([shot.captured(), image]) if beside and shot.captured else image

@@ -28,19 +28,19 @@ class RenderSettings:
     """Only these cameras; for an orbit, those that it passes."""
 
     timesteps: tuple[int, ...] = ()
-    """Only these timesteps; for an orbit, the poses shown in turn (default: the first of training)."""
+    """Only these timesteps; for an orbit, its sequence of poses (default: the first of training)."""
 
     views: int = 60
-    """Of the orbit, with --frames orbit."""
+    """Number of views of the orbit, with --frames orbit."""
 
     beyond: float = 30.0
-    """With --frames orbit: how far it goes on beyond the outermost cameras, degrees."""
+    """With --frames orbit: angle beyond the outermost cameras, degrees."""
 
     video: bool = False
     """Write videos, too: one for each sequence and camera. Needs PyAV (extra `video`)."""
 
     beside: bool = False
-    """With --video of captured frames: put the captured image beside each."""
+    """With --video of captured frames: show the captured image next to each."""
 
     fps: float = 25.0
     """With --video: frames per second."""
@@ -52,10 +52,10 @@ class RenderSettings:
     """Reader of the capture; default: the one that finds it."""
 
     head: str | None = None
-    """Head model for captures that bring none: FLAME pickle or npz."""
+    """Head model for captures without one: FLAME pickle or npz."""
 
     device: str = "cpu"
-    """Where to render."""
+    """Rendering device."""
 
     dependent = (
         DependentOptions(("views", "beyond"), "frames", ("orbit",)),

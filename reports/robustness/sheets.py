@@ -1,4 +1,4 @@
-"""Contact sheets of the robustness tests, drawn from what a command left in its folder."""
+"""Contact sheets of the robustness tests, drawn from the output folder of a command."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ EXTREMES_WIDTH, REENACT_WIDTH, REENACT_COLUMNS = 110, 150, 8
 
 
 def robustness_report(folder: Path) -> Findings:
-    """Draw the contact sheet of what ``headbench run extremes`` or ``headbench run reenact`` left in a folder, and summarise it.
+    """Draw the contact sheet of ``headbench run extremes`` or ``headbench run reenact``; summarise it.
 
-    Does not pass where an avatar broke a limit or failed.
+    Does not pass if an avatar broke a limit or failed.
     """
     record = read_json(folder / RECORD_FILE)
     avatars, failed = record["avatars"], record.get("failed", [])
@@ -125,7 +125,7 @@ def _extremes_section(folder: Path, avatar: Mapping[str, Any], width: int) -> Sh
 
 
 def _picture(path: Path, width: int) -> Any:
-    """The image at a width, by area where that is smaller; frames that were not finite left no file."""
+    """The image at a width, reduced by area; frames that were not finite have no file."""
     if not path.exists():
         return "not finite"
     image = read_png(path)

@@ -1,7 +1,8 @@
-"""Two methods' values of one metric, matched frame by frame: what every comparison starts from.
+"""Two methods' values of one metric, matched frame by frame, for comparisons.
 
-The levels are subject -> sequence -> timestep (with its cameras), and the seeds of each method beside them. Avatars
-of different seeds are trained apart, so the seeds of two methods are not paired with each other; the frames are.
+The levels are subject -> sequence -> timestep (with its cameras), and, separately, the seeds of each method.
+Avatars of different seeds are trained apart, so the seeds of two methods are not paired with each other; the
+frames are.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class SubjectPairs:
 def pair(first: pd.DataFrame, second: pd.DataFrame) -> tuple[SubjectPairs, ...]:
     """Match two methods' rows of one metric of one task (one per frame and seed, or per subject and seed).
 
-    Raises `InputError` where the two do not have values of exactly the same frames, in every seed.
+    Raises `InputError` unless both have values of exactly the same frames, in every seed.
     """
     tables = [_by_seed(rows) for rows in (first, second)]
     unmatched = tables[0].index.symmetric_difference(tables[1].index)
@@ -94,7 +95,7 @@ def _by_seed(rows: pd.DataFrame) -> pd.DataFrame:
 
 REPLICATES = 4_000
 LEAST_SUBJECTS = 3
-"""Two subjects have one degree of freedom; an interval from them says nothing."""
+"""Two subjects have one degree of freedom, which is too few for an interval."""
 
 
 def interval(
@@ -119,7 +120,7 @@ def interval(
     drawn = generator.integers(count, size=(replicates, count))
     means = pools[drawn, generator.integers(replicates, size=drawn.shape)]
     shifts, errors = means.mean(axis=1) - mean, _standard_error(means)
-    # A replicate of one subject alone has no error of its own: as far out as can be. Sums of equal numbers
+    # A replicate of a single subject has no standard error and counts as infinite. Sums of equal numbers
     # differ by rounding.
     alike = errors <= 1e-9 * error
     ratios = np.divide(shifts, errors, out=np.copysign(np.full(replicates, np.inf), shifts), where=~alike)

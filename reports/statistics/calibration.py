@@ -18,15 +18,21 @@ from .comparisons import LEVEL, best_set, least_p, sign_flip_p
 
 @dataclass(frozen=True)
 class Population:
-    """Subjects with sequences with frames whose errors follow each other, and seeds beside them; in dB, say.
+    """Subjects with sequences of frames with correlated errors, and seeds; for example in dB.
 
     Attributes
     ----------
-    mean : of the difference over the population: what an interval should cover. 0 is the null.
-    subject_sd, sequence_sd, frame_sd : standard deviation at each level.
-    correlation : of neighbouring frames (a stationary autoregressive series of order 1).
-    seeds, seed_sd : trainings of each method and subject, and how much a training moves the mean of a subject.
-    skewed : the subjects' differences are exponential less their mean instead of normal.
+    mean : float
+        Mean difference over the population, which an interval should cover. 0 is the null hypothesis.
+    subject_sd, sequence_sd, frame_sd : float
+        Standard deviation at each level.
+    correlation : float
+        Correlation of consecutive frames (a stationary autoregressive series of order 1).
+    seeds, seed_sd : int or float
+        Number of trainings of each method and subject, and standard deviation of a subject's mean
+        between trainings.
+    skewed : bool
+        Whether the subjects' differences are centred exponential instead of normal.
     """
 
     subjects: int
@@ -68,7 +74,7 @@ class Population:
 TRIALS, QUICK_TRIALS = 2_000, 100
 REPLICATES = 1_000
 RANGE = (0.03, 0.07)
-"""What counts as 5 %, give or take two standard errors of the simulation."""
+"""Range around 5 % of two standard errors of the simulation."""
 
 CASES: Mapping[str, Population] = {
     "3 subjects": Population(3),
@@ -86,7 +92,7 @@ CASES: Mapping[str, Population] = {
 
 
 def stress(quick: bool, progress: Progress) -> Findings:
-    """Calibrate every case of `CASES` and the sets of the best; passed where the level is kept as promised."""
+    """Calibrate every case of `CASES` and the sets of the best; passed if the level is kept as specified."""
     trials = QUICK_TRIALS if quick else TRIALS
     cases: list[Row] = []
     for index, (case, population) in enumerate(CASES.items()):
@@ -116,9 +122,10 @@ def calibrate(population: Population, trials: int, seed: int = 0) -> Row:
     Returns
     -------
     Row
-        In %: how often the sign-flip test rejects (None where so few subjects cannot be tested), how often the interval
-        covers, and how often a paired t-test over frames rejects; and a verdict on what was promised. The test's exactness
-        assumes differences that are symmetric about their mean.
+        In %: how often the sign-flip test rejects (None if there are too few subjects to test), how
+        often the interval covers the mean, and how often a paired t-test over frames rejects; and a
+        verdict on these rates. The exactness of the test assumes differences that are symmetric about
+        their mean.
     """
     generator = np.random.default_rng(seed)
     rejected = covered = frame_test = 0
@@ -149,7 +156,7 @@ def standard_error(trials: int) -> float:
 
 
 def frame_t_test_p(subjects: tuple[SubjectPairs, ...]) -> float:
-    """P-value of a paired t-test that takes frames for independent: here only to show what it does."""
+    """P-value of a paired t-test that treats frames as independent, for comparison only."""
     sequences = [sequence for subject in subjects for sequence in subject.sequences]
     frames = [(each.first.mean(axis=0) - each.second.mean(axis=0)) / each.cameras for each in sequences]
     return float(stats.ttest_1samp(np.concatenate(frames), 0.0).pvalue)

@@ -1,9 +1,9 @@
 """The exact sign-flip test on paired differences of few subjects (Fisher's randomisation test for pairs).
 
-Where two methods do not differ, a subject's difference is as likely to be positive as negative. All 2^n assignments
-of signs are then equally likely, and the p-value is the share of them whose mean is at least as far from zero as
-the one observed: exact for any distribution symmetric about zero, at any number of subjects. R. A. Fisher, The
-Design of Experiments (1935), section 21.
+If two methods do not differ, a subject's difference is as likely to be positive as negative. All 2^n
+assignments of signs are then equally likely, and the p-value is the share of them whose mean is at least as
+far from zero as the one observed: exact for any distribution symmetric about zero, at any number of subjects.
+R. A. Fisher, The Design of Experiments (1935), section 21.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CHUNK = 4_096
 
 
 def sign_flip_p(differences: Sequence[float] | FloatArray) -> float:
-    """Two-sided p-value of the mean of (n,) differences, one per subject; 1 where there are none."""
+    """Two-sided p-value of the mean of (n,) differences, one per subject; 1 if n is 0."""
     values = np.asarray(differences, dtype=np.float64)
     if not np.isfinite(values).all():
         raise ValueError("differences must be finite")
@@ -36,7 +36,7 @@ def sign_flip_p(differences: Sequence[float] | FloatArray) -> float:
     # Sums of the same terms in another order differ by rounding; they count as equal.
     threshold = abs(values.sum()) - 1e-9 * np.abs(values).sum()
     if values.size <= EXACT_UP_TO:
-        # The first sign can stay: turning all signs leaves the absolute sum as it is.
+        # The first sign is fixed: flipping all signs does not change the absolute sum.
         sums = values[:1]
         for value in values[1:]:
             sums = np.concatenate([sums + value, sums - value])
@@ -50,14 +50,14 @@ def sign_flip_p(differences: Sequence[float] | FloatArray) -> float:
 
 
 def least_p(subjects: int) -> float:
-    """Return the least p-value that so many subjects can give: that of differences which all have one sign."""
+    """Return the smallest p-value for a number of subjects: that of differences with equal signs."""
     if subjects < 1:
         return 1.0
     return 2.0 ** (1 - subjects) if subjects <= EXACT_UP_TO else 1.0 / (1 + DRAWS)
 
 
 def subjects_needed(level: float, comparisons: int = 1) -> int:
-    """How many subjects it takes for the first of so many comparisons to reach ``level`` after Holm."""
+    """Number of subjects required for the first of several comparisons to reach ``level`` after Holm."""
     return next(n for n in range(1, EXACT_UP_TO + 1) if comparisons * least_p(n) <= level)
 
 
@@ -108,7 +108,7 @@ class PairedComparison:
 
     @property
     def subjects(self) -> int:
-        """How many there are."""
+        """Number of subjects."""
         return len(self.differences)
 
     @property
@@ -119,12 +119,12 @@ class PairedComparison:
 
     @property
     def testable(self) -> bool:
-        """Whether so many subjects could give a corrected p-value at the level at all."""
+        """Whether a corrected p-value at the level is possible with this number of subjects."""
         return self.family * least_p(self.subjects) <= self.level
 
     @property
     def verdict(self) -> str:
-        """What may be said, in words."""
+        """Conclusion in words."""
         if self.difference is None or self.p_holm is None:
             return "no comparison"
         if not self.testable:
@@ -147,8 +147,8 @@ def compare(
     """Compare pairs of methods on one metric of one task ("" for a metric of the avatar as a whole), on whole images.
 
     The pairs are one family: their p-values are corrected together, by Holm. A method that lacks a value of any
-    frame has no comparison, and the reason stands in its place; it does not count in the family. ``rows`` are
-    checked by `Rows.check`. Raises `InputError` where both methods are complete, yet not on the same frames.
+    frame has no comparison, but a reason; it does not count in the family. ``rows`` are
+    checked by `Rows.check`. Raises `InputError` if both methods are complete, but on different frames.
     """
     comparisons = []
     summaries = {name: summarise(rows, name, metric, task) for name in dict.fromkeys(chain(*pairs))}
@@ -191,7 +191,7 @@ class BestSet:
 def best_set(
     means: Mapping[str, Mapping[str, float]], *, higher_is_better: bool, level: float = LEVEL
 ) -> BestSet:
-    """Find every method that cannot be told from the best.
+    """Find every method that does not differ significantly from the best.
 
     Each method is compared with all others by the sign-flip test, Holm over these comparisons; it is left out if
     one of them is better. Whichever method is truly the best is therefore left out with a probability of at most

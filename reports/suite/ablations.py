@@ -1,4 +1,4 @@
-"""What leaving out a part of a method changes: paired differences of its runs from the method as it is."""
+"""Ablations: paired differences between variants of a method and the full method."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def ablation_table(runs: RunSet, method: str) -> Table:
     Parameters
     ----------
     runs : RunSet
-        A run with ``method`` as it is and under the conditions that are its ablations, and with nothing else.
+        A run with only ``method`` itself and the conditions that are its ablations.
     """
     ablations = [label for label, record in runs.records.items() if record.condition]
     table = table_of(runs)

@@ -1,4 +1,4 @@
-"""``headbench doctor bench viewer``: how often a browser sees something new while a slider moves, and what each step takes."""
+"""``headbench doctor bench viewer``: frame rate in a browser while a slider moves, and time of each step."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .settings import ViewSettings
 from .state import FreeView, Sliders, State
 
 UNTRAINED = "headbench.methods.benchmarks.untrained:untrained"
-"""Makes a capture and an avatar of any size; named, as this package imports no method."""
+"""Creates a capture and an avatar of any size; referred to by name, since this package imports no method."""
 
 SPLATS, QUICK_SPLATS = (20_000, 60_000), (2_000,)
 WINDOW = 1280, 720
@@ -48,9 +48,9 @@ MOVE_SLIDER = """([x, y, every]) => { let step = 0; window.moving = setInterval(
 
 
 def speed(quick: bool, progress: Progress) -> Findings:
-    """Serve untrained avatars of ours, move a slider in Chromium; passed where images of the first keep `LEAST_RATE`.
+    """Serve untrained avatars, move a slider in Chromium; passed if images of the first reach `LEAST_RATE`.
 
-    Without Playwright and Chromium the rates of a browser are missing, and nothing is judged.
+    Without Playwright and Chromium the rates of a browser are missing, and the check is skipped.
     """
     counts, seconds = (QUICK_SPLATS, QUICK_SECONDS) if quick else (SPLATS, SECONDS)
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -39,7 +39,7 @@ class SplatArrays(NamedTuple):
 
 
 def key_of(scene: Scene, state: State) -> FrameKey | None:
-    """The frame whose pose drives; that of the camera asked for where it was recorded. None: neutral."""
+    """The frame of the pose, of the requested camera if it was recorded. None: neutral."""
     recording = scene.recordings.get(state.recording)
     cameras = None if recording is None else recording.get(state.timestep)
     if cameras is None:
@@ -50,8 +50,8 @@ def key_of(scene: Scene, state: State) -> FrameKey | None:
 def draw(scene: Scene, state: State, view: FreeView, size: tuple[int, int], scale: float = 1.0) -> DrawnPanes:
     """Draw all avatars in one image of about ``size`` (width, height) times ``scale``.
 
-    In a camera of the capture panels show frames as metrics see them, fitted into their place, below a scale of 1 drawn at
-    that size; otherwise the free view.
+    In a camera of the capture, panels show frames as for metrics, scaled to fit (below a scale of 1, drawn at
+    that size); otherwise the free view.
     """
     key = key_of(scene, state)
     captured = key if key is not None and key.camera == state.camera else None
@@ -87,7 +87,7 @@ def draw(scene: Scene, state: State, view: FreeView, size: tuple[int, int], scal
 
 
 def arrangement(count: int, width: int, height: int) -> tuple[int, int]:
-    """Rows and columns for so many panels, such that a head in each is largest."""
+    """Rows and columns for a number of panels that maximise the size of a head in each."""
 
     def head(rows: int) -> float:
         return min(width / -(-count // rows) / HEAD_ASPECT, height / rows)
@@ -102,7 +102,7 @@ def pose_of(shown: ShownAvatar, state: State, key: FrameKey | None) -> HeadPose:
 
 
 def moved(scene: Scene, shown: ShownAvatar, camera: Camera, key: FrameKey | None) -> Camera:
-    """A camera of the first avatar's world as an avatar's method sees it; of another subject it looks at that one's head."""
+    """Convert a camera to an avatar's world; for another subject it faces that one's head."""
     motion = np.eye(4)
     motion[:3, 3] = scene.first.center - shown.center
     there = Camera(camera.id, camera.width, camera.height, camera.K, camera.world_to_camera @ motion)
@@ -110,7 +110,7 @@ def moved(scene: Scene, shown: ShownAvatar, camera: Camera, key: FrameKey | None
 
 
 def splats_of(scene: Scene, shown: ShownAvatar, state: State, view: FreeView) -> SplatArrays | None:
-    """Splats of an avatar in the world of the first, coloured as the view sees them; None where it has none to give."""
+    """Splats of an avatar in the first one's world, coloured for the view; None if it provides none."""
     if not isinstance(shown.avatar, SplatAvatar):
         return None
     key = key_of(scene, state)
@@ -130,7 +130,7 @@ def splats_of(scene: Scene, shown: ShownAvatar, state: State, view: FreeView) ->
 
 
 def _frame(shown: ShownAvatar, state: State, key: FrameKey, place: tuple[int, int] | None) -> ByteArray:
-    """A frame of the capture as metrics see it; with a place, drawn no larger than that."""
+    """A frame of the capture as for metrics; with a place, drawn no larger than that."""
     pose, camera = pose_of(shown, state, key), shown.form.clip.cameras[shown.form.key(key).camera]
     if place is None:
         return quantise(shown.form.restore(key, shown.avatar.render(camera, pose, state.background).rgb))

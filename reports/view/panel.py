@@ -1,4 +1,4 @@
-"""The controls of one browser, in viser's terms, and the state that they say."""
+"""The controls of one browser, as viser elements, and their state."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .state import Sliders, State
 
 JAW, NECK, EYES = ("open", "sideways", "roll"), ("nod", "turn", "tilt"), ("up and down", "sideways")
 REACH = {"jaw": 0.4, "neck": 0.5, "eyes": 0.5}
-"""How far sliders of joints go, radians."""
+"""Range of the sliders of joints, radians."""
 FREE = "free"
 IMAGES, SPLATS = "images", "splats"
 MOST_FPS = 60
@@ -21,7 +21,8 @@ class ControlPanel:
 
     Attributes
     ----------
-    screenshot, turntable, sequence : buttons, for whoever does it.
+    screenshot, turntable, sequence : button
+        Buttons, whose actions the caller sets.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class ControlPanel:
             self._camera = gui.add_dropdown(
                 *("Camera", (FREE, *cameras)),
                 initial_value=FREE,
-                hint="A camera of the capture shows the captured image beside, where there is one.",
+                hint="A camera of the capture shows the captured image next to it, if there is one.",
             )
         self._recording.on_update(lambda _: self._recording_chosen())
         self._camera.on_update(lambda _: jumped("" if self._camera.value == FREE else self._camera.value))
@@ -80,7 +81,7 @@ class ControlPanel:
 
     @property
     def state(self) -> State:
-        """What the controls say."""
+        """State of the controls."""
         values = {name: tuple(s.value for s in sliders) for name, sliders in self._joints.items()}
         leading = {name: tuple(s.value for s in sliders) for name, sliders in self._expressions.items()}
         red, green, blue = (channel / 255 for channel in self._background.value)
@@ -108,7 +109,7 @@ class ControlPanel:
         self._timestep.value = (self._timestep.value + frames) % len(self._steps)
 
     def show_times(self, text: str) -> None:
-        """Write what was measured above the controls."""
+        """Show measurements above the controls."""
         names = " | ".join(shown.label for shown in self._scene.shown)
         lost = "".join(f"\n\nNot shown: {reason}" for reason in self._scene.missing)
         self._legend.content = f"**{names}**\n\n{text}\n\nDrawn by trained models.{lost}"

@@ -1,4 +1,4 @@
-"""What a viewer shows: avatars with the captures they were made from, and the recordings that drive them."""
+"""Scene of a viewer: avatars with their captures, and the recordings that animate them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .settings import ViewSettings
 
 log = logging.getLogger(__name__)
 NEUTRAL = "neutral"
-"""What drives where no recording does."""
+"""Name of the neutral pose, without a recording."""
 MOST_SHOWN = 12
 """Avatars at once; more would be drawn too small to see."""
 
@@ -40,8 +40,10 @@ class ShownAvatar:
 
     Attributes
     ----------
-    label : says which it is; unique.
-    sources : clips of other subjects in the form of its method, by subject.
+    label : str
+        Unique name.
+    sources : Mapping[str, AdaptedClip]
+        Clips of other subjects, adapted to its method, by subject.
     """
 
     label: str
@@ -75,7 +77,7 @@ class ShownAvatar:
         return head_center(self.clip)
 
     def pose(self, key: FrameKey | None) -> HeadPose:
-        """The pose that was recorded with a frame: of its own subject as it is, of another retargeted; None: neutral."""
+        """The recorded pose of a frame, retargeted if it is of another subject; None: neutral."""
         if key is None:
             return self.neutral
         if key.subject == self.clip.subject:
@@ -87,7 +89,7 @@ class ShownAvatar:
     def camera(self, view: Camera, key: FrameKey | None) -> Camera:
         """A camera of the world of `clip` as the method sees the world at a timestep.
 
-        A method that wants one video has the head stand still and the camera move.
+        For a method with one video, the head is fixed and the camera moves.
         """
         own = key if key is not None and key.subject == self.clip.subject else self._first
         seen = self.form.clip.cameras[self.form.key(own).camera].world_to_camera
@@ -114,7 +116,8 @@ class Scene:
 
     Attributes
     ----------
-    missing : avatars of the runs that are not there, each with the reason.
+    missing : Sequence[str]
+        Avatars of the runs that are missing, each with the reason.
     """
 
     shown: Sequence[ShownAvatar]
@@ -127,7 +130,7 @@ class Scene:
         return self.shown[0]
 
     def heads(self) -> dict[str, FloatArray]:
-        """How far the sliders of each head model go, by its version."""
+        """Ranges of the sliders of each head model, by its version."""
         reach: dict[str, FloatArray] = {}
         for shown in self.shown:
             known = reach.get(shown.version)
@@ -136,9 +139,9 @@ class Scene:
 
 
 def open_scene(settings: ViewSettings, kept: Path) -> Scene:
-    """Load the avatars that are asked for; ``kept`` is a folder for tracking that has to be refitted.
+    """Load the requested avatars; ``kept`` is a folder for tracking that has to be refitted.
 
-    Raises `InputError` where there is nothing to show, or more than `MOST_SHOWN`.
+    Raises `InputError` without avatars, or with more than `MOST_SHOWN`.
     """
     missing: list[str] = []
     shown: list[ShownAvatar] = []
@@ -201,7 +204,7 @@ def _opened(path: Path, settings: ViewSettings, kept: Path, missing: list[str]) 
 
 
 def _run_of(path: Path) -> tuple[Path | None, tuple[str, str, int] | None]:
-    """The run that a folder is, or lies in with subject, method and seed; None for an avatar of no run."""
+    """The run of a folder, with subject, method and seed of a cell; None for an avatar outside of runs."""
     if (path / "run.json").is_file():
         return path, None
     home = avatar_folder(path).resolve()
@@ -230,7 +233,7 @@ def _imported(path: Path, settings: ViewSettings, kept: Path) -> ShownAvatar:
     method = stored.method
     if settings.data is None:
         expected = "the capture that the avatar was made from, with its cameras and poses"
-        raise InputError("command line", "--data", expected, "none, and the avatar lies in no run")
+        raise InputError("command line", "--data", expected, "none, and the avatar belongs to no run")
     config = _config(settings.data, settings, kept)
     clips = open_clips(config)
     if len(clips) > 1:

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 def view_avatars(settings: ViewSettings, progress: Progress = no_progress) -> Findings:
-    """Serve until interrupted, or for the seconds asked for."""
+    """Serve until interrupted, or for a number of seconds."""
     viser()
     check_port(settings.host, settings.port)
     with tempfile.TemporaryDirectory(prefix="headbench-view-") as kept:
@@ -59,7 +59,7 @@ def serving(scene: Scene, settings: ViewSettings) -> Iterator[Any]:
     server.request_share_url = lambda verbose=True: None
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()
-    # What is drawn for a browser that goes meanwhile is not missed.
+    # Drawing for a browser that disconnects is discarded.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     server.sessions = {}
     lock = threading.Lock()
@@ -84,7 +84,7 @@ def serving(scene: Scene, settings: ViewSettings) -> Iterator[Any]:
 
 
 def viser() -> Any:
-    """The module. Raises `UnavailableError` where it is not installed."""
+    """The module. Raises `UnavailableError` if it is not installed."""
     try:
         return importlib.import_module("viser")
     except ImportError:

@@ -1,4 +1,4 @@
-"""One browser at the viewer: draws what its controls and its camera ask for, again and again."""
+"""One browser at the viewer: draws the view of its controls and camera continuously."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ log = logging.getLogger(__name__)
 SCALE = 100.0
 """Units of the browser's world in a metre: covariances travel as 16-bit floats, which would round those in square metres."""
 DRAFT_S = 0.06
-"""What a draft may take while something moves; its size follows from what the last one took."""
+"""Maximum time of a draft while something moves; its size follows from the time of the last one."""
 REST_S = 0.3
-"""After so long without a change the image is drawn in full."""
+"""Time without a change after which the image is drawn in full."""
 LEAST_DRAFT = 0.12
 STILL = 1e-4
 """Motion of the camera that is not drawn: metres, and as much of a unit quaternion."""
@@ -43,11 +43,12 @@ TURNTABLE_VIEWS, BEYOND_DEGREES = 90, 30.0
 
 
 class Session:
-    """A browser and what it sees. One thread draws; ``lock`` is held meanwhile, for avatars are shared.
+    """A browser and its view. One thread draws, with ``lock`` held, since avatars are shared.
 
     Attributes
     ----------
-    updates : images or sets of splats sent so far.
+    updates : int
+        Number of images or sets of splats sent so far.
     """
 
     def __init__(self, client: Any, scene: Scene, expressions: int, lock: threading.Lock):
@@ -179,7 +180,7 @@ class Session:
         return round(width * factor), round(height * factor)
 
     def _camera_moved(self) -> None:
-        """Take note of a change that can be seen; where the browser slows a motion down, it tells of smaller ones."""
+        """Record a visible change; a browser that smooths a motion also reports smaller ones."""
         camera = self._client.camera
         now = np.concatenate([camera.position / SCALE, camera.wxyz, [camera.fov, *self._size()]])
         if self._seen is None or np.abs(now - self._seen).max() > STILL:
@@ -210,7 +211,7 @@ class Session:
             camera.fov = FreeView.of(view).fov
 
     def _step_back(self) -> None:
-        """Let all avatars side by side be seen."""
+        """Show all avatars side by side."""
         camera, factor = self._client.camera, 1 + 0.5 * (len(self._scene.shown) - 1)
         camera.position = camera.look_at + factor * (camera.position - camera.look_at)
 
@@ -219,7 +220,7 @@ class Session:
             self._place(self._scene.first.clip.cameras[name])
         self._changed.set()
 
-    # -------------------------------------------------------------- what is saved
+    # -------------------------------------------------------------- saved files
 
     def _do(self, task: Callable[[], None]) -> None:
         self._tasks.append(task)

@@ -29,13 +29,13 @@ class ViewSettings(RunOptions):
     """Capture of another subject, with the same head model, whose sequences drive the avatars too."""
 
     expressions: int = 10
-    """Sliders for so many leading expressions of each head model."""
+    """Number of sliders for the leading expressions of each head model."""
 
     method: str = ""
     """Method of an avatar outside of runs as package.module:SPEC, where it is not registered."""
 
     device: str = ""
-    """Where to draw; by default where the run was trained."""
+    """Rendering device; by default that of the training."""
 
     host: str = "127.0.0.1"
     """Address to listen at. Any other than the machine's own lets everybody who reaches it look and draw."""
@@ -44,7 +44,7 @@ class ViewSettings(RunOptions):
     """Port to listen at; 0 takes a free one."""
 
     seconds: float | None = None
-    """Stop after so long; by default when interrupted."""
+    """Stop after this time; by default when interrupted."""
 
     def __post_init__(self) -> None:
         if not self.avatars:

@@ -1,4 +1,4 @@
-"""What one browser asks to see: the pose that sliders and recordings make, and the camera."""
+"""View requested by a browser: the pose from sliders and recordings, and the camera."""
 
 from __future__ import annotations
 
@@ -13,12 +13,16 @@ from .scene import NEUTRAL
 
 @dataclass(frozen=True)
 class Sliders:
-    """What is added to a pose. Angles in radians, added to axis-angle vectors.
+    """Offsets added to a pose. Angles in radians, added to axis-angle vectors.
 
     Attributes
     ----------
-    expressions : leading coefficients by head model, in the model's own units.
-    jaw, neck : (3,) about x, y and z. eyes : (2,) about x and y, of both.
+    expressions : Mapping[str, tuple[float, ...]]
+        Leading coefficients by head model, in the model's units.
+    jaw, neck : tuple[float, ...]
+        (3,) rotations about x, y and z.
+    eyes : tuple[float, ...]
+        (2,) rotations of both eyes about x and y.
     """
 
     expressions: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -70,14 +74,19 @@ class FreeView:
 
 @dataclass(frozen=True)
 class State:
-    """Everything that decides the image.
+    """Everything that determines the image.
 
     Attributes
     ----------
-    recording, timestep : which sequence drives and where it is; `NEUTRAL`, 0 for none.
-    camera : of the capture, drawn as metrics see it, with the captured image beside; "" for the free view.
-    background : each channel from 0 to 1.
-    splats : whether browsers draw splats themselves.
+    recording, timestep : str or int
+        Sequence that animates the avatar and its timestep; `NEUTRAL` and 0 for none.
+    camera : str
+        Camera of the capture, drawn as for metrics, with the captured image next to it; "" for the
+        free view.
+    background : tuple[float, float, float]
+        RGB, each in [0, 1].
+    splats : bool
+        Whether browsers render the splats.
     """
 
     sliders: Sliders = field(default_factory=Sliders)
