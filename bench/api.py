@@ -107,6 +107,8 @@ def train(
         clip that the method cannot be trained on; or ``out`` holds a different avatar of the same
         subject, method and seed.
     """
+    if not isinstance(method, str):
+        raise InputError("train", "method", "a name, or 'module:SPEC'", type(method).__name__)
     check_device(device)
     clip = open_clip(clip) if isinstance(clip, (str, Path)) else clip
     values = {

@@ -93,6 +93,10 @@ class CaptureClip:
     read_background: FloatArray | None = None
     source: Clip | None = None
 
+    def __repr__(self) -> str:
+        cameras, frames = len(self.cameras), {name: len(keys) for name, keys in self.splits.items()}
+        return f"{type(self).__name__}({self.subject!r}, cameras: {cameras}, frames: {frames})"
+
     @cached_property
     def fingerprint(self) -> str:
         """Hex digest of the files' content, the steps with their parameters, and what the splits hold."""

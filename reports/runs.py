@@ -249,7 +249,7 @@ class RunSet:
     def changed(self) -> tuple[str, ...]:
         """Labels of methods under a condition; empty if all are, as in a curve."""
         changed = tuple(label for label, record in self.records.items() if record.condition)
-        return changed if len(changed) + len(self.trivial) < len(self.records) else ()
+        return changed if {*changed, *self.trivial} < {*self.records} else ()
 
     @property
     def protocol_ids(self) -> dict[str, str]:

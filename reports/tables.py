@@ -266,7 +266,10 @@ def build_table(
     groups = (
         (METHODS_TITLE, tuple(line for line in lines if not line.trivial)),
         (CONDITIONS_TITLE, tuple(line for line in lines if line.method in changed)),
-        (TRIVIAL_TITLE, tuple(line for line in lines if line.method in trivial)),
+        (
+            TRIVIAL_TITLE,
+            tuple(line for line in lines if line.method in trivial and line.method not in changed),
+        ),
     )
     return Table(
         columns=columns,

@@ -257,6 +257,13 @@ def resolve_cells(config: RunConfig) -> list[tuple[ResolvedMethod, Condition]]:
                 settings = merge(config.settings.get(spec.name, {}), condition.settings)
                 changed = resolve_method(spec, config.preset, settings)
                 changed = replace(changed, spec=replace(changed.spec, name=method.spec.name))
+            if condition.part != 1 and changed.budget == Budget():
+                if condition.methods:
+                    where = f"conditions, budget of {condition.name}"
+                    raise InputError(
+                        "settings", where, f"a budget of {method.spec.name} to take a part of", "none"
+                    )
+                continue  # a baseline, which has nothing to take a part of
             label = check_name(label_of(method.spec.name, condition.name), "settings", "method and condition")
             if label in labels:
                 raise InputError("settings", "conditions", "another name for a method or a condition", label)

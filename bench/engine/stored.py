@@ -200,7 +200,7 @@ def open_avatar(folder: Path, method: str = "") -> StoredAvatar:
         raise InputError(path, "made_by", "an avatar that its method reads", "a variant of a sweep", remedy)
     name = method or record["method"]
     if not method and name not in discover("methods"):
-        remedy = "Install the package that registers it, or name it with --method package.module:SPEC."
+        remedy = "Install the package that registers it, or name it: --method package.module:SPEC, in Python method='package.module:SPEC'."
         raise InputError(path, "method", "a method that is registered here", repr(name), remedy)
     spec: MethodSpec = get("methods", name)
     if method and spec.name != record["method"]:

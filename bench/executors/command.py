@@ -36,7 +36,9 @@ def status(settings: StatusSettings, progress: Progress) -> Findings:
     sizes = usage(run)
     parts = ", ".join(f"{kind} {shown(size)}" for kind, size in sizes.items() if size)
     text = f"{found.text}\ndisk: {shown(sum(sizes.values()))}: {parts}"
-    text += f"\ndeleted: {shown(freed)} of {', '.join(settings.clean)}" if settings.clean else ""
+    if settings.clean:
+        text += f"\ndeleted: {shown(freed)} of {', '.join(settings.clean)}"
+        text += "; the next start of the run renders again" if "renders" in settings.clean else ""
     return found._replace(text=text, data={**found.data, "disk": sizes, "deleted": freed})
 
 

@@ -52,7 +52,9 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
                 methods.setdefault(name, {})[job.method.spec.name] = None
         for name in settings.variants:
             if name not in methods:
-                raise InputError("sweep", "variants", "a variant of these methods", repr(name))
+                raise InputError(
+                    "sweep", "variants", f"a variant of these methods: {', '.join(methods)}", repr(name)
+                )
         conditions = [
             Condition(name, tuple(names), derive=Named("variant", {"name": name}))
             for name, names in methods.items()

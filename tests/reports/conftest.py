@@ -74,7 +74,7 @@ def write_manifest():
                     name.partition("+")[0],
                     "1",
                     "m:M",
-                    name in trivial,
+                    name.partition("+")[0] in trivial,
                     config,
                     {},
                     condition=name.partition("+")[2],

@@ -134,3 +134,13 @@ def test_a_failed_subject_leaves_no_mean_of_the_others(half_failed, part):
     assert [task.task for task in table.tasks] == (
         ["self_reenactment"] if part.sequences else ["novel_view", "self_reenactment"]
     )
+
+
+def test_methods_under_a_condition_are_listed_apart(write_run):
+    levels = {"ga": 30.0, "ga+few": 31.0, "mean-image": 15.0, "mean-image+few": 14.0}
+    runs = RunSet.read([write_run("run", levels)])
+    assert (runs.ranked, runs.changed) == (("ga",), ("ga+few", "mean-image+few"))
+    groups = {title: [row.method for row in rows] for title, rows in table_of(runs).groups}
+    assert [*groups.values()] == [["ga"], ["ga+few", "mean-image+few"], ["mean-image"]]
+    curve = RunSet.read([write_run("curve", {"ga+few": 31.0, "ga+more": 32.0})])
+    assert curve.ranked == ("ga+few", "ga+more")

@@ -14,6 +14,8 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 
+HALF = Condition("half", budget="1/2")
+
 
 def clip(name, /, **parameters):
     return Condition("c", clip=Named(name, parameters))
@@ -122,3 +124,12 @@ def test_rows_and_record_of_version_1_are_read_by_their_labels(config):
     write_json(folder.manifest, {**record, "format": 1})
     assert [method.label for method in folder.read_manifest().methods] == ["toy", "toy+dim"]
     assert {method.condition for method in folder.read_manifest().methods} == {""}
+
+
+def test_a_part_of_a_budget_leaves_out_methods_without_one(config, toy, monkeypatch):
+    monkeypatch.setattr(toy, "MIRROR", replace(toy.MIRROR, presets={}))
+    both = replace(config, methods=("toy_plugin:METHOD", "toy_plugin:MIRROR"))
+    labels = [(m.spec.name, c.name) for m, c in resolve_cells(replace(both, conditions=(PLAIN, HALF)))]
+    assert labels == [("toy", ""), ("toy", "half"), ("mirror", "")]
+    with pytest.raises(InputError, match="a budget of mirror to take a part of"):
+        resolve_cells(replace(both, conditions=(PLAIN, replace(HALF, methods=("mirror",)))))
