@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import asdict, dataclass
 from typing import Literal
 
 import tyro
 
 from .contracts import Progress
-from .registry import Group, discover, resolve
+from .registry import Group, discover
 from .specs import Findings
 
 
@@ -51,22 +50,10 @@ def list_installed(settings: ListSettings, progress: Progress) -> Findings:
             for entry in entries
             for preset, values in entry.get("presets", {}).items()
         ]
-    if settings.what == "conditions":
-        for entry in entries:
-            if not entry["error"]:
-                taken = ", ".join(parameters_of(entry["implementation"])) or "none"
-                entry["summary"] += f" Kind: {entry['kind']}; parameters: {taken}."
     width = max((len(entry["name"]) for entry in entries), default=0)
     shown = [f"broken: {entry['error']}" if entry["error"] else entry["summary"] for entry in entries]
     lines = [f"{entry['name']:<{width}}  {text}" for entry, text in zip(entries, shown)]
     return Findings("\n".join(lines), entries)
-
-
-def parameters_of(function: str) -> list[str]:
-    """Names of the keyword parameters of a "module:function", with their defaults."""
-    every = inspect.signature(resolve(function)).parameters.values()
-    named = [parameter for parameter in every if parameter.kind == parameter.KEYWORD_ONLY]
-    return [p.name if p.default is p.empty else f"{p.name}={p.default!r}" for p in named]
 
 
 def presets_of_methods() -> str:

@@ -47,35 +47,35 @@ REENACT_COMMAND = CommandSpec(
 
 HOLD_OUT = ConditionSpec(
     name="hold-out",
-    summary="Holds a camera and every n-th timestep out of the training frames: scores no test frame.",
+    summary="Clip: holds a camera and every n-th timestep out of the training frames; parameters camera, every.",
     kind="clip",
     implementation="headbench.bench.experiments.held_out:hold_out",
 )
 
 CAMERAS = ConditionSpec(
     name="cameras",
-    summary="Trains with a part of the training cameras.",
+    summary="Clip: a part of the training cameras; parameter part.",
     kind="clip",
     implementation="headbench.bench.experiments.held_out:fewer_cameras",
 )
 
 TIMESTEPS = ConditionSpec(
     name="timesteps",
-    summary="Trains with a part of the training timesteps.",
+    summary="Clip: a part of the training timesteps; parameter part.",
     kind="clip",
     implementation="headbench.bench.experiments.held_out:fewer_timesteps",
 )
 
 TRACKING_ERROR = ConditionSpec(
     name="tracking-error",
-    summary="Trains with another level of tracking error, of synthetic captures.",
+    summary="Clip: another level of tracking error, of synthetic captures; parameter level.",
     kind="clip",
     implementation="headbench.bench.experiments.tracking:with_tracking_error",
 )
 
 VARIANT = ConditionSpec(
     name="variant",
-    summary="Derives a smaller or faster avatar without training, see `MethodSpec.variants`.",
+    summary="Derive: a smaller or faster avatar without training; parameter name, see `run sweep`.",
     kind="derive",
     implementation="headbench.bench.experiments.sweep:variant",
 )
