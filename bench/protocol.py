@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from .contracts import Clip, FrameKey, TaskName
 from .errors import InputError
 from .io.files import digest
+
+Item = TypeVar("Item")
 
 TASK_TITLES: Mapping[str, str] = {
     "novel_view": "Novel view",
@@ -187,10 +189,10 @@ def _background(clips: Sequence[Clip]) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def evenly(frames: list[FrameKey], count: int | None) -> list[FrameKey]:
-    """At most ``count`` frames, each in the middle of its equal share; None: all."""
+def evenly(frames: Sequence[Item], count: int | None) -> list[Item]:
+    """At most ``count`` items, each in the middle of its equal share; None: all."""
     if count is None or count >= len(frames):
-        return frames
+        return list(frames)
     if count < 1:
         raise InputError("protocol", "max_frames", "at least 1", str(count))
     return [frames[(2 * i + 1) * len(frames) // (2 * count)] for i in range(count)]

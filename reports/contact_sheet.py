@@ -12,9 +12,9 @@ import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray, FrameKey
 from ..bench.errors import InputError
-from ..bench.protocol import TASK_TITLES
+from ..bench.protocol import TASK_TITLES, evenly
 from .drawing import SheetSection, Tile, TileRow, colour_map, write_sheet
-from .runs import RunData, evenly_spaced
+from .runs import RunData
 
 FRAMES_PER_TASK = 3
 PANEL_WIDTH = 240
@@ -25,9 +25,7 @@ def write_contact_sheet(run_folder: Path, frames_per_task: int = FRAMES_PER_TASK
     """Draw some frames of each task, evenly spaced over its sorted keys; return the file written."""
     data = RunData.read(run_folder)
     frames = [
-        _compared(data, task, key)
-        for task in data.tasks
-        for key in evenly_spaced(data.keys(task), frames_per_task)
+        _compared(data, task, key) for task in data.tasks for key in evenly(data.keys(task), frames_per_task)
     ]
     protocols = ", ".join(f"{p.id} ({p.hash})" for p in data.manifest.protocols.values())
     subjects = dict.fromkeys(key.subject for task in data.tasks for key in data.keys(task))

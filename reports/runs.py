@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from ..bench.contracts import ByteArray, Clip, FrameKey
 from ..bench.engine.captures import open_run_clips
@@ -19,8 +19,6 @@ from ..bench.manifest import Manifest, MethodRecord
 from ..bench.protocol import missing_tasks
 from ..bench.rows import ALL, Rows
 from ..bench.specs import MetricSpec
-
-Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -364,9 +362,3 @@ def _flat(value: Any, prefix: str = "") -> dict[str, str]:
             key: text for name, part in value.items() for key, text in _flat(part, f"{prefix}.{name}").items()
         }
     return {prefix: "+".join(map(str, value)) if isinstance(value, list) else str(value)}
-
-
-def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
-    """At most ``count`` items, each in the middle of its equal share of the sequence."""
-    count = min(count, len(items))
-    return [items[(2 * i + 1) * len(items) // (2 * count)] for i in range(count)]

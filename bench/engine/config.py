@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from difflib import get_close_matches
 from functools import partial
@@ -228,6 +228,15 @@ def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:
     if stray:
         raise unknown("settings", "method", min(stray), [spec.name for spec in specs])
     return [resolve_method(spec, config.preset, config.settings.get(spec.name, {})) for spec in specs]
+
+
+def with_methods(config: RunConfig, names: Collection[str]) -> RunConfig:
+    """The configuration with the methods of some names alone, and their settings."""
+    return replace(
+        config,
+        methods=tuple(asked for asked in config.methods if get("methods", asked).name in names),
+        settings={name: values for name, values in config.settings.items() if name in names},
+    )
 
 
 def resolve_cells(config: RunConfig) -> list[tuple[ResolvedMethod, Condition]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from ..condition import Condition, Named
 from ..contracts import Budget, Clip, Progress, no_progress
 from ..engine.captures import open_run_clips, run_configuration
-from ..engine.config import ResolvedMethod, resolve_methods
+from ..engine.config import ResolvedMethod, resolve_methods, with_methods
 from ..engine.jobs import check_programs
 from ..engine.run import run_locked
 from ..engine.store import Cell, RunFolder
@@ -56,10 +56,8 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Find
         config, opened = open_run_clips(source.root, settings, out=out)
         held = Named("hold-out", {"camera": settings.camera, "every": settings.every})
         config = replace(
-            config,
+            with_methods(config, _names(wanted)),
             clip=held,
-            methods=_asked(config.methods, wanted),
-            settings={name: value for name, value in config.settings.items() if name in _names(wanted)},
             frames_per_task=settings.frames,
             metrics=METRICS,
             metric_profiles=("canonical",),
@@ -117,11 +115,6 @@ def _named(text: str) -> str:
 
 def _names(methods: Sequence[ResolvedMethod]) -> list[str]:
     return [method.spec.name for method in methods]
-
-
-def _asked(names: Sequence[str], wanted: Sequence[ResolvedMethod]) -> tuple[str, ...]:
-    """Names of the selected methods in a configuration: a name, or a module and its attribute."""
-    return tuple(name for name in names if get("methods", name).name in _names(wanted))
 
 
 def _wanted(settings: CurveSettings, source: RunFolder) -> list[ResolvedMethod]:

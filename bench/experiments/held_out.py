@@ -24,6 +24,7 @@ from ..contracts import (
 from ..engine.config import RunConfig
 from ..errors import HeadbenchError, InputError
 from ..io.files import digest
+from ..protocol import evenly
 
 CAMERA: TaskName = "novel_view"
 TIMESTEPS: TaskName = "self_reenactment"
@@ -132,9 +133,7 @@ def fewer_cameras(clip: Clip, config: RunConfig | None = None, *, part: str) -> 
 def fewer_timesteps(clip: Clip, config: RunConfig | None = None, *, part: str) -> Clip:
     """A clip with a part of its training timesteps, one at least, spread evenly."""
     timesteps = sorted({key.timestep for key in clip.splits["train"]})
-    count = count_of(len(timesteps), part)
-    chosen = [timesteps[(2 * i + 1) * len(timesteps) // (2 * count)] for i in range(count)]
-    return _reduced(clip, "timesteps", chosen)
+    return _reduced(clip, "timesteps", evenly(timesteps, count_of(len(timesteps), part)))
 
 
 def count_of(whole: int, part: str) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..condition import Condition, Named
 from ..contracts import Progress, no_progress
+from ..engine.config import with_methods
 from ..engine.jobs import trained
 from ..engine.run import run_locked
 from ..engine.store import RunFolder
@@ -52,11 +53,8 @@ def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) ->
     with nullcontext() if settings.out else output_inside(source.root), locked(out):
         config, jobs = trained(source.root, settings.methods, settings, out)
         check_executor(execution, config.device)
-        names = {job.method.spec.name for job in jobs}
         config = replace(
-            config,
-            methods=tuple(name for name in config.methods if get("methods", name).name in names),
-            settings={name: value for name, value in config.settings.items() if name in names},
+            with_methods(config, {job.method.spec.name for job in jobs}),
             regions=(),
             conditions=(Condition(drive=Named(drive, settings.parameters)),),
             source=settings.run,

@@ -9,7 +9,7 @@ from pathlib import Path
 from ..condition import PLAIN, Condition, Named
 from ..contracts import Avatar, Clip, Progress, no_progress
 from ..engine.adaptation import TrainingView
-from ..engine.config import default_names
+from ..engine.config import default_names, with_methods
 from ..engine.jobs import trained
 from ..engine.run import run_locked
 from ..engine.store import RunFolder
@@ -60,14 +60,11 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
             for name, names in methods.items()
             if not settings.variants or name in settings.variants
         ]
-        names = {job.method.spec.name for job in able}
         # Cost of avatars, independent of the run's metrics.
         costs = [name for name in default_names("metrics") if get("metrics", name).kind == "avatar"]
         metrics = dict.fromkeys((*config.metrics, *costs))
         config = replace(
-            config,
-            methods=tuple(name for name in config.methods if get("methods", name).name in names),
-            settings={name: value for name, value in config.settings.items() if name in names},
+            with_methods(config, {job.method.spec.name for job in able}),
             frames_per_task=config.frames_per_task if settings.frames is None else settings.frames,
             metrics=tuple(name for name in metrics if get("metrics", name).kind != "training"),
             conditions=(PLAIN, *conditions),

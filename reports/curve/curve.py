@@ -10,6 +10,7 @@ from typing import Any
 from ...bench.condition import Condition
 from ...bench.contracts import Budget
 from ...bench.engine.scoring import FULL
+from ...bench.experiments.tracking import tracking_error
 from ...bench.io.files import write_text
 from ...bench.manifest import ClipRecord, MethodRecord
 from ...bench.rows import ALL, Rows
@@ -120,7 +121,7 @@ def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipR
         Budget(**record.budget),
         len(given["cameras"]),
         len(given["timesteps"]),
-        condition.clip.parameters.get("level", _tracking_error(clip)),
+        condition.clip.parameters.get("level", tracking_error(clip.steps)),
         cost,
         values,
         {},
@@ -130,12 +131,6 @@ def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipR
 def _step(steps: Sequence[Mapping[str, Any]], name: str) -> Mapping[str, Any]:
     """Parameters of a processing step, empty if it was not applied."""
     return next((step["parameters"] for step in steps if step["name"] == name), {})
-
-
-def _tracking_error(clip: ClipRecord) -> float | None:
-    """The level of tracking error of a synthetic capture; None for a recording."""
-    made = clip.steps[0]["parameters"].get("synthetic") if clip.steps else None
-    return float(made.get("tracking_error", 0.0)) if made else None
 
 
 def _number(value: object) -> float | None:

@@ -11,9 +11,9 @@ import cv2
 
 from ...bench.io.documents import read_json
 from ...bench.io.images import read_png
+from ...bench.protocol import evenly
 from ...bench.specs import Findings
 from ..drawing import SheetSection, Tile, TileRow, write_sheet
-from ..runs import evenly_spaced
 
 RECORD_FILE, SHEET_FILE = "record.json", "contact_sheet.png"
 
@@ -77,7 +77,7 @@ def write_reenact_sheet(
     sections = []
     for (target, source), group in groupby(sorted(rendered, key=pair), key=pair):
         avatars = list(group)
-        chosen = evenly_spaced(range(len(avatars[0]["shown"])), columns)
+        chosen = evenly(range(len(avatars[0]["shown"])), columns)
         first = [avatars[0]["shown"][i] for i in chosen]
         places = [shown["key"].split("/") for shown in first]
         rows = [TileRow(["source"], [Tile(_picture(folder / shown["source"], width)) for shown in first])]

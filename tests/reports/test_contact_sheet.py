@@ -6,10 +6,10 @@ from matplotlib.colors import to_rgb
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_png
+from headbench.bench.protocol import evenly
 from headbench.reports import drawing
 from headbench.reports.contact_sheet import ComparedFrame, contact_sheet
 from headbench.reports.drawing import BOX, SheetSection, Tile, TileRow, colour_map, write_sheet
-from headbench.reports.runs import evenly_spaced
 
 
 def picture(seed, height=90, width=60):
@@ -158,4 +158,4 @@ def test_the_colour_map_grows_brighter_steadily():
     [(range(10), 2, [2, 7]), (range(9), 3, [1, 4, 7]), ("ab", 5, ["a", "b"]), ([], 3, [])],
 )
 def test_frames_are_spread_evenly(items, count, chosen):
-    assert evenly_spaced(items, count) == chosen
+    assert evenly(items, count) == chosen

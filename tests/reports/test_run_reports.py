@@ -5,11 +5,12 @@ from PIL import Image
 
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
+from headbench.bench.protocol import evenly
 from headbench.bench.registry import resolve
 from headbench.bench.rows import Rows
 from headbench.reports import specs
 from headbench.reports.contact_sheet import write_contact_sheet
-from headbench.reports.runs import RunData, RunSet, evenly_spaced
+from headbench.reports.runs import RunData, RunSet
 from headbench.reports.table_report import layouts, table_of, table_text, write_tables
 
 
@@ -56,7 +57,7 @@ def test_contact_sheet_of_a_run(toy_run):
     assert Image.open(path).size[0] >= 700
     sheet = np.asarray(Image.open(path).convert("RGB"))
     data = RunData.read(toy_run)
-    key = evenly_spaced(data.keys("novel_view"), 2)[0]
+    key = evenly(data.keys("novel_view"), 2)[0]
     level = data.ground_truth(key)[0, 0, 0]
     assert (sheet == (level, level, level)).all(axis=2).sum() >= 8 * 6  # the truth of that frame is on it
 
