@@ -13,7 +13,7 @@ import pandas as pd
 from .condition import PLAIN
 from .contracts import Avatar, ByteArray, Clip, FrameKey, TaskName
 from .engine import run as runner
-from .engine.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
+from .engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
 from .engine.captures import capture_configuration, open_clips, reader_of
 from .engine.config import ResolvedMethod, build_run_config, default_names, resolve_methods
 from .engine.scoring import ScoredFrames, check_regions, score_frames
@@ -248,7 +248,7 @@ def _adapted(
     """The clip in the form that a method needs, what takes long kept in a folder; None where it has that form."""
     needs = MethodNeeds.of(method.spec)
     step = plan(clip, needs, heads)
-    return None if step is None else carry_out(step, needs, folder, f"adapting {clip.subject}")
+    return None if step is None else apply(step, needs, folder, f"adapting {clip.subject}")
 
 
 def _drawn(avatar: Any, form: AdaptedClip, protocol: Protocol, key: FrameKey) -> ByteArray:

@@ -14,7 +14,7 @@ from .contracts import Progress
 from .errors import InputError
 from .io.files import check_writable, write_json
 from .registry import get, resolve
-from .specs import Findings
+from .specs import CommandResult
 
 Key = TypeVar("Key", bound=Hashable)
 Row = Mapping[str, Any]
@@ -44,11 +44,11 @@ def take_turns(
     return {key: each[1:] for key, each in seconds.items()}
 
 
-def findings(tables: Mapping[str, Sequence[Row]], note: str, faults: Sequence[str] = ()) -> Findings:
+def findings(tables: Mapping[str, Sequence[Row]], note: str, faults: Sequence[str] = ()) -> CommandResult:
     """What a benchmark found: its tables by title, a note on how to read them, and what breaks a bound."""
     parts = [f"{title}\n\n{table(rows)}" for title, rows in tables.items() if rows]
     data = {title: [dict(row) for row in rows] for title, rows in tables.items()}
-    return Findings("\n\n".join([*parts, note, *faults]), data, passed=not faults)
+    return CommandResult("\n\n".join([*parts, note, *faults]), data, passed=not faults)
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -97,24 +97,24 @@ class BenchSettings(StressSettings):
     """Instead of speed alone, what settings that give up accuracy for speed buy."""
 
 
-def bench(settings: BenchSettings, progress: Progress) -> Findings:
+def bench(settings: BenchSettings, progress: Progress) -> CommandResult:
     """Benchmark a part of headbench itself on this machine."""
     return _measure(settings, "tradeoffs" if settings.tradeoffs else "speed", progress)
 
 
-def stress(settings: StressSettings, progress: Progress) -> Findings:
+def stress(settings: StressSettings, progress: Progress) -> CommandResult:
     """Test a part of headbench at numerical extremes and print the result of each case."""
     return _measure(settings, "stress", progress)
 
 
-def _measure(settings: StressSettings, kind: str, progress: Progress) -> Findings:
+def _measure(settings: StressSettings, kind: str, progress: Progress) -> CommandResult:
     function = getattr(get("benchmarks", settings.part), kind)
     if not function:
         found = f"{settings.part}, which has none"
         raise InputError("command line", "part", f"a benchmark with {kind}", found)
     if settings.out is not None:
         check_writable(Path(settings.out), "--out")
-    findings: Findings = resolve(function)(settings.quick, progress)
+    findings: CommandResult = resolve(function)(settings.quick, progress)
     if settings.out is not None:
         write_json(Path(settings.out), findings.data)
     return findings

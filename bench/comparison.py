@@ -39,7 +39,7 @@ from .options import DependentOptions
 from .progress import log_to_file
 from .progress import progress as show_progress
 from .registry import get, resolve
-from .specs import Findings
+from .specs import CommandResult
 
 Preset = Literal["smoke", "demo", "fast", "paper"]
 
@@ -64,7 +64,7 @@ class DemoSettings:
     and the like change the capture."""
 
 
-def demo(settings: DemoSettings, progress: Progress) -> Findings:
+def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
     """Run a complete comparison on a synthetic capture: render it, train, measure, print the table."""
     values = parse_assignments(settings.set)
     capture = {"preset": settings.preset, "seed": settings.seed, "out": settings.out}
@@ -134,7 +134,7 @@ class RunSettings:
         return presets_of_methods()
 
 
-def run(settings: RunSettings, progress: Progress) -> Findings:
+def run(settings: RunSettings, progress: Progress) -> CommandResult:
     """Train methods on a capture, render, measure, and write tables and pictures."""
     values: dict[str, Any] = read_yaml(Path(settings.config)) if settings.config else {}
     values = with_homes(values, settings.config or "")
@@ -172,12 +172,12 @@ def run(settings: RunSettings, progress: Progress) -> Findings:
         return _run(config, execution, unchecked=settings.unchecked)
 
 
-def _run(config: RunConfig, execution: Execution | None = None, **record: Any) -> Findings:
+def _run(config: RunConfig, execution: Execution | None = None, **record: Any) -> CommandResult:
     from .engine.run import run as run_comparison
 
     rows = run_comparison(config, execution, **record)
     text = f"{_table([config.out])}\n\nPictures, tables and everything else: {config.out}"
-    return Findings(
+    return CommandResult(
         text, {"out": config.out, "failed": rows.failed, "means": means(config.out)}, not rows.failed
     )
 

@@ -10,7 +10,7 @@ import tyro
 
 from .contracts import Progress
 from .errors import ExitCode, HeadbenchError, install_extra
-from .specs import Findings, MethodSpec, Need
+from .specs import CommandResult, MethodSpec, Need
 
 State = Literal["ready", "partly", "missing"]
 
@@ -54,7 +54,7 @@ class PluginStatus(NamedTuple):
         return "partly" if self.missing else "ready"
 
 
-def doctor(settings: DoctorSettings, progress: Progress) -> Findings:
+def doctor(settings: DoctorSettings, progress: Progress) -> CommandResult:
     """Report for every method, metric and reader what is missing on this machine, and how to install it.
 
     Raises `InputError` for unknown methods and settings, and for an invalid device.
@@ -116,7 +116,7 @@ def doctor(settings: DoctorSettings, progress: Progress) -> Findings:
         ],
     }
     text = "\n".join([head, *_lines(statuses), verdict])
-    return Findings(text, data, not unavailable, ExitCode.NO_VERDICT if unavailable else ExitCode.OK)
+    return CommandResult(text, data, not unavailable, ExitCode.NO_VERDICT if unavailable else ExitCode.OK)
 
 
 def _device(device: str) -> Iterator[Need]:

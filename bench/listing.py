@@ -9,7 +9,7 @@ import tyro
 
 from .contracts import Progress
 from .registry import Group, discover
-from .specs import Findings
+from .specs import CommandResult
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class ListSettings:
     """What to list; datasets are readers, and what makes captures."""
 
 
-def list_installed(settings: ListSettings, progress: Progress) -> Findings:
+def list_installed(settings: ListSettings, progress: Progress) -> CommandResult:
     """List what is installed: methods, presets, metrics, their profiles, readers, reports, benchmarks, commands."""
     group: Group = "methods" if settings.what == "presets" else settings.what
     entries = []
@@ -53,7 +53,7 @@ def list_installed(settings: ListSettings, progress: Progress) -> Findings:
     width = max((len(entry["name"]) for entry in entries), default=0)
     shown = [f"broken: {entry['error']}" if entry["error"] else entry["summary"] for entry in entries]
     lines = [f"{entry['name']:<{width}}  {text}" for entry, text in zip(entries, shown)]
-    return Findings("\n".join(lines), entries)
+    return CommandResult("\n".join(lines), entries)
 
 
 def presets_of_methods() -> str:

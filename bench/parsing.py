@@ -16,7 +16,7 @@ from typing import Annotated, Any, Union, get_args
 import tyro
 
 from .errors import ExitCode, HeadbenchError
-from .io.files import check_kind, expand_home, plain
+from .io.files import check_kind, expand_home, to_jsonable
 from .io.lock import locked
 from .options import check_dependent, given_options
 from .progress import log_to_terminal, progress
@@ -104,7 +104,7 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
         lock = locked(Path(folder)) if folder else nullcontext()
         with log_to_terminal(), lock, progress(name) as report:
             findings = resolve(spec.function)(settings, report)
-        show(json_module.dumps(findings.data, indent=1, default=plain) if json else findings.text)
+        show(json_module.dumps(findings.data, indent=1, default=to_jsonable) if json else findings.text)
         if findings.code is not None:
             return findings.code
         return ExitCode.OK if findings.passed else ExitCode.NEGATIVE

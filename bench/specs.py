@@ -279,7 +279,7 @@ class DatasetSpec:
     """A reader: ``implementation`` names a function ``(path, **settings) -> Clip``.
 
     ``find`` names a function ``(root) -> list of paths`` that lists the captures under a folder. A reader with
-    a keyword ``progress`` is given a `Progress`; one with a keyword ``remembered`` is given False where the bytes
+    a keyword ``progress`` is given a `Progress`; one with a keyword ``use_cache`` is given False where the bytes
     of every file have to be read, whatever it remembers of an earlier time. ``reads`` is False for one that
     makes captures instead: its function takes ``out`` and settings and writes what another reader reads.
     Settings whose annotation admits a `Path` name files; a run finds them again after it was moved together with them.
@@ -347,7 +347,7 @@ class ReportSpec:
     writes: bool = True
 
 
-class Findings(NamedTuple):
+class CommandResult(NamedTuple):
     """Result of a command or of a benchmark of the toolkit."""
 
     text: str
@@ -364,7 +364,7 @@ class Findings(NamedTuple):
 class BenchmarkSpec:
     """A benchmark of the toolkit itself, as opposed to one of avatars.
 
-    ``speed``, ``tradeoffs`` and ``stress`` each name a function ``(quick, progress) -> Findings``, or are "":
+    ``speed``, ``tradeoffs`` and ``stress`` each name a function ``(quick, progress) -> CommandResult``, or are "":
     speed, settings that trade accuracy for speed, and behaviour at extreme inputs.
     """
 
@@ -392,7 +392,7 @@ class CommandSpec:
         help. Help of the command loads this module. A static method ``notes() -> str``
         gives more text for the help.
     function : str
-        "package.module:function" of ``(settings, progress: Progress) -> Findings``. The exit code is 0, or 1 where
+        "package.module:function" of ``(settings, progress: Progress) -> CommandResult``. The exit code is 0, or 1 where
         the findings did not pass, unless they give one.
     writes : str
         The setting with the folder that the command writes: no other process works in it meanwhile; "" for none.

@@ -13,7 +13,7 @@ import numpy as np
 from ..bench.benchmarks import Row, findings, take_turns
 from ..bench.contracts import ByteArray, Progress
 from ..bench.errors import UnavailableError, install_extra
-from ..bench.specs import BenchmarkSpec, Findings
+from ..bench.specs import BenchmarkSpec, CommandResult
 
 METRICS = BenchmarkSpec(
     name="metrics",
@@ -28,7 +28,7 @@ Pairs = list[tuple[ByteArray, ByteArray]]
 Ways = Mapping[str, Callable[[], float]]
 
 
-def speed(quick: bool, progress: Progress) -> Findings:
+def speed(quick: bool, progress: Progress) -> CommandResult:
     """Milliseconds per image of PSNR + SSIM and of LPIPS, in this package and other libraries, and their
     values."""
     height, width = QUICK_SIZE if quick else SIZE

@@ -15,7 +15,7 @@ from ..bench.io.files import (
     check_writable,
     write_text,
 )
-from ..bench.specs import Findings
+from ..bench.specs import CommandResult
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ SUFFIXES = {".md": "md", ".txt": "md", ".tex": "latex", ".html": "html", ".csv":
 """Formats of tables by the suffix of a file."""
 
 
-def print_table(settings: TableSettings, progress: Progress) -> Findings:
+def print_table(settings: TableSettings, progress: Progress) -> CommandResult:
     """Print a table of finished runs on the same frames, or write it to a file."""
     from .table_report import table_text
 
@@ -66,6 +66,6 @@ def print_table(settings: TableSettings, progress: Progress) -> Findings:
     plain = re.sub(r"\x1b\[\d+m", "", text)  # without the styles of a terminal
     data = {"format": options["format"] or ("md" if plain == text else "text"), "table": plain}
     if out is None:
-        return Findings(text, data)
+        return CommandResult(text, data)
     write_text(Path(out), text)
-    return Findings(out, {**data, "out": out})
+    return CommandResult(out, {**data, "out": out})

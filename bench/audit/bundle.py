@@ -21,7 +21,7 @@ from ..io.documents import MAX_JSON_BYTES, checked, parse_json
 from ..io.files import atomic_path, check_writable, digest_file, write_json
 from ..io.provenance import RENDER, source_type
 from ..manifest import PROTOCOLS, Manifest, protocol_path
-from ..specs import Findings
+from ..specs import CommandResult
 from .settings import BundleSettings, check_shown
 
 INDEX = "bundle.json"
@@ -66,7 +66,7 @@ class Bundle:
     format: Literal[1] = 1
 
 
-def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> Findings:
+def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> CommandResult:
     """Write a bundle of a finished run.
 
     Raises `InputError` for a run that is not finished, methods that it does not have, and frames that are missing or
@@ -108,7 +108,7 @@ def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> 
                 progress(number + 1, len(files) + 1, name)
     size = out.stat().st_size
     text = f"{out}: {len(files)} files, {size / 1e6:.1f} MB, methods {', '.join(methods)}"
-    return Findings(text, {"out": out, "bytes": size, "methods": methods, "renders": settings.renders})
+    return CommandResult(text, {"out": out, "bytes": size, "methods": methods, "renders": settings.renders})
 
 
 def without_paths(manifest: Manifest, methods: tuple[str, ...]) -> Manifest:

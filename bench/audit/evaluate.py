@@ -31,7 +31,7 @@ from ..io.lock import locked
 from ..protocol import Protocol, make_protocols
 from ..registry import discover, get, resolve
 from ..rows import Rows
-from ..specs import Findings, MethodSpec, MetricSpec
+from ..specs import CommandResult, MethodSpec, MetricSpec
 from .background import check_background
 from .naming import Render, check_truth, composited, named_renders
 from .settings import EvaluateSettings
@@ -54,7 +54,7 @@ def images_method(label: str, version: str) -> ResolvedMethod:
     return ResolvedMethod(MethodSpec(label, "images of a folder", "", version=version), None, Budget())
 
 
-def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress) -> Findings:
+def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress) -> CommandResult:
     """Check everything, bring the images into the layout of a run, score them, write rows, manifest and reports.
 
     The text is the table, together with the run named by ``like``.
@@ -114,7 +114,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
     together = [*([Path(settings.like)] if settings.like else []), folder.root]
     text = resolve(get("reports", "table-text").implementation)(together)
     data = {"out": folder.root, "method": method.spec.name, "version": method.spec.version, "rows": len(rows)}
-    return Findings(f"{text}\n{folder.root}", data, not rows.failed)
+    return CommandResult(f"{text}\n{folder.root}", data, not rows.failed)
 
 
 def _open(settings: EvaluateSettings, heads: Mapping[str, str]) -> tuple[RunConfig, list[Clip]]:

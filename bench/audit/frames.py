@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..io.files import check_output_folder, write_text
 from ..protocol import make_protocols
 from ..registry import get, resolve
-from ..specs import DatasetSpec, Findings
+from ..specs import CommandResult, DatasetSpec
 from .naming import MAP_COLUMNS, image_name
 from .settings import FramesSettings
 
@@ -28,7 +28,7 @@ COLUMNS = (
 )
 
 
-def write_frames(settings: FramesSettings, progress: Progress = no_progress) -> Findings:
+def write_frames(settings: FramesSettings, progress: Progress = no_progress) -> CommandResult:
     """Write `FRAMES_FILE` and `MAP_FILE` for the protocols of a run, or those of a run on a capture.
 
     Raises `InputError` if the path is neither a run nor a capture, for options that require a capture, and
@@ -57,7 +57,7 @@ def write_frames(settings: FramesSettings, progress: Progress = no_progress) -> 
     hashes = {task: protocol.hash for task, protocol in protocols.items()}
     shown = ", ".join(f"{count} of {task} (protocol {hashes[task]})" for task, count in counts.items())
     text = f"{out}: {FRAMES_FILE} and {MAP_FILE} with {sum(counts.values())} frames: {shown}."
-    return Findings(text, {"out": out, "frames": counts, "protocols": hashes})
+    return CommandResult(text, {"out": out, "frames": counts, "protocols": hashes})
 
 
 def _open(settings: FramesSettings) -> tuple[RunConfig, list[Clip]]:

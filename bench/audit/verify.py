@@ -25,7 +25,7 @@ from ..manifest import Manifest, ProtocolRecord
 from ..protocol import Protocol, make_protocols
 from ..registry import get, resolve
 from ..rows import ALL, FRAME, Rows
-from ..specs import Findings, MetricSpec
+from ..specs import CommandResult, MetricSpec
 from .bundle import read_bundle
 from .evaluate import NoAvatar, images_method
 from .settings import VerifySettings
@@ -61,7 +61,7 @@ class _Report:
     unverified: int = 0
 
 
-def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> Findings:
+def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> CommandResult:
     """Verify a run; not passed if anything differs.
 
     Recomputed: fingerprints of the captures, hashes of the protocols, fingerprint of each avatar's inputs,
@@ -77,10 +77,10 @@ def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> Fi
             return _verify(settings, Path(scratch), progress)
     except InputError as error:
         text = f"Verify: missing or invalid: {error}"
-        return Findings(text, {"error": str(error)}, False, ExitCode.NO_VERDICT)
+        return CommandResult(text, {"error": str(error)}, False, ExitCode.NO_VERDICT)
 
 
-def _verify_bundle(settings: VerifySettings, scratch: Path, progress: Progress) -> Findings:
+def _verify_bundle(settings: VerifySettings, scratch: Path, progress: Progress) -> CommandResult:
     """Check a bundle's digests and records; recompute the metrics of its renders if it has them."""
     file, folder = Path(settings.run), RunFolder(scratch / "run")
     bundle = read_bundle(file, folder.root)
@@ -95,7 +95,7 @@ def _verify_bundle(settings: VerifySettings, scratch: Path, progress: Progress) 
             f"{file}: {report.files} files as listed, rows of one protocol for each task. No value was recomputed: the "
             "bundle has no renders (`headbench bundle --renders`)."
         )
-        return Findings(text, asdict(report))
+        return CommandResult(text, asdict(report))
     if settings.data is None:
         limit = PIXELS_PER_BYTE * file.stat().st_size
         settings = replace(
@@ -129,7 +129,7 @@ def _captured_again(manifest: Manifest, out: Path, limit: int, progress: Progres
 
 def _verify(
     settings: VerifySettings, scratch: Path, progress: Progress, shown: Path | None = None
-) -> Findings:
+) -> CommandResult:
     """Verify a run folder; ``shown``: the bundle that it was unpacked from, which holds no avatars."""
     folder = RunFolder(Path(settings.run))
     manifest = folder.read_manifest()
@@ -138,7 +138,7 @@ def _verify(
     avatars = shown is None and any(method.implementation for method in manifest.methods)
     used: tuple[Plugins, ...] = ("methods", "metrics") if avatars else ("metrics",)
     config, clips = open_run_clips(
-        folder.root, settings, out=scratch, altered=True, remembered=False, used=used
+        folder.root, settings, out=scratch, altered=True, use_cache=False, used=used
     )
     folder.read_rows(manifest)
     rows = folder.rows_by_condition(manifest)
@@ -161,7 +161,7 @@ def _verify(
     left = f"; {report.unverified} values bound to a machine or absent are not recomputed"
     left = left if report.unverified else ""
     text = "\n".join([f"{shown or folder.root}: {verdict}: {looked}{left}.", *lines])
-    return Findings(text, asdict(report), not report.mismatches)
+    return CommandResult(text, asdict(report), not report.mismatches)
 
 
 def _clips(folder: RunFolder, manifest: Manifest, clips: Sequence[Clip]) -> Iterator[Mismatch]:

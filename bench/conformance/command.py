@@ -11,13 +11,13 @@ import tyro
 
 from ..configuration import parse_assignments
 from ..contracts import Clip, Progress, no_progress
-from ..engine.adaptation import MethodNeeds, carry_out, plan
+from ..engine.adaptation import MethodNeeds, apply, plan
 from ..engine.config import DemoConfig, ResolvedMethod, RunConfig, resolve_method
 from ..errors import InputError
 from ..machine import check_device
 from ..options import DependentOptions
 from ..registry import SPEC_TYPES, Group, discover, get, resolve
-from ..specs import DatasetSpec, Findings, MethodSpec, MetricSpec
+from ..specs import CommandResult, DatasetSpec, MethodSpec, MetricSpec
 from .methods import attempt, check_method
 from .metrics import check_metric
 
@@ -58,7 +58,7 @@ KINDS: dict[Group, str] = {"methods": "method", "datasets": "reader", "metrics":
 TIMESTEPS = 4  # of the capture made on the spot
 
 
-def check_plugin(settings: CheckPluginSettings, progress: Progress = no_progress) -> Findings:
+def check_plugin(settings: CheckPluginSettings, progress: Progress = no_progress) -> CommandResult:
     """Check a method, reader or metric against its contract and list every violation; exit code 1 if there are any.
 
     Raises `InputError` for wrong usage, and `HeadbenchError` where the plug-in cannot be imported.
@@ -84,7 +84,7 @@ def check_plugin(settings: CheckPluginSettings, progress: Progress = no_progress
         count = "1 breach" if len(breaches) == 1 else f"{len(breaches)} breaches"
         title = f"{spec.name}: {count} of the contract of a {kind}"
         verdict = "\n".join([title, *(f"- {breach}" for breach in breaches)])
-    return Findings(verdict, {"name": spec.name, "kind": kind, "breaches": breaches}, not breaches)
+    return CommandResult(verdict, {"name": spec.name, "kind": kind, "breaches": breaches}, not breaches)
 
 
 def _find(settings: CheckPluginSettings) -> tuple[MethodSpec | DatasetSpec | MetricSpec, str]:
@@ -138,4 +138,4 @@ def _adapted(clip: Clip, method: ResolvedMethod, folder: Path) -> Clip:
     """The clip in the form that the method declares to need, as in a run."""
     needs = MethodNeeds.of(method.spec)
     planned = plan(clip, needs, {})
-    return clip if planned is None else carry_out(planned, needs, folder / "adapted", "adapting").clip
+    return clip if planned is None else apply(planned, needs, folder / "adapted", "adapting").clip

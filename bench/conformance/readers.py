@@ -15,7 +15,7 @@ from ..configuration import build_arguments
 from ..contracts import Camera, Clip, FrameKey, HeadAsset, HeadPose, TaskName, no_progress
 from ..engine.captures import HARNESS, found_captures
 from ..errors import InputError
-from ..io.files import check_name, plain
+from ..io.files import check_name, to_jsonable
 from ..registry import resolve
 from ..specs import DatasetSpec
 from .methods import attempt, refusal
@@ -226,7 +226,7 @@ def _record(clip: Clip) -> Iterator[str]:
     if not isinstance(clip.fingerprint, str) or not clip.fingerprint:
         yield "fingerprint is no text"
     try:
-        json.dumps([*clip.steps], default=plain)
+        json.dumps([*clip.steps], default=to_jsonable)
     except TypeError as error:
         yield f"steps cannot be written as JSON: {error}"
 

@@ -114,7 +114,7 @@ def plan(clip: Clip, needs: MethodNeeds, heads: Mapping[str, str]) -> Adaptation
     return adapter()(clip, needs, heads)
 
 
-def carry_out(adaptation: Adaptation, needs: MethodNeeds, folder: Path, label: str) -> AdaptedClip:
+def apply(adaptation: Adaptation, needs: MethodNeeds, folder: Path, label: str) -> AdaptedClip:
     """Run a planned adaptation and check that its result meets the needs."""
     with progress(label) as report:
         adapted = adaptation(folder, report)

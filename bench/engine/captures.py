@@ -18,20 +18,20 @@ from ..io.files import check_name
 from ..progress import progress
 from ..registry import discover, get, resolve
 from ..specs import LABEL, DatasetSpec, ResolutionRule, is_label
-from .adaptation import MethodNeeds, carry_out, plan
+from .adaptation import MethodNeeds, apply, plan
 from .config import RunConfig, RunOptions, resolve_change
 from .store import RunFolder
 
 log = logging.getLogger(__name__)
 Plugins = Literal["methods", "metrics"]
-HARNESS = ("progress", "remembered")
+HARNESS = ("progress", "use_cache")
 """Keywords of a reader that are set by the harness, not by settings, see `DatasetSpec`."""
 
 
-def open_clips(config: RunConfig, *, remembered: bool = True, only: int | None = None) -> list[Clip]:
+def open_clips(config: RunConfig, *, use_cache: bool = True, only: int | None = None) -> list[Clip]:
     """Open every capture under ``config.data``, validated by its reader, at the evaluated image size.
 
-    ``remembered`` is False to read every byte, ignoring the reader's cache. ``only`` is
+    ``use_cache`` is False to read every byte, ignoring the reader's cache. ``only`` is
     the index of a single capture to open, None for all.
 
     Raises `InputError` for a folder without captures, a setting the reader does not know or of the wrong type,
@@ -42,7 +42,7 @@ def open_clips(config: RunConfig, *, remembered: bool = True, only: int | None =
     if not root.exists():
         raise InputError(root, "--data", "a capture folder", "no such folder")
     clips: list[Clip] = []
-    found = found_captures(spec, root, config.reader_settings, remembered=remembered)
+    found = found_captures(spec, root, config.reader_settings, use_cache=use_cache)
     for path, read in found if only is None else found[only : only + 1]:
         with progress(f"reading {path.name}") as report:
             clips.append(changed(_reduced(_checked(read(report)), config), config.clip, config))
@@ -53,7 +53,7 @@ def open_clips(config: RunConfig, *, remembered: bool = True, only: int | None =
 
 
 def found_captures(
-    spec: DatasetSpec, root: Path, settings: Mapping[str, Any], *, remembered: bool = True
+    spec: DatasetSpec, root: Path, settings: Mapping[str, Any], *, use_cache: bool = True
 ) -> list[tuple[Path, Callable[[Progress], Clip]]]:
     """Path of each capture that a reader finds under ``root``, and its reader.
 
@@ -70,7 +70,7 @@ def found_captures(
 
     def reads(path: Path) -> Callable[[Progress], Clip]:
         def one(report: Progress) -> Clip:
-            offered = {"progress": report, "remembered": remembered}
+            offered = {"progress": report, "use_cache": use_cache}
             clip: Clip = read(path, **arguments, **{name: offered[name] for name in asked})
             return clip
 
@@ -178,7 +178,7 @@ def open_run_clips(
     *,
     out: Path | None = None,
     altered: bool = False,
-    remembered: bool = True,
+    use_cache: bool = True,
     only: int | None = None,
     used: tuple[Plugins, ...] = ("methods", "metrics"),
 ) -> tuple[RunConfig, list[Clip]]:
@@ -191,7 +191,7 @@ def open_run_clips(
         folder, which the caller must have locked.
     altered : bool
         Return captures even if they differ from those of the run.
-    remembered, only : bool, int or None
+    use_cache, only : bool, int or None
         See `open_clips`.
     used : tuple[Plugins, ...]
         Plug-ins that the caller resolves from the returned settings. Names that would import a module
@@ -210,7 +210,7 @@ def open_run_clips(
     for config in _configurations(run, options, used):
         config = config if out is None else replace(config, out=str(out))
         try:
-            clips = open_clips(config, remembered=remembered, only=only)
+            clips = open_clips(config, use_cache=use_cache, only=only)
         except InputError as error:
             refused.append(error)
             continue
@@ -321,7 +321,7 @@ def _reduced(clip: Clip, config: RunConfig) -> Clip:
     planned = plan(clip, needs, {})
     if planned is None:
         return clip
-    return carry_out(planned, needs, Path(config.out), f"reducing {clip.subject}").clip
+    return apply(planned, needs, Path(config.out), f"reducing {clip.subject}").clip
 
 
 def _checked(clip: Clip) -> Clip:

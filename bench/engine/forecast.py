@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from ..manifest import Manifest, MethodRecord
 from ..progress import duration
-from ..specs import Findings
+from ..specs import CommandResult
 from .disk import shown
 from .steps import Job
 from .store import Cell, RunFolder
@@ -31,7 +31,7 @@ class _Known(NamedTuple):
     frames: int
 
 
-def forecast(jobs: Sequence[Job], runs: Sequence[Path]) -> Findings:
+def forecast(jobs: Sequence[Job], runs: Sequence[Path]) -> CommandResult:
     """List cells with their state and an estimate of their remaining cost.
 
     The estimate of a cell is the mean over the trained cells of its method in ``runs``: seconds are scaled by
@@ -56,7 +56,7 @@ def forecast(jobs: Sequence[Job], runs: Sequence[Path]) -> Findings:
     lines.append(f"{'all, one after another':<40} {'':<9} {_text(total)}")
     if any(cell["seconds"] is None for cell in cells):
         lines.append("unknown: no trained cell of the method; name a run that has one with --estimates RUN.")
-    return Findings("\n".join(lines), {"cells": cells, "total": total._asdict()})
+    return CommandResult("\n".join(lines), {"cells": cells, "total": total._asdict()})
 
 
 def _trained(run: Path) -> Iterator[_Known]:

@@ -102,7 +102,7 @@ class _Forms:
             for (fingerprint, needs), (changed, step) in planned.items():
                 if step is not None:
                     folder, label = self._out.adapted / changed.subject, f"adapting {changed.subject}"
-                    self._made[fingerprint, needs] = adaptation.carry_out(step, needs, folder, label)
+                    self._made[fingerprint, needs] = adaptation.apply(step, needs, folder, label)
 
     def of(self, clip: Clip, method: ResolvedMethod, condition: Condition) -> AdaptedClip | None:
         """The adapted clip; None if no adaptation is needed."""

@@ -18,7 +18,7 @@ from ..io.lock import locked
 from ..machine import check_device, check_device_answers, use_device
 from ..progress import log_to_file
 from ..rows import ALL, Rows
-from ..specs import Findings, MetricSpec
+from ..specs import CommandResult, MetricSpec
 from .captures import open_run_clips
 from .config import RunOptions, resolve_cells, resolve_metrics
 from .jobs import load, make_jobs
@@ -57,7 +57,7 @@ class Change:
 
 def measure_speed_again(
     run: Path, options: RunOptions, methods: Sequence[str], progress: Progress
-) -> Findings:
+) -> CommandResult:
     """Measure the speed of the avatars of a finished run again, one after another, and rewrite its tables and report.
 
     Rows of other metrics are not changed. An avatar whose measurement fails keeps its former rows. The former values stay in
@@ -116,7 +116,7 @@ def measure_speed_again(
         "failures": failures,
         "left_out": left_out,
     }
-    return Findings("\n".join(lines), data, not failures)
+    return CommandResult("\n".join(lines), data, not failures)
 
 
 def _jobs(

@@ -10,7 +10,7 @@ import tyro
 from ..contracts import Progress
 from ..engine.config import RunOptions
 from ..engine.disk import Deletable
-from ..specs import Findings
+from ..specs import CommandResult
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class StatusSettings:
     trainings that did not end, damaged avatars that were set aside, logs of processes and jobs."""
 
 
-def status(settings: StatusSettings, progress: Progress) -> Findings:
+def status(settings: StatusSettings, progress: Progress) -> CommandResult:
     """Show which cells of a run are waiting, running, done or failed, and the time left."""
     from ..engine.disk import clean, shown, usage
     from .status import run_status
@@ -57,7 +57,7 @@ class SpeedSettings(RunOptions):
     """Only these methods; default: all of the run."""
 
 
-def speed(settings: SpeedSettings, progress: Progress) -> Findings:
+def speed(settings: SpeedSettings, progress: Progress) -> CommandResult:
     """Measure the speed of a finished run's avatars again, without training, and update its tables and report."""
     from ..engine.speed import measure_speed_again
 

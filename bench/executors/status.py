@@ -18,7 +18,7 @@ from ..io.lock import is_locked
 from ..manifest import Manifest
 from ..progress import duration
 from ..rows import ALL
-from ..specs import Findings
+from ..specs import CommandResult
 from .outcome import TaskOutcome, read_outcome
 from .settings import is_speed
 from .slurm import Queued, queue, read_submitted
@@ -58,7 +58,7 @@ class CellState:
         return f"{self.subject} {self.method} seed {self.seed}"
 
 
-def run_status(run: Path) -> Findings:
+def run_status(run: Path) -> CommandResult:
     """Describe the cells of a run. Raises `InputError` for a folder that is not a run."""
     folder = RunFolder(run)
     cells = cell_states(folder, folder.read_manifest())
@@ -83,7 +83,7 @@ def run_status(run: Path) -> Findings:
         "seconds_left": left,
         "cells": [asdict(cell) for cell in cells],
     }
-    return Findings("\n".join([text, *lines]), data, not counts["failed"])
+    return CommandResult("\n".join([text, *lines]), data, not counts["failed"])
 
 
 def time_left(cells: Sequence[CellState]) -> tuple[float | None, bool]:

@@ -20,7 +20,7 @@ from ..errors import InputError
 from ..io.files import check_kind, output_inside, refuse_links
 from ..io.lock import locked
 from ..registry import get, resolve
-from ..specs import Findings
+from ..specs import CommandResult
 from .curve_settings import CurveSettings
 from .held_out import CAMERA, TIMESTEPS, count_of
 
@@ -29,7 +29,7 @@ METRICS: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "primitives")
 """Metrics of a curve, independent of the run's, as defined by the canonical profile."""
 
 
-def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Findings:
+def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> CommandResult:
     """Plot quality against training time, cameras, timesteps or tracking error, measured on held-out training frames.
 
     Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. A restart keeps finished
@@ -71,7 +71,7 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Find
         refuse_links(out)
         _drop_interrupted(out)
         run_locked(config, execution, trust=settings.trust, clips=clips, reports=False)
-        found: Findings = resolve(get("reports", "curve").implementation)(out, settings.over)
+        found: CommandResult = resolve(get("reports", "curve").implementation)(out, settings.over)
         return found
 
 

@@ -18,14 +18,14 @@ from ..io.files import check_kind, output_inside, write_json
 from ..io.lock import locked
 from ..registry import get, resolve
 from ..rows import ALL, Rows
-from ..specs import Findings
+from ..specs import CommandResult
 from .robustness_settings import ExtremesSettings, ReenactSettings
 
 RECORD_FILE = "record.json"
 """File with settings, limits, protocols and results of each avatar."""
 
 
-def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -> Findings:
+def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -> CommandResult:
     """Render a run's avatars in views and expressions beyond those of training; check stability limits.
 
     Does not pass if a limit is broken or an avatar failed. A restart keeps finished work. Raises `InputError`
@@ -34,7 +34,7 @@ def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -
     return _run(settings, "extremes", "extremes")
 
 
-def reenact_run(settings: ReenactSettings, progress: Progress = no_progress) -> Findings:
+def reenact_run(settings: ReenactSettings, progress: Progress = no_progress) -> CommandResult:
     """Drive a run's avatars with another subject's expressions; check stability limits.
 
     Does not pass if a limit is broken or an avatar failed. A restart keeps finished work. Raises `InputError`
@@ -44,7 +44,7 @@ def reenact_run(settings: ReenactSettings, progress: Progress = no_progress) -> 
     return _run(settings, "reenact", "cross_reenactment")
 
 
-def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) -> Findings:
+def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) -> CommandResult:
     """Run the plan in the folder of the task; write the record and the report."""
     execution, source = settings.execution, RunFolder(Path(settings.run))
     source.read_manifest()  # before a folder is created
@@ -62,7 +62,7 @@ def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) ->
         clips = list({job.clip.subject: job.clip for job in jobs}.values())
         rows = run_locked(config, execution, trust=settings.trust, clips=clips, reports=False)
         _write_record(out, drive, rows, settings.others)
-        shown: Findings = resolve(get("reports", "robustness").implementation)(out)
+        shown: CommandResult = resolve(get("reports", "robustness").implementation)(out)
         return shown
 
 

@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..executors.settings import check_executor
 from ..io.files import write_text
 from ..registry import discover, get, resolve
-from ..specs import Findings
+from ..specs import CommandResult
 from .suite_settings import ABLATIONS, SEED, SuiteSettings
 
 OURS = "ours"
@@ -20,7 +20,7 @@ REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
 """Regions of the frame with separate tables."""
 
 
-def suite(settings: SuiteSettings, progress: Progress = no_progress) -> Findings:
+def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandResult:
     """Run the benchmark suite: ten synthetic subjects, all methods, tables by region and part.
 
     Ablations are conditions of the same run. Writes ``results.md`` into ``out``.
@@ -72,4 +72,4 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> Findings
     text = resolve(get("reports", "suite").implementation)(out / "run", OURS)
     write_text(out / "results.md", text)
     data = {"out": out, "run": out / "run", "failed": failed}
-    return Findings(f"{text}\n{out / 'results.md'}", data, not failed)
+    return CommandResult(f"{text}\n{out / 'results.md'}", data, not failed)

@@ -17,11 +17,11 @@ from ..errors import InputError
 from ..io.files import check_kind, check_name, output_inside
 from ..io.lock import locked
 from ..registry import get, resolve
-from ..specs import Findings, MethodSpec
+from ..specs import CommandResult, MethodSpec
 from .sweep_settings import SweepSettings
 
 
-def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Findings:
+def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> CommandResult:
     """Derive smaller and faster variants of a run's avatars without training; quality against size and frame time.
 
     The trained avatars are measured again with their variants, so that frame times are comparable. Writes
@@ -72,7 +72,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Find
         )
         clips = list({job.clip.subject: job.clip for job in able}.values())
         run_locked(config, execution, trust=settings.trust, clips=clips, reports=False)
-        shown: Findings = resolve(get("reports", "pareto").implementation)(
+        shown: CommandResult = resolve(get("reports", "pareto").implementation)(
             (str(out),), out, settings.task, settings.metric, settings.time
         )
         return shown

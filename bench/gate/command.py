@@ -7,11 +7,11 @@ from pathlib import Path
 
 from ..errors import ExitCode, InputError
 from ..io.files import check_writable, write_text
-from ..specs import Findings
+from ..specs import CommandResult
 from .settings import BaselineOptions
 
 
-def compare_with_baseline(run: Path, baseline: Path, settings: BaselineOptions) -> Findings:
+def compare_with_baseline(run: Path, baseline: Path, settings: BaselineOptions) -> CommandResult:
     """Compare a run with a committed baseline: exit code 1 if a number got worse, 3 if one is missing.
 
     Results or a baseline that are missing or invalid are a finding too, with exit code 3, so that CI does not
@@ -29,7 +29,7 @@ def compare_with_baseline(run: Path, baseline: Path, settings: BaselineOptions) 
         from .verdicts import failed_junit, failed_markdown
 
         _write_reports(settings, failed_junit(str(error)), failed_markdown(str(error)))
-        return Findings(
+        return CommandResult(
             f"Gate: missing or invalid: {error}", {"error": str(error)}, False, ExitCode.NO_VERDICT
         )
 
@@ -41,7 +41,7 @@ def _write_reports(settings: BaselineOptions, junit: str, markdown: str) -> None
             write_text(Path(path), text)
 
 
-def _judge(run: Path, baseline_file: Path, settings: BaselineOptions) -> Findings:
+def _judge(run: Path, baseline_file: Path, settings: BaselineOptions) -> CommandResult:
     from .baseline import Baseline, read_results
     from .verdicts import (
         environment_changes,
@@ -71,10 +71,10 @@ def _judge(run: Path, baseline_file: Path, settings: BaselineOptions) -> Finding
         "verdicts": [{**asdict(v), "place": str(v.place), "change": v.change} for v in verdicts],
         "environment_changes": changes,
     }
-    return Findings(to_text(verdicts, code, notes), data, code == 0, code)
+    return CommandResult(to_text(verdicts, code, notes), data, code == 0, code)
 
 
-def _update(run: Path, path: Path, settings: BaselineOptions) -> Findings:
+def _update(run: Path, path: Path, settings: BaselineOptions) -> CommandResult:
     from .baseline import Baseline, read_results
     from .verdicts import judge
 
@@ -98,4 +98,4 @@ def _update(run: Path, path: Path, settings: BaselineOptions) -> Findings:
         by_reason.setdefault(reason, []).append(str(place))
     lines += [f"  unavailable: {', '.join(places)}: {reason}" for reason, places in by_reason.items()]
     data = {"baseline": path, "values": len(baseline.values), "gone": [str(place) for place in gone]}
-    return Findings("\n".join(lines), data, True, 0)
+    return CommandResult("\n".join(lines), data, True, 0)

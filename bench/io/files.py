@@ -322,7 +322,7 @@ def write_json(path: Path, value: Any) -> None:
 
     Raises `ValueError` for a number that is not finite: no reader would take it.
     """
-    write_text(path, json.dumps(value, indent=1, default=plain, allow_nan=False) + "\n")
+    write_text(path, json.dumps(value, indent=1, default=to_jsonable, allow_nan=False) + "\n")
 
 
 def check_writable(path: Path, option: str) -> None:
@@ -554,9 +554,9 @@ def expand_home(text: str, source: str) -> str:
     return path
 
 
-def plain(value: Any) -> Any:
+def to_jsonable(value: Any) -> Any:
     """Convert a dataclass, array, path or set to values that JSON supports; for
-    ``json.dumps(default=plain)``."""
+    ``json.dumps(default=to_jsonable)``."""
     if is_dataclass(value) and not isinstance(value, type):
         return asdict(value)
     if isinstance(value, np.generic):
@@ -596,7 +596,7 @@ def digest(*values: Any) -> str:
         elif isinstance(value, bytes):
             state.update(value)
         else:
-            state.update(json.dumps(value, sort_keys=True, default=plain).encode())
+            state.update(json.dumps(value, sort_keys=True, default=to_jsonable).encode())
         state.update(b"\0")
     return state.hexdigest()
 

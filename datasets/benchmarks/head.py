@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ...bench.benchmarks import Row, findings, table, take_turns
 from ...bench.contracts import FloatArray, Progress
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from ..head.arrays import HeadArrays
 from ..head.model import HeadModel
 from ..head.procedural.model import procedural_head
@@ -80,7 +80,7 @@ ROUNDS, QUICK_ROUNDS = 200, 40
 ONCE = "identity blended once"
 
 
-def speed(quick: bool, progress: Progress) -> Findings:
+def speed(quick: bool, progress: Progress) -> CommandResult:
     """Time poses of one identity, blended once and at each call, in turns; passed where both agree."""
     model = HeadModel(sized_head("2023", *FLAME_SIZES))
     rows: list[Row] = []
@@ -163,7 +163,7 @@ HEAD_EXTREMES = (
 )
 
 
-def stress(quick: bool, progress: Progress) -> Findings:
+def stress(quick: bool, progress: Progress) -> CommandResult:
     """Try every case; ``quick`` tries the same, it takes seconds."""
     rows = []
     for done, case in enumerate(HEAD_EXTREMES):
@@ -174,7 +174,7 @@ def stress(quick: bool, progress: Progress) -> Findings:
         "Vertices in float32 against float64, as parts of the extent; gradients relative.\n\n"
         f"{table(rows)}\n\n{sound} of {len(rows)} behave as expected."
     )
-    return Findings(text, {"verdicts": rows}, passed=sound == len(rows))
+    return CommandResult(text, {"verdicts": rows}, passed=sound == len(rows))
 
 
 def try_extreme(case: HeadExtreme, head: HeadArrays | None = None) -> Row:

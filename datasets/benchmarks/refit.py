@@ -12,7 +12,7 @@ import torch
 
 from ...bench.benchmarks import Row, findings
 from ...bench.contracts import FloatArray, FrameKey, HeadAsset, HeadPose, Progress
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from ..clip import CaptureClip, FrameFiles
 from ..head.arrays import HeadArrays
 from ..head.procedural.model import procedural_head
@@ -35,7 +35,7 @@ CASES = (
 """Name, versions of source and target, whether their bases have FLAME's sizes."""
 
 
-def speed(quick: bool, progress: Progress) -> Findings:
+def speed(quick: bool, progress: Progress) -> CommandResult:
     """Refit four synthetic performances; passed where residuals and rates keep their bounds."""
     rows: list[Row] = []
     faults = []

@@ -13,7 +13,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import write_json
 from ...bench.io.lock import LOCK_FILE
 from ...bench.options import DependentOptions
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from ..options import CaptureOptions
 
 
@@ -50,7 +50,7 @@ MARKER = "headbench-export.json"
 """File that a folder written by `export_colmap` is recognised by: another may be somebody's own model and images."""
 
 
-def export_colmap(settings: ExportColmapSettings, progress: Progress) -> Findings:
+def export_colmap(settings: ExportColmapSettings, progress: Progress) -> CommandResult:
     """Write frames of a capture as a COLMAP dataset: images, masks and a sparse model.
 
     See `export_model`. Raises `InputError` for timesteps that the capture lacks.
@@ -84,4 +84,4 @@ def export_colmap(settings: ExportColmapSettings, progress: Progress) -> Finding
         f"{out}: {written.cameras} cameras, {written.images} images, {written.points} points "
         f"with {written.observations} observations"
     )
-    return Findings(text, {"out": out, **written._asdict()})
+    return CommandResult(text, {"out": out, **written._asdict()})

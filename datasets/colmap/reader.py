@@ -129,7 +129,7 @@ def read_dataset(
     held_out_cameras: Sequence[str] = (),
     exclude: Mapping[int, str] | str | Path | None = None,
     cache_mb: float = 512.0,
-    remembered: bool = True,
+    use_cache: bool = True,
     progress: Progress = no_progress,
 ) -> CaptureClip:
     """Read a COLMAP dataset as a clip; lens distortion is taken out of images and masks as they are read.
@@ -145,7 +145,7 @@ def read_dataset(
         white.
     held_out_sequences, held_out_cameras : Sequence[str]
         Splits as for the reader ``ga``. Without them every frame is for training.
-    exclude, cache_mb, remembered : Mapping[int, str] | str | Path | None, float, bool
+    exclude, cache_mb, use_cache : Mapping[int, str] | str | Path | None, float, bool
         As for the reader ``ga``.
 
     Raises
@@ -183,7 +183,7 @@ def read_dataset(
         raise InputError(root, "splits", "training frames left", "none left")
     used = {*timesteps.values(), *model.files}
     used |= {file for frame in files.values() for file in (frame.image, frame.mask) if file is not None}
-    digests = content_digests(used, remembered_for=root if remembered else None, progress=progress)
+    digests = content_digests(used, cached_for=root if use_cache else None, progress=progress)
     contents = {Path(os.path.relpath(file, root)).as_posix(): value for file, value in digests.items()}
     declared = declaration.background if declaration else (1.0, 1.0, 1.0)
     ground = check_colour(declared if background is None else background)

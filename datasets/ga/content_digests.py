@@ -43,19 +43,19 @@ class Stamp(NamedTuple):
 
 
 def content_digests(
-    files: Iterable[Path], *, remembered_for: Path | None = None, progress: Progress = no_progress
+    files: Iterable[Path], *, cached_for: Path | None = None, progress: Progress = no_progress
 ) -> dict[Path, str]:
     """Hex SHA-256 of each file's content.
 
     Parameters
     ----------
-    remembered_for : Path | None
+    cached_for : Path | None
         The capture that the files belong to. Digests of files with an unchanged `Stamp` are taken
         from the user's cache (``digests`` of `cache_folder`, never the capture itself), and new
         digests are stored there. None reads every byte.
     """
     paths = sorted(set(files))
-    place = _place(remembered_for) if remembered_for else None
+    place = _place(cached_for) if cached_for else None
     known = _read_cache(place) if place else {}
     stamps = {path: Stamp.of(path) for path in paths}
     result = {path: known[_name(stamps[path])] for path in paths if _name(stamps[path]) in known}

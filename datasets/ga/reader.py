@@ -63,7 +63,7 @@ def read_capture(
     leaks: LeakPolicy = "error",
     decode: bool = False,
     cache_mb: float = 512.0,
-    remembered: bool = True,
+    use_cache: bool = True,
     progress: Progress = no_progress,
 ) -> CaptureClip:
     """Read a capture folder (or the folder that holds its one union).
@@ -103,7 +103,7 @@ def read_capture(
         Whether to decode every image when checking; finds damage in the middle of files.
     cache_mb : float
         Maximum memory for decoded images, in 10^6 bytes.
-    remembered : bool
+    use_cache : bool
         Whether to reuse cached digests of files that have not changed since. ``headbench verify``
         sets it to False.
 
@@ -140,7 +140,7 @@ def read_capture(
     images = {
         FrameKey(subject, names[e.sequence_folder], e.timestep, e.camera_id): e.image for e in everything
     }
-    digests = content_digests(used, remembered_for=folder if remembered else None, progress=progress)
+    digests = content_digests(used, cached_for=folder if use_cache else None, progress=progress)
     found = find_leaks(splits, images, progress=progress)
     record = {
         "cy": convention,

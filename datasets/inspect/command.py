@@ -13,7 +13,7 @@ import tyro
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import write_json
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from ..options import CaptureOptions
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class InspectSettings(CaptureOptions):
 PICTURE, NUMBERS = "inspection.png", "inspection.json"
 
 
-def inspect(settings: InspectSettings, progress: Progress = no_progress) -> Findings:
+def inspect(settings: InspectSettings, progress: Progress = no_progress) -> CommandResult:
     """Plot the contents of a capture: camera rig, splits, tracked mesh over images, motion by sequence.
 
     Raises `InputError` for a capture that the reader refuses (``headbench lint`` then reports all that is wrong),
@@ -70,7 +70,7 @@ def inspect(settings: InspectSettings, progress: Progress = no_progress) -> Find
     data = summary(clip, splits, sequences, space)
     write_json(out / NUMBERS, data)
     text = _text(clip, splits, sequences, space)
-    return Findings(f"{text}\n\nPicture: {out / PICTURE}", {**data, "picture": str(out / PICTURE)})
+    return CommandResult(f"{text}\n\nPicture: {out / PICTURE}", {**data, "picture": str(out / PICTURE)})
 
 
 def summary(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from .rules import SEVERITIES, Finding, apply, several
 from .settings import LintSettings
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _WIDTH = 100
 
 
-def lint(settings: LintSettings, progress: Progress = no_progress) -> Findings:
+def lint(settings: LintSettings, progress: Progress = no_progress) -> CommandResult:
     """Check a capture for faults that make a comparison unfair or wrong; --list explains the codes.
 
     Passed without errors; with ``strict``, without warnings too.
@@ -51,11 +51,11 @@ def lint(settings: LintSettings, progress: Progress = no_progress) -> Findings:
         "cameras": {camera: _finite(asdict(facts)) for camera, facts in evidence.cameras.items()},
         "findings": [asdict(finding) for finding in findings],
     }
-    return Findings(_report(evidence, findings, passed), data, passed)
+    return CommandResult(_report(evidence, findings, passed), data, passed)
 
 
 def lint_capture(settings: LintSettings, progress: Progress = no_progress) -> tuple[Evidence, list[Finding]]:
-    """Findings for a capture, worst first, and what they rest on."""
+    """CommandResult for a capture, worst first, and what they rest on."""
     from ..ga.reader import find_capture
     from ..open import find_reader
     from .catalogue import RULES
@@ -141,7 +141,7 @@ def _filled(head: str, text: str) -> list[str]:
     )
 
 
-def _explained() -> Findings:
+def _explained() -> CommandResult:
     from .catalogue import GROUPS, RULES
 
     lines = []
@@ -164,4 +164,4 @@ def _explained() -> Findings:
             for rule in RULES
         ]
     }
-    return Findings("\n".join(lines).rstrip(), data)
+    return CommandResult("\n".join(lines).rstrip(), data)

@@ -64,7 +64,7 @@ def read_video(
     held_out_sequences: Sequence[str] = (),
     exclude: Mapping[int, str] | str | Path | None = None,
     cache_mb: float = 512.0,
-    remembered: bool = True,
+    use_cache: bool = True,
     progress: Progress = no_progress,
 ) -> CaptureClip:
     """Read a tracked video, or all videos of one subject in IMavatar's layout.
@@ -88,7 +88,7 @@ def read_video(
         quarter of a video with fewer than 700 frames.
     held_out_sequences : Sequence[str]
         Names of the videos for self-reenactment, instead of the last frames.
-    exclude, cache_mb, remembered : Mapping[int, str] | str | Path | None, float, bool
+    exclude, cache_mb, use_cache : Mapping[int, str] | str | Path | None, float, bool
         As for the reader ``ga``.
 
     Raises
@@ -118,7 +118,7 @@ def read_video(
     files = {names[key]: FrameFiles(frame.image, frame.mask) for key, frame in zip(keys, track.frames)}
     used = {*track.files, *(file for frame in track.frames for file in (frame.image, frame.mask))}
     used |= {root / DECLARATION_FILE} if declaration else set()
-    digests = content_digests(used, remembered_for=root if remembered else None, progress=progress)
+    digests = content_digests(used, cached_for=root if use_cache else None, progress=progress)
     contents = {Path(os.path.relpath(file, root)).as_posix(): value for file, value in digests.items()}
     declared = declaration.background if declaration else (1.0, 1.0, 1.0)
     ground = check_colour(declared if background is None else background)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from ..ga.layout import HEAD_FILE
 from ..head.arrays import save_head
 from .names import SUBJECT_NAMES, chosen_subjects
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .prepare import SubjectResult
 
 
-def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progress) -> Findings:
+def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progress) -> CommandResult:
     """Convert raw NeRSemble recordings to captures; an interrupted conversion is continued.
 
     Everything about every subject is checked before the first frame is decoded.
@@ -73,13 +73,15 @@ def _table(plans: list[PreparationPlan]) -> list[str]:
     return lines
 
 
-def _checked(plans: list[PreparationPlan]) -> Findings:
+def _checked(plans: list[PreparationPlan]) -> CommandResult:
     images = sum(job.count * len(job.cameras) for plan in plans for job in plan.jobs)
     text = "\n".join([*_table(plans), "", f"All there: {images} images to make."])
-    return Findings(text, {"images": images, "subjects": [plan.subject for plan in plans]})
+    return CommandResult(text, {"images": images, "subjects": [plan.subject for plan in plans]})
 
 
-def _done(results: list[SubjectResult], plans: list[PreparationPlan], settings: PrepareSettings) -> Findings:
+def _done(
+    results: list[SubjectResult], plans: list[PreparationPlan], settings: PrepareSettings
+) -> CommandResult:
     """Passed unless parameters were asked for and are missing."""
     lines = _table(plans)
     for plan, result in zip(plans, results, strict=True):
@@ -98,10 +100,10 @@ def _done(results: list[SubjectResult], plans: list[PreparationPlan], settings: 
         data[result.subject] = {**vars(result), "missing": list(result.missing)}
         del data[result.subject]["subject"]
     passed = not settings.tracking or all(result.union is not None for result in results)
-    return Findings("\n".join(lines), data, passed)
+    return CommandResult("\n".join(lines), data, passed)
 
 
-def record_nersemble(settings: RecordSettings, progress: Progress = no_progress) -> Findings:
+def record_nersemble(settings: RecordSettings, progress: Progress = no_progress) -> CommandResult:
     """Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to test `prepare`.
 
     For synthetic captures, as they bring their own head model.
@@ -132,4 +134,4 @@ def record_nersemble(settings: RecordSettings, progress: Progress = no_progress)
         f"--head {out / HEAD_FILE} --subjects {clip.subject} --sequences {','.join(sequences)} --downscale 1"
     )
     data = {"subject": clip.subject, "sequences": sequences, "cameras": [*clip.cameras], "codec": codec}
-    return Findings(text, data)
+    return CommandResult(text, data)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from ..ga import layout
 from ..ga.transforms import FrameEntry, read_transforms, timesteps_of
 from ..ga.validate import check_images, check_timesteps
@@ -55,7 +55,7 @@ class UnionReport:
 
 def check_unions(
     root: Path, subjects: Sequence[str], *, rejoin: bool = False, progress: Progress = no_progress
-) -> Findings:
+) -> CommandResult:
     """Check the union of each subject under ``root``; with ``rejoin`` write those of the paper's split too.
 
     Passed where every subject has one and all are whole.
@@ -75,7 +75,7 @@ def check_unions(
         if report.rejoined:
             lines.append(f"{'':8} paper's split: {report.rejoined}")
     passed = not any(report.fault for report in reports)
-    return Findings("\n".join(lines), {report.subject: vars(report) for report in reports}, passed)
+    return CommandResult("\n".join(lines), {report.subject: vars(report) for report in reports}, passed)
 
 
 def _report(root: Path, subject: str, rejoin: bool) -> UnionReport:

@@ -17,7 +17,7 @@ from ...bench.io.files import (
     check_output_folder,
 )
 from ...bench.io.lock import locked
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class SynthSettings(ExecutionOptions):
     on lips and lids. 0 to 4."""
 
 
-def synth(settings: SynthSettings, progress: Progress) -> Findings:
+def synth(settings: SynthSettings, progress: Progress) -> CommandResult:
     """Render a synthetic multi-view capture in the GaussianAvatars/VHAP layout."""
     out, execution = Path(settings.out), settings.execution
     check_executor(execution, "cpu")
@@ -65,4 +65,4 @@ def synth(settings: SynthSettings, progress: Progress) -> Findings:
 
         values = {**settings.others, "out": out, "size": size}
         synthesize(**values, execution=execution, progress=progress)
-    return Findings(settings.out, {"out": out})
+    return CommandResult(settings.out, {"out": out})

@@ -11,7 +11,7 @@ from ...bench.contracts import HeadAsset, HeadPose, Progress, SplatAvatar, no_pr
 from ...bench.engine.stored import StoredAvatar, open_avatar
 from ...bench.errors import InputError
 from ...bench.io.files import check_writable
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from ..ops.harmonics import harmonic_colors
 from ..shared.avatar_files import read_shared_head
 from ..shared.rendering import view_of
@@ -41,22 +41,22 @@ def open_splats(settings: AvatarOptions) -> tuple[StoredAvatar, SplatAvatar]:
     return stored, avatar
 
 
-def export_ply(settings: ExportPlySettings, progress: Progress = no_progress) -> Findings:
+def export_ply(settings: ExportPlySettings, progress: Progress = no_progress) -> CommandResult:
     """Write an avatar in one pose as a 3D Gaussian splatting PLY; see `export_pose`."""
     return export_pose(settings, "ply", progress)
 
 
-def export_glb(settings: ExportGlbSettings, progress: Progress = no_progress) -> Findings:
+def export_glb(settings: ExportGlbSettings, progress: Progress = no_progress) -> CommandResult:
     """Write an avatar in one pose as binary glTF with splats; see `export_pose`."""
     return export_pose(settings, "glb", progress)
 
 
-def export_sog(settings: ExportSogSettings, progress: Progress = no_progress) -> Findings:
+def export_sog(settings: ExportSogSettings, progress: Progress = no_progress) -> CommandResult:
     """Write an avatar in one pose as SOG; see `export_pose`."""
     return export_pose(settings, "sog", progress)
 
 
-def export_pose(settings: ExportOptions, name: str, progress: Progress) -> Findings:
+def export_pose(settings: ExportOptions, name: str, progress: Progress) -> CommandResult:
     """Write an avatar in one pose in a format of `FORMATS`, read it back, and compare.
 
     Raises `InputError` for a folder that holds no avatar of splats, and for a timestep that the capture lacks;
@@ -83,7 +83,7 @@ def export_pose(settings: ExportOptions, name: str, progress: Progress) -> Findi
         words = f"spherical harmonics fitted to its colours, off by {data['residual_rms']:.4f} (rms)"
         words += f", {data['residual_p95']:.4f} (95 % of splats)"
     text = f"{out}: {len(splats.means)} splats, {out.stat().st_size / 1e6:.2f} MB; {words};"
-    return Findings(f"{text} PSNR against the avatar's own frames {lost:.1f} dB or more", data)
+    return CommandResult(f"{text} PSNR against the avatar's own frames {lost:.1f} dB or more", data)
 
 
 def _least_psnr(avatar: SplatAvatar, pose: HeadPose, found: StoredSplats) -> float:

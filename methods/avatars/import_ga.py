@@ -14,7 +14,7 @@ from ...bench.engine.stored import AVATAR_FILE, SAME_SHAPE, write_avatar_record
 from ...bench.errors import InputError
 from ...bench.io.files import check_name, digest_file, user_files
 from ...bench.io.lock import LOCK_FILE
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from ...datasets.clip import CaptureClip
 from ...datasets.ga.tracking import TeethPolicy, Tracking, find_head, read_animation
 from ...datasets.head.arrays import HeadArrays
@@ -47,7 +47,7 @@ class HeadSettings:
     teeth: TeethPolicy = "auto"
 
 
-def import_avatar(settings: ImportGASettings, progress: Progress = no_progress) -> Findings:
+def import_avatar(settings: ImportGASettings, progress: Progress = no_progress) -> CommandResult:
     """Import a GaussianAvatars PLY, with its flame_param.npz or its capture, as an avatar of the method ga.
 
     Raises `InputError` for a file that does not fit, and for a folder that holds something already.
@@ -78,7 +78,7 @@ def import_avatar(settings: ImportGASettings, progress: Progress = no_progress) 
     triangles = f"{used} of {len(head.faces)} triangles"
     text = f"{out}: {len(binding)} splats on {triangles}, subject {subject.name}"
     data = {"out": out, "splats": len(binding), "triangles": used, "subject": subject.name, **notes}
-    return Findings("; ".join([text, *(f"{name}: {value}" for name, value in notes.items())]), data)
+    return CommandResult("; ".join([text, *(f"{name}: {value}" for name, value in notes.items())]), data)
 
 
 def _identity(

@@ -12,7 +12,7 @@ import torch
 
 from ...bench.benchmarks import Row, findings, take_turns
 from ...bench.contracts import Progress, StagedAvatar
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from ..shared.threads import torch_threads
 from .untrained import MemoryClip, beside_ga, untrained
 
@@ -21,7 +21,7 @@ QUICK_SIZES = ((2_000, 72, 104),)
 ROUNDS, QUICK_ROUNDS = 50, 3
 
 
-def speed(quick: bool, progress: Progress) -> Findings:
+def speed(quick: bool, progress: Progress) -> CommandResult:
     """Time whole frames and their stages, a new pose and camera every frame."""
     sizes, rounds = (QUICK_SIZES, QUICK_ROUNDS) if quick else (SIZES, ROUNDS)
     frames: list[Row] = []

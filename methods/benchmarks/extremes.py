@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ...bench.benchmarks import Row, table
 from ...bench.contracts import Progress
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from ..splats.constants import ALPHA_MIN
 from ..splats.rasterize import available_backends, rasterize
 from .scenes import (
@@ -346,7 +346,7 @@ EXTREMES = (
 )
 
 
-def stress(quick: bool, progress: Progress) -> Findings:
+def stress(quick: bool, progress: Progress) -> CommandResult:
     """Try every case on every backend; with ``quick`` on the preferred one alone."""
     names = [name for name in available_backends() if name not in ("cpu", "reference")] or ["reference"]
     rows: list[Row] = []
@@ -361,7 +361,7 @@ def stress(quick: bool, progress: Progress) -> Findings:
         "Against the float64 reference: mean absolute error of the image, relative L2 error of the worst gradient.\n\n"
         f"{table(rows)}\n\n{sound} of {len(rows)} behave as expected."
     )
-    return Findings(text, {"verdicts": rows}, passed=sound == len(rows))
+    return CommandResult(text, {"verdicts": rows}, passed=sound == len(rows))
 
 
 def try_extreme(case: Extreme, backend: str) -> Row:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ...bench.benchmarks import Row, findings, take_turns
 from ...bench.contracts import Progress
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from ..shared.threads import torch_threads
 from ..splats import available_backends, cpu, rasterize
 from ..splats.request import Rendering
@@ -58,7 +58,7 @@ class Passes:
                 self.stages[name] = min(self.stages.get(name, seconds), seconds)
 
 
-def speed(quick: bool, progress: Progress) -> Findings:
+def speed(quick: bool, progress: Progress) -> CommandResult:
     """Time every size on every instruction set; with ``quick`` three sizes, in few runs."""
     backends = [name for name in available_backends() if name.startswith("cpu-")] or ["reference"]
     peaks = {name: cpu.peak_flops(name) for name in backends if name != "reference"}
@@ -109,7 +109,7 @@ def measure_backend(scene: SplatScene, backend: str, peak: float | None, rounds:
 TRADEOFF_SIZE, QUICK_TRADEOFF_SIZE = (60_000, 550, 802), (5_000, 128, 184)
 
 
-def tradeoffs(quick: bool, progress: Progress) -> Findings:
+def tradeoffs(quick: bool, progress: Progress) -> CommandResult:
     """Errors and times of settings that draw less, on a head's load, against the exact one."""
     scene = head_shell(*(QUICK_TRADEOFF_SIZE if quick else TRADEOFF_SIZE))
     backend = available_backends()[0]

@@ -17,7 +17,7 @@ from torch.profiler import ProfilerActivity, profile
 from ...bench.benchmarks import Row, findings, take_turns
 from ...bench.configuration import build
 from ...bench.contracts import Progress
-from ...bench.specs import Findings, MethodSpec
+from ...bench.specs import CommandResult, MethodSpec
 from ...datasets.head.procedural.model import procedural_head
 from ..ga.config import GAConfig
 from ..ga.method import GAAppearance
@@ -45,7 +45,7 @@ SHOWN = 12
 """Operations shown for each method; the others are added up."""
 
 
-def speed(quick: bool, progress: Progress) -> Findings:
+def speed(quick: bool, progress: Progress) -> CommandResult:
     """Time an iteration of each method at the demo's size and preset, and where in it the time goes."""
     count, rounds = (QUICK_SPLATS, QUICK_ROUNDS) if quick else (SPLATS, ROUNDS)
     clip = with_images(*untrained(count, *SIZE))

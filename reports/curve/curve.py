@@ -14,7 +14,7 @@ from ...bench.experiments.tracking import tracking_error
 from ...bench.io.files import write_text
 from ...bench.manifest import ClipRecord, MethodRecord
 from ...bench.rows import ALL, Rows
-from ...bench.specs import Findings, MetricSpec
+from ...bench.specs import CommandResult, MetricSpec
 from ..aggregate import subject_means
 from ..runs import RunData
 from ..writers import csv_text
@@ -28,7 +28,7 @@ AXES = {
 }
 
 
-def curve_report(out: Path, over: str) -> Findings:
+def curve_report(out: Path, over: str) -> CommandResult:
     """Write ``curve.csv`` and ``curve.png`` of the run in ``out``; return its points and a table of their means.
 
     Parameters
@@ -93,7 +93,7 @@ def curve_report(out: Path, over: str) -> Findings:
         "missing": missing,
         "failed": failed,
     }
-    return Findings(points_text(means, metrics, tasks, held, missing, failed), data, not failed)
+    return CommandResult(points_text(means, metrics, tasks, held, missing, failed), data, not failed)
 
 
 def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipRecord) -> CurvePoint:

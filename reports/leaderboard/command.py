@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class LeaderboardSettings:
     """Heading of the page."""
 
 
-def leaderboard_build(settings: LeaderboardSettings, progress: Progress = no_progress) -> Findings:
+def leaderboard_build(settings: LeaderboardSettings, progress: Progress = no_progress) -> CommandResult:
     """Build a leaderboard page in Markdown and HTML from the result bundles in a folder."""
     from .page import build
 

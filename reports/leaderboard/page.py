@@ -13,7 +13,7 @@ from ...bench.engine.store import RunFolder
 from ...bench.errors import InputError
 from ...bench.io.files import digest_file, entries, write_text
 from ...bench.manifest import Manifest
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from ..runs import RunSet
 from ..table_report import table_of
 from ..tables import Table
@@ -61,7 +61,7 @@ class Board:
     submissions: tuple[Submission, ...]
 
 
-def build(folder: Path, out: Path, title: str, progress: Progress) -> Findings:
+def build(folder: Path, out: Path, title: str, progress: Progress) -> CommandResult:
     """Write ``leaderboard.md`` and ``leaderboard.html``.
 
     Raises `InputError` for a folder without bundles, and for a bundle that is not as it lists itself.
@@ -79,7 +79,7 @@ def build(folder: Path, out: Path, title: str, progress: Progress) -> Findings:
     page = render_page("leaderboard.html", title=title, boards=boards, heads=HEADS)
     write_text(out / "leaderboard.html", page)
     text = f"{len(files)} bundles, {len(boards)} tables: {out / 'leaderboard.md'}, {out / 'leaderboard.html'}"
-    return Findings(text, {"out": out, "tables": [asdict(board.table) for board in boards]})
+    return CommandResult(text, {"out": out, "tables": [asdict(board.table) for board in boards]})
 
 
 def _read(file: Path, into: Path) -> Submission:

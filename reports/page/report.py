@@ -20,7 +20,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_text
 from ...bench.io.provenance import COMPOSITE, source_type, tool
 from ...bench.protocol import TASK_TITLES
-from ...bench.specs import Findings, MetricSpec
+from ...bench.specs import CommandResult, MetricSpec
 from ..aggregate import summarise
 from ..drawing import colour_map
 from ..pareto.points import LATENCY, SIZE, SPEED, pareto_front
@@ -63,7 +63,7 @@ def write_page(run_folder: Path) -> list[Path]:
     return [out]
 
 
-def write_report(settings: PageSettings, progress: Progress = no_progress) -> Findings:
+def write_report(settings: PageSettings, progress: Progress = no_progress) -> CommandResult:
     """`headbench report`: read runs and write the page."""
     out = Path(settings.out or ("report" if settings.split else "report.html"))
     max_mb = settings.max_mb or (MAX_SPLIT_MB if settings.split else MAX_MB)
@@ -86,7 +86,7 @@ def write_report(settings: PageSettings, progress: Progress = no_progress) -> Fi
     shown = len(pictures.shown)
     text = f"{out}: {size / MEGABYTE:.1f} MB, {shown} of {frames} frames with pictures"
     text += f"; no ground truth: {pictures.truth}" if pictures.truth else ""
-    return Findings(text, {"out": out, "bytes": size, "frames": frames, "shown": shown})
+    return CommandResult(text, {"out": out, "bytes": size, "frames": frames, "shown": shown})
 
 
 def _size(page: str, files: Sequence[PictureFile]) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.io.files import check_output_folder, write_text
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from .settings import ParetoSettings
 
 if TYPE_CHECKING:
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
 
 
-def pareto_runs(settings: ParetoSettings, progress: Progress = no_progress) -> Findings:
+def pareto_runs(settings: ParetoSettings, progress: Progress = no_progress) -> CommandResult:
     """Plot quality against size and frame time of finished runs, with the Pareto front, and write CSV."""
     return pareto(settings.runs, Path(settings.out), settings.task, settings.metric, settings.time)
 
 
-def pareto(runs: Sequence[str], out: Path, task: str, metric_name: str = "", time: str = "") -> Findings:
+def pareto(runs: Sequence[str], out: Path, task: str, metric_name: str = "", time: str = "") -> CommandResult:
     """Write ``points.csv`` and ``pareto.png`` of finished runs. Raises `InputError` for runs that cannot be compared."""
     from ..writers import csv_text
     from .plot import write_plot
@@ -53,7 +53,7 @@ def pareto(runs: Sequence[str], out: Path, task: str, metric_name: str = "", tim
         "left_out": left_out,
         "note": note,
     }
-    return Findings(_text(points, fronts, left_out, metric.label, metric.digits, note), data)
+    return CommandResult(_text(points, fronts, left_out, metric.label, metric.digits, note), data)
 
 
 def _text(

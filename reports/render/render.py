@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, HeadPose, Progress, no_progress
-from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
+from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
 from ...bench.engine.captures import open_clips, reader_of
 from ...bench.engine.config import RunConfig
 from ...bench.engine.store import Cell
@@ -22,7 +22,7 @@ from ...bench.io.files import grouped_writes
 from ...bench.io.images import quantise, read_png, write_png
 from ...bench.io.provenance import COMPOSITE, RENDER
 from ...bench.io.video import webm_writer, write_webm
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from .settings import RenderSettings
 
 ORBIT = "orbit"
@@ -39,7 +39,7 @@ class Shot(NamedTuple):
     captured: Callable[[], ByteArray] | None = None
 
 
-def render_avatar(settings: RenderSettings, progress: Progress = no_progress) -> Findings:
+def render_avatar(settings: RenderSettings, progress: Progress = no_progress) -> CommandResult:
     """Render a stored avatar; see the settings.
 
     Raises `InputError` for an invalid avatar, a capture that the method does not support, and cameras and
@@ -55,7 +55,7 @@ def render_avatar(settings: RenderSettings, progress: Progress = no_progress) ->
     out = Path(settings.out)
     form = AdaptedClip(clip)
     if adaptation is not None:
-        form = carry_out(adaptation, needs, out / "adapted" / clip.subject, f"adapting {clip.subject}")
+        form = apply(adaptation, needs, out / "adapted" / clip.subject, f"adapting {clip.subject}")
     shots = [
         *(_orbit(settings, form, out) if settings.frames == ORBIT else _frames(settings, clip, form, out))
     ]
@@ -67,7 +67,7 @@ def render_avatar(settings: RenderSettings, progress: Progress = no_progress) ->
             progress(index + 1, len(shots), shot.path.name)
     videos = _videos(shots, settings) if settings.video else []
     text = f"{out}: {len(shots)} frames in {shots[0].path.parent.name}/" + "".join(f"\n{v}" for v in videos)
-    return Findings(text, {"out": out, "frames": [shot.path for shot in shots], "videos": videos})
+    return CommandResult(text, {"out": out, "frames": [shot.path for shot in shots], "videos": videos})
 
 
 def _clip(settings: RenderSettings) -> Clip:

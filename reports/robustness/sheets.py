@@ -12,7 +12,7 @@ import cv2
 from ...bench.io.documents import read_json
 from ...bench.io.images import read_png
 from ...bench.protocol import evenly
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from ..drawing import SheetSection, Tile, TileRow, write_sheet
 
 RECORD_FILE, SHEET_FILE = "record.json", "contact_sheet.png"
@@ -21,7 +21,7 @@ EXTRAPOLATED, BROKEN = "#e88714", "#cd142d"
 EXTREMES_WIDTH, REENACT_WIDTH, REENACT_COLUMNS = 110, 150, 8
 
 
-def robustness_report(folder: Path) -> Findings:
+def robustness_report(folder: Path) -> CommandResult:
     """Draw the contact sheet of ``headbench run extremes`` or ``headbench run reenact``; summarise it.
 
     Does not pass if an avatar broke a limit or failed.
@@ -37,7 +37,7 @@ def robustness_report(folder: Path) -> Findings:
         write(folder, rendered)
         text += f"\n{folder / SHEET_FILE}"
     passed = not failed and all(avatar["frames_broken"] == 0 for avatar in avatars)
-    return Findings(text, {"out": folder, "avatars": avatars}, passed)
+    return CommandResult(text, {"out": folder, "avatars": avatars}, passed)
 
 
 def write_extremes_sheet(

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from ...bench.benchmarks import Row, findings
 from ...bench.contracts import FloatArray, Progress
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from .bootstrap import SequencePairs, SubjectPairs, interval
 from .comparisons import LEVEL, best_set, least_p, sign_flip_p
 
@@ -91,7 +91,7 @@ CASES: Mapping[str, Population] = {
 }
 
 
-def stress(quick: bool, progress: Progress) -> Findings:
+def stress(quick: bool, progress: Progress) -> CommandResult:
     """Calibrate every case of `CASES` and the sets of the best; passed if the level is kept as specified."""
     trials = QUICK_TRIALS if quick else TRIALS
     cases: list[Row] = []

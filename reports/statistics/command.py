@@ -15,7 +15,7 @@ from ...bench.errors import InputError
 from ...bench.gate.settings import DEPENDENT, BaselineOptions
 from ...bench.options import DependentOptions
 from ...bench.protocol import TASK_TITLES
-from ...bench.specs import Findings, MetricSpec
+from ...bench.specs import CommandResult, MetricSpec
 
 if TYPE_CHECKING:
     from ..runs import RunSet
@@ -75,7 +75,7 @@ FIELDS = (
 )
 
 
-def compare_runs(settings: CompareSettings, progress: Progress = no_progress) -> Findings:
+def compare_runs(settings: CompareSettings, progress: Progress = no_progress) -> CommandResult:
     """Test paired differences between methods of finished runs, or compare one run with a baseline file.
 
     Raises `InputError` for runs, methods and metrics that do not fit.
@@ -90,7 +90,9 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
     return compare_methods(RunSet.read([Path(folder) for folder in settings.runs], part), settings, progress)
 
 
-def compare_methods(runs: RunSet, settings: CompareSettings, progress: Progress = no_progress) -> Findings:
+def compare_methods(
+    runs: RunSet, settings: CompareSettings, progress: Progress = no_progress
+) -> CommandResult:
     """`compare_runs` of runs that are read already; the settings' runs, region and sequences are not looked at."""
     from ..conditions import conditions, note_of
     from ..table_report import COMPARISON
@@ -122,7 +124,7 @@ def compare_methods(runs: RunSet, settings: CompareSettings, progress: Progress 
     else:
         text = "\n\n".join(_text(spec, c, note_of(times.get(spec.name, {}))) for spec, c in found)
         text = f"{runs.part}\n\n{text}" if runs.part else text
-    return Findings(text, {"level": settings.level, "comparisons": every})
+    return CommandResult(text, {"level": settings.level, "comparisons": every})
 
 
 def _pairs(runs: RunSet, against: str | None, trivial: bool) -> list[tuple[str, str]]:

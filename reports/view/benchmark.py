@@ -18,7 +18,7 @@ from ...bench.contracts import Progress
 from ...bench.engine.adaptation import AdaptedClip
 from ...bench.io.images import encode_image
 from ...bench.registry import resolve
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from .drawing import draw, splats_of
 from .scene import Scene, ShownAvatar
 from .server import serving
@@ -47,7 +47,7 @@ MOVE_SLIDER = """([x, y, every]) => { let step = 0; window.moving = setInterval(
     {clientX: x + 40 * Math.sin(step / 10), clientY: y, bubbles: true, buttons: 1})); }, every); }"""
 
 
-def speed(quick: bool, progress: Progress) -> Findings:
+def speed(quick: bool, progress: Progress) -> CommandResult:
     """Serve untrained avatars, move a slider in Chromium; passed if images of the first reach `LEAST_RATE`.
 
     Without Playwright and Chromium the rates of a browser are missing, and the check is skipped.

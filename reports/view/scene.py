@@ -12,7 +12,7 @@ import numpy as np
 
 from ...bench.condition import PLAIN
 from ...bench.contracts import Avatar, Camera, Clip, FloatArray, FrameKey, HeadPose
-from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, carry_out, plan
+from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
 from ...bench.engine.captures import open_clips, open_run_clips, reader_of, run_configuration
 from ...bench.engine.config import ResolvedMethod, RunConfig, resolve_methods
 from ...bench.engine.jobs import load, make_jobs
@@ -261,7 +261,7 @@ def _form(clip: Clip, needs: MethodNeeds, heads: Mapping[str, str], kept: Path) 
     adaptation = plan(clip, needs, heads)
     if adaptation is None:
         return AdaptedClip(clip)
-    return carry_out(adaptation, needs, kept / "adapted" / clip.subject, f"adapting {clip.subject}")
+    return apply(adaptation, needs, kept / "adapted" / clip.subject, f"adapting {clip.subject}")
 
 
 def _source(settings: ViewSettings, config: RunConfig) -> list[Clip]:

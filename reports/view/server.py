@@ -18,7 +18,7 @@ from typing import Any
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError, UnavailableError, install_extra
-from ...bench.specs import Findings
+from ...bench.specs import CommandResult
 from .scene import Scene, open_scene
 from .session import Session
 from .settings import ViewSettings
@@ -26,7 +26,7 @@ from .settings import ViewSettings
 log = logging.getLogger(__name__)
 
 
-def view_avatars(settings: ViewSettings, progress: Progress = no_progress) -> Findings:
+def view_avatars(settings: ViewSettings, progress: Progress = no_progress) -> CommandResult:
     """Serve until interrupted, or for a number of seconds."""
     viser()
     check_port(settings.host, settings.port)
@@ -42,7 +42,7 @@ def view_avatars(settings: ViewSettings, progress: Progress = no_progress) -> Fi
                     time.sleep(0.2)
             except KeyboardInterrupt:
                 pass
-    return Findings(f"the viewer of {names} has ended", {"address": address})
+    return CommandResult(f"the viewer of {names} has ended", {"address": address})
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from headbench.bench.engine import captures
 from headbench.bench.engine.config import DemoConfig, parse_size
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.registry import Plugin, discover
-from headbench.bench.specs import Findings
+from headbench.bench.specs import CommandResult
 from headbench.datasets.synthetic import capture
 
 GALLERY = Path(__file__).parents[2] / "reports" / "gallery"
@@ -205,11 +205,11 @@ def test_help_lists_the_presets_of_every_method(capsys, command):
 @pytest.fixture
 def toy_benchmark(monkeypatch, tmp_path):
     (tmp_path / "toy_benchmark.py").write_text(
-        "from headbench.bench.specs import BenchmarkSpec, Findings\n"
+        "from headbench.bench.specs import BenchmarkSpec, CommandResult\n"
         "def speed(quick, progress):\n"
-        "    return Findings('a table', {'quick': quick})\n"
+        "    return CommandResult('a table', {'quick': quick})\n"
         "def stress(quick, progress):\n"
-        "    return Findings('a bad table', {}, passed=False)\n"
+        "    return CommandResult('a bad table', {}, passed=False)\n"
         "SPEC = BenchmarkSpec('toy', 'a toy', speed='toy_benchmark:speed', stress='toy_benchmark:stress')\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
@@ -321,7 +321,9 @@ def test_seeds_are_a_list_and_presets_are_those_of_the_methods(monkeypatch, tmp_
     monkeypatch.setattr(
         comparison,
         "_run",
-        lambda config, execution, unchecked: seen.append((config.seeds, config.preset)) or Findings("", {}),
+        lambda config, execution, unchecked: (
+            seen.append((config.seeds, config.preset)) or CommandResult("", {})
+        ),
     )
     for words in ([], ["--seeds", "3,1,4"], ["--seeds", "7", "--preset", "of-a-plug-in"]):
         assert cli.main(["run", "--data", str(tmp_path), "--out", str(tmp_path / "out"), *words]) == 0
@@ -335,7 +337,7 @@ def test_a_run_takes_the_reader_that_finds_its_capture(monkeypatch, tmp_path, to
     monkeypatch.setattr(
         comparison,
         "_run",
-        lambda config, execution, unchecked: seen.append(config.reader) or Findings("", {}),
+        lambda config, execution, unchecked: seen.append(config.reader) or CommandResult("", {}),
     )
     (tmp_path / "data").mkdir()
     words = ["run", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")]
@@ -366,7 +368,9 @@ def test_a_run_takes_its_executor_from_options_and_settings(
 ):
     seen = []
     monkeypatch.setattr(
-        comparison, "_run", lambda config, execution, unchecked: seen.append(execution) or Findings("", {})
+        comparison,
+        "_run",
+        lambda config, execution, unchecked: seen.append(execution) or CommandResult("", {}),
     )
     assert cli.main(["run", "--data", "d", "--out", str(tmp_path / "o"), *words]) == 0
     assert [(e.executor, e.workers, e.slurm.partition) for e in seen] == [(executor, workers, partition)]

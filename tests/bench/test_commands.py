@@ -19,7 +19,7 @@ from headbench.bench.io.lock import locked
 TOY = '''
 from dataclasses import dataclass
 import tyro
-from headbench import CommandSpec, Findings, InputError
+from headbench import CommandSpec, CommandResult, InputError
 
 @dataclass(frozen=True)
 class Settings:
@@ -38,13 +38,13 @@ class Lists:
     """How much."""
 
 def count(settings, progress):
-    return Findings("", {"lists": [settings.paths, settings.names, settings.levels]})
+    return CommandResult("", {"lists": [settings.paths, settings.names, settings.levels]})
 
 def look(settings, progress):
     if settings.limit < 0:
         raise InputError("command line", "limit", "at least 0", str(settings.limit))
     code = 3 if settings.limit == 3 else None
-    return Findings(f"looked at {settings.path}", {"limit": settings.limit}, settings.limit < 1, code)
+    return CommandResult(f"looked at {settings.path}", {"limit": settings.limit}, settings.limit < 1, code)
 
 def spec(settings="toy_command:Settings", function="toy_command:look", **more):
     return CommandSpec("toy", "toys", "Look at it.", settings, function, **more)
@@ -240,7 +240,7 @@ def test_a_word_of_earlier_versions_leads_to_the_new_line(capsys, word):
     [
         ("not_there:LOOK", "not_there", "broken: "),
         ("toy_command:not_there", "not_there", "broken: "),
-        ("toy_command:Findings", "a CommandSpec", "broken: "),
+        ("toy_command:CommandResult", "a CommandSpec", "broken: "),
         ("toy_command:NO_SETTINGS", "not_there", "Look"),
         ("toy_command:NO_DATACLASS", "a dataclass", "Look"),
         ("toy_command:NO_FUNCTION", "not_there", "Look"),

@@ -55,7 +55,7 @@ def test_single_frame_overfit_of_a_synthetic_capture(tmp_path, spec, height, ite
     needs = MethodNeeds.of(spec)
     planned = adaptation.plan(clip, needs, {})
     if planned is not None:
-        clip = adaptation.carry_out(planned, needs, tmp_path / "adapted", "adapting").clip
+        clip = adaptation.apply(planned, needs, tmp_path / "adapted", "adapting").clip
     assert spec is not GBS or clip.head.version == "procedural2020"
     key = clip.splits["train"][-1]
     assert psnr_by_heart(spec, clip, key, tmp_path / "avatar", iterations, settings) >= 35.0

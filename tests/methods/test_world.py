@@ -55,7 +55,7 @@ def psnr(spec, clip, folder):
     needs = MethodNeeds.of(spec)
     planned = adaptation.plan(clip, needs, {})
     if planned is not None:
-        clip = adaptation.carry_out(planned, needs, folder / "adapted", "adapting").clip
+        clip = adaptation.apply(planned, needs, folder / "adapted", "adapting").clip
     method = resolve_method(spec, "smoke", SMALLER.get(spec.name, {}))
     avatar = method.create().fit(
         clip, folder / "avatar", Budget(iterations=60), device="cpu", seed=0, progress=no_progress

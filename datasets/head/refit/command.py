@@ -11,7 +11,7 @@ import numpy as np
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.files import write_json
-from ....bench.specs import Findings
+from ....bench.specs import CommandResult
 from ..arrays import HeadArrays
 from .settings import RefitCommandSettings
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 BLOCKS_FOLDER = "refit-blocks"
 
 
-def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progress) -> Findings:
+def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progress) -> CommandResult:
     """Refit the tracking of a capture to another head model, with residuals in millimetres and a heat map.
 
     Started again after a kill it continues at the block of timesteps it was at.
@@ -58,7 +58,7 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
     }
     write_json(out / "refit.json", data)
     lines = [report.text(), *_bounds(report, clip), f"Capture: {union}"]
-    return Findings("\n".join(lines), data)
+    return CommandResult("\n".join(lines), data)
 
 
 def target_head(name: str) -> HeadArrays:

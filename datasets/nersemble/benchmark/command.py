@@ -6,13 +6,13 @@ from pathlib import Path
 
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import ExitCode, UnavailableError
-from ....bench.specs import Findings
+from ....bench.specs import CommandResult
 from .settings import SubmissionCheckSettings, SubmissionWriteSettings
 
 SHOWN = 20
 
 
-def submission_write(settings: SubmissionWriteSettings, progress: Progress = no_progress) -> Findings:
+def submission_write(settings: SubmissionWriteSettings, progress: Progress = no_progress) -> CommandResult:
     """Write a submission to the NeRSemble benchmark and report the loss of its codec; exit code 3 without ffmpeg.
 
     Videos are H.264 of constant rate factor 14, YUV 4:2:0, as the benchmark's documentation says. The cost is measured on
@@ -28,7 +28,7 @@ def submission_write(settings: SubmissionWriteSettings, progress: Progress = no_
     try:
         encoded = write_submission(frames, track, out, progress)
     except UnavailableError as error:
-        return Findings(str(error), {"error": str(error)}, False, ExitCode.NO_VERDICT)
+        return CommandResult(str(error), {"error": str(error)}, False, ExitCode.NO_VERDICT)
     lines = [f"{'video':<56}{'frames':>7}{'MB':>8}{'dB to frames':>14}"]
     lines += [
         f"{e.video.name:<56}{e.frames:>7}{e.size / 1e6:>8.2f}{decibels(e.error):>14.2f}" for e in encoded
@@ -47,10 +47,10 @@ def submission_write(settings: SubmissionWriteSettings, progress: Progress = no_
         for e in encoded
     ]
     data_out = {"out": out, "videos": videos, "cost_db": {str(psnr): cost for psnr, cost in costs.items()}}
-    return Findings("\n".join(lines), data_out)
+    return CommandResult("\n".join(lines), data_out)
 
 
-def submission_check(settings: SubmissionCheckSettings, progress: Progress = no_progress) -> Findings:
+def submission_check(settings: SubmissionCheckSettings, progress: Progress = no_progress) -> CommandResult:
     """Check a submission to the NeRSemble benchmark as its server does and decode every frame."""
     from .submission import check_submission
 
@@ -64,4 +64,4 @@ def submission_check(settings: SubmissionCheckSettings, progress: Progress = no_
     if not issues.refused:
         lines.append("Nothing that the server would refuse.")
     data_out = {"track": track.name, "refused": issues.refused, "noted": issues.noted}
-    return Findings("\n".join(lines), data_out, not issues.refused)
+    return CommandResult("\n".join(lines), data_out, not issues.refused)

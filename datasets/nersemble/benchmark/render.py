@@ -10,7 +10,7 @@ from ....bench.engine.stored import AVATAR_FILE, HEAD_FILE, open_avatar
 from ....bench.errors import InputError
 from ....bench.io.files import grouped_writes
 from ....bench.io.images import quantise, write_png
-from ....bench.specs import Findings
+from ....bench.specs import CommandResult
 from ...head.arrays import HeadArrays, read_head
 from ...head.loaders import load_head
 from ...head.teeth import with_teeth_where_possible
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 WHITE = (1.0, 1.0, 1.0)
 
 
-def render_participant(settings: SubmissionRenderSettings, progress: Progress = no_progress) -> Findings:
+def render_participant(settings: SubmissionRenderSettings, progress: Progress = no_progress) -> CommandResult:
     """Render every frame of a participant's test sequences from all cameras of the track.
 
     Raises `InputError` for an unknown participant, an avatar that cannot be read, and tracking or cameras that are missing or
@@ -61,7 +61,9 @@ def render_participant(settings: SubmissionRenderSettings, progress: Progress = 
                     write_png(home / f"{name}_{timestep:05d}_{serial}.png", image)
                     done += 1
                     progress(done, total, name)
-    return Findings(f"{home}: {total} frames of {len(sequences)} sequences", {"out": home, "frames": total})
+    return CommandResult(
+        f"{home}: {total} frames of {len(sequences)} sequences", {"out": home, "frames": total}
+    )
 
 
 def _head(folder: Path, given: str | None) -> HeadArrays:

@@ -12,7 +12,7 @@ import tyro
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.files import write_json
-from ....bench.specs import Findings
+from ....bench.specs import CommandResult
 from ...options import CaptureOptions
 
 
@@ -42,7 +42,7 @@ class StepsSettings(CaptureOptions):
 JAW_PICTURE, CLUSTER_PICTURE, NUMBERS = "jaw_bases.png", "expression_clusters.png", "steps.json"
 
 
-def steps(settings: StepsSettings, progress: Progress = no_progress) -> Findings:
+def steps(settings: StepsSettings, progress: Progress = no_progress) -> CommandResult:
     """Plot the jaw bases and expression clusters computed from a capture's training frames.
 
     Raises `InputError` for a capture that the reader refuses, for counts below 1, and for a head without a face
@@ -81,4 +81,4 @@ def steps(settings: StepsSettings, progress: Progress = no_progress) -> Findings
         *(f"Leak: {note}" for note in jaws.record()["leaks"]),
         f"Pictures: {out / JAW_PICTURE}, {out / CLUSTER_PICTURE}",
     ]
-    return Findings("\n".join(lines), data)
+    return CommandResult("\n".join(lines), data)

@@ -10,7 +10,7 @@ import tyro
 
 from ....bench.contracts import Progress
 from ....bench.errors import InputError
-from ....bench.specs import Findings
+from ....bench.specs import CommandResult
 from ...options import CaptureOptions
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class TongueSettings(CaptureOptions):
 DECISIONS_FILE = "tongue.yaml"
 
 
-def tongue(settings: TongueSettings, progress: Progress) -> Findings:
+def tongue(settings: TongueSettings, progress: Progress) -> CommandResult:
     """Find the frames that show the tongue, for review on a contact sheet and with overrides.
 
     Raises `InputError` before any image is looked at, for captures and decisions that cannot be read.
@@ -65,7 +65,7 @@ def tongue(settings: TongueSettings, progress: Progress) -> Findings:
         text.append(_summary(clip.subject, decided[clip.subject]))
         data[clip.subject] = _data(decided[clip.subject])
     text.append(f"Decisions: {path}\nTo leave these frames out: --set reader_settings.exclude={path}")
-    return Findings("\n\n".join(text), data)
+    return CommandResult("\n\n".join(text), data)
 
 
 def _look(

@@ -14,7 +14,7 @@ from ....bench.contracts import ByteArray, Clip, HeadAsset, Progress, no_progres
 from ....bench.engine.stored import avatar_digest, open_avatar, write_avatar_record
 from ....bench.errors import InputError
 from ....bench.io.images import quantise
-from ....bench.specs import Findings
+from ....bench.specs import CommandResult
 from ...ours.avatar import OursAvatar
 from ...ours.storage import Field
 from ...shared.avatar_files import read_shared_head, save_shared_head
@@ -30,7 +30,7 @@ from .simplify import simplify, training_poses
 SIMPLIFIED, WHOLE = "left out", "all"
 
 
-def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) -> Findings:
+def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) -> CommandResult:
     """Store an avatar of the method "ours", and measure its size and quality; see the settings.
 
     Raises `InputError` for a folder without the exact file of an avatar of ours, and for the capture of another
@@ -76,7 +76,7 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
         comparison = Comparison(clip, exact, settings.frames, settings.scale)
         costs = _costs(field, exact, head, settings.precision, comparison, progress)
         data |= {"frames": len(comparison.keys), "exact": _plain(comparison.exact), "quality": costs}
-    return Findings(_text(data), data)
+    return CommandResult(_text(data), data)
 
 
 def _costs(

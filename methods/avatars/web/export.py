@@ -17,7 +17,7 @@ from ....bench.engine.stored import AVATAR_FILE, HEAD_FILE
 from ....bench.errors import InputError
 from ....bench.io.files import check_writable, write_text
 from ....bench.io.provenance import RENDER, note, source_type, tool
-from ....bench.specs import Findings
+from ....bench.specs import CommandResult
 from ...shared.avatar_files import read_shared_head
 from ...shared.rendering import view_of
 from ...splats import rasterize
@@ -45,7 +45,7 @@ DISTANCE_BY_HEIGHT = 2.6
 """Distance of the camera by the extent of the splats."""
 
 
-def export_page(settings: ExportHtmlSettings, progress: Progress = no_progress) -> Findings:
+def export_page(settings: ExportHtmlSettings, progress: Progress = no_progress) -> CommandResult:
     """Bake, write, read back and compare; see the settings."""
     out = Path(settings.out)
     check_writable(out, "--out")
@@ -79,7 +79,7 @@ def export_page(settings: ExportHtmlSettings, progress: Progress = no_progress) 
     worst = min(losses, key=lambda name: losses[name])
     text = f"{out}: {len(baked.means)} splats, {len(sliders)} sliders, {size / 1e6:.2f} MB; PSNR against headbench's renderer: "
     text += ", ".join(f"{name} {value:.1f}" for name, value in losses.items()) + f" dB; the least: {worst}"
-    return Findings(text, {"out": out, "splats": len(baked.means), "bytes": size, "psnr": losses})
+    return CommandResult(text, {"out": out, "splats": len(baked.means), "bytes": size, "psnr": losses})
 
 
 def _reach(poses: Sequence[HeadPose], version: str, reach: FloatArray) -> FloatArray:

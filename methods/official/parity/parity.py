@@ -28,7 +28,7 @@ from ....bench.io.lock import locked
 from ....bench.progress import log_to_file
 from ....bench.registry import get
 from ....bench.rows import Rows
-from ....bench.specs import Findings
+from ....bench.specs import CommandResult
 from ....bench.streams import on_terminal
 from ...shared.config import PAPER_ITERATIONS, SplatTraining
 from ...shared.schedule import DensifySchedule, Timeline
@@ -82,7 +82,7 @@ class Difference:
     half_width: float | None
 
 
-def compare(settings: ParitySettings, progress: Progress = no_progress) -> Findings:
+def compare(settings: ParitySettings, progress: Progress = no_progress) -> CommandResult:
     """Train and score both, and write the table of their differences; see the command."""
     out = Path(settings.out)
     config = run_config(settings, out)
@@ -115,7 +115,7 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Findi
     }
     write_json(out / "parity.json", data)
     apart = [d for d in differences if d.metric == "psnr" and abs(d.difference) > settings.tolerance]
-    return Findings(text, data, bool(differences) and not apart and not rows.failed)
+    return CommandResult(text, data, bool(differences) and not apart and not rows.failed)
 
 
 def run_config(settings: ParitySettings, out: Path) -> RunConfig:

@@ -57,8 +57,8 @@ def test_an_untouched_run_verifies_with_the_counts_checked(run, capsys):
 def test_captures_are_read_whole_whatever_is_remembered(run, toy, monkeypatch):
     asked = []
 
-    def read(path, *, remembered=True):
-        asked.append(remembered)
+    def read(path, *, use_cache=True):
+        asked.append(use_cache)
         return toy.ToyClip(path)
 
     monkeypatch.setattr(toy, "read", read)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import tyro
 
-from headbench import ALL, CommandSpec, Findings, InputError, Progress, RunData
+from headbench import ALL, CommandResult, CommandSpec, InputError, Progress, RunData
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ WORST = CommandSpec(
 )
 
 
-def worst(settings: WorstSettings, progress: Progress) -> Findings:
+def worst(settings: WorstSettings, progress: Progress) -> CommandResult:
     """List the worst frames of each method of a finished run."""
     run = RunData.read(Path(settings.run))
     metrics = {spec.name: spec for spec in run.metrics if spec.per_frame}
@@ -54,4 +54,4 @@ def worst(settings: WorstSettings, progress: Progress) -> Findings:
                 data.append({"task": task, "method": method, "frame": frame, "value": row.value})
     if not data:
         raise InputError("command line", "--region", "one that the run measured", settings.region)
-    return Findings("\n".join(lines), data)
+    return CommandResult("\n".join(lines), data)

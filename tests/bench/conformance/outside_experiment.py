@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import headbench as hb
-from headbench import PLAIN, CommandSpec, Condition, ConditionSpec, Findings, Named, Progress
+from headbench import PLAIN, CommandResult, CommandSpec, Condition, ConditionSpec, Named, Progress
 
 
 class NoisyClip:
@@ -71,7 +71,7 @@ COMMAND = CommandSpec(
 )
 
 
-def noise(settings: NoiseSettings, progress: Progress) -> Findings:
+def noise(settings: NoiseSettings, progress: Progress) -> CommandResult:
     """Train under each condition, by the engine that runs every comparison; print the table."""
     conditions = [PLAIN] + [
         Condition(f"noise-{each:g}", clip=Named("outside_experiment:NOISE", {"deviation": each}))
@@ -85,4 +85,4 @@ def noise(settings: NoiseSettings, progress: Progress) -> Findings:
         conditions=conditions,
     )
     table = hb.read_runs([run]).table()
-    return Findings(table.to_string(), table.to_dict())
+    return CommandResult(table.to_string(), table.to_dict())

@@ -43,7 +43,7 @@ def test_settings_reach_the_reader_with_their_types(config, toy, monkeypatch):
         ("background", "red", "a number"),
         ("head", [1], "a path"),
         ("progress", 3, "one of"),
-        ("remembered", True, "one of"),
+        ("use_cache", True, "one of"),
         ("path", "elsewhere", "one of"),
         ("hed", "x", "head"),
     ],

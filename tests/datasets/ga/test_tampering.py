@@ -52,7 +52,7 @@ def test_the_leak_check_reads_the_bytes(exchanged):
 def test_what_verify_opens_has_another_fingerprint(exchanged):
     capture, before = exchanged
     config = RunConfig(str(capture.union), "out", reader="ga", reader_settings={"leaks": "record"})
-    remembered, fresh = (open_clips(config, remembered=choice)[0] for choice in (True, False))
+    remembered, fresh = (open_clips(config, use_cache=choice)[0] for choice in (True, False))
     assert remembered.source_fingerprint == before
     assert fresh.source_fingerprint != before
 

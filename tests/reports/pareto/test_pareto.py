@@ -18,7 +18,7 @@ from PIL import Image
 
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
-from headbench.bench.io.files import plain
+from headbench.bench.io.files import to_jsonable
 from headbench.bench.rows import Row, Rows
 from headbench.bench.specs import MetricSpec
 from headbench.reports.pareto.command import COSTS, pareto_runs
@@ -119,7 +119,7 @@ def test_frame_time_is_the_named_metric_or_else_the_median(make_run, tmp_path):
     manifest, rows = RunFolder(tmp_path / "r").manifest, RunFolder(tmp_path / "r").rows
     record, parts = json.loads(manifest.read_text()), [pd.read_parquet(rows)]
     for name, value in (("latency_p50", 4.0), ("processor_time", 9.0)):
-        record["metrics"].append(plain(replace(METRICS[3], name=name, unit="ms")))
+        record["metrics"].append(to_jsonable(replace(METRICS[3], name=name, unit="ms")))
         parts.append(parts[0][parts[0]["metric"] == "fps"].assign(metric=name, value=value))
     manifest.write_text(json.dumps(record))
     Rows(pd.concat(parts, ignore_index=True)).write(rows)
@@ -135,7 +135,7 @@ def test_frame_times_that_do_not_compare_have_a_note(make_run, tmp_path, change_
     folders = [make_run(name, **methods) for name in ("r", "other")[: 1 + several]]
     for folder in folders:
         rows = pd.read_parquet(RunFolder(Path(folder)).rows)
-        metric = {**plain(METRICS[3]), "name": time or "fps", "unit": "ms" if time else "FPS"}
+        metric = {**to_jsonable(METRICS[3]), "name": time or "fps", "unit": "ms" if time else "FPS"}
         change_manifest(
             Path(folder), lambda m, new=metric: m["metrics"].__setitem__(3, new | {"machine_bound": True})
         )
