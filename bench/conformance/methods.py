@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from ..contracts import Avatar, Clip, Frame, HeadPose, no_progress
-from ..engine.adaptation import TrainingView
 from ..engine.config import ResolvedMethod
+from ..engine.guard import TrainingView
 from ..errors import InputError, UnavailableError
 from ..io.files import digest_file
 

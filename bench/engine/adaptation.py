@@ -17,37 +17,10 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from ..contracts import ByteArray, Clip, FloatArray, FrameKey, Progress
+from ..contracts import Clip, FloatArray, FrameKey, Progress
 from ..errors import HeadbenchError, InputError
 from ..progress import progress
 from ..specs import MethodSpec, ResolutionRule
-
-
-class TrainingView:
-    """A `Clip` that gives images and masks of training frames only; everything else is unchanged.
-
-    Cameras and driving signals of held-out frames stay visible: they do not reveal the ground truth images.
-    """
-
-    def __init__(self, clip: Clip):
-        self._clip = clip
-        self._allowed = frozenset(clip.splits["train"])
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._clip, name)
-
-    def image(self, key: FrameKey) -> ByteArray:
-        """(H, W, 3) 8-bit sRGB of a training frame. Raises `HeadbenchError` for any other."""
-        return self._clip.image(self._checked(key))
-
-    def mask(self, key: FrameKey) -> ByteArray | None:
-        """(H, W) 8-bit coverage of a training frame. Raises `HeadbenchError` for any other."""
-        return self._clip.mask(self._checked(key))
-
-    def _checked(self, key: FrameKey) -> FrameKey:
-        if key not in self._allowed:
-            raise HeadbenchError(f"the method read {key}, which is not a training frame")
-        return key
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,7 @@ def make_jobs(
     forms = _Forms(config, folder, RunFolder(out or folder.root))
     forms.plan([(clip, method, condition) for clip in clips for method, condition in cells])
     source = RunFolder(Path(config.source)) if config.source else None
+    hidden = tuple(Path(text) for text in (config.data, config.source, str(folder.root)) if text)
     kept: dict[str, Any] = {}
     return [
         Job(
@@ -71,6 +72,7 @@ def make_jobs(
             condition,
             None if source is None else source.cell(clip.subject, method.spec.name, seed),
             config,
+            hidden=hidden if method.is_isolated(config.isolation) else None,
             kept=kept,
         )
         for clip in clips

@@ -30,6 +30,7 @@ from ..specs import ConditionSpec, DatasetSpec, MetricSpec
 from . import adaptation
 from .captures import open_clips, relative_paths
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
+from .guard import ChangedInputError
 from .jobs import make_jobs, run_cell
 from .scoring import make_metric
 from .steps import Job, failed_rows, reason_of, steps_ahead
@@ -170,7 +171,8 @@ def _planned(
     for method, condition in cells:
         places = product([clip.subject for clip in clips], config.seeds)
         label = label_of(method.spec.name, condition.name)
-        if not all(folder.cell(subject, label, seed).ended("measure") for subject, seed in places):
+        isolated = method.is_isolated(config.isolation)  # its process checks them with the clip
+        if not isolated and not all(folder.cell(s, label, seed).ended("measure") for s, seed in places):
             check_settings([(method, condition)])
     if config.drive:
         driven = make_jobs(config, cells, clips, {}, folder, out)
@@ -314,6 +316,8 @@ def _run_inline(job: Job, metrics: Sequence[MetricSpec], each: RunCell) -> Rows:
     outcome_path(job.cell.folder).unlink(missing_ok=True)  # of an earlier process or job
     try:
         return each(job, metrics)
+    except ChangedInputError:
+        raise  # what the next cells would be given is not what the others were
     except HeadbenchError as error:
         log.error("%s failed: %s", job.name, error)
         return failed_rows(job, metrics, reason_of(error))

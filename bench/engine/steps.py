@@ -21,7 +21,7 @@ from ..contracts import (
     Camera,
     CheckedMethod,
     Clip,
-    FloatArray,
+    Frame,
     FrameKey,
     HeadPose,
     ListedFrames,
@@ -33,6 +33,8 @@ from ..errors import HeadbenchError, InputError, UnavailableError, is_damage
 from ..io.documents import read_json
 from ..io.files import digest, digest_file, grouped_writes, refuse_links, write_text
 from ..io.images import quantise, read_png, write_png
+from ..isolation.landlock import landlock_version
+from ..isolation.parent import IsolatedAvatar, IsolatedMethod
 from ..machine import PeakMemory, ProcessorLoad, machine_name, processor_seconds, use_device
 from ..progress import RunProgress, duration, progress
 from ..protocol import Protocol
@@ -40,8 +42,9 @@ from ..registry import get
 from ..rows import ALL, Row, Rows
 from ..source import code_digest, is_outside
 from ..specs import ConditionSpec, MetricSpec
-from .adaptation import AdaptedClip, TrainingView
+from .adaptation import AdaptedClip
 from .config import ResolvedMethod, RunConfig, resolve_change
+from .guard import TrainingView, check_frame, check_unchanged, state_digest
 from .scoring import FULL, ScoredFrames, make_metric, score_frames
 from .store import Cell, StepState, avatar_files
 from .stored import AVATAR_FILE, shown_by, training_losses, write_avatar_record
@@ -61,7 +64,8 @@ class Job:
     ``clip`` is the ground truth of every metric. ``adapted`` is the clip adapted to this method and
     condition, None if that is the clip itself. ``regions`` are evaluated besides the whole frame. ``source``
     is the cell whose avatar is used instead of training. ``config`` is that of the run. ``kept`` is a cache
-    shared by the cells of a run. ``line`` shows the progress of the run.
+    shared by the cells of a run. ``line`` shows the progress of the run. ``hidden``: the method runs in
+    processes of its own that cannot read these folders; None for this process.
     """
 
     clip: Clip
@@ -76,14 +80,23 @@ class Job:
     source: Cell | None = None
     config: RunConfig | None = None
     line: RunProgress | None = None
+    hidden: tuple[Path, ...] | None = None
     created: list[Any] = field(default_factory=list, repr=False, compare=False)
     kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     def create(self) -> Any:
         """The `Method` of this cell, created when it is first asked for."""
         if not self.created:
-            self.created.append(self.method.create())
+            own = self.hidden is not None
+            made = IsolatedMethod(self.method, self.cell.avatar, self.hidden or ()) if own else None
+            self.created.append(made or self.method.create())
         return self.created[0]
+
+    def check_unchanged(self) -> None:
+        """Raise `ChangedInputError` if the clip in memory differs from when it was first given to a method."""
+        clip = self.form.clip
+        place = f"state of {id(clip)}"
+        check_unchanged(clip, self.kept.setdefault(place, state_digest(clip)), self.label)
 
     def progress(self, step: str) -> AbstractContextManager[Progress]:
         """The progress of a step: of the run if the cell belongs to one, otherwise a separate one."""
@@ -195,6 +208,7 @@ def fit(job: Job) -> Avatar:
     if earlier is None or earlier["status"] != "done":
         interruptions = 0 if earlier is None else earlier.get("interruptions", 0) + 1
         record = job.method.record()
+        job.check_unchanged()
         use_device(job.device)  # before a record says that a training has begun
         job.cell.begin("fit", job.fit_fingerprint, interruptions=interruptions, method=record)
         if isinstance(method, PreparedMethod):
@@ -216,6 +230,7 @@ def fit(job: Job) -> Avatar:
                 job.cell.set_aside(job.cell.avatar)
                 _train(job, method, report)
         seconds = time.perf_counter() - start
+        job.check_unchanged()
         clip, budget = job.form.clip, asdict(job.method.budget)
         origin = {"seed": job.seed, "budget": budget, "capture": clip.fingerprint}
         write_avatar_record(job.cell.avatar, job.method, *shown_by(clip), "training", origin)
@@ -225,6 +240,7 @@ def fit(job: Job) -> Avatar:
             seconds=round(seconds, 3),
             processor_seconds=round(processor_seconds() - processor, 3),
             interruptions=interruptions,
+            **({} if job.hidden is None else {"landlock": landlock_version()}),
             peak_memory_bytes=memory.peak,
             memory_before_bytes=memory.before,
             **memory.device_record,
@@ -310,6 +326,7 @@ def drive(job: Job, avatar: Avatar) -> Rows:
     change = job.condition.drive
     with job.progress(RENDERING) as report:
         rows, details, files = resolve_change(change, "drive")(job, avatar, report)
+    job.check_unchanged()
     rows.write(job.cell.rows)
     job.cell.finish(
         "measure",
@@ -408,19 +425,17 @@ def render(job: Job, avatar: Avatar) -> None:
         return
     recorded = time.monotonic()
     with job.progress(RENDERING) as report, grouped_writes():
-        for index, (name, rgb) in enumerate(_drawn(job, avatar, missing, report)):
+        for index, (name, frame) in enumerate(_drawn(job, avatar, missing, report)):
             protocol, key = missing[name]
             camera = form.clip.cameras[form.key(key).camera]
-            if rgb.shape != (camera.height, camera.width, 3):
-                raise InputError(
-                    job.name, str(key), f"shape {(camera.height, camera.width, 3)}", f"{rgb.shape}"
-                )
-            written = write_png(cell.folder / name, quantise(form.restore(key, rgb)))
+            check_frame(frame, (camera.height, camera.width), job.name, key)
+            written = write_png(cell.folder / name, quantise(form.restore(key, frame.rgb)))
             known[name] = hashlib.sha256(written).hexdigest()
             if time.monotonic() - recorded > RECORD_EVERY_S:
                 cell.begin(DIGESTS, made_of, files=known)
                 recorded = time.monotonic()
             report(index + 1, len(missing), protocol.task)
+        job.check_unchanged()
         lacking = missing.keys() - known.keys()
         if lacking:
             first = missing[min(lacking)][1]
@@ -430,8 +445,8 @@ def render(job: Job, avatar: Avatar) -> None:
 
 def _drawn(
     job: Job, avatar: Avatar, missing: Mapping[str, tuple[Protocol, FrameKey]], report: Progress
-) -> Iterator[tuple[str, FloatArray]]:
-    """Path and (H, W, 3) colours of each frame: one by one, or by task if the avatar renders lists."""
+) -> Iterator[tuple[str, Frame]]:
+    """Path and frame of each render: one by one, or by task if the avatar renders lists."""
     clip = job.form.clip
     views: dict[str, dict[FrameKey, tuple[str, tuple[Camera, HeadPose], Sequence[float]]]] = {}
     for name, (protocol, key) in missing.items():
@@ -440,7 +455,7 @@ def _drawn(
         if isinstance(avatar, ListedFrames):
             views.setdefault(protocol.task, {})[seen] = (name, view, protocol.background)
         else:
-            yield name, avatar.render(*view, protocol.background).rgb
+            yield name, avatar.render(*view, protocol.background)
     before = 0
     for task, listed in views.items():
         assert isinstance(avatar, ListedFrames)
@@ -451,7 +466,7 @@ def _drawn(
             report(before, len(missing), f"{task}, {done} of {total} drawn {note}")  # none of them read yet
 
         for key, frame in avatar.render_listed(asked, background, drawing):
-            yield listed[key][0], frame.rgb
+            yield listed[key][0], frame
         before += len(listed)
 
 
@@ -518,6 +533,7 @@ def measure(
                 found = outcome.details.items() if isinstance(outcome, Measurement) else ()
                 # JSON has only finite numbers; a metric with another value has its own row.
                 details[spec.name] = {k: v for k, v in found if not isinstance(v, float) or math.isfinite(v)}
+    job.check_unchanged()
     replaced = [spec.name for spec in metrics if spec.implementation in repeated & had]
     step = job.cell.step("measure")
     history = [] if step is None else [*step.get("earlier", [])]
@@ -681,7 +697,10 @@ def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement |
         if not spec.machine_bound:
             return metric(avatar, pairs)  # type: ignore[no-any-return]
         with ProcessorLoad(job.device, wait=True) as load:
-            found = metric(avatar, pairs)
+            if isinstance(avatar, IsolatedAvatar):
+                found = avatar.measured(metric, pairs)
+            else:
+                found = metric(avatar, pairs)
         return Measurement(found.value, {**found.details, **load.details})
     except UnavailableError as error:
         return error

@@ -29,6 +29,7 @@ from ..rows import Rows
 from ..specs import MAX_LABEL, MetricSpec
 from .captures import open_clips
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
+from .guard import ChangedInputError
 from .jobs import make_jobs, run_cell
 from .steps import Job, failed_rows, log_kept, steps_ahead, stored_rows, trained_files
 from .store import RunFolder
@@ -133,7 +134,11 @@ def execute_cell(task: Task, report: Callable[[str], None]) -> None:
             report(words)
 
     job = replace(job, line=RunProgress({job.name: steps_ahead(job, metrics)}, show))
-    run_cell(job, metrics if task.speed else [metric for metric in metrics if not is_speed(metric)])
+    try:
+        run_cell(job, metrics if task.speed else [metric for metric in metrics if not is_speed(metric)])
+    except ChangedInputError:
+        _opened.forget()  # the next cell of this process opens the capture again
+        raise
 
 
 class _Opened:
@@ -142,6 +147,10 @@ class _Opened:
     def __init__(self) -> None:
         self._run: _Run | None = None
         self._clips: list[Clip] = []
+
+    def forget(self) -> None:
+        """Let the next cell open its capture again."""
+        self._clips = []
 
     def job(
         self, run: Path, subject: str, label: str, seed: int, capture: int

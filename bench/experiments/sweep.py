@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ..condition import PLAIN, Condition, Named
 from ..contracts import Avatar, Clip, Progress, no_progress
-from ..engine.adaptation import TrainingView
 from ..engine.config import default_names, with_methods
+from ..engine.guard import TrainingView
 from ..engine.jobs import trained
 from ..engine.run import run_locked
 from ..engine.store import RunFolder

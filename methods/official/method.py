@@ -499,7 +499,7 @@ def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) ->
 
     Every image under the program's folders is one that was exported for a training key, each as often, or a placeholder,
     which has a single pixel and so shows no frame. `clip` gives no pixels of other frames
-    (`headbench.bench.engine.adaptation.TrainingView`), so that none can stand under such a name.
+    (`headbench.bench.engine.guard.TrainingView`), so that none can stand under such a name.
 
     Raises `InputError` for an image of another frame, one that nobody exported, and one that is gone.
     """

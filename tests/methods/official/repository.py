@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.bench.engine.adaptation import TrainingView
+from headbench.bench.engine.guard import TrainingView
 from headbench.datasets.head.teeth import lip_rings
 from headbench.methods.official.config import GAOfficialConfig
 from headbench.methods.official.ga.method import GAOfficial

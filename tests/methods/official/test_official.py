@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Budget, ListedFrames, SharingAvatar, no_progress
-from headbench.bench.engine.adaptation import TrainingView
+from headbench.bench.engine.guard import TrainingView
 from headbench.bench.engine.stored import avatar_digest
 from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
 from headbench.bench.io.documents import read_json

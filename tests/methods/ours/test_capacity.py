@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.bench.engine.adaptation import TrainingView
+from headbench.bench.engine.guard import TrainingView
 from headbench.bench.engine.stored import TRAINING_FILE
 from headbench.methods.ours.capacity import plan_capacity
 from headbench.methods.ours.config import Lines, OursConfig, Penalty, PlannedCapacity

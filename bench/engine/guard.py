@@ -1,0 +1,121 @@
+"""Keeps a method from changing, and from reading, what other methods are measured by.
+
+In one process this prevents accidents, not intent: `bench.isolation` runs a method in processes of its own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from ..contracts import ByteArray, Clip, Frame, FrameKey, HeadAsset
+from ..errors import HeadbenchError, InputError
+
+HEAD = tuple(name for name in vars(HeadAsset) if not name.startswith("_"))
+SHARED = ("shape", "static_offset", "background", "cameras", "poses")
+"""Attributes of a clip that all methods are given."""
+SLACK = 1e-3
+"""How far colours and coverage may exceed [0, 1]: rounding in float32, below a quarter of an 8-bit step."""
+
+
+class ChangedInputError(HeadbenchError):
+    """A method changed what other methods are given, so that no result of this process can be trusted from here on."""
+
+
+class TrainingView:
+    """A `Clip` that gives images and masks of training frames only; nothing of it can be changed in place.
+
+    Cameras and driving signals of held-out frames stay visible: they do not reveal the ground truth images.
+    """
+
+    def __init__(self, clip: Clip):
+        freeze(clip)
+        allowed = frozenset(clip.splits["train"])
+        self.subject, self.head, self.shape = clip.subject, clip.head, clip.shape
+        self.static_offset, self.background = clip.static_offset, clip.background
+        self.cameras, self.poses = MappingProxyType(clip.cameras), MappingProxyType(clip.poses)
+        self.splits, self.excluded = MappingProxyType(clip.splits), MappingProxyType(clip.excluded)
+        self.steps, self.fingerprint = tuple(clip.steps), clip.fingerprint
+
+        def image(key: FrameKey) -> ByteArray:
+            """(H, W, 3) 8-bit sRGB of a training frame. Raises `HeadbenchError` for any other."""
+            return _copied(clip.image(_checked(key)))
+
+        def mask(key: FrameKey) -> ByteArray | None:
+            """(H, W) 8-bit coverage of a training frame. Raises `HeadbenchError` for any other."""
+            found = clip.mask(_checked(key))
+            return None if found is None else _copied(found)
+
+        def _checked(key: FrameKey) -> FrameKey:
+            if key not in allowed:
+                raise HeadbenchError(f"the method read {key}, which is not a training frame")
+            return key
+
+        self.image, self.mask = image, mask
+
+
+def _copied(image: ByteArray) -> ByteArray:
+    """A copy in memory that cannot be made writable; the reader may keep the original for the next call."""
+    return np.frombuffer(image.tobytes(), image.dtype).reshape(image.shape)
+
+
+def freeze(clip: Clip) -> None:
+    """Make the arrays of a clip read-only, in place: those of its head model, cameras, poses, shape and background."""
+    for array in _arrays(clip):
+        array.flags.writeable = False
+
+
+def state_digest(clip: Clip) -> str:
+    """Digest of what all methods are given: cameras, poses, splits, head model, shape, background."""
+    state = hashlib.blake2b(digest_size=16)
+    state.update(repr([sorted(clip.cameras), list(clip.poses), sorted(clip.splits.items())]).encode())
+    state.update(repr([(c.id, c.width, c.height) for c in clip.cameras.values()]).encode())
+    for array in _arrays(clip):
+        state.update(np.ascontiguousarray(array).data)
+    return state.hexdigest()
+
+
+def check_unchanged(clip: Clip, before: str, name: str) -> None:
+    """Raise `ChangedInputError` unless a clip has the digest that `state_digest` gave."""
+    if state_digest(clip) != before:
+        raise ChangedInputError(
+            f"{name} changed cameras, poses or the head model of {clip.subject} in memory, which every method is given. "
+            "Its results are not recorded. Leave the method out, or run it with --set isolation=all."
+        )
+
+
+def check_frame(frame: Frame, size: tuple[int, int], name: str, key: FrameKey) -> None:
+    """Raise `InputError` unless a frame has (height, width) ``size`` and finite values in [0, 1]."""
+    for part, shape in (("rgb", (*size, 3)), ("alpha", size)):
+        values = np.asarray(getattr(frame, part))
+        if values.shape != shape:
+            raise InputError(name, f"{part} of {key}", f"shape {shape}", f"{values.shape}")
+        low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+        if not (low >= -SLACK and high <= 1 + SLACK):  # also for values that are not a number
+            raise InputError(
+                name, f"{part} of {key}", "finite values from 0 to 1", f"values from {low:g} to {high:g}"
+            )
+
+
+def _arrays(clip: Clip) -> Iterator[np.ndarray[Any, Any]]:
+    """The arrays that all methods are given, in an order that depends on the clip alone."""
+    for name in HEAD:
+        yield from _within(getattr(clip.head, name, None))
+    for name in SHARED:
+        yield from _within(getattr(clip, name))
+
+
+def _within(value: Any) -> Iterator[np.ndarray[Any, Any]]:
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, Mapping):
+        for _, each in sorted(value.items()):
+            yield from _within(each)
+    elif is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            yield from _within(getattr(value, field.name))
