@@ -30,6 +30,8 @@ log = logging.getLogger(__name__)
 FRAME = ["subject", "sequence", "timestep", "camera"]
 """Columns that name a frame."""
 STATUSES = ("ok", "missing", "failed")
+SUSPECT = "suspect: "
+"""Beginning of the reason of a measured value that is too good, see `MetricSpec.suspect_above`."""
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,9 @@ PSNR = MetricSpec(
     summary="Peak signal-to-noise ratio over the 8-bit frame, or over a region of it, capped at 100 dB.",
     kind="regional",
     default=True,
+    # Of the suite's 60,480 whole frames the best has 45.5 dB, by any native method or baseline; rounding to 8 bits alone
+    # limits a perfect render to 58.9 dB, unless it is the test image itself.
+    suspect_above=50.0,
 )
 
 CAP = 100.0

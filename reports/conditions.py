@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from ..bench.rows import Rows
+from ..bench.rows import ALL, SUSPECT, Rows
 from ..bench.specs import MetricSpec
 from .aggregate import whole_images
 
@@ -88,6 +88,20 @@ def marks(
                 note.append(f"Measured on {each.text}; not comparable with other machines or thread counts.")
             if note:
                 notes[metric, method] = " ".join(note)
+    return notes
+
+
+def suspects(rows: Rows, methods: Sequence[str]) -> dict[tuple[str, str, str], str]:
+    """The note for each metric, method and task with values that are marked as suspect in their rows."""
+    notes = {}
+    for method in methods:
+        own = rows.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+        own = own[(own["status"] == "ok") & own["reason"].str.startswith(SUSPECT)]
+        for (metric, task), found in own.groupby(["metric", "task"]):
+            why = str(found["reason"].iloc[0]).removeprefix(SUSPECT)
+            notes[str(metric), method, str(task)] = (
+                f"Suspect, not ranked: {len(found)} frames are {why}, which no method reaches that has not seen them."
+            )
     return notes
 
 

@@ -16,7 +16,7 @@ from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from ..bench.specs import MetricSpec
 from .aggregate import Aggregate, subject_means, summarise, whole_images
-from .conditions import conditions, marks, measured_on
+from .conditions import conditions, marks, measured_on, suspects
 from .statistics.comparisons import LEVEL, BestSet, best_set, counted
 
 
@@ -182,6 +182,7 @@ PUBLISHED = "Columns headed published: figures from papers, of other data and co
 AVATAR_TITLE = "Avatar"
 METHODS_TITLE = "Methods"
 TRIVIAL_TITLE = "Trivial baselines (not ranked)"
+SUSPECT_TITLE = "Suspect: better than any method that has not seen the frames (not ranked)"
 CONDITIONS_TITLE = "Under other conditions (not ranked)"
 
 
@@ -246,6 +247,8 @@ def build_table(
     )
     found = conditions(rows, metrics, methods)
     marked = marks(found, trivial)
+    suspect = suspects(rows, methods)
+    unranked = {*trivial, *changed, *(method for _, method, _ in suspect)}
     notes: list[str] = []
     lines: list[TableRow] = []
     for method in methods:
@@ -254,17 +257,16 @@ def build_table(
                 summarise(rows, method, c.metric, c.task),
                 c.digits,
                 notes,
-                marked.get((c.metric, method), ""),
+                suspect.get((c.metric, method, c.task)) or marked.get((c.metric, method), ""),
             )
             for c in columns
         )
-        lines.append(
-            TableRow(method, ", ".join(rows.versions(method)), method in (*trivial, *changed), cells)
-        )
+        lines.append(TableRow(method, ", ".join(rows.versions(method)), method in unranked, cells))
     bests = [_best(rows, lines, index, column) for index, column in enumerate(columns)]
     lines = _ranked(lines, columns, bests)
     groups = (
         (METHODS_TITLE, tuple(line for line in lines if not line.trivial)),
+        (SUSPECT_TITLE, tuple(line for line in lines if line.method in unranked - {*trivial, *changed})),
         (CONDITIONS_TITLE, tuple(line for line in lines if line.method in changed)),
         (
             TRIVIAL_TITLE,

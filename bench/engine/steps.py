@@ -39,13 +39,13 @@ from ..machine import PeakMemory, ProcessorLoad, machine_name, processor_seconds
 from ..progress import RunProgress, duration, progress
 from ..protocol import Protocol
 from ..registry import get
-from ..rows import ALL, Row, Rows
+from ..rows import ALL, SUSPECT, Row, Rows
 from ..source import code_digest, is_outside
 from ..specs import ConditionSpec, MetricSpec
 from .adaptation import AdaptedClip
 from .config import ResolvedMethod, RunConfig, resolve_change
 from .guard import TrainingView, check_frame, check_unchanged, state_digest
-from .scoring import FULL, ScoredFrames, make_metric, score_frames
+from .scoring import FULL, Score, ScoredFrames, make_metric, score_frames
 from .store import Cell, StepState, avatar_files
 from .stored import AVATAR_FILE, shown_by, training_losses, write_avatar_record
 
@@ -682,10 +682,27 @@ def _score(job: Job, specs: Sequence[MetricSpec], protocol: Protocol) -> dict[st
         scored = score_frames(keys, frames, specs, job.regions, report, job.device)
     return {
         name: [
-            _row(job, by_name[name], protocol, s.key, s.value, s.status, s.reason, s.region) for s in scores
+            _row(
+                job,
+                by_name[name],
+                protocol,
+                s.key,
+                s.value,
+                s.status,
+                s.reason or _suspicion(by_name[name], s),
+                s.region,
+            )
+            for s in scores
         ]
         for name, scores in scored.items()
     }
+
+
+def _suspicion(spec: MetricSpec, score: Score) -> str:
+    """Reason of a row whose value is too good to be true, "" for any other."""
+    if score.region != FULL or not score.value > spec.suspect_above:
+        return ""
+    return f"{SUSPECT}above {spec.suspect_above:g} {spec.unit}"
 
 
 def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement | UnavailableError:

@@ -46,11 +46,12 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
         seeds=settings.seeds,
         regions=REGIONS,
         conditions=(PLAIN, *ablations),
+        isolation=settings.isolation,
     )
     cells = resolve_cells(config)
     resolve_metrics(config)
     check_executor(execution, config.device)
-    check_settings(cells)
+    check_settings(cell for cell in cells if not cell[0].is_isolated(config.isolation))
     plain = next((m.record() for m, c in cells if m.spec.name == OURS and c == PLAIN), None)
     for method, condition in cells:
         if condition.name and method.record() == plain:

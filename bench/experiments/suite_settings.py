@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..engine.config import parse_size
+from ..engine.config import Isolation, parse_size
 from ..errors import InputError
 from ..executors.options import ExecutionOptions
 from ..listing import presets_of_methods
@@ -73,6 +73,9 @@ class SuiteSettings(ExecutionOptions):
 
     tracking_error: float = 1.0
     """As for `headbench synth`."""
+
+    isolation: Isolation = "plugins"
+    """Methods that train and render in processes of their own, without access to test images (see SECURITY.md)."""
 
     def __post_init__(self) -> None:
         """Refuse invalid sizes and names."""

@@ -101,6 +101,14 @@ class ReadsClosure(Attack):
         found(out, whole.image(clip.splits["novel_view"][0])[0, 0, 0])
 
 
+class ShowsTruth(ReadsClosure):
+    """Renders the test images, which it finds in memory."""
+
+    def drawn(self, frame, camera, pose):
+        level = 40 + 10 * pose.timestep + (camera.id == "b")
+        return Frame(np.full_like(frame.rgb, level / 255), frame.alpha)
+
+
 class AsksForTestImage(Attack):
     def attack(self, clip, out):
         found(out, clip.image(clip.splits["novel_view"][0])[0, 0, 0])

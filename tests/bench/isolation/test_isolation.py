@@ -14,9 +14,11 @@ from headbench.bench.contracts import Frame, FrameKey
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.config import RunConfig
 from headbench.bench.engine.guard import ChangedInputError, check_frame
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.isolation.landlock import landlock_version, without
 from headbench.bench.rows import ALL
+from headbench.reports.tables import METHODS_TITLE, SUSPECT_TITLE, build_table
 
 restricted = pytest.mark.skipif(landlock_version() < 6, reason="this kernel has no Landlock of version 6")
 
@@ -91,6 +93,24 @@ def test_arrays_changed_by_force_end_the_run(config):
 def test_one_process_holds_test_images(config):
     """What isolation is for: nothing in one process can be hidden from Python code."""
     assert attacked(config, "ReadsClosure")[3] == "41"
+
+
+def test_test_images_as_renders_are_suspect(config):
+    methods = ("attacks:SHOWSTRUTH", "toy_plugin:METHOD")
+    rows = runner.run(replace(config, methods=methods))
+    marked = rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    marked = marked[marked["reason"] != ""]
+    assert set(marked["reason"]) == {"suspect: above 50 dB"}
+    assert len(marked) == 5  # every frame of the one method, none of the other
+    assert set(marked["method"]) == {"showstruth"}
+    psnr = [metric for metric in RunFolder(Path(config.out)).read_manifest().metrics if metric.name == "psnr"]
+    table = build_table(
+        rows, psnr, ("showstruth", "toy"), ("novel_view", "self_reenactment"), protocol_ids={}
+    )
+    groups = {title: [line.method for line in lines] for title, lines in table.groups}
+    assert groups == {METHODS_TITLE: ["toy"], SUSPECT_TITLE: ["showstruth"]}
+    assert "5 frames" not in " ".join(table.notes)
+    assert "3 frames are above 50 dB" in table.notes[0]
 
 
 @pytest.mark.parametrize(
