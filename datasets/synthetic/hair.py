@@ -200,7 +200,7 @@ def _sample(
     return rng.choice(len(faces), count, p=chance / chance.sum())
 
 
-Field = Callable[[FloatArray, float], FloatArray]
+GrowthField = Callable[[FloatArray, float], FloatArray]
 """Growth direction (n, 3) at points (n, 3), for a share in [0, 1] of the strand's length."""
 
 
@@ -226,7 +226,7 @@ class Strands:
 def grow(
     roots: FloatArray,
     lengths: FloatArray,
-    field: Field,
+    field: GrowthField,
     keep_out: Callable[[FloatArray, float], FloatArray],
     segments: int,
 ) -> FloatArray:

@@ -60,7 +60,7 @@ MATERIALS: Mapping[str, Material] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Panel:
+class AreaLight:
     """A rectangle that shines evenly from one side.
 
     ``center``, ``half_width``, ``half_height``: (3,) metres, its corners are ``center ± half_width ± half_height``;
@@ -95,7 +95,7 @@ def rig_middle(frontal: Camera) -> FloatArray:
     return rotation[2] * CAMERA_DISTANCE - (rotation * shift[:, None]).sum(axis=0)
 
 
-def panels(middle: FloatArray) -> tuple[Panel, ...]:
+def panels(middle: FloatArray) -> tuple[AreaLight, ...]:
     """Eight diffused panels around ``middle`` (3,): four above the cameras, two below them, two at the sides.
 
     NeRSemble's rig has eight LED panels with diffusers (Kirschstein et al. 2023, section 3); sizes and places are ours.
@@ -126,14 +126,14 @@ def _panel(
     distance: float,
     size: tuple[float, float],
     radiance: FloatArray,
-) -> Panel:
+) -> AreaLight:
     (a, e), (width, height) = place, size
     outward = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
     right = np.array([np.cos(a), 0.0, -np.sin(a)])
     up = np.cross(outward, right)
     outward, right, up = (on_grid(axis, ANGLE_BITS) for axis in (outward, right, up))
     center = on_grid(middle + distance * outward, LENGTH_BITS)
-    return Panel(center, 0.5 * width * right, 0.5 * height * up, -outward, radiance)
+    return AreaLight(center, 0.5 * width * right, 0.5 * height * up, -outward, radiance)
 
 
 def window(camera: Camera, points: FloatArray) -> tuple[slice, slice]:
@@ -171,7 +171,7 @@ class PanelTracer:
 
     def __init__(
         self,
-        lights: Sequence[Panel],
+        lights: Sequence[AreaLight],
         samples: int,
         threads: int = 1,
         seed: int = 0,

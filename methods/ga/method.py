@@ -21,7 +21,7 @@ from ..ops.harmonics import (
     initial_coefficients,
     occupied_degree,
 )
-from ..ops.mesh import Frames
+from ..ops.mesh import TriangleFrames
 from ..ops.splats import activate, to_world
 from ..shared.avatar_files import (
     SUBJECT_FILE,
@@ -81,7 +81,7 @@ class GAAppearance:
         """Fit the steps of the harmonics' degree to the run."""
         self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
 
-    def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
+    def frames(self, timestep: int, optimiser: Optimiser) -> TriangleFrames:
         """Triangle frames; differentiable in the refined tracking."""
         row = self._row[timestep]
         if not self._config.refine_tracking:
@@ -90,7 +90,13 @@ class GAAppearance:
         return self._mesh.frames(self._mesh.posed(self._at(row) | refined))
 
     def place(
-        self, frames: Frames, binding: Tensor, view: View, timestep: int, optimiser: Optimiser, iteration: int
+        self,
+        frames: TriangleFrames,
+        binding: Tensor,
+        view: View,
+        timestep: int,
+        optimiser: Optimiser,
+        iteration: int,
     ) -> ShadedSplats:
         """Colour by direction from the camera; opacity as it is."""
         world = to_world(frames, binding, optimiser["means"], optimiser["log_scales"], optimiser["quats"])
@@ -108,7 +114,7 @@ class GAAppearance:
         return RefinedTracking(subject, np.array(self.timesteps), before, after)
 
     @torch.no_grad()
-    def _tracked_frames(self, row: int) -> Frames:
+    def _tracked_frames(self, row: int) -> TriangleFrames:
         return self._mesh.frames(self._mesh.posed(self._at(row)))
 
     def _at(self, row: int) -> dict[str, Tensor]:

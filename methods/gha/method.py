@@ -24,7 +24,7 @@ from torch import Tensor
 
 from ...bench.contracts import Budget, Progress
 from ..shared.avatar_files import TRACKED, RefinedTracking, Subject, finish_fit
-from ..shared.loop import Fit, Outcome, train
+from ..shared.loop import Fit, TrainingSummary, train
 from ..shared.method import TrainedMethod
 from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import torch_on_one_thread
@@ -72,7 +72,7 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
         training = GaussianTraining(scene, head, mesh_head, mesh.tensors, sampler)
         budget = within(second, fit.budget, mesh.seconds)
         try:
-            outcome = train(
+            summary = train(
                 training,
                 sampler,
                 replace(fit, budget=budget, progress=_phase_progress(fit.progress, mesh.iterations, 0)),
@@ -85,11 +85,11 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
         tensors = training.tensors()
         write_avatar(out / AVATAR_FILE, config, {**tensors, **scene.frame()})
         corrected(scene, training.optimiser["corrections"].detach()).save(out / DRIVING_FILE)
-        whole = Outcome(
-            mesh.iterations + outcome.iterations,
-            mesh.iterations + outcome.planned,
-            mesh.seconds + outcome.seconds,
-            [(mesh.iterations + at, value) for at, value in outcome.losses],
+        whole = TrainingSummary(
+            mesh.iterations + summary.iterations,
+            mesh.iterations + summary.planned,
+            mesh.seconds + summary.seconds,
+            [(mesh.iterations + at, value) for at, value in summary.losses],
         )
         counts = {"splats": len(tensors["points"]), "mesh_iterations": mesh.iterations}
         finish_fit(fit, whole, Subject.of(clip), clip.head, **counts)

@@ -43,7 +43,7 @@ from ..shared.avatar_files import (
     write_record,
     write_subject,
 )
-from ..shared.loop import Fit, Outcome, check_budget, check_training_split
+from ..shared.loop import Fit, TrainingSummary, check_budget, check_training_split
 from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import threads
 from .checkout import Checkout, Environment, Repository, inspect_checkout, inspect_interpreter
@@ -391,7 +391,7 @@ class OfficialMethod(ABC, Generic[Config]):
         remarks = self.remarks(fit.clip, fit.seed)
         remarks["differences"] += self._of_launch(patches)
         recorded = {**remarks, "official": official, **kept}
-        write_record(fit, Outcome(iterations, iterations, time.monotonic() - start), **recorded)
+        write_record(fit, TrainingSummary(iterations, iterations, time.monotonic() - start), **recorded)
 
     def _export(self, fit: Fit, checkout: Checkout, work: Workplace) -> None:
         """Write the program's input, or keep the complete one of an earlier call; then compare it with the

@@ -20,7 +20,7 @@ NORMAL = 1
 """Column of a frame's rotation that is the triangle's normal."""
 
 
-class Frames(NamedTuple):
+class TriangleFrames(NamedTuple):
     """Frame of each triangle.
 
     Attributes
@@ -42,7 +42,7 @@ class Frames(NamedTuple):
 
 
 @Operation
-def triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
+def triangle_frames(vertices: Tensor, faces: Tensor) -> TriangleFrames:
     """Frames of the triangles (v0, v1, v2) of a mesh.
 
     a0 = unit(v1 - v0), a1 = unit(a0 x (v2 - v0)), a2 = -unit(a1 x a0), R = [a0 a1 a2];
@@ -67,15 +67,15 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
     height = (across * side).sum(0).abs()
     rotation = torch.stack([along, normal, across], dim=1).permute(2, 0, 1).contiguous()
     size = 0.5 * (base_length + height)
-    return Frames(rotation, corners.mean(1).t().contiguous(), size, matrix_to_quaternion(rotation))
+    return TriangleFrames(rotation, corners.mean(1).t().contiguous(), size, matrix_to_quaternion(rotation))
 
 
 @triangle_frames.compiled(KERNEL)
-def _triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
-    return Frames(*_TriangleFrames.apply(vertices, faces))  # type: ignore[no-untyped-call]
+def _triangle_frames(vertices: Tensor, faces: Tensor) -> TriangleFrames:
+    return TriangleFrames(*_TriangleFramesOperation.apply(vertices, faces))  # type: ignore[no-untyped-call]
 
 
-class _TriangleFrames(torch.autograd.Function):
+class _TriangleFramesOperation(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, vertices: Tensor, faces: Tensor) -> tuple[Tensor, ...]:
         ctx.save_for_backward(vertices, faces)

@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 
 from ...bench.native.dispatch import Operation
 from .kernel import KERNEL, call, empty_like
-from .mesh import Frames
+from .mesh import TriangleFrames
 
 
 class WorldSplats(NamedTuple):
@@ -49,7 +49,7 @@ def _activate(log_scales: Tensor, quats: Tensor) -> Activated:
 
 @Operation
 def to_world(
-    frames: Frames,
+    frames: TriangleFrames,
     binding: Tensor,
     means: Tensor,
     log_scales: Tensor,
@@ -85,7 +85,7 @@ def to_world(
 
 @to_world.compiled(KERNEL)
 def _to_world(
-    frames: Frames,
+    frames: TriangleFrames,
     binding: Tensor,
     means: Tensor,
     log_scales: Tensor,

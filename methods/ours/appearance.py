@@ -13,7 +13,7 @@ from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...datasets.head.arrays import faces_in_region
 from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
 from ..ops.harmonics import harmonic_colors, initial_coefficients
-from ..ops.mesh import NORMAL, Frames
+from ..ops.mesh import NORMAL, TriangleFrames
 from ..ops.planes import Bounds, line_offsets, plane_colors, smoothing
 from ..ops.splats import directions_to, to_world
 from ..shared.optimisation import Optimiser
@@ -47,7 +47,7 @@ FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weigh
 class PreparedTimestep:
     """Constants of training: frames, directions, driving coefficients, penalty weights."""
 
-    frames: Frames
+    frames: TriangleFrames
     turns: Tensor  # (F, 3, 3) world directions to canonical ones
     expression: Tensor  # (E,)
     jaw: Tensor  # (J,)
@@ -116,12 +116,18 @@ class OursAppearance:
         self._lines_from = timeline.at(self._config.lines.start)
         self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
 
-    def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
+    def frames(self, timestep: int, optimiser: Optimiser) -> TriangleFrames:
         """Triangle frames, without gradient."""
         return self._prepared(timestep).frames
 
     def place(
-        self, frames: Frames, binding: Tensor, view: View, timestep: int, optimiser: Optimiser, iteration: int
+        self,
+        frames: TriangleFrames,
+        binding: Tensor,
+        view: View,
+        timestep: int,
+        optimiser: Optimiser,
+        iteration: int,
     ) -> ShadedSplats:
         """Colour by canonical position and direction; what the lines change, once they are on."""
         prepared = self._prepared(timestep)

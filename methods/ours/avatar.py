@@ -30,7 +30,7 @@ from .field import (
     position_part,
 )
 from .inference import DrivenPose, LineOffsets
-from .storage import FIELD_FILE, RESIDUAL, Field, read_field, splat_columns
+from .storage import FIELD_FILE, RESIDUAL, StoredField, read_field, splat_columns
 
 
 class OursAvatar(StoredSplatAvatar):
@@ -42,7 +42,7 @@ class OursAvatar(StoredSplatAvatar):
 
     Attributes
     ----------
-    subject, field : Subject, Field
+    subject, field : Subject, StoredField
         The subject, and the content of its file.
     neutral : LocalSplats
         The splats before an expression changes them.
@@ -57,7 +57,7 @@ class OursAvatar(StoredSplatAvatar):
         stored: Sequence[Path],
         mesh: SubjectMesh,
         subject: Subject,
-        field: Field,
+        field: StoredField,
         device: str,
         cutoffs: Cutoffs = USUAL,
     ):

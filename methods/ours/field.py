@@ -16,7 +16,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ..ops.mesh import Frames, turns_between
+from ..ops.mesh import TriangleFrames, turns_between
 from ..ops.planes import (
     AXES,
     ENCODING_SIZE,
@@ -194,7 +194,7 @@ class CanonicalFrames:
     rotation: Tensor
 
     @classmethod
-    def of(cls, frames: Frames) -> CanonicalFrames:
+    def of(cls, frames: TriangleFrames) -> CanonicalFrames:
         """Take what is needed from triangle frames."""
         linear = (frames.size[:, None, None] * frames.rotation).flatten(1)
         return cls(linear, frames.center, frames.rotation)
@@ -203,7 +203,7 @@ class CanonicalFrames:
         """Canonical positions (N, 3) of local means: k_c R_c mean + T_c."""
         return points_on(means, binding, self.linear, self.center)
 
-    def turns(self, frames: Frames) -> Tensor:
+    def turns(self, frames: TriangleFrames) -> Tensor:
         """(F, 3, 3) rotations that take world directions of a posed mesh to canonical ones: R_c R_t^T."""
         return turns_between(self.rotation, frames.rotation)
 

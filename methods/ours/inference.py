@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..ops.mesh import Frames
+from ..ops.mesh import TriangleFrames
 from ..ops.planes import AXES, Bounds, LinePosition, line_position, offset_writer
 from .field import blend_lines, line_table, normalised_weight, offset_layers
 
@@ -21,7 +21,7 @@ from .field import blend_lines, line_table, normalised_weight, offset_layers
 class DrivenPose(NamedTuple):
     """Results for a pose that are cached for known poses."""
 
-    frames: Frames
+    frames: TriangleFrames
     turns: Tensor
     """(F, 3, 3) world directions to canonical ones."""
     offsets: Tensor | None

@@ -62,30 +62,30 @@ def write_field(
         "line_box": torch.stack(list(line_box)),
         "jaw_bases": torch.from_numpy(np.asarray(jaw_bases, dtype=np.float32)),
     }
-    save_field(path, Field(tensors, tuple(dynamic)))
+    save_field(path, StoredField(tensors, tuple(dynamic)))
 
 
-class Field(NamedTuple):
+class StoredField(NamedTuple):
     """Content of an avatar's file: its tensors by name, and the attributes that the lines change."""
 
     tensors: dict[str, Tensor]
     dynamic: tuple[Dynamic, ...]
 
 
-def save_field(path: Path, field: Field) -> None:
+def save_field(path: Path, field: StoredField) -> None:
     """Write the exact file of a field, whole or not at all."""
     tensors = {name: value.cpu().contiguous() for name, value in field.tensors.items()}
     write_bytes(path, save(tensors, {DYNAMIC: ",".join(field.dynamic)}))
 
 
-def read_field(path: Path, head: HeadAsset, device: str) -> Field:
+def read_field(path: Path, head: HeadAsset, device: str) -> StoredField:
     """Read and check what `write_field` wrote. Raises `InputError` where a tensor is missing or does not fit."""
     tensors, metadata = read_safetensors(path)
     field = checked_field(path, tensors, metadata.get(DYNAMIC, "opacity"), head)
     return field._replace(tensors={name: value.to(device) for name, value in field.tensors.items()})
 
 
-def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: HeadAsset) -> Field:
+def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: HeadAsset) -> StoredField:
     """Make a field of tensors that came from outside, and of what they say the lines change, by comma.
 
     Raises `InputError` where a tensor is missing, is not finite float32 or does not fit the others.
@@ -104,7 +104,7 @@ def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: Head
     number = Member("f", None, MAX_MAGNITUDE, "f4")
     check_tensors(path, tensors, dict.fromkeys([*needed, *tensors], number))
     _check_shapes(path, tensors, head, offset_width(dynamic))
-    return Field(tensors, dynamic)
+    return StoredField(tensors, dynamic)
 
 
 def _check_shapes(path: Path, tensors: Mapping[str, Tensor], head: HeadAsset, outputs: int) -> None:

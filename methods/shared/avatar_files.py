@@ -17,7 +17,7 @@ from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.documents import read_json
 from ...bench.io.files import atomic_path, digest, write_json
 from ...datasets.head.arrays import STORED, HeadArrays, read_head, save_head
-from .loop import Fit, Outcome
+from .loop import Fit, TrainingSummary
 
 RECORDED_LOSSES = 200  # losses of an avatar's record at most
 _SIZES = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
@@ -164,15 +164,15 @@ def is_finished(folder: Path, run: str) -> bool:
     return True
 
 
-def write_record(fit: Fit, outcome: Outcome, **more: Any) -> None:
+def write_record(fit: Fit, summary: TrainingSummary, **more: Any) -> None:
     """Write how the run went. The last file of a fit: its presence says that the avatar is whole."""
-    done: dict[str, Any] = {"iterations": outcome.iterations, "planned_iterations": outcome.planned}
+    done: dict[str, Any] = {"iterations": summary.iterations, "planned_iterations": summary.planned}
     if fit.trials:
         done["trials"] = [asdict(trial) for trial in fit.trials]
-    if outcome.losses:
-        done["losses"] = [[at, float(f"{value:.4g}")] for at, value in thinned(outcome.losses)]
+    if summary.losses:
+        done["losses"] = [[at, float(f"{value:.4g}")] for at, value in thinned(summary.losses)]
     write_json(
-        fit.out / TRAINING_FILE, {"run": fit.run, **done, "seconds": round(outcome.seconds, 3), **more}
+        fit.out / TRAINING_FILE, {"run": fit.run, **done, "seconds": round(summary.seconds, 3), **more}
     )
 
 
@@ -183,8 +183,8 @@ def thinned(losses: Sequence[tuple[int, float]], count: int = RECORDED_LOSSES) -
     return [(group[-1][0], sum(value for _, value in group) / len(group)) for group in groups]
 
 
-def finish_fit(fit: Fit, outcome: Outcome, subject: Subject, head: HeadAsset, **more: Any) -> None:
+def finish_fit(fit: Fit, summary: TrainingSummary, subject: Subject, head: HeadAsset, **more: Any) -> None:
     """Write what every trained avatar has beside its own files, the record last."""
     write_subject(fit.out / SUBJECT_FILE, subject)
     save_shared_head(fit.out, head)
-    write_record(fit, outcome, **more)
+    write_record(fit, summary, **more)

@@ -84,7 +84,7 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrainingSummary:
     """Summary of a run: iterations done and planned, and seconds over all its parts.
 
     ``losses`` are pairs of an iteration and the loss of its image, from every `REPORT_EVERY`-th iteration, the first and the last planned one.
@@ -104,7 +104,7 @@ def train(
     published_length: int,
     checkpoint_every_s: float,
     began: float | None = None,
-) -> Outcome:
+) -> TrainingSummary:
     """Train until the budget is spent; continue from the checkpoint in ``fit.out`` if it is of the same run.
 
     One iteration is: loss of one image, gradients, `after_backward` (densification), Adam step; the last
@@ -176,7 +176,7 @@ def train(
                 last_save = clock()
             fit.progress(iteration, total, note + trainable.note() if note else "")
     wait()
-    return Outcome(iteration, total, seconds(), losses)
+    return TrainingSummary(iteration, total, seconds(), losses)
 
 
 def synchroniser(device: str) -> Callable[[], None]:

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from ...bench.contracts import Camera, Clip, FrameKey
-from ..ops.mesh import Frames
+from ..ops.mesh import TriangleFrames
 from ..ops.photometric import photometric_loss
 from ..ops.splats import WorldSplats
 from ..splats import rasterize
 from ..splats.request import Rendering
 from .config import DensifiedTraining, SplatTraining
-from .loop import Fit, Outcome, TrainingImages, train
+from .loop import Fit, TrainingImages, TrainingSummary, train
 from .losses import position_penalty, scale_penalty
 from .optimisation import Densifier, Optimiser
 from .rendering import View, scene_center, scene_extent, view_of
@@ -118,7 +118,7 @@ class SplatTrainer:
         """Number of splats."""
         return f"{len(self.binding)} splats"
 
-    def run(self, fit: Fit) -> Outcome:
+    def run(self, fit: Fit) -> TrainingSummary:
         """Train to the end of the budget; see `train`."""
         length, seconds = self._settings.schedule_length, self._settings.checkpoint_every_s
         try:
@@ -181,11 +181,17 @@ class Appearance(Protocol):
     def begin(self, timeline: Timeline) -> None:
         """Fit schedules to the length of the run."""
 
-    def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
+    def frames(self, timestep: int, optimiser: Optimiser) -> TriangleFrames:
         """Triangle frames of a training timestep."""
 
     def place(
-        self, frames: Frames, binding: Tensor, view: View, timestep: int, optimiser: Optimiser, iteration: int
+        self,
+        frames: TriangleFrames,
+        binding: Tensor,
+        view: View,
+        timestep: int,
+        optimiser: Optimiser,
+        iteration: int,
     ) -> ShadedSplats:
         """Splats in the world with their colours and opacities as this camera sees them."""
 

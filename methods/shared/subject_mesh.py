@@ -13,7 +13,7 @@ from torch import Tensor
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose
 from ...datasets.head.arrays import check_size
 from ...datasets.head.model import HeadModel
-from ..ops.mesh import Frames, triangle_frames
+from ..ops.mesh import TriangleFrames, triangle_frames
 
 Value = TypeVar("Value")
 
@@ -68,12 +68,12 @@ class SubjectMesh:
         still = {name: torch.zeros_like(arguments[name]) for name in ("rotation", "neck", "translation")}
         return self.posed({**arguments, **still})
 
-    def frames(self, vertices: Tensor) -> Frames:
+    def frames(self, vertices: Tensor) -> TriangleFrames:
         """Triangle frames of a mesh; differentiable in its vertices."""
         return triangle_frames(vertices, self.faces)
 
     @torch.no_grad()
-    def drive(self, pose: HeadPose) -> Frames:
+    def drive(self, pose: HeadPose) -> TriangleFrames:
         """Triangle frames of a pose in the world. Raises `InputError` for another head model's pose."""
         return self.frames(self.posed(self.arguments([pose])))
 

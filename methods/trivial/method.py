@@ -17,7 +17,7 @@ from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.images import read_pixels
 from ...datasets.images import write_image
 from ..shared.avatar_files import TRACKED, write_arrays, write_record
-from ..shared.loop import Fit, Outcome
+from ..shared.loop import Fit, TrainingSummary
 from ..shared.method import TrainedMethod
 from .spec import MEAN_IMAGE, NEAREST_CAMERA, NearestCameraConfig
 
@@ -129,7 +129,7 @@ class MeanImage(TrainedMethod[None, MeanImageAvatar]):
             "head_model": np.array(clip.head.version),
         }
         write_arrays(fit.out / MEAN_FILE, arrays)
-        write_record(fit, Outcome(len(keys), len(keys), 0.0))
+        write_record(fit, TrainingSummary(len(keys), len(keys), 0.0))
 
 
 class NearestCameraAvatar(_ImageAvatar):
@@ -221,7 +221,7 @@ class NearestCamera(TrainedMethod[NearestCameraConfig, NearestCameraAvatar]):
             "images": images,
         }
         write_arrays(fit.out / INDEX_FILE, arrays)
-        write_record(fit, Outcome(len(keys), len(keys), 0.0))
+        write_record(fit, TrainingSummary(len(keys), len(keys), 0.0))
 
     def _timesteps(self, clip: Clip) -> list[int]:
         timesteps = sorted({key.timestep for key in clip.splits["train"]})

@@ -11,7 +11,7 @@ import torch
 from ....bench.contracts import HeadAsset
 from ....bench.errors import InputError
 from ...ours.field import PLANES, CanonicalFrames
-from ...ours.storage import PER_SPLAT, RESIDUAL, SPLAT_WIDTHS, Field, checked_field
+from ...ours.storage import PER_SPLAT, RESIDUAL, SPLAT_WIDTHS, StoredField, checked_field
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import SubjectMesh
 from .container import Arrays, Content, coded, packed_sizes, read_content, write_content
@@ -43,7 +43,7 @@ PARTS: Mapping[str, tuple[str, ...]] = {
 """Parts of an avatar by the beginnings of their arrays' names; what is in none of them is "other"."""
 
 
-def encode(field: Field, subject: Subject, head: HeadAsset, precision: Precision) -> Content:
+def encode(field: StoredField, subject: Subject, head: HeadAsset, precision: Precision) -> Content:
     """Content of the compact file of an avatar whose splats are sorted by triangle (`simplify`)."""
     tensors = {name: value.cpu() for name, value in field.tensors.items()}
     splats, steps = encode_splats(tensors, precision, "rotation" in field.dynamic)
@@ -63,7 +63,7 @@ def encode(field: Field, subject: Subject, head: HeadAsset, precision: Precision
     return Content({**splats, **shared, **person.arrays, **other}, text, steps)
 
 
-def decode(path: Path, content: Content, head: HeadAsset, device: str) -> tuple[Subject, Field]:
+def decode(path: Path, content: Content, head: HeadAsset, device: str) -> tuple[Subject, StoredField]:
     """Subject and field of such a content. Raises `InputError`, which names ``path``, where it does not fit."""
     arrays = Arrays(path, content)
     subject = decode_subject(arrays, head)
@@ -75,12 +75,14 @@ def decode(path: Path, content: Content, head: HeadAsset, device: str) -> tuple[
     return subject, field._replace(tensors={name: value.to(device) for name, value in tensors.items()})
 
 
-def write_compact(path: Path, field: Field, subject: Subject, head: HeadAsset, precision: Precision) -> None:
+def write_compact(
+    path: Path, field: StoredField, subject: Subject, head: HeadAsset, precision: Precision
+) -> None:
     """Write a compact file whole or not at all."""
     write_content(path, encode(field, subject, head, precision))
 
 
-def read_compact(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Field]:
+def read_compact(path: Path, head: HeadAsset, device: str) -> tuple[Subject, StoredField]:
     """Read what `write_compact` wrote. Raises `InputError` for anything else, before it takes more memory."""
     return decode(path, read_content(path), head, device)
 
@@ -90,7 +92,7 @@ def part_sizes(content: Content) -> dict[str, int]:
     return _by_part(packed_sizes(content.arrays))
 
 
-def exact_sizes(field: Field, subject: Subject) -> dict[str, int]:
+def exact_sizes(field: StoredField, subject: Subject) -> dict[str, int]:
     """Bytes by part of the exact files, without their headers."""
     sizes = {name: value.nbytes for name, value in field.tensors.items() if name != "splats"}
     widths = {"opacities": "logits", "means": "positions", "quats": "rotations", "binding": "triangles"}

@@ -16,7 +16,7 @@ from ....bench.errors import InputError
 from ....bench.io.images import quantise
 from ....bench.specs import CommandResult
 from ...ours.avatar import OursAvatar
-from ...ours.storage import Field
+from ...ours.storage import StoredField
 from ...shared.avatar_files import read_shared_head, save_shared_head
 from ...shared.losses import picture_ssim, psnr, squared_error
 from ...shared.schedule import evenly
@@ -80,7 +80,7 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
 
 
 def _costs(
-    field: Field,
+    field: StoredField,
     exact: OursAvatar,
     head: HeadAsset,
     precision: Precision,

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from ....bench.contracts import Clip, HeadPose
 from ...ours.avatar import OursAvatar
-from ...ours.storage import PER_SPLAT, SPLAT_WIDTHS, Field
+from ...ours.storage import PER_SPLAT, SPLAT_WIDTHS, StoredField
 from ...splats.constants import ALPHA_MIN
 from .encoding import negligible_lines
 from .precision import Precision
 
 
-def simplify(avatar: OursAvatar, poses: Iterable[HeadPose], precision: Precision) -> Field:
+def simplify(avatar: OursAvatar, poses: Iterable[HeadPose], precision: Precision) -> StoredField:
     """The avatar's field with its splats sorted by triangle, without splats and lines that no pose shows.
 
     Parameters
@@ -37,7 +37,7 @@ def simplify(avatar: OursAvatar, poses: Iterable[HeadPose], precision: Precision
         if name in tensors:
             tensors[name] = tensors[name].index_select(0, order)
     if "lines" not in tensors:
-        return Field(tensors, field.dynamic)
+        return StoredField(tensors, field.dynamic)
     silent = torch.from_numpy(negligible_lines(tensors, precision.lines))
     mask = silent.to(tensors["lines"].device)[:, None, None, None]
     tensors["lines"] = tensors["lines"].masked_fill(mask, 0)
@@ -47,7 +47,7 @@ def simplify(avatar: OursAvatar, poses: Iterable[HeadPose], precision: Precision
         lines = {name for name in tensors if name.startswith(("lines", "line_"))} - {"line_box"}
         tensors = {name: value for name, value in tensors.items() if name not in lines}
         tensors["jaw_bases"] = tensors["jaw_bases"][:0]
-    return Field(tensors, field.dynamic)
+    return StoredField(tensors, field.dynamic)
 
 
 def training_poses(clip: Clip) -> list[HeadPose]:

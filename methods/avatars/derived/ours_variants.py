@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ....bench.contracts import Clip, HeadAsset, Variant
 from ...ours.avatar import OursAvatar
-from ...ours.storage import FIELD_FILE, PER_SPLAT, Field, checked_field, read_field, save_field
+from ...ours.storage import FIELD_FILE, PER_SPLAT, StoredField, checked_field, read_field, save_field
 from ...shared.avatar_files import SUBJECT_FILE, read_shared_head, save_shared_head, write_subject
 from ...shared.subject_mesh import SubjectMesh
 from ..compact.file import COMPACT_FILE, read_compact, write_compact
@@ -47,7 +47,7 @@ def variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
         yield Variant(recipe.name, recipe.summary, partial(_make, whole, head, rows, recipe, device))
 
 
-def _idle(recipe: Recipe, field: Field) -> bool:
+def _idle(recipe: Recipe, field: StoredField) -> bool:
     """Whether a recipe asks for fewer samples of planes or lines, and nothing else, in vain."""
     if replace(recipe, planes=None, lines=None) != Recipe():
         return False
@@ -68,7 +68,7 @@ def _make(
         if name in tensors:
             tensors[name] = tensors[name].index_select(0, rows)
     tensors = _resampled(tensors, recipe)
-    field = Field(tensors, whole.field.dynamic)
+    field = StoredField(tensors, whole.field.dynamic)
     save_shared_head(out, head)
     subject = whole.subject
     if recipe.storage == "compact":
