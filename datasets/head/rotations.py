@@ -122,11 +122,6 @@ def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     return torch.where(unit[:1] < 0, -unit, unit).movedim(0, -1).contiguous()
 
 
-def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
-    """Axis-angle vectors of length at most pi of rotation matrices. (..., 3, 3) to (..., 3)."""
-    return quaternion_to_axis_angle(matrix_to_quaternion(matrix))
-
-
 _GENERATORS = np.array(
     [
         [[0, 0, 0], [0, 0, -1], [0, 1, 0]],

@@ -149,13 +149,14 @@ RENDERING = (
 )
 """Settings that rendering depends on."""
 
-FRAME = ("origin", "center", "background", "expression_scale", "code_low", "code_high")
-"""Small tensors: (3,) metres, (3,) metres, (3,) colour that was trained on, (E,) divisors of the expression code, (E,) bounds of it
-that colour and attributes follow."""
-
 
 def write_avatar(path: Path, config: GHAConfig, tensors: Mapping[str, Tensor]) -> None:
-    """Write the tensors of points, networks, landmarks and `FRAME`. Points with features are one (N, 11 + F) table."""
+    """Write the tensors of points, networks and landmarks, and the small ones.
+
+    Points with features are one (N, 11 + F) table. The small tensors are ``origin`` and ``center`` (3,), metres;
+    ``background`` (3,), the training background; ``expression_scale`` (E,), divisors of the expression code; and
+    ``code_low`` and ``code_high`` (E,), the bounds of the code for colours and attributes.
+    """
     table = torch.cat(
         [tensors[name].reshape(len(tensors["points"]), -1) for name in (*POINTS, "features")], 1
     )

@@ -67,10 +67,6 @@ class Mlp:
         """Index of the layer with the input skip connection; 0 for a single layer."""
         return len(self.widths) // 2 if self.hidden else 0
 
-    def takes_inputs(self, layer: int) -> bool:
-        """Whether a layer receives the inputs, after the values of the previous layer, if any."""
-        return layer in (0, self._skip_layer)
-
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of every tensor, by name."""
         widths = self.widths

@@ -46,8 +46,6 @@ class BenchmarkTrack:
         (width, height) in pixels.
     sequences : Mapping[str, Mapping[str, int | None]]
         Sequences to render, by participant, with the number of frames if it is published.
-    train_serial : str
-        The camera of the training videos; "" if there are several.
     totals : Mapping[str, int] | None
         Published number of frames of all sequences of a participant together.
     """
@@ -57,7 +55,6 @@ class BenchmarkTrack:
     fps: float
     sequences: Mapping[str, Mapping[str, int | None]]
     serials: tuple[str, ...]
-    train_serial: str = ""
     totals: Mapping[str, int] | None = None
 
     def videos(self, data: Path | None = None) -> Iterator[Video]:
@@ -95,7 +92,6 @@ MONO = BenchmarkTrack(
     24.3,
     {name: dict.fromkeys(_TEST_SEQUENCES) for name in ("393", "404", "461", "477", "486")},
     ("222200037", "222200046", "220700191", "222200039"),
-    train_serial="222200037",
     totals={"393": 816, "404": 665, "461": 486, "477": 530, "486": 608},
 )
 TRACKS: Mapping[TrackName, BenchmarkTrack] = {track.name: track for track in (NVS, MONO)}
