@@ -24,10 +24,10 @@ from .field import COLOR_NETWORK, FIRST_LAYER, LAST_LAYER, PLANES, WIDTHS, offse
 
 FIELD_FILE = "avatar.safetensors"
 DYNAMIC = "dynamic"
-"""Key of the file's metadata: what the lines change, in the order of the offset network's outputs."""
+"""Key of the file's metadata: attributes that the lines change, in the order of the offset network's outputs."""
 
 RESIDUAL = "color_residual"
-"""The (N, 3) colours of their own, where splats have one beside that of the planes."""
+"""The (N, 3) separate colours of splats, added to those of the planes."""
 
 PER_SPLAT = ("splats", "sh_dc", "sh_rest", RESIDUAL)
 """Tensors with a row for each splat."""
@@ -79,16 +79,16 @@ def save_field(path: Path, field: StoredField) -> None:
 
 
 def read_field(path: Path, head: HeadAsset, device: str) -> StoredField:
-    """Read and check what `write_field` wrote. Raises `InputError` where a tensor is missing or does not fit."""
+    """Read and check what `save_field` wrote. Raises `InputError` if a tensor is missing or does not fit."""
     tensors, metadata = read_safetensors(path)
     field = checked_field(path, tensors, metadata.get(DYNAMIC, "opacity"), head)
     return field._replace(tensors={name: value.to(device) for name, value in field.tensors.items()})
 
 
 def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: HeadAsset) -> StoredField:
-    """Make a field of tensors that came from outside, and of what they say the lines change, by comma.
+    """Make a field of untrusted tensors and the comma-separated attributes that the lines change.
 
-    Raises `InputError` where a tensor is missing, is not finite float32 or does not fit the others.
+    Raises `InputError` if a tensor is missing, is not finite float32 or does not fit the others.
     """
     given = names.split(",")
     if len(set(given)) != len(given) or not set(given) <= set(WIDTHS):
@@ -108,7 +108,7 @@ def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: Head
 
 
 def _check_shapes(path: Path, tensors: Mapping[str, Tensor], head: HeadAsset, outputs: int) -> None:
-    """Raise `InputError` at the first tensor that does not fit the others, so that no rendering can."""
+    """Raise `InputError` for the first tensor that does not fit the others, so that rendering cannot fail."""
 
     def require(name: str, fits: bool, expected: str) -> None:
         if not fits:
@@ -129,7 +129,7 @@ def _check_shapes(path: Path, tensors: Mapping[str, Tensor], head: HeadAsset, ou
     for name in ("plane_box", "line_box"):
         exactly(name, 2, 3)
         if not (tensors[name][0] < tensors[name][1]).all():
-            raise InputError(path, name, "a low corner below the high one", str(tensors[name].tolist()))
+            raise InputError(path, name, "a low corner below the high corner", str(tensors[name].tolist()))
 
     if "sh_dc" in tensors:
         exactly("sh_dc", len(splats), 3)

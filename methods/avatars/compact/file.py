@@ -40,7 +40,7 @@ PARTS: Mapping[str, tuple[str, ...]] = {
     "networks": (*MATRICES, "line_gain", "line_bias"),
     "subject": ("shape", "static_offset"),
 }
-"""Parts of an avatar by the beginnings of their arrays' names; what is in none of them is "other"."""
+"""Parts of an avatar by the prefixes of their array names; all other arrays are "other"."""
 
 
 def encode(field: StoredField, subject: Subject, head: HeadAsset, precision: Precision) -> Content:
@@ -50,7 +50,7 @@ def encode(field: StoredField, subject: Subject, head: HeadAsset, precision: Pre
     person = encode_subject(subject, precision)
     steps |= person.steps
     text = {**person.text, "dynamic": ",".join(field.dynamic)}
-    # Where the reader will put the splats decides which samples of the planes they need.
+    # Decoded positions decide which samples of the planes are needed.
     read = Arrays(Path(), Content({**splats, **person.arrays}, text, steps))
     table = decode_splats(read)["splats"]
     stored = decode_subject(read, head)
@@ -64,7 +64,7 @@ def encode(field: StoredField, subject: Subject, head: HeadAsset, precision: Pre
 
 
 def decode(path: Path, content: Content, head: HeadAsset, device: str) -> tuple[Subject, StoredField]:
-    """Subject and field of such a content. Raises `InputError`, which names ``path``, where it does not fit."""
+    """Subject and field of the content of a compact file. Raises `InputError`, naming ``path``, for invalid content."""
     arrays = Arrays(path, content)
     subject = decode_subject(arrays, head)
     tensors = {**decode_splats(arrays), **decode_field(arrays)}
@@ -88,7 +88,7 @@ def read_compact(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Sto
 
 
 def part_sizes(content: Content) -> dict[str, int]:
-    """Bytes by part, as packed; the file has a header of a few kB besides."""
+    """Packed bytes by part, without the header of a few kB."""
     return _by_part(packed_sizes(content.arrays))
 
 
@@ -110,7 +110,7 @@ def _by_part(sizes: Mapping[str, int]) -> dict[str, int]:
 
 
 def encode_subject(subject: Subject, precision: Precision) -> Content:
-    """The part of a compact file that says whom it shows."""
+    """Arrays of the subject in a compact file."""
     arrays = {
         "shape": subject.shape.astype(np.float32),
         "static_offset": coded(subject.static_offset.T, precision.subject),
@@ -120,7 +120,7 @@ def encode_subject(subject: Subject, precision: Precision) -> Content:
 
 
 def decode_subject(arrays: Arrays, head: HeadAsset) -> Subject:
-    """Whom a compact file shows. Raises `InputError` where that does not fit the head model."""
+    """Subject of a compact file. Raises `InputError` if it does not fit the head model."""
     for key in ("name", "head_model"):
         if key not in arrays.text:
             raise InputError(arrays.path, f"text, {key}", "a string", "none")

@@ -1,4 +1,4 @@
-"""Leave out of an avatar what no picture of it shows, before it is stored compactly."""
+"""Remove invisible splats and lines from an avatar before it is stored compactly."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .precision import Precision
 
 
 def simplify(avatar: OursAvatar, poses: Iterable[HeadPose], precision: Precision) -> StoredField:
-    """The avatar's field with its splats sorted by triangle, without splats and lines that no pose shows.
+    """The avatar's field with its splats sorted by triangle, without splats and lines that are invisible in all poses.
 
     Parameters
     ----------
@@ -24,14 +24,13 @@ def simplify(avatar: OursAvatar, poses: Iterable[HeadPose], precision: Precision
         Training poses. A splat whose opacity stays below 1/255 in all of them is removed; the
         renderer culls such splats, so these poses do not change. Without poses no splat is removed.
     precision : Precision
-        Lines that it rounds to zero are set to zero. If no other lines remain, and the lines change
-        opacity alone, every pose changes an opacity by the same number; it is added once, and lines
-        and network are left out.
+        Lines that it rounds to zero are set to zero. If no other lines remain, and the lines change only opacity,
+        every pose changes an opacity by the same number; it is added once, and lines and network are removed.
     """
     field = avatar.field
     tensors = dict(field.tensors)
     kept = _visible(avatar, poses)
-    # Splats of one depth are drawn in order; sorting is stable, so those of one triangle keep theirs.
+    # Splats of equal depth are drawn in index order; stable sorting keeps the order within a triangle.
     order = kept[torch.argsort(tensors["splats"][kept, -1], stable=True)]
     for name in PER_SPLAT:
         if name in tensors:
@@ -56,7 +55,7 @@ def training_poses(clip: Clip) -> list[HeadPose]:
 
 
 def _visible(avatar: OursAvatar, poses: Iterable[HeadPose]) -> Tensor:
-    """Numbers of the splats that some pose shows."""
+    """Indices of the splats that are visible in some pose."""
     splats = avatar.field.tensors["splats"]
     keep = None
     for pose in poses:

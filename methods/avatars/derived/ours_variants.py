@@ -32,7 +32,7 @@ from .recipes import (
 
 EXACT_PARTS = ("plane_box", "line_box", "jaw_bases")
 TRIANGLES = "triangles"
-_ANY = 1 << 30  # more samples than anything has
+_ANY = 1 << 30  # no reduction
 
 
 def variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
@@ -48,7 +48,7 @@ def variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
 
 
 def _idle(recipe: Recipe, field: StoredField) -> bool:
-    """Whether a recipe asks for fewer samples of planes or lines, and nothing else, in vain."""
+    """Whether a recipe only reduces samples of planes or lines, and the avatar has no more samples than that."""
     if replace(recipe, planes=None, lines=None) != Recipe():
         return False
     changed = _resampled(field.tensors, recipe)
@@ -62,7 +62,7 @@ def _resampled(tensors: dict[str, Tensor], recipe: Recipe) -> dict[str, Tensor]:
 def _make(
     whole: OursAvatar, head: HeadAsset, rows: Tensor, recipe: Recipe, device: str, out: Path
 ) -> OursAvatar:
-    """Write what a recipe leaves of an avatar; return what is read back."""
+    """Write an avatar reduced by a recipe; return the avatar that is read back."""
     tensors = dict(whole.field.tensors)
     for name in PER_SPLAT:
         if name in tensors:
@@ -73,7 +73,7 @@ def _make(
     subject = whole.subject
     if recipe.storage == "compact":
         path, precision = out / COMPACT_FILE, Precision()
-        # Sorts the splats by triangle and leaves out lines that would be rounded to nothing.
+        # Sorts the splats by triangle and removes lines that would be rounded to zero.
         field = simplify(OursAvatar([], whole.mesh, subject, field, device), [], precision)
         write_compact(path, field, subject, head, precision)
         subject, field = read_compact(path, head, device)
