@@ -15,13 +15,13 @@ from ....bench.io.arrays import Member, read_arrays
 
 TrackName = Literal["nvs", "mono_flame_avatar"]
 TRACKING_FILE = "flame2023_tracking_v2.npz"
-"""Of the second version of the track; submissions by the first one, without ``_v2``, are no longer taken."""
+"""File of the second version of the track; submissions by the first one, without ``_v2``, are no longer accepted."""
 CRF = 14
 """Constant rate factor of H.264 that submissions are encoded with."""
 
 
 class Video(NamedTuple):
-    """A video of a submission; ``frames`` is None where only the benchmark's own files say how many it has."""
+    """A video of a submission; ``frames`` is None if the number is only in the benchmark's files."""
 
     participant: str
     sequence: str
@@ -60,7 +60,7 @@ class BenchmarkTrack:
     def videos(self, data: Path | None = None) -> Iterator[Video]:
         """All videos of a submission.
 
-        ``data`` is the benchmark's folder; the tracking in it tells how many frames there are where that is not published.
+        ``data`` is the benchmark's folder; its tracking gives the number of frames if that is not published.
         Raises `InputError` for tracking that is missing or damaged.
         """
         for participant, sequences in self.sequences.items():
