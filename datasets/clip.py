@@ -168,8 +168,7 @@ class CaptureClip:
         return HeadRegions(self.head, self.shape, self.static_offset)
 
     def _processed(self, key: FrameKey, part: Literal["image", "mask"]) -> ByteArray:
-        """Image or mask of a frame after all pixel steps, read-only; both are cached because they are computed
-        together."""
+        """Image or mask of a frame after all pixel steps, read-only; both are cached because they are computed together."""
         found = self.store.find((self.fingerprint, key, part))
         if found is not None:
             return found

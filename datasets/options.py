@@ -26,8 +26,7 @@ class CaptureOptions:
     """Head model for captures that bring none: FLAME pickle or npz."""
 
     cy: Literal["auto", "top", "bottom", "centre"] = "auto"
-    """Principal-point convention of the reader ga; auto takes the declared one, else compares with the
-    images."""
+    """Principal-point convention of the reader ga; auto takes the declared one, else compares with the images."""
 
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")] = ()
     """A setting of the reader, such as `exclude=tongue.yaml`, as reader_settings of `headbench run`; repeatable."""

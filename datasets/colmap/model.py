@@ -277,8 +277,7 @@ _PLACES = (".", "sparse/0", "sparse")
 
 
 def find_model(path: str | PathLike[str]) -> tuple[Path, Path] | None:
-    """Files of cameras and images of the model in a folder or its ``sparse/0`` or ``sparse``; binary files are
-    preferred."""
+    """Files of cameras and images of the model in a folder or its ``sparse/0`` or ``sparse``; binary files are preferred."""
     for place in _PLACES:
         for suffix in (".bin", ".txt"):
             files = Path(path) / place / f"cameras{suffix}", Path(path) / place / f"images{suffix}"

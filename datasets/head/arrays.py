@@ -322,6 +322,5 @@ _in_memory: WeakValueDictionary[str, HeadArrays] = WeakValueDictionary()
 
 
 def in_memory(head: HeadArrays, fingerprint: str) -> HeadArrays:
-    """The head with the same fingerprint that is already in memory, else ``head``, since captures have copies of one
-    head."""
+    """The head with the same fingerprint that is already in memory, else ``head``, since captures have copies of one head."""
     return _in_memory.setdefault(fingerprint, head)

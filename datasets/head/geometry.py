@@ -8,8 +8,7 @@ from ...bench.contracts import FloatArray, IntArray
 
 
 def smoothstep(values: FloatArray, low: float | FloatArray, high: float | FloatArray) -> FloatArray:
-    """Smoothstep: 0 at ``low``, 1 at ``high`` (which may be smaller), with a cubic of zero slope at both ends
-    between."""
+    """Smoothstep: 0 at ``low``, 1 at ``high`` (which may be smaller), with a cubic of zero slope at both ends between."""
     t = np.clip((values - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 

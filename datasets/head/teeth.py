@@ -80,8 +80,7 @@ def with_teeth(arrays: HeadArrays) -> HeadArrays:
 
 
 def with_teeth_where_possible(arrays: HeadArrays) -> HeadArrays:
-    """Append teeth to a head without them; if the rings of the lips are not found, log the reason and return it
-    unchanged."""
+    """Append teeth to a head without them; if the rings of the lips are not found, log the reason and return it unchanged."""
     if "teeth" in arrays.regions:
         return arrays
     try:

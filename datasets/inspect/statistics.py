@@ -171,8 +171,7 @@ def _reach(clip: CaptureClip, expressions: FloatArray) -> FloatArray:
 
 
 def expression_space(clip: CaptureClip) -> ExpressionSpace:
-    """The `ExpressionSpace` of a clip. It is computed exactly in the space of coefficients, without V x T values in
-    memory."""
+    """The `ExpressionSpace` of a clip. It is computed exactly in the space of coefficients, without V x T values in memory."""
     excluded = {key.timestep for key in clip.excluded}
     test = {key.timestep for key in clip.splits.get("self_reenactment", ())}
     timesteps = [t for t in sorted(clip.poses) if t not in excluded]

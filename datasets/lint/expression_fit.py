@@ -54,8 +54,7 @@ class ExpressionFit(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """Geometric mean of both: the mean is dominated by the few vertices that move much, the median by the
-        others."""
+        """Geometric mean of both: the mean is dominated by the few vertices that move much, the median by the others."""
         return math.sqrt(self.mean * self.median)
 
 

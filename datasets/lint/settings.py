@@ -31,8 +31,7 @@ class LintSettings(CaptureOptions):
     """Frames to decode for the checks of colour, masks and tracking, spread over timesteps and cameras."""
 
     duplicates: int = 600
-    """Number of images to decode in the search for near-duplicates between splits. Identical files are searched among
-    all images."""
+    """Number of images to decode in the search for near-duplicates between splits. Identical files are searched among all images."""
 
     camera_timesteps: int = 8
     """Number of timesteps on which each camera is compared with the others; 0 skips this."""

@@ -261,8 +261,7 @@ class _Meshes:
         }
 
     def _rotations(self, path: Path, count: int) -> FloatArray | None:
-        """Concatenated axis-angle vectors from 6D rotations or axis-angle in a file; None if they are
-        missing."""
+        """Concatenated axis-angle vectors from 6D rotations or axis-angle in a file; None if they are missing."""
         if not path.is_file():
             return None
         values = self._numbers(path)

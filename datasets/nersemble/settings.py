@@ -47,8 +47,7 @@ class PrepareSettings:
     """Soft edges with masks: "unblend" removes the light of the BACKGROUND still, if there is one; "plain" multiplies
     by the mask, as VHAP does, which leaves fringes."""
     cut: bool = False
-    """If cameras have different frames, keep the common ones instead of raising an error; tracking is cut
-    accordingly."""
+    """If cameras have different frames, keep the common ones instead of raising an error; tracking is cut accordingly."""
     workers: int = 0
     """Number of cameras processed at a time; 0 stands for one per processor core."""
     check: bool = False

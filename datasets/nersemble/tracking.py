@@ -57,8 +57,7 @@ class TrackedSequence:
         return {**rows, "translation": moved.astype(np.float32), **self.constant}
 
     def canonical(self) -> dict[str, FloatArray]:
-        """``canonical_flame_param.npz``: zeros except for identity, static offset and an open jaw
-        (float64)."""
+        """``canonical_flame_param.npz``: zeros except for identity, static offset and an open jaw (float64)."""
         zeros = {
             key: np.zeros_like(values[:1]) for key, values in self.frames.items() if key != "dynamic_offset"
         }

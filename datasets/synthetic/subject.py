@@ -299,8 +299,7 @@ def _weights_on(corners: IntArray, parents: IntArray, weights: FloatArray) -> Fl
 def _split(
     triangles: IntArray, owner: IntArray, middle: IntArray, position: FloatArray
 ) -> tuple[IntArray, IntArray]:
-    """Replace each triangle by 1 to 4, depending on which of its edges (01, 12, 20) have a midpoint (>=
-    0)."""
+    """Replace each triangle by 1 to 4, depending on which of its edges (01, 12, 20) have a midpoint (>= 0)."""
     count = (middle >= 0).sum(axis=1)
     done, whose = [triangles[count == 0]], [owner[count == 0]]
 

@@ -87,8 +87,7 @@ def export_pose(settings: ExportOptions, name: str, progress: Progress) -> Comma
 
 
 def _least_psnr(avatar: SplatAvatar, pose: HeadPose, found: StoredSplats) -> float:
-    """Minimum PSNR over `VIEWS`, dB: the file's splats rendered by this package against the avatar's frames,
-    on white."""
+    """Minimum PSNR over `VIEWS`, dB: the file's splats rendered by this package against the avatar's frames, on white."""
     source = Source(avatar, pose, np.zeros(3), np.zeros((4, 3)))
     extent = np.quantile(source.seen(pose).means, (0.005, 0.995), axis=0)
     distance = float((extent[1] - extent[0]).max()) / np.tan(np.radians(FIELD_OF_VIEW))

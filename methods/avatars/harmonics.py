@@ -29,8 +29,7 @@ class Harmonics(NamedTuple):
     rest: Tensor
     """(N, 3, 15)."""
     residual: Tensor | None
-    """(N,) root of the weighted mean squared error over directions and channels, in colour units; None if nothing was
-    fitted."""
+    """(N,) root of the weighted mean squared error over directions and channels, in colour units; None if nothing was fitted."""
 
 
 def harmonics_of(avatar: SplatAvatar, pose: HeadPose, directions: int) -> Harmonics:

@@ -35,8 +35,7 @@ class ExportOptions(AvatarOptions):
     """Timestep of the capture; default: the first of its training frames."""
 
     directions: int = 96
-    """Number of viewing directions, evenly spread over the sphere, in which colours other than spherical harmonics are
-    sampled."""
+    """Number of viewing directions, evenly spread over the sphere, in which colours other than spherical harmonics are sampled."""
 
     dependent = (DependentOptions(("timestep", "reader", "head", "cy", "set"), "capture"),)
 
@@ -59,8 +58,7 @@ class ExportGlbSettings(ExportOptions):
 
 @dataclass(frozen=True)
 class ExportSogSettings(ExportOptions):
-    """Write an avatar in one pose as SOG, for web viewers, in about a sixth of a PLY's bytes. Needs gaussforge (extra
-    `formats`)."""
+    """Write an avatar in one pose as SOG, for web viewers, in about a sixth of a PLY's bytes. Needs gaussforge (extra `formats`)."""
 
 
 @dataclass(frozen=True)

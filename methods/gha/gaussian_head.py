@@ -149,8 +149,7 @@ def feature_background(background: Tensor, channels: int) -> Tensor:
 
 
 def feature_camera(camera: Camera, upscale: int) -> Camera:
-    """The camera of the feature image: ``upscale`` times smaller, its image padded at the right and below to whole
-    pixels."""
+    """The camera of the feature image: ``upscale`` times smaller, its image padded at the right and below to whole pixels."""
     if upscale == 1:
         return camera
     width, height = -(-camera.width // upscale), -(-camera.height // upscale)

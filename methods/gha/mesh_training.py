@@ -252,8 +252,7 @@ FOLDER, RESULT_FILE = "mesh", "mesh.safetensors"
 
 
 class MeshResult(NamedTuple):
-    """Result of the mesh phase: its tensors by name, iterations done, and seconds spent, including those of
-    its start."""
+    """Result of the mesh phase: its tensors by name, iterations done, and seconds spent, including those of its start."""
 
     tensors: Mapping[str, Tensor]
     iterations: int

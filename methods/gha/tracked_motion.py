@@ -73,8 +73,7 @@ class TrackedMotion(NamedTuple):
         return cls(encode(rest), codes, every, weights, config.displacement_scale)
 
     def error(self, network: Mlp, weights: Weights, generator: torch.Generator) -> Tensor:
-        """Mean squared error of the network's displacements, relative to the vertices' motion, over a draw of codes
-        and vertices."""
+        """Mean squared error of the network's displacements, relative to the vertices' motion, over a draw of codes and vertices."""
         device = self.codes.device
         rows = to_device(torch.randint(self.encoded.shape[0], (POINTS_AT_ONCE,), generator=generator), device)
         drawn = to_device(torch.randint(len(self.codes), (CODES_AT_ONCE,), generator=generator), device)

@@ -213,8 +213,7 @@ class Inference:
         return module.Trained(levels, arrays["table"], low, box.side, *prior, density, color)
 
     def _starts(self, condition: Tensor) -> np.ndarray:
-        """(2, units) contributions of the conditions to the first layer: outside the mouth, where all are one, and at
-        the mouth."""
+        """(2, units) contributions of the conditions to the first layer: outside the mouth, where all are one, and at the mouth."""
         weight = self.parameters["density_0"].detach().numpy()
         width = self.field.architecture.conditions
         conditions = np.stack([np.ones(width, np.float32), condition[:width].numpy().astype(np.float32)])

@@ -154,8 +154,7 @@ class PosedSurface:
 
     @cached_property
     def _shrinking(self) -> np.ndarray:
-        """(F,) canonical metres per metre of this pose around a triangle: the smallest scale blended there, at most
-        1."""
+        """(F,) canonical metres per metre of this pose around a triangle: the smallest scale blended there, at most 1."""
         scale = (torch.linalg.vector_norm(self.matrices[:, :, :3], dim=(1, 2)) / math.sqrt(3)).numpy()
         neighbours = self.surface.blend.neighbours
         across = np.where(neighbours >= 0, neighbours, np.arange(len(scale))[:, None])

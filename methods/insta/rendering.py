@@ -167,8 +167,7 @@ def camera_rays(camera: Camera, columns: np.ndarray, rows: np.ndarray, jitter: n
 
 
 def pixels_of_hull(camera: Camera, points: FloatArray) -> Region:
-    """Box of the pixels whose rays may hit the convex hull of (N, 3) points; the whole image if a point is behind the
-    camera."""
+    """Box of the pixels whose rays may hit the convex hull of (N, 3) points; the whole image if a point is behind the camera."""
     transform = np.asarray(camera.world_to_camera, np.float64)
     seen = np.asarray(points, np.float64) @ transform[:3, :3].T + transform[:3, 3]
     if seen[:, 2].min() <= 1e-6:

@@ -216,8 +216,7 @@ class OfficialMethod(ABC, Generic[Config]):
         return {"leaks": [], "differences": []}
 
     def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
-        """Texts in their sources that the CPU shim replaces in memory for a training with this number of
-        iterations."""
+        """Texts in their sources that the CPU shim replaces in memory for a training with this number of iterations."""
         return []
 
     def patches_to_render(self, folder: Path, checkout: Checkout) -> list[Patch]:
@@ -267,8 +266,7 @@ class OfficialMethod(ABC, Generic[Config]):
         return [*python, str(work.root / LAUNCHER.name), str(work.root / PLAN), *script]
 
     def _order(self, fit: Fit, work: Workplace) -> list[str]:
-        """Names of the images in the order of the native method with this seed, one for each iteration; empty for
-        their order."""
+        """Names of the images in the order of the native method with this seed, one for each iteration; empty for their order."""
         if self.config.order == "published":
             return []
         images = read_json(work.root / EXPORTED)["images"]
@@ -297,8 +295,7 @@ class OfficialMethod(ABC, Generic[Config]):
         return inspect_interpreter(self.name, self.config, self.repository)
 
     def check(self, clip: Clip | None, budget: Budget) -> None:
-        """Raise `InputError` for a missing checkout or interpreter, and for a clip or budget that the code does not
-        support."""
+        """Raise `InputError` for a missing checkout or interpreter, and for a clip or budget that the code does not support."""
         self._checked(clip, budget)
 
     def _checked(self, clip: Clip | None, budget: Budget) -> Checkout:

@@ -14,8 +14,7 @@ from ...datasets.steps.masks import recomposite
 
 
 def check_masks(clip: Clip) -> None:
-    """Raise `InputError` for a clip without masks, judged by its first training frame; `straight_rgba` checks the
-    others."""
+    """Raise `InputError` for a clip without masks, judged by its first training frame; `straight_rgba` checks the others."""
     coverage_of(clip, clip.splits["train"][0])
 
 

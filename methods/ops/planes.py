@@ -286,16 +286,14 @@ def _shader(from_position: Tensor, of_direction: Tensor, last: Tensor, samples: 
 
 
 def in_steps(values: Tensor) -> tuple[Tensor, Tensor]:
-    """(N, H) int16 and (H,) float32 steps; the error is at most half a step, 1.5e-5 of the largest value of a
-    column."""
+    """(N, H) int16 and (H,) float32 steps; the error is at most half a step, 1.5e-5 of the largest value of a column."""
     largest = values.abs().amax(0) if len(values) else values.new_zeros(values.shape[1])
     steps = (largest / torch.iinfo(torch.int16).max).clamp_min(torch.finfo(values.dtype).tiny)
     return (values / steps).round_().to(torch.int16), steps
 
 
 def direction_table(of_direction: Tensor, samples: int) -> Tensor:
-    """(3 L, H): contribution of each coordinate to the hidden layer at L samples from -1 to 1, by (27, H) weights of
-    `encode`."""
+    """(3 L, H): contribution of each coordinate to the hidden layer at L samples from -1 to 1, by (27, H) weights of `encode`."""
     along = torch.linspace(-1, 1, samples, dtype=torch.float64)
     # Selects one coordinate in each wave.
     waves = encode(along[:, None].expand(-1, AXES)).unflatten(1, (-1, AXES))

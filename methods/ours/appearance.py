@@ -107,8 +107,7 @@ class OursAppearance:
         return {name: (value.to(self._device), rate) for name, (value, rate) in initial.items()}
 
     def stored(self, optimiser: Optimiser) -> dict[str, Tensor]:
-        """Trained `parameters` in the form of an avatar: the factors on directions are part of the
-        weights."""
+        """Trained `parameters` in the form of an avatar: the factors on directions are part of the weights."""
         return {name: optimiser[name] for name in self.parameters()} | self._network(optimiser)
 
     def begin(self, timeline: Timeline) -> None:
@@ -208,8 +207,7 @@ def driving_coefficients(
 
 
 def softened(offsets: Tensor, softness: float) -> Tensor:
-    """|offset|, replaced below ``softness`` by a parabola with continuous slope (Huber 1964): offset^2 / (2
-    softness)."""
+    """|offset|, replaced below ``softness`` by a parabola with continuous slope (Huber 1964): offset^2 / (2 softness)."""
     if softness == 0:
         return offsets.abs()
     zero = torch.zeros_like(offsets)

@@ -274,8 +274,7 @@ def pixel_footprint(clip: Clip, center: FloatArray) -> float:
 
 
 def largest_displacements(mesh: SubjectMesh, poses: list[HeadPose]) -> FloatArray:
-    """(F,) maximum displacement of a triangle's centroid from the canonical mesh by expression, jaw and eyes,
-    metres."""
+    """(F,) maximum displacement of a triangle's centroid from the canonical mesh by expression, jaw and eyes, metres."""
     largest = torch.zeros(len(mesh.faces), device=mesh.faces.device)
     with torch.no_grad():
         for pose in poses:

@@ -71,8 +71,7 @@ def offset_width(dynamic: Sequence[Dynamic]) -> int:
 
 
 def apply_offsets(splats: LocalSplats, offsets: Tensor, dynamic: Sequence[Dynamic]) -> LocalSplats:
-    """Add (N, `offset_width`) offsets, in the order of ``dynamic``, to logits, local means, quaternions and
-    log-scales."""
+    """Add (N, `offset_width`) offsets, in the order of ``dynamic``, to logits, local means, quaternions and log-scales."""
     parts = dict(zip(dynamic, offsets.split([WIDTHS[name] for name in dynamic], dim=1)))
     if "opacity" in parts:
         parts["opacity"] = parts["opacity"][:, 0]

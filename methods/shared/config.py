@@ -171,8 +171,7 @@ and rotation (`ga/README.md`)."""
 
 
 def splat_presets(short: Mapping[str, Any], paper: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Presets of a mesh-bound method from its own settings for short and published runs, with budgets and splat
-    settings."""
+    """Presets of a mesh-bound method from its own settings for short and published runs, with budgets and splat settings."""
     return {
         "smoke": {"budget": {"iterations": 60}, **short, "splats": SHORT_SPLATS},
         "demo": {"budget": {"iterations": 2_000}, **short, "splats": {**SHORT_SPLATS, "max_splats": 20_000}},

@@ -32,8 +32,7 @@ REPORT_EVERY = 10  # iterations between reads of the loss, each of which waits f
 
 
 class Trainable(Protocol):
-    """Trainable part of a method. Random numbers are drawn by iteration (`schedule`), never from a global
-    state."""
+    """Trainable part of a method. Random numbers are drawn by iteration (`schedule`), never from a global state."""
 
     @property
     def optimiser(self) -> Optimiser: ...
@@ -203,8 +202,7 @@ def _estimate(
     clock: Callable[[], float],
     wait: Callable[[], None],
 ) -> int:
-    """Number of iterations in a number of seconds, at least one, estimated from a few steps without
-    effect."""
+    """Number of iterations in a number of seconds, at least one, estimated from a few steps without effect."""
     trainable.begin(Timeline(published_length, published_length))
     durations = []
     for step in range(1, TIMED_STEPS + 2):

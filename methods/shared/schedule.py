@@ -20,8 +20,7 @@ Item = TypeVar("Item")
 
 
 def evenly(items: Sequence[Item], most: int) -> list[Item]:
-    """Evenly spread items, up to a maximum number, including the first and the last if there are two or
-    more."""
+    """Evenly spread items, up to a maximum number, including the first and the last if there are two or more."""
     rows = np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int))
     return [items[row] for row in rows]
 

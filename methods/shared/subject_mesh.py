@@ -85,8 +85,7 @@ def centroid_displacements(one: Tensor, other: Tensor, faces: Tensor) -> Tensor:
 
 
 class BoundedCache(Generic[Value]):
-    """Values by key, computed on request; the least recently used ones are dropped beyond a number of
-    entries."""
+    """Values by key, computed on request; the least recently used ones are dropped beyond a number of entries."""
 
     def __init__(self, compute: Callable[[int], Value], entries: int):
         self._compute, self._entries = compute, max(entries, 1)

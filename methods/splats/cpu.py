@@ -22,8 +22,7 @@ KERNEL = Kernel(
 
 
 def instruction_sets() -> dict[str, str]:
-    """Available instruction sets of the kernel, by backend name, the fastest first; empty if it is
-    missing."""
+    """Available instruction sets of the kernel, by backend name, the fastest first; empty if it is missing."""
     available = KERNEL.instruction_sets
     return {"cpu": available[0], **{f"cpu-{name}": name for name in available}} if available else {}
 

@@ -233,8 +233,7 @@ def draw(gsplat: Any, request: Request) -> Rendering:
 
 
 class _TakeAbsolute(torch.autograd.Function):
-    """Pass the 2D means through; the gradient of a second input is the absolute gradients that gsplat stores as an
-    attribute."""
+    """Pass the 2D means through; the gradient of a second input is the absolute gradients that gsplat stores as an attribute."""
 
     @staticmethod
     def forward(ctx: Any, means2d: Tensor, absolute: Tensor, holder: list[Tensor]) -> Tensor:

@@ -265,8 +265,7 @@ def _composite_chunk(
 
 
 class _CollectAbsolute(torch.autograd.Function):
-    """Pass means (P, M, 2) through; the gradient of a second input (M, 2) is the sum of their absolute gradients over
-    P."""
+    """Pass means (P, M, 2) through; the gradient of a second input (M, 2) is the sum of their absolute gradients over P."""
 
     @staticmethod
     def forward(ctx: Any, means: Tensor, absolute: Tensor) -> Tensor:

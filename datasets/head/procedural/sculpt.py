@@ -98,8 +98,7 @@ def feature_points() -> FloatArray:
 
 
 def clean(vertices: FloatArray, faces: IntArray, *, merge: float, flip: bool) -> tuple[FloatArray, IntArray]:
-    """Largest piece of the mesh, with vertices nearer than ``merge`` metres merged, and slivers flipped if
-    requested."""
+    """Largest piece of the mesh, with vertices nearer than ``merge`` metres merged, and slivers flipped if requested."""
     import pymeshlab
 
     meshes = pymeshlab.MeshSet()

@@ -212,8 +212,7 @@ class FitProblem:
         return np.asarray(result / _MILLIMETRES)
 
     def _columns(self, head: HeadAsset, canonical: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(n, 3, N) vertices without eyelids, (n, 3, N) eyelids alone, and (J, 3, N) joints, by the columns of z;
-        millimetres."""
+        """(n, 3, N) vertices without eyelids, (n, 3, N) eyelids alone, and (J, 3, N) joints, by the columns of z; millimetres."""
         rows, lids = self.vertices, self._free_size - self.expression_size
         columns = [9 * (joint - 1) + entry for joint, entry in self._correctives]
         expression = np.asarray(head.expression_basis, dtype=np.float64)

@@ -22,8 +22,7 @@ class RefitSettings:
     """
 
     static_offset: Literal["zero", "residual"] = "zero"
-    """Residual of the neutral head after fitting identity: dropped, or kept as a static offset (only for equal
-    topologies)."""
+    """Residual of the neutral head after fitting identity: dropped, or kept as a static offset (only for equal topologies)."""
 
     neck: Literal["fold", "keep"] = "fold"
     """Rotation of the neck: merged into the head's, as in monocular trackers, or kept."""
@@ -38,8 +37,7 @@ class RefitSettings:
     """Weight of a vertex around the eyes relative to other vertices of the face."""
 
     prior_mm: float = 0.005
-    """Regularisation: root mean square distance with the same cost as a coefficient of one standard deviation,
-    millimetres."""
+    """Regularisation: root mean square distance with the same cost as a coefficient of one standard deviation, millimetres."""
 
     coefficient_bound: float = 6.0
     """Largest magnitude of identity and expression coefficients, standard deviations."""

@@ -117,8 +117,7 @@ def _by_camera(folder: Path, participant: str, method: str) -> dict[tuple[str, s
 
 
 def _check_lengths(where: Path, track: BenchmarkTrack, counts: dict[Video, int]) -> None:
-    """Check that cameras of a sequence have equal lengths, and sequences of a participant the published number of
-    frames."""
+    """Check that cameras of a sequence have equal lengths, and sequences of a participant the published number of frames."""
     by_sequence: dict[tuple[str, str], set[int]] = {}
     for video, count in counts.items():
         by_sequence.setdefault((video.participant, video.sequence), set()).add(count)

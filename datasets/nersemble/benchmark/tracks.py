@@ -98,8 +98,7 @@ TRACKS: Mapping[TrackName, BenchmarkTrack] = {track.name: track for track in (NV
 
 
 def tracking_file(data: Path, participant: str, sequence: str) -> Path:
-    """Tracking of a sequence in the benchmark's folder. Raises `InputError` if it is missing or of version
-    1."""
+    """Tracking of a sequence in the benchmark's folder. Raises `InputError` if it is missing or of version 1."""
     folder = data / "mono_flame_avatar" / participant / "sequences" / sequence / "tracking"
     path = folder / TRACKING_FILE
     if not path.is_file():

@@ -105,8 +105,7 @@ def mouth_patch(strength: FloatArray, atlas: MouthAtlas) -> np.ndarray:
 def _camera_strength(
     colours: ByteArray, seen: np.ndarray, atlas: MouthAtlas
 ) -> tuple[FloatArray, np.ndarray]:
-    """(T, H, W) standard deviations by which each pixel looks covered to one camera, and whether it is
-    visible."""
+    """(T, H, W) standard deviations by which each pixel looks covered to one camera, and whether it is visible."""
     known = seen & (seen.mean(axis=0) > _LEAST_SEEN)
     rows = known.any(axis=(1, 2))
     strength = np.zeros(known.shape, np.float32)

@@ -17,8 +17,7 @@ class ExportHtmlSettings(AvatarOptions):
     """
 
     capture: str | None = None
-    """Capture whose poses determine the range of the sliders and the pose of the head; without one the range is -2 to
-    2."""
+    """Capture whose poses determine the range of the sliders and the pose of the head; without one the range is -2 to 2."""
 
     expressions: int = 10
     """Number of leading expressions with sliders."""

@@ -146,7 +146,6 @@ def _encloses(camera: Camera, side: int) -> bool:
 
 
 def _centred(center: float, side: int) -> tuple[int, float]:
-    """Start of a window with a point in its middle, and the offset of the point to the right of the middle, at most
-    half a pixel."""
+    """Start of a window with a point in its middle, and the offset of the point to the right of the middle, at most half a pixel."""
     begin = math.floor(center - side / 2 + 0.5)
     return begin, center - begin - side / 2

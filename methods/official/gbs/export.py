@@ -139,8 +139,7 @@ class VideoHead:
         }
 
     def _write_lists(self, folder: Path) -> None:
-        """Triangles of the back of the head and vertices of the neck: theirs for FLAME, else those of the head's
-        regions."""
+        """Triangles of the back of the head and vertices of the neck: theirs for FLAME, else those of the head's regions."""
         if self.is_flames:
             for name in (BACK_FILE, NECK_FILE):
                 content = read_bytes(self._checkout / name, "a list of numbers", MOST_TEMPLATE)

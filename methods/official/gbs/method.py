@@ -202,8 +202,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         return name.startswith("pred_") and not name.startswith("pred_mask_")
 
     def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
-        """A render on black, composited on the background by its coverage, after its frame is verified by the ground
-        truth."""
+        """A render on black, composited on the background by its coverage, after its frame is verified by the ground truth."""
         number = path.name.removeprefix("pred_")
         check_mark(path.with_name(f"gt_{number}"), frame.number)
         parts = []

@@ -75,8 +75,7 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
     config_class, repository = GHAOfficialConfig, GHA_REPOSITORY
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
-        """Check that the background is white, pixels are not skewed, timesteps have all cameras and the head has a
-        face."""
+        """Check that the background is white, pixels are not skewed, timesteps have all cameras and the head has a face."""
         where = f"clip {clip.subject}"
         _check_white(clip.background, where)
         for name in sorted({key.camera for keys in clip.splits.values() for key in keys}):

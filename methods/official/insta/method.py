@@ -87,8 +87,7 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
     def export(
         self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
     ) -> dict[str, FrameKey]:
-        """Write the training frames as a tracked video, and the files that the program opens in its working
-        directory."""
+        """Write the training frames as a tracked video, and the files that the program opens in its working directory."""
         head = VideoMesh.of(Subject.of(clip), clip.head, checkout)
         head.write_masks(work.program)
         _copy_main(checkout, work)

@@ -59,8 +59,7 @@ class ParitySettings(ExecutionOptions):
     """Mean difference of PSNR, in decibels, up to which the two count as equal."""
 
     samples: int = 5_000
-    """Initial number of splats on the head, for gbs; published: 50,000, whose differences for each expression take
-    gigabytes."""
+    """Initial number of splats on the head, for gbs; published: 50,000, whose differences for each expression take gigabytes."""
 
     size: str = "96x136"
     """Width x height of the synthetic capture's images in pixels."""

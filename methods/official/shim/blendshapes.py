@@ -172,8 +172,7 @@ def nearest_features(
 
 
 def ids_and_weights(points: Tensor, grid: Tensor, align_corners: bool) -> tuple[Tensor, Tensor]:
-    """Values (P, 8) of an integer grid (D, H, W) at the nodes around (P, 3) points in [-1, 1] x, y, z, and their
-    weights."""
+    """Values (P, 8) of an integer grid (D, H, W) at the nodes around (P, 3) points in [-1, 1] x, y, z, and their weights."""
     sizes = torch.tensor(grid.shape[::-1])
     scaled = (points * 0.5 + 0.5) * (sizes - 1 if align_corners else sizes) - (0 if align_corners else 0.5)
     low = scaled.floor()

@@ -15,8 +15,7 @@ NEAR = 0.2
 
 
 class GaussianRasterizationSettings(NamedTuple):
-    """The published settings; matrices multiply row vectors from the right. ``prefiltered`` and ``debug`` have no
-    effect."""
+    """The published settings; matrices multiply row vectors from the right. ``prefiltered`` and ``debug`` have no effect."""
 
     image_height: int
     image_width: int
