@@ -27,7 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
         except BrokenPipeError:
             if not _reader_has_gone():
                 raise
-            return ExitCode.OK  # `headbench --help | head -1`: not an error of ours
+            return ExitCode.OK  # `headbench --help | head -1`: not an error
         finally:
             show(end="")  # what is still buffered, here, where an error can be reported
     except HeadbenchError as error:

@@ -1,4 +1,4 @@
-"""A capture as methods and the harness see it: a `Clip` over files on disk."""
+"""A `Clip` over files on disk."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from .region_masks import FOREGROUND, HeadRegions, select
 
 
 class FrameFiles(NamedTuple):
-    """Where a frame's pixels are, and which frame they were recorded as if a step gave it another key since.
+    """Files of a frame's pixels, and its recorded key if a step changed the key.
 
-    A clip of a reader from outside may have no files; its pixels come from `CaptureClip.source`.
+    A clip of an external reader may have no files; its pixels come from `CaptureClip.source`.
     """
 
     image: Path | None
@@ -42,27 +42,24 @@ class FrameFiles(NamedTuple):
 
 
 class FramePixels(NamedTuple):
-    """A frame on its way through pixel steps, not yet rounded to 8 bits."""
+    """A frame between pixel steps, not yet rounded to 8 bits."""
 
-    image: (
-        FloatArray  # (H, W, 3) float32 in [0, 1], composited on the clip's background as it is at that point
-    )
-    coverage: FloatArray | None  # (H, W) float32 in [0, 1]; None where the capture has no mask, and stays so
+    image: FloatArray  # (H, W, 3) float32 in [0, 1], composited on the current background
+    coverage: FloatArray | None  # (H, W) float32 in [0, 1]; None without a mask, also after all steps
 
 
 PixelStep = Callable[[FrameKey, FramePixels], FramePixels]
-"""Changes the pixels of a frame; the key is that which the frame was recorded as."""
+"""Changes the pixels of a frame, which is given by its recorded key."""
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureClip:
-    """A `Clip` (see there) whose images stay on disk until asked for.
+    """A `Clip` whose images are read from disk on request.
 
     Attributes
     ----------
     files : Mapping[FrameKey, FrameFiles]
-        Files of every frame, including excluded frames. With pixel steps, methods see other pixels
-        than the files hold.
+        Files of every frame, including excluded frames. Pixel steps change these pixels for methods.
     source_fingerprint : str
         Digest of the content of all files of the clip, independent of their location.
     store : ImageStore
@@ -99,7 +96,7 @@ class CaptureClip:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hex digest of the files' content, the steps with their parameters, and what the splits hold."""
+        """Hex digest of the files' content, the steps with their parameters, and the splits."""
         splits = {name: [str(key) for key in keys] for name, keys in self.splits.items()}
         excluded = {str(key): reason for key, reason in self.excluded.items()}
         return digest(self.source_fingerprint, [*self.steps], splits, excluded, self.background)
@@ -117,7 +114,7 @@ class CaptureClip:
         return self.store.image(files.image, self.background)
 
     def mask(self, key: FrameKey) -> ByteArray | None:
-        """(H, W) 8-bit foreground coverage, read-only; None where the capture has none."""
+        """(H, W) 8-bit foreground coverage, read-only; None if the capture has none."""
         if not self.has_mask(key):
             return None
         if self.pixel_steps:
@@ -126,18 +123,18 @@ class CaptureClip:
         return self._source.mask(files.recorded or key) if files.mask is None else self.store.mask(files.mask)
 
     def has_mask(self, key: FrameKey) -> bool:
-        """Whether a frame has a mask; nothing is decoded where it has a file."""
+        """Whether a frame has a mask; files are not decoded."""
         files = self._files(key)
         return files.mask is not None if files.image is not None else self._source_has_masks
 
     @cached_property
     def region_names(self) -> tuple[str, ...]:
-        """Regions that `region_masks` knows here, see `region_masks` the module."""
+        """Regions of `region_masks` for this clip."""
         masked = all(map(self.has_mask, self.files))
         return ((FOREGROUND,) if masked else ()) + self._head_regions.names
 
     def region_masks(self, key: FrameKey, names: Sequence[str]) -> dict[str, BoolArray]:
-        """(H, W) masks of the pixels in which each region is seen; all False where it is not."""
+        """(H, W) masks of the pixels in which each region is visible."""
         labels = self.store.find((self.fingerprint, key, "regions"))
         if labels is None:
             camera, pose = self.cameras[key.camera], self.poses[key.timestep]
@@ -150,20 +147,20 @@ class CaptureClip:
         return sorted({key.timestep for key in self.splits[split]})
 
     def derive(self, step: str, parameters: Mapping[str, Any], **changes: Any) -> CaptureClip:
-        """Copy with some fields changed and the step that changed them on record."""
+        """Copy with some fields changed and the step recorded."""
         record = StepRecord(step, parameters, self.fingerprint)
         return replace(self, steps=(*self.steps, record), **changes)
 
     def derive_pixels(
         self, step: str, parameters: Mapping[str, Any], change: PixelStep, **changes: Any
     ) -> CaptureClip:
-        """Copy whose frames pass through one more pixel step, on record."""
+        """Copy with one more pixel step, which is recorded."""
         ground = self.background if self.read_background is None else self.read_background
         steps = (*self.pixel_steps, change)
         return self.derive(step, parameters, pixel_steps=steps, read_background=ground, **changes)
 
     def recorded(self, key: FrameKey) -> FrameKey:
-        """The key that a frame was recorded as: the same unless a step renumbered the frames."""
+        """The recorded key of a frame, which differs if a step renumbered the frames."""
         return self._files(key).recorded or key
 
     @cached_property
@@ -171,7 +168,7 @@ class CaptureClip:
         return HeadRegions(self.head, self.shape, self.static_offset)
 
     def _processed(self, key: FrameKey, part: Literal["image", "mask"]) -> ByteArray:
-        """Image or mask of a frame after all pixel steps, read-only; both are kept as one gives the other."""
+        """Image or mask of a frame after all pixel steps, read-only; both are cached because they are computed together."""
         found = self.store.find((self.fingerprint, key, part))
         if found is not None:
             return found
@@ -200,7 +197,7 @@ class CaptureClip:
 
     @cached_property
     def _source_has_masks(self) -> bool:
-        """By one frame: all frames of a clip have a mask, or none."""
+        """Checked for one frame, since all or no frames of a clip have a mask."""
         return (
             self._source.mask(next(key for keys in self._source.splits.values() for key in keys)) is not None
         )
@@ -213,17 +210,17 @@ class CaptureClip:
 
 
 def check_apart(clip: CaptureClip, out: Path) -> None:
-    """Raise `InputError` where images of a capture lie in the folder that is to be written."""
+    """Raise `InputError` if images of a capture are in the output folder."""
     images = [files.image for files in clip.files.values() if files.image is not None]
     if any(out.resolve() in image.resolve().parents for image in images):
-        raise InputError("command line", "--out", "a folder apart from the capture", str(out))
+        raise InputError("command line", "--out", "a folder outside the capture", str(out))
 
 
 def as_capture(clip: Clip) -> CaptureClip:
-    """Any clip as a `CaptureClip`, so that every step and command works on it; one that is such comes back itself.
+    """Any clip as a `CaptureClip` for steps and commands; a `CaptureClip` is returned unchanged.
 
-    Pixels stay where they are and are asked of ``clip``. Raises `InputError` where its head model is none in FLAME's
-    layout, or the subject's identity or a pose is of another size.
+    Pixels are read from ``clip``. Raises `InputError` if its head model is not in FLAME's layout, or the subject's
+    identity or a pose has another size.
     """
     if isinstance(clip, CaptureClip):
         return clip

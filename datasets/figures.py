@@ -1,4 +1,4 @@
-"""Figures by matplotlib, without a window: one style for the pictures of all commands on captures."""
+"""Matplotlib figures without a window, in one style for all commands on captures."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from ..bench.contracts import ByteArray
 Colour = tuple[int, int, int]
 
 TRAIN, HELD_OUT = "#0072b2", "#d55e00"
-"""Two of Okabe and Ito's colours, told apart with any colour vision."""
+"""Two of Okabe and Ito's colours, distinguishable with any colour vision."""
 MUTED, RULE, LEAK = "#737373", "#d6d6d6", "#be1e2d"
 DPI = 100
 LONGEST = 2**16 - 1
-"""Pixels of a side that matplotlib draws at most; a larger figure is drawn with fewer of them."""
+"""Maximum side of a figure in matplotlib, pixels; larger figures get a lower resolution."""
 
 _STYLE: Any = {
-    "text.parse_math": False,  # names hold dollar signs
+    "text.parse_math": False,  # names may have dollar signs
     "font.size": 10,
     "axes.titlesize": 11,
     "axes.titlelocation": "left",
@@ -45,13 +45,13 @@ _STYLE: Any = {
 
 @contextmanager
 def new_figure(width: float, height: float) -> Iterator[Figure]:
-    """An empty figure of a size in inches; everything is drawn, and turned into pixels, within the context."""
-    with style.context(["default", _STYLE]):  # whatever the user's matplotlibrc says, such as text.usetex
+    """An empty figure of a size in inches; drawing and rasterising must happen within the context."""
+    with style.context(["default", _STYLE]):  # independent of the user's matplotlibrc, such as text.usetex
         yield Figure(figsize=(width, height), dpi=DPI, layout="constrained")
 
 
 def bands(figure: Figure, heights: Sequence[float]) -> list[SubFigure]:
-    """Parts of a figure below each other, of heights in these proportions."""
+    """Vertically stacked parts of a figure with proportional heights."""
     return list(np.asarray(figure.subfigures(len(heights), 1, height_ratios=heights)))
 
 
@@ -64,14 +64,14 @@ def pixels(figure: Figure) -> ByteArray:
 
 
 def show(axes: Axes, image: ByteArray, *, frame: bool = False) -> None:
-    """Put an image on axes of its own, without ticks."""
+    """Show an image on new axes without ticks."""
     axes.imshow(image)
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(frame)
 
 
 def shortened(text: str, length: int) -> str:
-    """The text, cut with an ellipsis to so many characters."""
+    """The text, shortened with an ellipsis to a number of characters."""
     return text if len(text) <= length else f"{text[: length - 1]}…"
 
 

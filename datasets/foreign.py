@@ -19,7 +19,7 @@ ARCHIVES = (".7z", ".bz2", ".gz", ".rar", ".tar", ".tgz", ".xz", ".zip", ".zst")
 IMAGES = (".bmp", ".exr", ".heic", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 HEADS = (".npz", ".pkl")
 LOOKED_AT = 2000
-"""Entries of a folder that are looked at, so that a large one costs no more."""
+"""Maximum number of entries of a folder that are inspected."""
 
 TRACK = (
     "headbench does not track: fit FLAME with VHAP to the video or images, export the result in GaussianAvatars' "
@@ -28,31 +28,31 @@ TRACK = (
 
 
 MONOCULAR = (
-    "The reader monocular reads what INSTA's generate.sh makes of Metrical Tracker's output (transforms_train.json, "
+    "The reader monocular reads the output of INSTA's generate.sh for Metrical Tracker (transforms_train.json, "
     "flame/exp, meshes, canonical.obj), and IMavatar's flame_params.json: choose it with --reader monocular "
     "(`headbench run`: --set reader=monocular)."
 )
 
 
 class Foreign(NamedTuple):
-    """The format that was found instead of a capture, and what to do about it."""
+    """The format found instead of a capture, and the remedy."""
 
     found: str
     remedy: str
 
 
 def describe(path: Path) -> Foreign:
-    """Recognise what lies at an existing ``path`` by the names in it; no file is opened but one of a tracker's."""
+    """Recognise the format at an existing ``path`` by file names; only a tracker's file is opened."""
     return _folder(path) if path.is_dir() else _file(path)
 
 
 def frame_route(frame: Mapping[str, Any]) -> str:
-    """The way from a frame of a transforms JSON that names no tracked parameters; "" for a frame that does."""
+    """Remedy for a frame of a transforms JSON without tracked parameters; "" for a frame with them."""
     if "flame_param_path" in frame:
         return ""
     if "mesh_path" in frame or "exp_path" in frame:
         return "Frames with meshes and coefficients are INSTA's: with flame/exp beside them the reader monocular reads them."
-    return f"It has cameras alone, as the JSONs of nerfstudio and instant-ngp. {TRACK}"
+    return f"It has only cameras, like the JSONs of nerfstudio and instant-ngp. {TRACK}"
 
 
 def _file(path: Path) -> Foreign:
@@ -119,7 +119,7 @@ def _nersemble(path: Path, names: list[str]) -> Foreign | None:
 
 
 def _nested(path: Path, names: list[str]) -> Foreign | None:
-    """A folder whose only content is a folder, as archives unpack to."""
+    """A folder that contains only a folder, as extracted archives often do."""
     inside = path / names[0]
     if len(names) > 1 or not inside.is_dir():
         return None
@@ -127,7 +127,7 @@ def _nested(path: Path, names: list[str]) -> Foreign | None:
 
 
 def _tracked(path: Path, names: list[str]) -> Foreign | None:
-    """Other toolkits' results of tracking, and trained models."""
+    """Tracking results of other toolkits, and trained models."""
     known: tuple[tuple[str, str, Callable[[str], bool]], ...] = (
         (
             "VHAP's tracking before its export",
@@ -156,7 +156,7 @@ def _tracked(path: Path, names: list[str]) -> Foreign | None:
         ),
         (
             "a capture of Gaussian Head Avatar",
-            "headbench has no reader for it; prepare the NeRSemble recording that it was made of.",
+            "headbench has no reader for it; prepare the NeRSemble recording from which it was made.",
             lambda name: name == "params" and {"images", "cameras"} <= set(names),
         ),
     )

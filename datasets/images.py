@@ -1,4 +1,4 @@
-"""Images and masks read and written; decoded ones held under a memory bound, least recently used goes first."""
+"""Reading and writing of images and masks, with a memory-bounded LRU cache of decoded ones."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _ROWS = 64
 class ImageStore:
     """Reads images and masks, keeping at most ``limit_mb`` (10^6 bytes) of decoded pixels.
 
-    Safe to share between threads: the lock covers the bookkeeping, never the decoding. Two threads that ask
-    for one image at one time may both decode it. Arrays are shared, hence read-only.
+    Thread-safe; the lock is not held during decoding, so two threads that request an image at once may both decode it.
+    Arrays are shared, hence read-only.
     """
 
     def __init__(self, limit_mb: float = 512.0):
@@ -35,7 +35,7 @@ class ImageStore:
 
     @property
     def held_bytes(self) -> int:
-        """Decoded bytes held now; never above the limit."""
+        """Bytes of cached arrays, at most the limit."""
         return self._held
 
     def image(self, path: Path, background: Iterable[float]) -> ByteArray:
@@ -55,7 +55,7 @@ class ImageStore:
         return array
 
     def find(self, key: Hashable) -> ByteArray | None:
-        """What was kept under a key, None where it was not or has gone since."""
+        """Cached array of a key, or None."""
         with self._lock:
             if key not in self._arrays:
                 return None
@@ -63,7 +63,7 @@ class ImageStore:
             return self._arrays[key]
 
     def keep(self, key: Hashable, array: ByteArray) -> None:
-        """Make an array read-only and keep it while there is room."""
+        """Make an array read-only and cache it."""
         array.flags.writeable = False
         with self._lock:
             if key not in self._arrays and array.nbytes <= self._limit:
@@ -77,7 +77,7 @@ class ImageStore:
 def read_image(path: Path, background: Iterable[float]) -> ByteArray:
     """Decode a PNG or JPEG to (H, W, 3) RGB, straight alpha composited on ``background`` and rounded.
 
-    Raises `InputError` where `read_pixels` does.
+    Raises `InputError` as `read_pixels` does.
     """
     pixels = read_pixels(path)
     if pixels.ndim == 2:
@@ -88,7 +88,7 @@ def read_image(path: Path, background: Iterable[float]) -> ByteArray:
     result = np.empty((*pixels.shape[:2], 3), np.uint8)
     for start in range(
         0, len(pixels), _ROWS
-    ):  # floating-point images of all rows would take ten times the file's
+    ):  # converting all rows to floating point at once would take ten times the memory
         rgba = cv2.cvtColor(pixels[start : start + _ROWS], cv2.COLOR_BGRA2RGBA)
         alpha = rgba[..., 3:].astype(np.float32) / 255
         blended = rgba[..., :3] * alpha + ground * (1 - alpha)
@@ -99,10 +99,10 @@ def read_image(path: Path, background: Iterable[float]) -> ByteArray:
 def read_mask(path: Path, size: tuple[int, int] | None = None, *, own: bool = False) -> ByteArray:
     """Decode a mask to (H, W) 8-bit coverage; ``own``: the alpha channel of the image that it belongs to.
 
-    It is the alpha channel where there is one, else the level of grey, else the largest of the three channels. The
-    entries of a colour table are labels where they are not all grey: whatever is not black then covers fully. So a
-    mask covers what a viewer shows as not black. An alpha channel that is opaque everywhere is no mask, but that of an
-    editor that always saves one, unless it is the image's ``own``. ``size`` and errors are those of `read_pixels`.
+    The coverage is the alpha channel if there is one, else the grey level, else the largest of the three channels.
+    Entries of a colour table that are not all grey are labels: all except black are covered fully. An alpha channel
+    that is opaque everywhere is ignored, since some editors always save one, unless it is the image's ``own``.
+    ``size`` and errors are those of `read_pixels`.
     """
     pixels = read_pixels(path, size)
     if pixels.ndim == 2:
@@ -117,7 +117,7 @@ def read_mask(path: Path, size: tuple[int, int] | None = None, *, own: bool = Fa
 
 
 def is_whole(path: Path, width: int, height: int) -> bool:
-    """Whether an image of that size is there, and complete: a crash can leave a renamed file without its content."""
+    """Whether a complete image of that size exists; a crash can leave a renamed file without content."""
     try:
         info = probe_image(path)
     except InputError:

@@ -1,4 +1,4 @@
-"""Pictures of meshes: an exact z-buffer over scanlines in numpy, Lambert shading, no graphics library.
+"""Rendering of meshes in numpy: an exact scanline z-buffer with Lambert shading.
 
 For figures, overlays and visibility tests, not for training. A head of 10,000 triangles at 400x600, supersampled
 twice, takes about a tenth of a second.
@@ -18,18 +18,18 @@ from .head.geometry import vertex_normals
 
 PAPER = (1.0, 1.0, 1.0)
 CLAY = (0.78, 0.76, 0.74)
-"""Colour of a mesh that has none of its own."""
+"""Default colour of a mesh."""
 
 NEAR = 1e-3
-"""Metres before the camera within which nothing is drawn: a triangle that reaches into it is left out whole."""
+"""Near plane, metres; triangles that cross it are not drawn."""
 
 MAX_LAYERS = 32
-"""Times that triangles, by their bounding boxes, may cover a picture; those of a head do it about four times."""
+"""Maximum ratio of the total area of the triangles' bounding boxes to the image; for a head it is about four."""
 _AT_ONCE = 2**21  # pixels
 
 _LIGHT = (-0.30, -0.45, -0.84)  # camera axes: from the upper left, mostly from the viewer
 _AMBIENT = 0.25
-_BACK_FACE = 0.45  # how bright the inside of a surface is, seen through an opening
+_BACK_FACE = 0.45  # brightness of the inside of a surface
 
 
 class Fragments(NamedTuple):
@@ -59,7 +59,7 @@ def draw_mesh(
     Parameters
     ----------
     vertices : FloatArray
-        (V, 3) in the world, metres. Triangles with a non-finite corner are left out.
+        (V, 3) in the world, metres. Triangles with a non-finite corner are skipped.
     faces : IntArray
         (F, 3), counter-clockwise from outside; the inside is drawn too, darker.
     colors : FloatArray | None
@@ -86,7 +86,7 @@ def draw_mesh(
     layer[hit, :3] = np.clip(shaded, 0, 1)
     layer[hit, 3] = 1
     layer = cv2.resize(layer, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    # The layer is premultiplied: colours are 0 where nothing was hit, so the average needs no division.
+    # The layer is premultiplied: colours are 0 outside the mesh, so the average needs no division.
     ground = np.asarray(background)
     ground = ground.astype(np.float32) / (255 if ground.dtype == np.uint8 else 1)
     picture = opacity * layer[..., :3] + (1 - opacity * layer[..., 3:]) * ground
@@ -96,7 +96,7 @@ def draw_mesh(
 def rasterize_mesh(vertices: FloatArray, faces: IntArray, camera: Camera) -> Fragments:
     """Find the triangle in front at each pixel's centre, exactly and without gaps along shared edges.
 
-    A centre on an edge belongs to one of its two triangles. Among triangles at one depth (to float32) the one of
+    A pixel centre on an edge belongs to one of its two triangles. Among triangles at one depth (to float32) the one of
     lowest index is in front. See `draw_mesh` for ``vertices`` and ``faces``; `NEAR` bounds the depth.
 
     Raises
@@ -111,7 +111,8 @@ def rasterize_mesh(vertices: FloatArray, faces: IntArray, camera: Camera) -> Fra
     front = np.zeros(height * width, dtype=np.uint64)
     for start, end in _parts(corners, width, height):
         place, inverse, which = _fragments(corners[start:end], width, height)
-        # Positive floats order as their bits do: depth above, triangle below, and the largest key is in front.
+        # Positive floats sort like their bits: with depth in the high and triangle in the low bits, the largest key is
+        # in front.
         order = np.uint64(len(kept) - start) - which.astype(np.uint64)
         keys = (np.maximum(inverse, 0).view(np.uint32).astype(np.uint64) << np.uint64(32)) | order
         np.maximum.at(front, place, keys)
@@ -142,7 +143,7 @@ def portrait_camera(
     fill: float = 0.92,
     distance: float = 1.2,
 ) -> Camera:
-    """Place a camera before a head that looks along +z with +y up, so that all of it is in the picture.
+    """Place a camera in front of a head that looks along +z with +y up, so that all of it is visible.
 
     Parameters
     ----------
@@ -205,10 +206,10 @@ def _parts(corners: FloatArray, width: int, height: int) -> Iterator[tuple[int, 
 
 
 def _fragments(corners: FloatArray, width: int, height: int) -> tuple[IntArray, FloatArray, IntArray]:
-    """Number of the pixel, 1/z and triangle of each pixel centre inside a triangle."""
+    """Pixel index, 1/z and triangle of each pixel centre inside a triangle."""
     which, row, left, right = _spans(corners, width, height)
     counts = right - left
-    # Fragments lie one span after another; what a span has in common is repeated over its fragments.
+    # Fragments are ordered by span; values of a span are repeated over its fragments.
     first = np.repeat(np.cumsum(counts) - counts, counts)
     along = np.arange(len(first)) - first
     # 1/z is linear over the image of a triangle, so along a span it takes a start and a slope.
@@ -220,8 +221,8 @@ def _fragments(corners: FloatArray, width: int, height: int) -> tuple[IntArray, 
 def _spans(corners: FloatArray, width: int, height: int) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     """Triangle, row, first column and end column of every non-empty run of pixel centres inside a triangle.
 
-    A centre on the left or upper border is inside, one on the right or lower border is not. Each edge is cut from
-    its upper to its lower end, so that two triangles that share it find the same cut, to the last bit.
+    A centre on the left or upper border is inside, one on the right or lower border is not. Each edge is intersected
+    from its upper to its lower end, so that two triangles that share it get bit-identical results.
     """
     order = np.argsort(corners[:, :, 1], axis=1, kind="stable")
     top, middle, bottom = (
@@ -298,7 +299,7 @@ def _brightness(vertices: FloatArray, faces: IntArray, camera: Camera) -> FloatA
 
 
 def _seen_from_inside(vertices: FloatArray, faces: IntArray, camera: Camera) -> np.ndarray:
-    """(F,) which triangles turn their back on the camera."""
+    """(F,) whether triangles face away from the camera."""
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.einsum("ij,ij->i", normals, corners[:, 0] - camera.center) > 0

@@ -9,7 +9,7 @@ import numpy as np
 from ..bench.contracts import FloatArray
 
 SPAN_VARIANCE = 0.99
-"""Share of the training variance that the span of training holds; the rest is taken for noise of the tracking."""
+"""Fraction of the training variance in the span of training; the rest is regarded as tracking noise."""
 
 
 class Novelty(NamedTuple):
@@ -30,10 +30,10 @@ class Novelty(NamedTuple):
 
 
 def displacement_metric(basis: FloatArray) -> FloatArray:
-    """(E, E) matrix that turns coefficients into faces whose distances are root mean squares over the vertices.
+    """(E, E) matrix from coefficients to faces whose distances are root mean squares over the vertices.
 
-    Exact, and never V x T numbers at once: distances between faces are distances between coefficients in the metric of the
-    basis, (V, 3, E), which is its Gram matrix over the number of vertices.
+    This is exact without V x T values in memory: distances between faces are distances between coefficients in the
+    metric of the basis, (V, 3, E), which is its Gram matrix divided by the number of vertices.
     """
     basis = np.asarray(basis, np.float64)
     values, vectors = np.linalg.eigh(np.einsum("vie,vif->ef", basis, basis) / len(basis))

@@ -1,4 +1,4 @@
-"""Opens captures of any layout: the reader is found through the registry, by its name or by the folder's content."""
+"""Opens captures of any layout; the reader is found in the registry by name or by the folder's content."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .foreign import describe
 
 
 def find_reader(path: str | PathLike[str], name: str = "") -> DatasetSpec:
-    """The reader called ``name``, see `registry.get`; with no name, the one that finds captures under ``path``.
+    """The reader ``name``, see `registry.get`; without a name, the one that finds captures under ``path``.
 
     Raises
     ------

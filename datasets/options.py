@@ -1,4 +1,4 @@
-"""Options that every command on a capture has; light to import."""
+"""Options of all commands on captures. Light to import."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class CaptureOptions:
     """Options of opening a capture."""
 
     reader: str = ""
-    """Reader of the capture: a name that `headbench list` shows, or "module:SPEC"; default: the one that finds it."""
+    """Reader of the capture: a name that `headbench list` shows, or "module:SPEC"; default: the one that recognises
+    it."""
 
     head: str | None = None
     """Head model for captures that bring none: FLAME pickle or npz."""
 
     cy: Literal["auto", "top", "bottom", "centre"] = "auto"
-    """Principal-point convention of the reader ga; auto takes the declared one, else compares with the
-    images."""
+    """Principal-point convention of the reader ga; auto takes the declared one, else compares with the images."""
 
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")] = ()
     """A setting of the reader, such as `exclude=tongue.yaml`, as reader_settings of `headbench run`; repeatable."""

@@ -1,14 +1,14 @@
 """Masks of the parts of the tracked head in a frame: from the posed mesh by a z-buffer, and from the mask.
 
 * ``foreground``: pixels that the mask covers by half or more.
-* ``face``: the mesh's face, lips, eyes and the opening of the mouth, where nothing of the mesh is before them.
+* ``face``: the mesh's face, lips, eyes and the opening of the mouth, where the mesh does not hide them.
 * ``mouth``: the convex hull of the visible lips, so that teeth, tongue and the dark between them belong to it.
 * ``eyes``: eyeballs and the skin about them.
-* ``neck`` and ``ears``: the mesh's, where nothing of it is before them.
-* ``hair``: the mesh's scalp, and foreground beyond the mesh whose nearest pixel of the mesh is scalp: hair stands
-  off the head that carries it. Hair that hangs down beside the neck is not told from it.
+* ``neck`` and ``ears``: those of the mesh, where it does not hide them.
+* ``hair``: the mesh's scalp, and foreground beyond the mesh whose nearest pixel of the mesh is scalp: hair extends
+  beyond the head. Hair beside the neck is included.
 
-Mouth and hair end where the foreground does, if there is a mask. A region is as good as the tracking.
+Mouth and hair are limited to the foreground, if there is a mask. Regions are as accurate as the tracking.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ PARTS: Mapping[str, tuple[str, ...]] = {
     "neck": ("neck", "boundary"),
     "ears": ("left_ear", "right_ear"),
 }
-"""Regions of the head model that each part is made of; those that a model does not have are done without."""
+"""Regions of the head model that form each part; missing ones are skipped."""
 
 _NEEDED = {name: regions[0] for name, regions in PARTS.items()}
 _BITS = {name: 1 << bit for bit, name in enumerate((FOREGROUND, *PARTS))}
 
 
 class HeadRegions:
-    """The parts of one subject's head, ready to be found in frames. Safe to share between threads."""
+    """The parts of one subject's head, for masks of frames. Thread-safe."""
 
     def __init__(self, head: HeadArrays, shape: FloatArray, static_offset: FloatArray) -> None:
         self._head, self._shape, self._offset = head, shape, static_offset
@@ -53,7 +53,7 @@ class HeadRegions:
     def labels(self, camera: Camera, pose: HeadPose, mask: ByteArray | None) -> ByteArray:
         """(H, W) 8-bit, one bit for each region that a pixel is in; see `select`.
 
-        ``mask`` is the (H, W) 8-bit coverage, None where there is none: nothing is foreground then.
+        ``mask`` is the (H, W) 8-bit coverage; with None nothing is foreground.
         """
         front = rasterize_mesh(self._subject.meshes([pose])[0], self._head.faces, camera).face
         covered = front >= 0
@@ -72,7 +72,7 @@ class HeadRegions:
 
     @cached_property
     def _bits_of_faces(self) -> IntArray:
-        """(F,) bits of the parts that a triangle lies in with two corners or three, so that seams have no gaps."""
+        """(F,) bits of the parts that contain at least two corners of a triangle, so that seams have no gaps."""
         regions, faces = self._head.regions, self._head.faces
         bits = np.zeros(len(faces), dtype=np.uint8)
         for name in self.names:

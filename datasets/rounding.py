@@ -1,8 +1,8 @@
-"""Numbers rounded to a grid of powers of two, so that every x86-64 machine makes the same ones.
+"""Rounding to a grid of powers of two, so that all x86-64 machines give the same values.
 
-The last digits of exp, sin, decompositions and long sums depend on instruction set, BLAS and threads. What a synthetic
-capture is made of is rounded where it is made, a thousand times coarser and more than those digits; products and sums of such
-numbers that fit into the 53 bits of a float64 are then exact, in whatever order they are taken.
+The last digits of exp, sin, decompositions and long sums depend on instruction set, BLAS and threads. Values of a
+synthetic capture are rounded when computed, at least a thousand times coarser than those digits; products and sums of
+such numbers within the 53 bits of a float64 are then exact in any order.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Captures that headbench reads or makes, and benchmarks. Light to import: implementations are named, not loaded."""
+"""Specs of readers, synthetic captures, commands and benchmarks. Light to import: implementations are named, not
+loaded."""
 
 from ..bench.specs import BenchmarkSpec, CommandSpec, DatasetSpec
 

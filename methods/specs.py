@@ -1,4 +1,4 @@
-"""The commands of `methods`; light to import."""
+"""Commands of `methods`. Light: no implementation is imported."""
 
 from ..bench.specs import CommandSpec
 

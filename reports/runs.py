@@ -140,7 +140,7 @@ LONGEST_DIFFERENCE = 48
 
 
 @dataclass(frozen=True)
-class Part:
+class FrameSelection:
     """A part of the frames: one region of the head instead of the whole frame, and some sequences (none named: all)."""
 
     region: str = FULL
@@ -155,7 +155,7 @@ class Part:
         )
 
 
-WHOLE = Part()
+WHOLE = FrameSelection()
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class RunSet:
     part: str = ""
 
     @classmethod
-    def read(cls, folders: Sequence[Path], part: Part = WHOLE) -> RunSet:
+    def read(cls, folders: Sequence[Path], part: FrameSelection = WHOLE) -> RunSet:
         """Read runs, or a part of their frames.
 
         Seeds of the same method with the same settings are merged. A method with other
@@ -211,7 +211,7 @@ class RunSet:
                 shown.setdefault(own[method], (run, method))
         return cls(runs, rows, _metrics(runs), tasks, records, trivial, keys, shown).of(part)
 
-    def of(self, part: Part) -> RunSet:
+    def of(self, part: FrameSelection) -> RunSet:
         """A part of the frames of runs that were read whole.
 
         Raises `InputError` for a region or a sequence that they do not have.
@@ -272,7 +272,7 @@ class RunSet:
         return "; ".join(dict.fromkeys(run.machine for run in self.runs))
 
 
-def _of_part(rows: Rows, part: Part, file: Path) -> Rows:
+def _of_part(rows: Rows, part: FrameSelection, file: Path) -> Rows:
     asked = (("region", {part.region}, rows.regions), ("sequences", {*part.sequences}, rows.sequences))
     for key, names, known in asked:
         if names - known:

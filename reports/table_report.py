@@ -22,7 +22,7 @@ from ..bench.manifest import MethodRecord
 from ..bench.registry import unknown
 from ..bench.specs import MetricSpec
 from ..bench.streams import on_terminal
-from .runs import WHOLE, Part, RunSet
+from .runs import WHOLE, FrameSelection, RunSet
 from .tables import AVATAR_TITLE, Table, TableCell, TableRow, build_table
 from .writers import WRITERS, column_name, to_text
 
@@ -268,14 +268,14 @@ def table_text(
     """Return a table of one or more runs as text, in a format of `WRITERS` or as "text", which has aligned columns.
 
     Without a format it is "text" if standard output is a terminal, else "md".
-    ``published`` adds columns with the figures that papers printed; ``region`` and ``sequences`` are those of `Part`,
+    ``published`` adds columns with the figures that papers printed; ``region`` and ``sequences`` are those of `FrameSelection`,
     ``columns`` and ``digits`` those of `Columns`. Raises `InputError` for a format, a layout, columns or runs that do not fit.
     """
     styled = format is None and on_terminal()
     format = format or ("text" if styled else "md")
     if format not in (*WRITERS, "text"):
         raise InputError("table", "format", f"one of {', '.join(WRITERS)}, text", repr(format))
-    runs = RunSet.read(run_folders, Part(region, sequences))
+    runs = RunSet.read(run_folders, FrameSelection(region, sequences))
     known = (*layouts(runs), *PAPER)
     if layout not in known:
         raise InputError(run_folders[0], "layout", f"one of {', '.join(known)}", repr(layout))

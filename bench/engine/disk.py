@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -14,13 +14,6 @@ from .store import Cell, RunFolder
 
 Kind = Literal["avatars", "renders", "checkpoints", "damaged", "logs", "other"]
 Deletable = Literal["renders", "checkpoints", "damaged", "logs"]
-LOSSES: Mapping[str, str] = {
-    "renders": "the next start of the run renders them again; pictures of reports need them",
-    "checkpoints": "trainings that did not end begin again",
-    "damaged": "avatars that were set aside because their files were damaged",
-    "logs": "what processes and jobs printed",
-}
-"""Consequence of deleting each kind of file."""
 
 
 def usage(run: Path) -> dict[Kind, int]:

@@ -240,7 +240,7 @@ def _remove_dead(paths: Iterable[str]) -> None:
         try:
             stream = FileIO(path, "r+", opener=no_link)
         except (OSError, InputError):
-            continue  # finished meanwhile, or not one of ours
+            continue  # finished meanwhile, or not a temporary file of headbench
         with stream:
             if _lock(stream):
                 Path(path).unlink(missing_ok=True)

@@ -28,26 +28,27 @@ class ExportColmapSettings(CaptureOptions):
     """Folder to write: images/, masks/ and sparse/0/."""
 
     tracking: bool = False
-    """Write the tracked parameters and the head model beside the model, so that the reader colmap reads it all."""
+    """Also write the tracked parameters and the head model, so that the reader colmap can read the dataset."""
 
     timesteps: tuple[int, ...] = ()
-    """Timesteps to write; default: the first of training, as COLMAP's scenes do not move."""
+    """Timesteps to write; default: the first of training, since COLMAP's scenes are static."""
 
     all_timesteps: bool = False
-    """Write every timestep. The points are still the mesh of the first."""
+    """Write every timestep. The points are the mesh of the first one."""
 
     format: Literal["bin", "txt"] = "bin"
     """Of the sparse model."""
 
     names: Literal["nested", "flat"] = "nested"
-    """Of images: SUBJECT/SEQUENCE/TIMESTEP/CAMERA.png, or SEQUENCE_TIMESTEP_CAMERA.png in one folder, as readers of 3D
-    Gaussian splatting, GaussianAvatars, OpenSplat and nerfbaselines need it; masks are then NAME.png and NAME.png.png."""
+    """Names of images: SUBJECT/SEQUENCE/TIMESTEP/CAMERA.png, or SEQUENCE_TIMESTEP_CAMERA.png in one folder, as readers
+    of 3D Gaussian splatting, GaussianAvatars, OpenSplat and nerfbaselines need it; masks are then NAME.png and
+    NAME.png.png."""
 
     dependent = (DependentOptions(("timesteps",), "all_timesteps", False),)
 
 
 MARKER = "headbench-export.json"
-"""File that a folder written by `export_colmap` is recognised by: another may be somebody's own model and images."""
+"""File that identifies a folder written by `export_colmap`; others may have the user's own model and images."""
 
 
 def export_colmap(settings: ExportColmapSettings, progress: Progress) -> CommandResult:
@@ -65,7 +66,7 @@ def export_colmap(settings: ExportColmapSettings, progress: Progress) -> Command
     if present and MARKER not in present:
         expected = "a new folder, or one that this command wrote"
         found = "one with other files"
-        raise InputError(out, "--out", expected, found, "Nothing was written. Name another folder.")
+        raise InputError(out, "--out", expected, found, "Nothing was written. Choose another folder.")
     chosen = set(settings.timesteps) or {clip.timesteps("train")[0]}
     if settings.all_timesteps:
         chosen = set(clip.poses)

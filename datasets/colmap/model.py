@@ -1,8 +1,9 @@
 """Read cameras and images of a COLMAP sparse model, binary or text.
 
-The files come from outside, and pycolmap's own reader (4.2) trusts them: of 220 places to cut off an ``images.bin``
-of three images, 72 gave wrong numbers without an error and 9 no end; it also needs a file of points, which many
-projects lack. So every count and length is compared here with the bytes there before it is used.
+The files are untrusted, and pycolmap's own reader (4.2) does not validate them: of 220 truncations of an
+``images.bin`` of three images, 72 gave wrong values without an error and 9 did not terminate; it also requires a file
+of points, which many projects lack. Here every count and length is compared with the remaining bytes before it is
+used.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from ...bench.io.files import check_name, with_slashes
 
 @cache
 def pycolmap() -> Any:
-    """The package pycolmap, imported when first used, with the program's own handler of SIGTERM kept."""
+    """The package pycolmap, imported when first used, without its handler of SIGTERM."""
     package = importlib.import_module("pycolmap")
-    # Its import replaces the handler by one that prints a stack, behind the interpreter's back.
+    # Its import installs a handler in C that prints a stack.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
     return package
@@ -39,8 +40,8 @@ def pycolmap() -> Any:
 
 T = TypeVar("T")
 
-_MAX_PIXELS = 1 << 20  # along one side: far beyond any sensor
-_UNIT_TOLERANCE = 1e-3  # of a quaternion's length; COLMAP itself normalises what it reads
+_MAX_PIXELS = 1 << 20  # maximum pixels along one side, far above any sensor
+_UNIT_TOLERANCE = 1e-3  # of a quaternion's length; COLMAP normalises quaternions when reading
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class ColmapImage:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """Cameras and images of a model by COLMAP's numbers. The unit of length is the model's own."""
+    """Cameras and images of a model by COLMAP's ids. The unit of length is the model's own."""
 
     files: tuple[Path, Path]  # of the cameras and of the images
     cameras: Mapping[int, ColmapCamera]
@@ -108,7 +109,7 @@ def _check_image(file: Path, key: str, image: ColmapImage) -> None:
 def _by_number(
     file: Path, kind: str, entries: Iterable[tuple[int, T]], check: Callable[[Path, str, T], None]
 ) -> dict[int, T]:
-    """Cameras or images by number, each checked and there once."""
+    """Cameras or images by id, validated and unique."""
     found: dict[int, T] = {}
     for number, entry in entries:
         key = f"{kind} {number}"
@@ -124,7 +125,7 @@ _POINT = struct.calcsize("<ddQ")  # x, y and the number of a point of the model
 
 
 class _BinaryReader:
-    """Takes numbers off a file; `InputError` where it ends too early."""
+    """Reads numbers from a file; raises `InputError` if it ends too early."""
 
     def __init__(self, file: Path, stream: BinaryIO) -> None:
         self.file, self._stream = file, stream
@@ -142,7 +143,7 @@ class _BinaryReader:
         return struct.unpack("<" + layout, self._stream.read(size))
 
     def count(self, least: int, key: str) -> int:
-        """Read how many entries follow, each of at least ``least`` bytes."""
+        """Read the number of following entries, each of at least ``least`` bytes."""
         (number,) = self.take("Q", key)
         self._need(number * least, f"{number} of {key}")
         return int(number)
@@ -168,10 +169,10 @@ class _BinaryReader:
         if size > self.left:
             expected = f"{size} more bytes at byte {self._stream.tell()}"
             found = f"{self.left}"
-            raise InputError(self.file, key, expected, found, "The file was cut short or is damaged.")
+            raise InputError(self.file, key, expected, found, "The file is truncated or damaged.")
 
     def finish(self) -> None:
-        """Check that nothing is left over."""
+        """Check that the file has no further bytes."""
         if self.left:
             expected = "the end of the file after the last entry"
             raise InputError(self.file, "", expected, f"{self.left} more bytes")
@@ -228,7 +229,7 @@ def _cameras_text(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
 def _images_text(file: Path) -> Iterator[tuple[int, ColmapImage]]:
     lines = _lines(file)
     for line, text in lines:
-        words = text.strip().split(maxsplit=_IMAGE_WORDS - 1)  # the name, which comes last, may hold spaces
+        words = text.strip().split(maxsplit=_IMAGE_WORDS - 1)  # the name, which comes last, may have spaces
         if not words:
             continue
         key = f"line {line}"
@@ -244,7 +245,7 @@ def _images_text(file: Path) -> Iterator[tuple[int, ColmapImage]]:
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """Number and text of each line that is no comment. An empty line may be an image without points."""
+    """Number and text of each line except comments. An empty line may be an image without points."""
     try:
         with file.open("rb") as start:
             refuse_utf16(start.read(4), file, "text in UTF-8")
@@ -276,7 +277,7 @@ _PLACES = (".", "sparse/0", "sparse")
 
 
 def find_model(path: str | PathLike[str]) -> tuple[Path, Path] | None:
-    """The files of cameras and images of the model in a folder, or in its ``sparse/0`` or ``sparse``; bin before txt."""
+    """Files of cameras and images of the model in a folder or its ``sparse/0`` or ``sparse``; binary files are preferred."""
     for place in _PLACES:
         for suffix in (".bin", ".txt"):
             files = Path(path) / place / f"cameras{suffix}", Path(path) / place / f"images{suffix}"

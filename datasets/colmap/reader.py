@@ -1,7 +1,7 @@
 """Read a COLMAP dataset with a tracked head, and the cameras of a COLMAP sparse model.
 
-COLMAP gives cameras and images. What methods need besides is the tracked head: parameter files of VHAP beside the
-model, one for each timestep, and the head model they belong to. `export colmap --tracking` writes such a dataset::
+COLMAP gives cameras and images. Methods also need the tracked head: parameter files of VHAP beside the model, one for
+each timestep, and their head model. `export colmap --tracking` writes such a dataset::
 
     images/<subject>/<sequence>/<timestep>/<camera>.png     or images/<sequence>_<timestep>_<camera>.png
                                                             or images/<timestep>_<camera>.png
@@ -11,9 +11,9 @@ model, one for each timestep, and the head model they belong to. `export colmap 
     head_model.npz                                          unless given as head=
     headbench.json                                          optional, see `ga.layout.Declaration`
 
-Both put the centre of the top left pixel at (0.5, 0.5), and both map the world to the camera with OpenCV's axes,
-so that numbers are taken over as they are. A model's world is its own: position, orientation and scale are those
-of the reconstruction, metres only where it was made from metric poses; tracking has to be in the same world.
+As here, the centre of the top left pixel is at (0.5, 0.5), and the world is mapped to the camera with OpenCV's axes.
+Position, orientation and scale of the world are those of the reconstruction, in metres only if it was made from metric
+poses; tracking must be in the same world.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from .model import ColmapModel, find_model, read_model
 
 TRACKING_FOLDER = "flame_param"
 SAME_CAMERA = 1e-4
-"""Largest difference of two entries of world-to-camera matrices that are one camera's, metres."""
+"""Maximum difference between entries of the world-to-camera matrices of one camera, metres."""
 
 _FLAT_NAME = re.compile(r"(?P<sequence>.+)_(?P<timestep>\d{5,})_(?P<camera>.+)")
 _VHAP_NAME = re.compile(r"(?P<timestep>\d+)_(?P<camera>.+)")
@@ -54,7 +54,7 @@ _VHAP_NAME = re.compile(r"(?P<timestep>\d+)_(?P<camera>.+)")
 def model_cameras(
     model: ColmapModel, *, distortion: Literal["refuse", "left to the images"] = "refuse"
 ) -> dict[str, Camera]:
-    """Camera of each image by the image's name, which is its id too.
+    """Camera of each image by the image's name, which is also its id.
 
     Parameters
     ----------
@@ -106,12 +106,12 @@ def _lens(model: ColmapModel, number: int) -> Lens:
 
 
 def find_datasets(root: Path) -> list[Path]:
-    """The folder itself where it holds a sparse model and a folder of images."""
+    """The folder itself if it has a sparse model and a folder of images."""
     return [root] if (root / "images").is_dir() and find_model(root) is not None else []
 
 
 def pose_files(path: str | Path) -> dict[int, Path]:
-    """The file with the tracked parameters of every timestep that has one."""
+    """Parameter file of every timestep that has one."""
     files = entries(Path(path) / TRACKING_FOLDER, "*.npz")
     return {int(file.stem): file for file in files if file.stem.isdecimal()}
 
@@ -132,7 +132,7 @@ def read_dataset(
     use_cache: bool = True,
     progress: Progress = no_progress,
 ) -> CaptureClip:
-    """Read a COLMAP dataset as a clip; lens distortion is taken out of images and masks as they are read.
+    """Read a COLMAP dataset as a clip; lens distortion is removed from images and masks when they are read.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def read_dataset(
 
 
 def frame_key(root: Path, name: str) -> FrameKey:
-    """Key of an image by its name; no subject, and "capture" as the sequence, where the name has none."""
+    """Key of an image by its name; without them in the name, the subject is empty and the sequence "capture"."""
     parts = Path(name).with_suffix("").parts
     if len(parts) == 4 and parts[2].isdecimal():
         return FrameKey(parts[0], parts[1], int(parts[2]), parts[3])
@@ -234,13 +234,13 @@ def frame_key(root: Path, name: str) -> FrameKey:
 def _frame_files(root: Path, name: str) -> FrameFiles:
     image = root / "images" / name
     own_alpha = image if probe_image(image).has_alpha else None
-    # COLMAP's own convention: the image's whole name and one more suffix.
+    # COLMAP's convention: the full name of the image with an additional suffix.
     mask = root / "masks" / f"{name}.png"
     return FrameFiles(image, mask if mask.exists() else own_alpha)
 
 
 def _rig(model: ColmapModel, keys: Mapping[str, FrameKey]) -> tuple[dict[str, Camera], dict[str, Lens]]:
-    """Camera and lens by camera id; a camera has to be the same in all its images."""
+    """Camera and lens by camera id; a camera must be the same in all its images."""
     found = model_cameras(model, distortion="left to the images")
     lens_of = model_lenses(model)
     cameras: dict[str, Camera] = {}

@@ -1,6 +1,6 @@
 """Write a clip as a COLMAP dataset: images, masks, and a sparse model with the tracked mesh as its points.
 
-Layout of ``colmap`` itself and of the radiance-field codes that read it: ``images/``, ``masks/``, ``sparse/0/``.
+Layout of ``colmap`` and of radiance-field codes that read it: ``images/``, ``masks/``, ``sparse/0/``.
 """
 
 from __future__ import annotations
@@ -28,9 +28,7 @@ from .reader import TRACKING_FOLDER, frame_key
 
 ModelFormat = Literal["bin", "txt"]
 Naming = Literal["nested", "flat"]
-_DEPTH_TOLERANCE = (
-    2e-3  # metres a vertex may lie behind the surface drawn at its pixel and still count as seen
-)
+_DEPTH_TOLERANCE = 2e-3  # metres that a visible vertex may be behind the surface drawn at its pixel
 _SKEW_TOLERANCE = 1e-9
 _UNSEEN = (128, 128, 128)
 
@@ -45,7 +43,7 @@ class Exported(NamedTuple):
 
 
 class _Observation(NamedTuple):
-    """Indices, positions and colours of the vertices that an image sees."""
+    """Indices, positions and colours of the vertices visible in an image."""
 
     vertices: np.ndarray
     pixels: FloatArray
@@ -71,9 +69,9 @@ def export_model(
 ) -> Exported:
     """Write frames of a clip as a COLMAP dataset.
 
-    The points are the vertices of the mesh at the earliest timestep among ``keys``; images of that timestep
-    observe the vertices they see, and the points' colours come from them. Images of other timesteps have poses and
-    no points: the head has moved.
+    The points are the vertices of the mesh at the earliest timestep among ``keys``; images of that timestep observe
+    their visible vertices, which get their colours. Images of other timesteps have poses but no points because the
+    head has moved.
 
     Parameters
     ----------
@@ -124,10 +122,10 @@ def export_model(
             write_image(out / "images" / names[key], picture)
             mask = clip.mask(key)
             if mask is not None:
-                # COLMAP's own convention: the image's whole name and one more suffix, 0 for what to leave out.
+                # COLMAP's convention: the full name of the image with an additional suffix, 0 for masked pixels.
                 write_image(out / "masks" / f"{names[key]}.png", mask)
                 if naming == "flat":
-                    write_image(out / "masks" / names[key], mask)  # as nerfbaselines looks for it
+                    write_image(out / "masks" / names[key], mask)  # as nerfbaselines expects it
             progress(number, len(keys), str(key))
     _add_points(model, vertices, views)
     _write_model(model, out / "sparse" / "0", model_format)
@@ -137,7 +135,7 @@ def export_model(
 
 
 def export_tracking(clip: CaptureClip, timesteps: Collection[int], out: Path) -> None:
-    """Write what the reader ``colmap`` needs beside the model: parameters by timestep, head model, conventions."""
+    """Write the additional files of the reader ``colmap``: parameters by timestep, head model, conventions."""
     identity = identity_parameters(clip.shape, clip.static_offset)
     with grouped_writes():
         for timestep in sorted(timesteps):
@@ -152,7 +150,7 @@ def export_tracking(clip: CaptureClip, timesteps: Collection[int], out: Path) ->
 
 
 def _observe(vertices: FloatArray, faces: np.ndarray, camera: Camera, picture: ByteArray) -> _Observation:
-    """Find the vertices in the picture that no part of the mesh hides."""
+    """Find the vertices in the image that are not hidden by the mesh."""
     points = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     before = np.flatnonzero(points[:, 2] > 0)
     pixels = points[before] @ camera.K.T
@@ -166,7 +164,7 @@ def _observe(vertices: FloatArray, faces: np.ndarray, camera: Camera, picture: B
 
 
 def _add_points(model: Any, vertices: FloatArray, views: dict[int, _Observation]) -> None:
-    """Add all vertices, in order, with their mean colours and the images that observe them."""
+    """Add all vertices, in order, with mean colours and observing images."""
     sums, counts = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
     tracks: list[list[Any]] = [[] for _ in vertices]
     for number, view in views.items():
@@ -182,9 +180,9 @@ def _add_points(model: Any, vertices: FloatArray, views: dict[int, _Observation]
 
 
 def _write_model(model: Any, folder: Path, model_format: ModelFormat) -> None:
-    """Write a model elsewhere, then copy its files to their place: none of them is ever half-written.
+    """Write a model to a temporary folder, then copy its files, so that no file is incomplete.
 
-    Files of the other format go first: readers take the binary ones before the others, whichever is newer.
+    Files of the other format are removed first because readers prefer binary files even if they are older.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:

@@ -1,9 +1,9 @@
-"""One camera set for a capture: per-frame JSON entries to `Camera`s, sequences brought to one world.
+"""Cameras of a capture from per-frame JSON entries, with all sequences in one world.
 
 VHAP shifts the world of each sequence by the mean of its tracked translation and does not store the shift.
 A union of sequences therefore states each camera once per sequence, in worlds that differ by a translation.
-Here that translation is recovered from the cameras, so that a clip has one position per camera; the poses of
-the shifted sequences are to be moved along.
+Here that translation is recovered from the cameras, so that a clip has one position per camera; the poses of shifted
+sequences must be moved accordingly.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class CaptureCameras:
     shifts: Mapping[str, FloatArray]
 
     def resolve(self, cy: CyConvention) -> dict[str, Camera]:
-        """`Camera` by id, with the principal point read by the given convention."""
+        """`Camera` by id, with the given convention of the principal point."""
         return {
             name: Camera(
                 id=name,
@@ -58,7 +58,7 @@ class CaptureCameras:
         }
 
     def cy_matters(self) -> bool:
-        """Whether the readings from the top and from the bottom differ: some cy is off-centre by > 0.5 px."""
+        """Whether measuring cy from the top or the bottom makes a difference: some cy is off-centre by > 0.5 px."""
         return any(
             abs(view.intrinsics.get("cy", self.sizes[name][1] / 2) - self.sizes[name][1] / 2) > 0.5
             for name, view in self.views.items()
@@ -68,8 +68,8 @@ class CaptureCameras:
 def collect_cameras(entries: Sequence[FrameEntry], infos: Mapping[Path, ImageInfo]) -> CaptureCameras:
     """Gather the cameras of all frames.
 
-    Raises `InputError` where a camera moves or changes within a sequence, where sequences differ by more than
-    a translation, or where ``camera_index`` and ``camera_id`` do not go together.
+    Raises `InputError` if a camera moves or changes within a sequence, sequences differ by more than a translation, or
+    ``camera_index`` and ``camera_id`` do not match.
     """
     _check_ids(entries)
     sizes = {entry.image: (infos[entry.image].width, infos[entry.image].height) for entry in entries}
@@ -79,7 +79,7 @@ def collect_cameras(entries: Sequence[FrameEntry], infos: Mapping[Path, ImageInf
         _check_same_optics(first, entry, sizes)
         moved = np.abs(first.camera_to_world - entry.camera_to_world).max()
         if moved > ROTATION_TOLERANCE:
-            expected = f"camera {entry.camera_id} where {first.where} has it, as cameras stand still"
+            expected = f"camera {entry.camera_id} where {first.where} has it, since cameras are static"
             key = f"{entry.where}.transform_matrix"
             raise InputError(entry.file, key, expected, f"entries that differ by {moved:.3g}")
     views: dict[str, FrameEntry] = {}
@@ -124,7 +124,7 @@ def _check_same_optics(first: FrameEntry, entry: FrameEntry, sizes: Mapping[Path
 
 
 def same_intrinsics(one: FrameEntry, other: FrameEntry) -> bool:
-    """Whether two frames state the same intrinsics, to rounding."""
+    """Whether two frames have the same intrinsics up to rounding."""
     return one.intrinsics.keys() == other.intrinsics.keys() and all(
         math.isclose(value, other.intrinsics[key], rel_tol=1e-6, abs_tol=1e-9)
         for key, value in one.intrinsics.items()
@@ -134,11 +134,11 @@ def same_intrinsics(one: FrameEntry, other: FrameEntry) -> bool:
 def _shift(
     views: Mapping[str, FrameEntry], group: Mapping[str, FrameEntry], sizes: Mapping[Path, tuple[int, int]]
 ) -> FloatArray:
-    """Translation from a sequence's world to the first's, from the cameras they share."""
+    """Translation from a sequence's world to that of the first, from their common cameras."""
     shared = [name for name in group if name in views]
     any_entry = next(iter(group.values()))
     if not shared:
-        expected = "a camera that the first sequence has too, to bring both to one world"
+        expected = "a camera that the first sequence also has, to align both worlds"
         raise InputError(any_entry.file, any_entry.where, expected, f"cameras {', '.join(group)} only")
     for name in shared:
         _check_same_optics(views[name], group[name], sizes)
@@ -148,15 +148,15 @@ def _shift(
     spread = np.abs(differences[:, :3, 3] - shift).max()
     if turn > ROTATION_TOLERANCE or spread > POSITION_TOLERANCE:
         folder = any_entry.sequence_folder
-        expected = f"cameras of {folder} that equal those of the first sequence but for one shift"
+        expected = f"cameras of {folder} that equal those of the first sequence up to one shift"
         found = f"rotations that differ by {turn:.3g} and shifts by {spread:.3g} m"
         raise InputError(any_entry.file, f"{any_entry.where}.transform_matrix", expected, found)
-    # A difference at the level of the stored digits is ignored: the cameras then stay exactly as written.
+    # A difference within the stored precision is ignored, so that cameras are unchanged.
     return shift if np.abs(shift).max() > 1e-9 else np.zeros(3)
 
 
 def contradicted_focal(entry: FrameEntry, width: int) -> float | None:
-    """Focal length that ``camera_angle_x`` implies, pixels, where ``fl_x`` is another."""
+    """Focal length implied by ``camera_angle_x``, pixels, if ``fl_x`` differs."""
     if not {"fl_x", "camera_angle_x"} <= entry.intrinsics.keys():
         return None
     implied = width / (2 * math.tan(entry.intrinsics["camera_angle_x"] / 2))

@@ -1,4 +1,4 @@
-"""Digests of file contents, remembered in the user's cache as long as the system has not touched the files."""
+"""Digests of file contents, stored in the user's cache and valid while the files are unchanged."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from ...bench.errors import UnavailableError
 from ...bench.io.files import cache_folder, digest, digest_file, write_json
 
 _log = logging.getLogger(__name__)
-_THREADS = 4  # hashing releases the interpreter lock; more threads only help slow disks
+_THREADS = 4  # hashing releases the interpreter lock; more threads help only on slow disks
 
 MAX_CACHE_BYTES = 128 * 2**20
 """Size of the cache for all captures, about half a million files; the least recently read captures are
 dropped first."""
 
 YOUNG_NS = 2 * 10**9
-"""A file that changed so recently may change again within one step of the system's clock; it is not remembered."""
+"""Digests of files changed more recently are not stored: they may change again within the clock resolution."""
 
 
 class Stamp(NamedTuple):
@@ -72,11 +72,11 @@ def content_digests(
 
 
 def _place(folder: Path) -> Path | None:
-    """File of the cache for a capture; None where the user has no home."""
+    """Cache file of a capture; None if the user has no home folder."""
     try:
         return cache_folder() / "digests" / f"{digest(os.path.abspath(folder))[:32]}.json"
     except UnavailableError as error:
-        _log.info("digests are not kept: %s", error)
+        _log.info("digests are not stored: %s", error)
         return None
 
 
@@ -85,7 +85,7 @@ def _name(stamp: Stamp) -> str:
 
 
 def _read_cache(path: Path) -> dict[str, str]:
-    """Entries of the cache; none where it is missing or not as `_write_cache` left it."""
+    """Entries of the cache; none if it is missing or not written by `_write_cache`."""
     try:
         if path.stat().st_size > MAX_CACHE_BYTES:
             return {}
@@ -97,7 +97,7 @@ def _read_cache(path: Path) -> dict[str, str]:
 
 
 def _write_cache(path: Path, entries: dict[str, str]) -> None:
-    """Write the entries of one capture, and forget others until all fit into `MAX_CACHE_BYTES`."""
+    """Write the entries of one capture, and delete others until all fit into `MAX_CACHE_BYTES`."""
     try:
         write_json(path, {"digest": digest(entries), "entries": entries})
         kept = [(other.stat().st_mtime_ns, other.stat().st_size, other) for other in path.parent.iterdir()]
@@ -107,4 +107,4 @@ def _write_cache(path: Path, entries: dict[str, str]) -> None:
             if total > MAX_CACHE_BYTES:
                 other.unlink(missing_ok=True)
     except OSError as error:
-        _log.info("digests are not kept, %s cannot be written: %s", path, error)
+        _log.info("digests are not stored, %s cannot be written: %s", path, error)

@@ -1,4 +1,4 @@
-"""The GaussianAvatars/VHAP capture layout: its names, its keys and its conventions, both ways.
+"""The GaussianAvatars/VHAP capture layout: names, keys and conventions, for reading and writing.
 
 A capture is a *union* folder beside its *sequence* folders::
 
@@ -8,9 +8,8 @@ A capture is a *union* folder beside its *sequence* folders::
                                         flame_param/%05d.npz, canonical_flame_param.npz,
                                         transforms.json, transforms_{train,val,test}.json
 
-Two files of ours may stand beside the JSONs: ``headbench.json`` (a `Declaration`: what the layout itself
-leaves unsaid) and ``head_model.npz``. Tools of the field ignore them. `writer` writes the layout,
-`reader` reads it.
+Two additional files may be beside the JSONs: ``headbench.json`` (a `Declaration` of properties that the layout does
+not define) and ``head_model.npz``. Other tools ignore them. `writer` writes the layout, `reader` reads it.
 
 Conventions: ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, looking along -z);
 VHAP measures ``cy`` from the bottom edge since its commit 34afb35 (November 2024), from the top before.
@@ -34,8 +33,8 @@ from ...bench.io.files import check_name, with_slashes, write_json
 from ..rounding import ANGLE_BITS, on_grid
 
 CyConvention = Literal["top", "bottom", "centre"]
-"""Where the principal point stands: ``cy`` from the top edge, from the bottom edge, or (as GaussianAvatars
-does) both ``cx`` and ``cy`` ignored and the image centre taken."""
+"""Convention of the principal point: ``cy`` from the top edge, from the bottom edge, or the image centre instead of
+``cx`` and ``cy``, as in GaussianAvatars."""
 
 SPLIT_FILES = {
     "train": "transforms_train.json",
@@ -51,7 +50,7 @@ TEST_SEQUENCES_FILE = "sequences_test.txt"
 FORMAT_VERSION = 1
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Turns a camera-to-world matrix between the OpenCV and the OpenGL axes when multiplied from the right."""
+"""Converts a camera-to-world matrix between OpenCV and OpenGL axes when multiplied from the right."""
 
 _SEQUENCE_FOLDER = re.compile(r"(?P<subject>[^_]+)_(?P<sequence>.+?)(?:_v\d+(?:_.*)?)?")
 _UNION_FOLDER = re.compile(r"UNION\d*_(?P<subject>[^_]+)(?:_.*)?")
@@ -68,19 +67,19 @@ def parameter_name(timestep: int) -> str:
 
 
 def parse_sequence_folder(name: str) -> tuple[str, str]:
-    """Subject and sequence that a sequence folder is named after; ("", name) where it follows no pattern."""
+    """Subject and sequence in the name of a sequence folder; ("", name) if it follows no pattern."""
     match = _SEQUENCE_FOLDER.fullmatch(name)
     return (match["subject"], match["sequence"]) if match else ("", name)
 
 
 def parse_union_folder(name: str) -> str:
-    """Subject a union folder is named after, or "" where it follows no pattern."""
+    """Subject in the name of a union folder, or "" if it follows no pattern."""
     match = _UNION_FOLDER.fullmatch(name)
     return match["subject"] if match else ""
 
 
 def intrinsics_to_json(camera: Camera, cy: CyConvention) -> dict[str, float | int]:
-    """Eight intrinsic entries of a frame. ``camera_angle_*`` are full angles in radians."""
+    """Intrinsic entries of a frame. ``camera_angle_*`` are full angles in radians."""
     width, height = camera.width, camera.height
     fl_x, fl_y = float(camera.K[0, 0]), float(camera.K[1, 1])
     cy_top = float(camera.K[1, 2])
@@ -99,9 +98,9 @@ def intrinsics_to_json(camera: Camera, cy: CyConvention) -> dict[str, float | in
 def intrinsics_from_json(
     entries: Mapping[str, float], width: int, height: int, cy: CyConvention
 ) -> FloatArray:
-    """(3, 3) K in pixels of OpenCV's image axes, from whichever intrinsic entries a frame has.
+    """(3, 3) K in pixels of OpenCV's image axes, from the available intrinsic entries of a frame.
 
-    ``fl_x`` (and ``fl_y``, ``cx``, ``cy``) where present; otherwise square pixels from ``camera_angle_x``
+    Uses ``fl_x`` (and ``fl_y``, ``cx``, ``cy``) if present; otherwise square pixels from ``camera_angle_x``
     with the principal point at the image centre, as GaussianAvatars reads it.
     """
     fl_x = entries.get("fl_x") or width / (2 * math.tan(entries["camera_angle_x"] / 2))
@@ -116,7 +115,7 @@ def intrinsics_from_json(
 
 def extrinsics_to_json(world_to_camera: FloatArray) -> list[list[float]]:
     """4x4 camera-to-world with OpenGL axes, from world-to-camera with OpenCV axes."""
-    # The inverse by cofactors, in elementary operations: LAPACK's last digits differ between machines.
+    # The inverse is computed by cofactors because LAPACK's last digits differ between machines.
     a, b, c = world_to_camera[:3, :3]
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
@@ -134,7 +133,7 @@ def extrinsics_from_json(transform_matrix: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Declaration:
-    """``headbench.json``: what the layout leaves unsaid.
+    """``headbench.json``: properties that the layout does not define.
 
     Attributes
     ----------
@@ -147,7 +146,7 @@ class Declaration:
     cy : CyConvention
         Convention of the JSONs' principal point.
     excluded : Mapping[int, str]
-        Reason by timestep index of the folder's JSONs, for frames that no split may hold.
+        Reason by timestep index of the folder's JSONs, for frames excluded from all splits.
     synthetic : Mapping[str, Any]
         How the capture was synthesised; empty for a recording.
     """
@@ -169,14 +168,14 @@ class Declaration:
 
     @classmethod
     def read(cls, folder: Path) -> Declaration | None:
-        """Read ``headbench.json`` of ``folder``; None where there is none. Raises `InputError` on a bad one."""
+        """Read ``headbench.json`` of ``folder``; None if there is none. Raises `InputError` for an invalid file."""
         path = folder / DECLARATION_FILE
         if not path.exists():
             return None
         value = read_json(path)
         found = value.get("format_version")
         if found != FORMAT_VERSION:
-            remedy = "Read it with the release of headbench that wrote it."
+            remedy = "Use the release of headbench that wrote it."
             raise InputError(path, "format_version", f"{FORMAT_VERSION}", shown(found), remedy)
         file = checked(value, _DeclarationFile, path)
         check_name(file.subject, path, "subject")
@@ -198,7 +197,7 @@ class _Exclusion:
 
 @dataclass(frozen=True)
 class _DeclarationFile:
-    """A declaration as its file has it."""
+    """A declaration in the format of its file."""
 
     format_version: int
     subject: str

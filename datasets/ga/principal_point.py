@@ -1,9 +1,8 @@
-"""Tell from the images whether ``cy`` was measured from the top edge or from the bottom.
+"""Infer from the images whether ``cy`` is measured from the top or the bottom edge.
 
-VHAP changed the convention in November 2024 and its files do not say which one they follow. The two readings
-shift every projection by h - 2 cy pixels, so the outline of the tracked mesh lies on the outline of the
-foreground under one of them only. Hair and clothes hide parts of the outline; what shows (brow, nose, chin,
-cheeks, ears) decides.
+VHAP changed the convention in November 2024, and its files do not state it. The two conventions differ by h - 2 cy
+pixels in every projection, so the outline of the tracked mesh matches the outline of the foreground for only one of
+them. Hair and clothes hide parts of the outline; the visible ones (brow, nose, chin, cheeks, ears) are decisive.
 """
 
 from __future__ import annotations
@@ -27,27 +26,27 @@ from .tracking import Tracking
 from .transforms import FrameEntry
 
 OUTLINE_SIGMA = 0.004
-"""Scale on which outlines agree, as a fraction of the image height."""
+"""Tolerance of the agreement of outlines, as a fraction of the image height."""
 
 MARGIN = 0.05
-"""Least relative difference between the two agreements that decides."""
+"""Minimum relative difference between the two agreements for a decision."""
 
 VOTES = 0.75
-"""Least fraction of the frames that must say the same."""
+"""Minimum fraction of the frames with the same result."""
 
 FRAMES = 24
 """Frames to judge by."""
 
 FOREGROUND_LEVELS = 8
-"""Least difference from the background, in 8-bit levels, that makes a pixel foreground without a mask."""
+"""Minimum difference from the background of foreground pixels without a mask, 8-bit levels."""
 
 _SUBPIXEL_BITS = 4
 
 
 @dataclass(frozen=True)
 class CyEvidence:
-    """How well outlines agree under each reading: means over frames, in [0, 1], and the share of frames
-    that favour the top. ``decision`` is None where they do not decide."""
+    """Agreement of outlines for each convention, means over frames in [0, 1], and the fraction of frames in favour of
+    the top. ``decision`` is None without a clear result."""
 
     top: float
     bottom: float
@@ -65,7 +64,7 @@ class CyEvidence:
 
 @dataclass(frozen=True, eq=False)
 class OutlineView:
-    """A frame to judge by: the posed mesh (V, 3) in the world, the camera read from the top, the mask."""
+    """A sample frame: the posed mesh (V, 3) in the world, the camera with cy from the top, the mask."""
 
     vertices: FloatArray
     camera: Camera
@@ -82,10 +81,10 @@ def settle_cy(
     entries: Sequence[FrameEntry],
     background: Sequence[float],
 ) -> tuple[CyConvention, dict[str, Any]]:
-    """Decide how to read ``cy``: as asked, else as declared, else as the images say.
+    """Choose the convention of ``cy``: as requested, else as declared, else inferred from the images.
 
-    Returns the convention and what it rests on, for the step record. Raises `InputError` where it matters
-    (some |cy - h/2| > 0.5 px) and the images do not decide.
+    Returns the convention and its reason, for the step record. Raises `InputError` if it makes a difference (some |cy
+    - h/2| > 0.5 px) and the images are inconclusive.
     """
     if asked != "auto":
         return asked, {"source": "argument"}
@@ -112,7 +111,7 @@ def _pick_views(
     entries: Sequence[FrameEntry],
     background: Sequence[float],
 ) -> list[OutlineView]:
-    """Up to `FRAMES` frames, spread over timesteps and, by a stride prime to most rigs, over cameras."""
+    """Up to `FRAMES` frames, spread over timesteps and cameras (by a stride coprime to most rig sizes)."""
     cameras = rig.resolve("top")
     ordered = sorted(entries, key=lambda e: (e.timestep, e.camera_index))
     picks = np.linspace(0, len(ordered) - 1, min(FRAMES, len(ordered))).round().astype(int)
@@ -125,7 +124,7 @@ def _pick_views(
 
 
 def _foreground(entry: FrameEntry, background: Sequence[float]) -> ByteArray:
-    """The frame's mask, or where it has none the pixels that differ from the background."""
+    """The frame's mask, or without one the pixels that differ from the background."""
     if entry.mask is not None:
         return read_mask(entry.mask)
     levels = np.round(np.asarray(background) * 255)
@@ -134,11 +133,10 @@ def _foreground(entry: FrameEntry, background: Sequence[float]) -> ByteArray:
 
 
 def weigh_cy(views: Sequence[OutlineView], faces: IntArray) -> CyEvidence:
-    """Compare both readings of ``cy`` over some frames.
+    """Compare both conventions of ``cy`` over some frames.
 
     For each frame: the mesh is projected and filled; agreement is the mean over its outline's pixels of
-    exp(-(d / sigma)^2) with d the distance to the foreground's outline. The image border is no outline, as it
-    cuts both.
+    exp(-(d / sigma)^2) with d the distance to the foreground's outline. The image border is not part of the outline.
     """
     top, bottom = [], []
     for view in views:

@@ -1,8 +1,8 @@
 """Read a GaussianAvatars/VHAP capture, a union or a single sequence, into a `CaptureClip`.
 
-Everything is checked before anything long happens: JSON keys, images, parameters, timesteps, cameras, leaks
-between splits. What the layout leaves open (where ``cy`` counts from, teeth, shifted worlds) is settled as
-documented at the arguments, and the decisions stand in the clip's first step record.
+Everything is checked before any long work: JSON keys, images, parameters, timesteps, cameras, leaks between splits.
+Properties that the layout does not define (origin of ``cy``, teeth, shifted worlds) are resolved as documented for the
+arguments, and recorded in the clip's first step.
 """
 
 from __future__ import annotations
@@ -79,26 +79,25 @@ def read_capture(
         Subject id; "" takes it from ``headbench.json`` or the folder's name.
     cy : layout.CyConvention | Literal['auto']
         Convention of the principal point. "auto" takes the one that ``headbench.json`` declares, else
-        compares the tracked mesh with the masks; an `InputError` is raised if the images do not
-        decide and it matters. "centre" puts the principal point at the image centre, as
-        GaussianAvatars does.
+        compares the tracked mesh with the masks; an `InputError` is raised if the images are inconclusive and it makes
+        a difference. "centre" puts the principal point at the image centre, as GaussianAvatars does.
     teeth : TeethPolicy
         See `read_tracking`.
     background : Sequence[float] | None
-        (r, g, b) in [0, 1]; None takes the declared one, else white. In images without alpha it is
-        replaced by means of their masks, see `set_background`.
+        (r, g, b) in [0, 1]; None takes the declared one, else white. In images without alpha it is replaced using
+        their masks, see `set_background`.
     below_neck : bool
         Whether to keep pixels below the tracked neck; False turns them into background, see
         `mask_below_neck`.
     held_out_sequences, held_out_cameras : Sequence[str]
-        Make new splits instead of using the JSONs': all frames of these sequences (full names or
+        Define new splits instead of those of the JSONs: all frames of these sequences (full names or
         unique prefixes) are self-reenactment, these cameras' other frames novel view, the rest
         training.
     exclude : Mapping[int, str] | str | Path | None
         Frames to leave out in addition to those of ``headbench.json``: reason by timestep, or a file
         for `read_reasons`, such as the one that ``headbench prepare tongue`` writes.
     leaks : LeakPolicy
-        "error" refuses splits that share data; "record" notes it in the step record.
+        "error" refuses splits that share data; "record" only notes it in the step record.
     decode : bool
         Whether to decode every image when checking; finds damage in the middle of files.
     cache_mb : float
@@ -134,7 +133,7 @@ def read_capture(
     splits, frames = _index_frames(folder, subject, names, entries, infos)
     if held_out_sequences or held_out_cameras:
         splits = split_by_holding_out(folder, frames, held_out_sequences, held_out_cameras)
-    # Every file the clip depends on, but the head model, which may lie elsewhere and has its own digest.
+    # All files of the clip except the head model, which may be elsewhere and has its own digest.
     used = {file for e in everything for file in (e.file, e.image, e.mask, e.parameters) if file is not None}
     used |= {folder / layout.DECLARATION_FILE} if declaration else set()
     images = {
@@ -181,7 +180,7 @@ def read_capture(
 def find_captures(root: Path) -> list[Path]:
     """Captures under ``root``: the folder itself if it holds transforms JSONs, else its union folders.
 
-    Raises `InputError` where there is none, with what lies there instead and the way from it to a capture.
+    Raises `InputError` if there is none, with the format found and a conversion to a capture.
     """
     expected = "a folder with a capture in the GaussianAvatars/VHAP layout"
     if not root.exists():
@@ -200,7 +199,7 @@ def find_captures(root: Path) -> list[Path]:
 
 def find_capture(path: str | Path) -> Path:
     """The only capture at ``path``. Raises `InputError` if there is none or several."""
-    folder = Path(os.path.abspath(path))  # "." has no name to take a subject from
+    folder = Path(os.path.abspath(path))  # "." has no name for a subject
     captures = find_captures(folder)
     if len(captures) != 1:
         found = ", ".join(capture.name for capture in captures)
@@ -233,7 +232,7 @@ def pose_files(path: str | Path) -> dict[int, Path]:
 
 
 def _read_splits(folder: Path, resplit: bool) -> dict[str, list[FrameEntry]]:
-    """Entries by split name; with ``resplit``, ``transforms.json`` will do in place of the three."""
+    """Entries by split name; with ``resplit``, ``transforms.json`` may replace the three files."""
     paths = {name: folder / file for name, file in layout.SPLIT_FILES.items()}
     if not any(path.exists() for path in paths.values()):
         entries = {"train": read_transforms(folder / layout.ALL_FRAMES_FILE)}
@@ -288,7 +287,7 @@ def _index_frames(
     entries: Mapping[str, Sequence[FrameEntry]],
     infos: Mapping[Path, ImageInfo],
 ) -> tuple[dict[str, tuple[FrameKey, ...]], dict[FrameKey, FrameFiles]]:
-    """Keys by split as the JSONs have them, and files by key. Without a mask, an alpha channel is the mask."""
+    """Keys by split according to the JSONs, and files by key. Without a mask, the alpha channel is the mask."""
     splits: dict[str, tuple[FrameKey, ...]] = {}
     frames: dict[FrameKey, FrameFiles] = {}
     for part, group in entries.items():

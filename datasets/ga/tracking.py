@@ -48,7 +48,7 @@ def find_head(
         asset = _load(path, files)
     if declaration and asset.version != declaration.head_model:
         expected = f"{asset.version}, the version of the head model given"
-        remedy = "Coefficients of one head model mean nothing to another."
+        remedy = "Coefficients of different head models are not interchangeable."
         raise InputError(folder / DECLARATION_FILE, "head_model", expected, declaration.head_model, remedy)
     return asset
 
@@ -57,7 +57,7 @@ def _load(path: Path, files: Mapping[str, Any]) -> HeadArrays:
     if not path.exists():
         remedy = (
             "Captures of NeRSemble subjects need flame2023.pkl (FLAME 2023, versions with jaw rotation) from "
-            "https://flame.is.tue.mpg.de; give its path as head=. Synthetic captures hold their own."
+            "https://flame.is.tue.mpg.de; give its path as head=. Synthetic captures contain theirs."
         )
         raise InputError(path, "", "the head model the capture was tracked with", "no such file", remedy)
     return load_head(path, **files)
@@ -75,9 +75,9 @@ POSE_SIZES = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "e
 
 @dataclass(frozen=True, eq=False)
 class Tracking:
-    """What the parameter files hold, for the head they were resolved with (teeth appended if they ask for it).
+    """Content of the parameter files, and the head that they belong to (with teeth appended if needed).
 
-    ``notes`` records what the layout leaves open and how it was settled.
+    ``notes`` records decisions about properties that the layout does not define.
     """
 
     head: HeadArrays
@@ -92,9 +92,9 @@ def read_tracking(
 ) -> Tracking:
     """Read and check the parameter file of every timestep.
 
-    Identity and static offset are those of the first timestep, as GaussianAvatars takes them; how far later
-    ones differ is noted. ``dynamic_offset`` is ignored; that it is not zero is noted. Coefficient vectors
-    shorter than the head's bases are padded with zeros.
+    Identity and static offset are those of the first timestep, as in GaussianAvatars; differences of later ones are
+    noted. ``dynamic_offset`` is ignored, and noted if it is not zero. Coefficient vectors shorter than the head's
+    bases are padded with zeros.
 
     Parameters
     ----------
@@ -150,8 +150,8 @@ def read_animation(
 ) -> Tracking:
     """Read and check one file with the parameters of all timesteps, as GaussianAvatars stores it beside its splats.
 
-    As a parameter file of `read_tracking`, but with a row of each pose array for every timestep; the timestep of a pose is
-    its row. A file of one timestep is an animation of one row. Errors as of `read_tracking`.
+    Like a parameter file of `read_tracking`, with a row of each pose array for every timestep, whose number is the
+    timestep. A file of one timestep has one row. Errors are those of `read_tracking`.
     """
     arrays = read_npz(path)
     identity = _vector(path, arrays, "shape", head.shape_basis.shape[2])
@@ -180,8 +180,7 @@ def read_animation(
 
 
 def _eyelids(where: Path, head: HeadArrays, closed: float) -> dict[str, str]:
-    """How eyelids that files close by up to ``closed`` are treated: a note, and a warning if they are
-    lost."""
+    """Note on eyelids that are closed by up to ``closed`` in the files, with a warning if they are lost."""
     if not closed:
         return {}
     note = f"closed by up to {closed:.2f}"
@@ -194,9 +193,9 @@ def _eyelids(where: Path, head: HeadArrays, closed: float) -> dict[str, str]:
 def resolve_teeth(
     head: HeadArrays, rows: int | None, teeth: TeethPolicy, file: Path
 ) -> tuple[HeadArrays, int]:
-    """Bring head and static offset together: the head to use, and how many rows of the offset to use.
+    """Match head and static offset: returns the head to use, and the number of rows of the offset to use.
 
-    ``rows`` is the row count of the files' static offset, None where they have none.
+    ``rows`` is the number of rows of the files' static offset, None without one.
     """
     vertices = len(head.template)
     if teeth != "keep" and not len(head.regions.get("teeth", ())):
@@ -224,7 +223,7 @@ def check_motion(
     static_offset: FloatArray,
     poses: Mapping[int, HeadPose],
 ) -> None:
-    """Raise `InputError` where identity, or an expression, makes a mesh that is no head's by its size."""
+    """Raise `InputError` if identity or an expression gives a mesh with a size impossible for a head."""
     neutral = head.template + head.shape_basis @ shape + static_offset
     check_size(files[min(files)], "shape, static_offset", neutral, head.faces)
     reach = np.abs(head.expression_basis).max(axis=(0, 1))  # (E,) metres per unit
@@ -285,7 +284,7 @@ def _vector(path: Path, arrays: Mapping[str, np.ndarray], key: str, size: int) -
 
 
 def _offset(path: Path, arrays: Mapping[str, np.ndarray], key: str) -> FloatArray | None:
-    """A (1, n, 3) or (n, 3) array as (n, 3); None where the file has none."""
+    """A (1, n, 3) or (n, 3) array as (n, 3); None if the file has none."""
     if key not in arrays:
         return None
     array = _array(path, arrays, key)
@@ -296,7 +295,7 @@ def _offset(path: Path, arrays: Mapping[str, np.ndarray], key: str) -> FloatArra
 
 
 def _offset_change(path: Path, offset: FloatArray | None, first: FloatArray | None) -> float:
-    """Largest change of the static offset against the first timestep's, metres."""
+    """Largest change of the static offset relative to the first timestep, metres."""
     if offset is None or first is None or offset.shape != first.shape:
         if offset is None and first is None:
             return 0.0

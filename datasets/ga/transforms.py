@@ -1,4 +1,4 @@
-"""Read a transforms JSON into checked frame entries; every fault names its file and frame."""
+"""Read a transforms JSON into validated frame entries; errors name file and frame."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _IDENTITY, _LAST_ROW = np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class FrameEntry:
-    """One frame of a transforms JSON, paths resolved, types checked, nothing interpreted.
+    """One frame of a transforms JSON with resolved paths and checked types.
 
-    ``where`` is the JSON's path to the entry ("frames[17]"), for error messages. ``intrinsics`` holds those
-    of `INTRINSIC_KEYS` that the frame or the document states. ``width`` and ``height`` are None where the
-    JSON leaves them to the image.
+    ``where`` is the JSON's path to the entry ("frames[17]"), for error messages. ``intrinsics`` has those of
+    `INTRINSIC_KEYS` that the frame or the document states. ``width`` and ``height`` are None if the JSON does not
+    state them.
     """
 
     file: Path
@@ -50,8 +50,8 @@ class FrameEntry:
 def read_transforms(path: Path) -> list[FrameEntry]:
     """Read and check the frames of a transforms JSON.
 
-    Raises `InputError` for text that is no JSON, missing keys, values of the wrong type or range, and
-    matrices that are no rigid motion.
+    Raises `InputError` for invalid JSON, missing keys, values of the wrong type or range, and matrices that are not
+    rigid motions.
     """
     document = read_json(path)
     frames = document.get("frames")
@@ -62,9 +62,9 @@ def read_transforms(path: Path) -> list[FrameEntry]:
 
 
 def check_lenses(path: Path, document: Mapping[str, Any]) -> None:
-    """Raise `InputError` where a transforms JSON states lenses that are no pinhole's, with the keys of nerfstudio.
+    """Raise `InputError` if a transforms JSON has lenses other than pinholes, by the keys of nerfstudio.
 
-    Renders have no distortion, so that images with some compare with nothing.
+    Renders have no distortion and cannot be compared with distorted images.
     """
     frames = document.get("frames")
     parts = [("", document)]
@@ -95,10 +95,10 @@ LENS_KEYS = {
     *("distortion", "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "skew"),
 }
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE")
-"""Camera models that are a pinhole where their coefficients of distortion are 0."""
+"""Camera models that are pinholes if their distortion coefficients are 0."""
 UNDISTORT = (
-    "Undistort the images and state the pinhole that they then have (`colmap image_undistorter`); the reader colmap takes "
-    "distortion out by itself."
+    "Undistort the images and state their pinhole camera (`colmap image_undistorter`); the reader colmap "
+    "removes distortion itself."
 )
 
 
@@ -155,13 +155,13 @@ def _check_intrinsics(path: Path, where: str, intrinsics: Mapping[str, float]) -
 
 
 def _sequence_folder(folder: Path, image: str) -> str:
-    """Folder that holds ``images/``: the sequence's own, also when a union refers to it."""
+    """Folder of ``images/``: the sequence's own, also if a union refers to it."""
     parts = Path(image).parts
     return parts[1] if len(parts) > 2 and parts[0] == ".." else folder.name
 
 
 class _FrameReader:
-    """Typed access to one frame; intrinsics and size may stand at the document's top level instead."""
+    """Typed access to one frame; intrinsics and size may be at the document's top level instead."""
 
     def __init__(self, path: Path, where: str, frame: Mapping[str, Any], document: Mapping[str, Any]):
         self._path, self._where, self._frame, self._document = path, where, frame, document
@@ -226,7 +226,7 @@ def read_rigid(file: Path, key: str, value: Any) -> FloatArray:
 
 
 def found_entry(value: Any) -> str:
-    """An entry of a JSON for an error; None stands for one that is missing."""
+    """Representation of a JSON entry in an error; None for a missing one."""
     return "no such key" if value is None else repr(value)[:60]
 
 

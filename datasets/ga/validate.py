@@ -1,6 +1,6 @@
-"""Checks of a capture as a whole, made before any long work: images, timesteps, split leaks.
+"""Checks of a whole capture before any long work: images, timesteps, leaks between splits.
 
-Each fault is one `InputError` that names the file, the entry, what was expected and what was found.
+Each fault is an `InputError` with file, entry, expected and found value.
 """
 
 from __future__ import annotations
@@ -26,13 +26,12 @@ LeakPolicy = Literal["error", "record"]
 def check_images(
     entries: Sequence[FrameEntry], *, decode: bool = False, progress: Progress = no_progress
 ) -> dict[Path, ImageInfo]:
-    """Make sure that every image and mask is there, whole, and of the size its frame declares.
+    """Check that every image and mask exists, is complete, and has the size declared by its frame.
 
     Parameters
     ----------
     decode : bool
-        Whether to decode every file too, which finds damage in the middle (minutes for a large
-        capture).
+        Whether to decode every file, which finds damage in the middle (minutes for a large capture).
 
     Returns
     -------
@@ -57,7 +56,7 @@ def _probe_referenced(entry: FrameEntry, path: Path, key: str, decode: bool) -> 
     if not os.path.exists(path):  # unlike Path.exists, False for names no file can have
         where = f"{entry.where}.{key}"
         if not path.is_relative_to(entry.file.parent):
-            remedy = "Write relative paths: absolute ones of the machine that exported the capture do not hold on another."
+            remedy = "Write relative paths: absolute paths are valid only on the machine that exported the capture."
             raise InputError(entry.file, where, "a path relative to the JSON's folder", f"no {path}", remedy)
         raise InputError(entry.file, where, "an existing file", f"no {path}")
     return probe_image(path, decode=decode)
@@ -70,9 +69,9 @@ def _check_size(entry: FrameEntry, path: Path, info: ImageInfo, width: int, heig
 
 
 def check_timesteps(folder: Path, entries: Sequence[FrameEntry]) -> None:
-    """Make sure that timesteps run from 0 without a gap, each with one parameter file and one sequence.
+    """Check that timesteps are numbered from 0 without a gap, each with one parameter file and one sequence.
 
-    Readers of the layout index arrays by timestep, so a gap shifts every parameter behind it.
+    Readers of the layout index arrays by timestep, so a gap would shift all following parameters.
     """
     timesteps = timesteps_of(entries)
     if not entries:
@@ -80,7 +79,7 @@ def check_timesteps(folder: Path, entries: Sequence[FrameEntry]) -> None:
     if timesteps != [*range(len(timesteps))]:
         gap = next(i for i, t in enumerate(timesteps) if i != t)
         found = f"no frame of timestep {gap}, though timesteps reach {timesteps[-1]}"
-        raise InputError(folder, "timestep_index", "timesteps that count from 0 without a gap", found)
+        raise InputError(folder, "timestep_index", "timesteps numbered from 0 without a gap", found)
     first: dict[int, FrameEntry] = {}
     for entry in entries:
         other = first.setdefault(entry.timestep, entry)
@@ -99,11 +98,11 @@ def find_leaks(
     *,
     progress: Progress = no_progress,
 ) -> list[str]:
-    """Ways in which held-out data is seen in training, one sentence each; empty where there is none.
+    """Descriptions of held-out data in training, one sentence each; empty if there is none.
 
-    Looks for one image file or one image content in two splits, for self-reenactment timesteps among the
-    training timesteps, and for novel-view cameras among the training cameras. Contents are read from the files
-    at each call, but only of images that have their size in common with one of another split.
+    Looks for image files or contents in two splits, self-reenactment timesteps among the training timesteps, and
+    novel-view cameras among the training cameras. Contents are read at each call, but only for images with the same
+    file size as one of another split.
     """
     sizes = {images[key]: images[key].stat().st_size for keys in splits.values() for key in keys}
     split_of_size: dict[int, set[str]] = defaultdict(set)
@@ -137,7 +136,7 @@ def find_leaks(
 
 
 def check_leaks(folder: Path, leaks: list[str], policy: LeakPolicy) -> list[str]:
-    """Raise `InputError` for the leaks `find_leaks` found, or under ``"record"`` return them."""
+    """Raise `InputError` for leaks found by `find_leaks`, or return them if the policy is ``"record"``."""
     if leaks and policy == "error":
         remedy = 'Fix the split, or read with leaks="record" to have this noted in every result.'
         raise InputError(folder, "splits", "splits that share nothing", "; ".join(leaks), remedy)
@@ -145,9 +144,9 @@ def check_leaks(folder: Path, leaks: list[str], policy: LeakPolicy) -> list[str]
 
 
 def sequence_names(entries: Iterable[FrameEntry], declared: Mapping[str, str]) -> dict[str, str]:
-    """Sequence name by sequence folder: the declared one, else what the folder's name says.
+    """Sequence name by sequence folder: the declared one, else the one in the folder's name.
 
-    Folders whose names would say the same keep their whole names.
+    Folders whose names give the same sequence keep their full names.
     """
     folders = sorted({entry.sequence_folder for entry in entries})
     names = {folder: declared.get(folder) or parse_sequence_folder(folder)[1] for folder in folders}
@@ -156,7 +155,7 @@ def sequence_names(entries: Iterable[FrameEntry], declared: Mapping[str, str]) -
 
 
 def check_disjoint(file: Path, splits: Mapping[str, Sequence[FrameKey]]) -> None:
-    """Raise `InputError` where a key stands twice, in one split or in two."""
+    """Raise `InputError` for duplicate keys within a split or between splits."""
     for name, keys in splits.items():
         if len(set(keys)) != len(keys):
             twice, count = Counter(keys).most_common(1)[0]
@@ -206,7 +205,7 @@ def _match(file: Path, wanted: str, available: Sequence[str]) -> str:
 
 
 def require_full_grid(clip: CaptureClip, source: str | Path = "") -> None:
-    """Check that every camera has a frame at every timestep; excluded frames count as there.
+    """Check that every camera has a frame at every timestep; excluded frames count as existing.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Write a capture in the GaussianAvatars/VHAP layout, image by image and resumably.
+"""Write a capture in the GaussianAvatars/VHAP layout, resumable after every image.
 
-Images come first, in any order and over several runs; `CaptureWriter.write_metadata` then checks that all are
-there and writes parameters and JSONs, the union's last: a folder with a union JSON is a whole capture.
+Images are written first, in any order and over several runs; `CaptureWriter.write_metadata` then checks that all exist
+and writes parameters and JSONs, those of the union last, so a folder with a union JSON is a complete capture.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .transforms import read_transforms
 
 
 def camera_record(camera: Camera, index: int, cy: layout.CyConvention) -> dict[str, Any]:
-    """The camera's part of a frame record, keys in VHAP's order."""
+    """The camera entries of a frame record, with keys in VHAP's order."""
     return {
         "camera_index": index,
         "camera_id": camera.id,
@@ -67,7 +67,7 @@ def write_sequence(
     """Write a sequence's declaration and its four JSONs.
 
     The splits within the sequence are VHAP's: the first 70 % of the timesteps are training and, of the ``held_out``
-    cameras, novel views; the rest is test. Or the timesteps of ``test`` are, where it has some.
+    cameras, novel views; the rest is test. If ``test`` is not empty, its timesteps are test instead.
     """
     declaration.write(folder)
     count = 1 + max(frame["timestep_index"] for frame in frames)
@@ -85,11 +85,11 @@ def write_union(
     declaration: layout.Declaration | None,
     partly: Mapping[Path, Collection[int]] = MappingProxyType({}),
 ) -> dict[str, int]:
-    """Join sequence folders, ours or VHAP's, into a union beside them; return the frames per split.
+    """Join sequence folders of headbench or VHAP into a union beside them; return the number of frames per split.
 
     Timesteps are renumbered, training sequences first; nothing is copied. Frames of ``test`` are for
-    self-reenactment, with all cameras, as are the timesteps that ``partly`` names of folders of ``train``; of the rest of
-    these, the ``held_out`` cameras are for novel views.
+    self-reenactment, with all cameras, as are the timesteps in ``partly`` of folders in ``train``; for the other
+    timesteps of these, the ``held_out`` cameras are for novel views.
     """
     placed: list[tuple[dict[str, Any], bool, bool]] = []
     start = 0
@@ -127,7 +127,7 @@ def _write_splits(
     parts: dict[str, list[dict[str, Any]]] = {name: [] for name in layout.SPLIT_FILES}
     for frame, test, held_out in frames:
         parts["self_reenactment" if test else "novel_view" if held_out else "train"].append(frame)
-    # Training last: it is the file that readers recognise a capture by.
+    # Training is written last because readers recognise a capture by this file.
     for name, file in reversed(layout.SPLIT_FILES.items()):
         write_json(folder / file, transforms_document(parts[name], shared))
     return {name: len(part) for name, part in parts.items()}
@@ -143,15 +143,15 @@ CANONICAL_JAW = (0.3, 0.0, 0.0)
 """Axis-angle of the open mouth that VHAP stores in the canonical parameters, radians."""
 
 TRAIN_FRACTION = 0.7
-"""Part of a single sequence's timesteps that VHAP gives to training and novel views; the rest is test."""
+"""Fraction of a single sequence's timesteps that VHAP uses for training and novel views; the rest is test."""
 
 
 @dataclass(frozen=True, eq=False)
 class SequencePlan:
     """One sequence of a capture: its poses, one per timestep from 0, and the frames to leave out.
 
-    ``excluded`` maps a timestep of this sequence to the reason, such as "tongue out". ``held_out`` are timesteps that are for
-    self-reenactment while the others are not, as the end of a video.
+    ``excluded`` maps a timestep of this sequence to the reason, such as "tongue out". ``held_out`` are timesteps for
+    self-reenactment in a training sequence, such as the end of a video.
     """
 
     name: str
@@ -162,7 +162,7 @@ class SequencePlan:
 
 @dataclass(frozen=True, eq=False)
 class CapturePlan:
-    """Everything of a capture but its images.
+    """Everything in a capture except its images.
 
     Attributes
     ----------
@@ -185,7 +185,7 @@ class CapturePlan:
     background : tuple[float, float, float]
         (r, g, b) in [0, 1] that images are composited on.
     cy : layout.CyConvention
-        How the JSONs state the principal point; VHAP's own is "bottom".
+        Convention of the principal point in the JSONs; VHAP's is "bottom".
     synthetic : Mapping[str, Any]
         How the capture was synthesised (seed, noise, ...); empty for a recording.
     """
@@ -238,7 +238,7 @@ class CapturePlan:
 
 
 class CaptureWriter:
-    """Writes the capture of a plan under ``root``: one union folder and its sibling sequence folders."""
+    """Writes the capture of a plan under ``root``: a union folder and its sibling sequence folders."""
 
     def __init__(self, root: Path, plan: CapturePlan):
         self.root, self.plan = Path(root), plan
@@ -270,7 +270,7 @@ class CaptureWriter:
     ) -> None:
         """Write one image, (H, W, 3) RGB or (H, W, 4) straight-alpha RGBA, and its (H, W) mask.
 
-        Each is written atomically and the image last: a frame whose image exists is whole.
+        Each is written atomically, the image last, so a frame with an existing image is complete.
         """
         if mask is not None:
             write_image(self.mask_path(sequence, timestep, camera), mask)
@@ -279,7 +279,7 @@ class CaptureWriter:
     def write_metadata(self) -> Path:
         """Write parameters, JSONs and the head model; return the union folder.
 
-        Raises `InputError` naming the first image that is missing, broken or of the wrong size.
+        Raises `InputError` with the first image that is missing, damaged or of the wrong size.
         """
         plan = self.plan
         for sequence in plan.sequences:
@@ -351,7 +351,7 @@ class CaptureWriter:
 
 
 def pose_to_parameters(pose: HeadPose) -> dict[str, FloatArray]:
-    """Per-timestep part of a ``flame_param`` file, float32; ``eyelids`` (ours) only where the pose has them."""
+    """Per-timestep part of a ``flame_param`` file, float32; the additional ``eyelids`` only if the pose has them."""
     parameters = {
         "translation": pose.translation,
         "rotation": pose.rotation,

@@ -1,4 +1,4 @@
-"""A head model in FLAME's layout as plain arrays, checked once and stored as an npz."""
+"""A head model in FLAME's layout as plain arrays, validated and stored as an npz."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ JOINT_NAMES = ("root", "neck", "jaw", "left_eye", "right_eye")
 """Joint order of the layout; every pose argument of the model refers to it."""
 
 RING_REGIONS = ("lip_outside_ring_upper", "lip_outside_ring_lower")
-"""Regions whose order means something: vertices in sequence along the ring. All others are sorted."""
+"""Regions with ordered vertices, in sequence along the ring. All others are sorted."""
 
 FORMAT = "headbench-head-1"
 WEIGHT_TOLERANCE = 1e-4
 
 MAX_CORRECTION = 100.0
-"""Metres that all pose correctives together may move a vertex, whatever the pose; those of ICT-FaceKit do by 0.08."""
+"""Maximum displacement of a vertex by all pose correctives in any pose, metres; ICT-FaceKit's reach 0.08."""
 
 MAX_EXTENT, MAX_AREA = 10.0, 100.0
-"""Metres and square metres that an unposed head may have; a head with shoulders has 1 and 2. A few vertices far away, or
-a tangle of triangles across the room, take the time and memory of thousands of heads wherever a mesh is drawn."""
+"""Maximum extent and area of an unposed head, metres and square metres; a head with shoulders has 1 and 2. Distant
+vertices or large triangles would take the time and memory of thousands of heads when a mesh is drawn."""
 
 _ARRAYS = ("template", "faces", "shape_basis", "expression_basis", "pose_basis", "joint_regressor")
 STORED = (*_ARRAYS, "skinning_weights", "parents")
@@ -72,8 +72,7 @@ class HeadArrays:
     parents : IntArray
         (J,), the root has -1 and every joint comes after its parent.
     eyelid_basis : FloatArray | None
-        (V, 3, 2) left and right, added after skinning and turned with root and neck; None where the
-        model has none.
+        (V, 3, 2) left and right, added after skinning and rotated with root and neck; None if the model has none.
     regions : Mapping[str, IntArray]
         Vertex indices by name, unique; sorted except for `RING_REGIONS`.
     landmarks : Mapping[str, int]
@@ -94,7 +93,7 @@ class HeadArrays:
     landmarks: Mapping[str, int] = field(default_factory=dict)
 
     def validate(self, file: str | PathLike[str]) -> HeadArrays:
-        """Check everything the model relies on and return self.
+        """Validate the model and return self.
 
         Parameters
         ----------
@@ -166,7 +165,7 @@ class HeadArrays:
         if joints > MAX_EXTENT:
             expected = f"joints within {MAX_EXTENT:g} m of the origin"
             raise InputError(file, "joint_regressor", expected, f"{joints:g} m")
-        # Entries of a rotation less the identity are 2 at most.
+        # Entries of a rotation minus the identity are at most 2.
         corrected = 2 * float(np.abs(self.pose_basis).max(axis=(0, 1)).sum(dtype=np.float64))
         if corrected > MAX_CORRECTION:
             expected = f"correctives that move no vertex further than {MAX_CORRECTION:g} m together"
@@ -221,8 +220,8 @@ def save_head(path: Path, arrays: HeadArrays) -> None:
     """Write a head as one npz file (no pickled objects), whole or not at all.
 
     Members: ``format``, ``version``, the array fields by name, ``eyelid_basis`` if there is one,
-    ``region/<name>`` for each region, ``landmark_names`` and ``landmark_vertices``. Equal heads make equal bytes:
-    uncompressed, since what a compressor makes of them depends on its version.
+    ``region/<name>`` for each region, ``landmark_names`` and ``landmark_vertices``. Equal heads give equal bytes: the
+    file is uncompressed because compression depends on the library's version.
     """
     content: dict[str, np.ndarray] = {"format": np.array(FORMAT), "version": np.array(arrays.version)}
     content |= {name: np.asarray(getattr(arrays, name)) for name in STORED}
@@ -261,15 +260,15 @@ def read_head(path: Path) -> HeadArrays:
 
 
 def with_derived_regions(head: HeadArrays) -> HeadArrays:
-    """The head with regions that follow from those it has, as VHAP derives them from ``FLAME_masks.pkl``.
+    """The head with additional regions derived from existing ones, as VHAP does for ``FLAME_masks.pkl``.
 
     * ``hair`` = scalp - (face and neck), where scalp, face and neck are known;
     * ``ears``, ``eyeballs`` = left and right together;
     * ``left_eye``, ``right_eye`` = eye region and eyeball of the side;
     * ``skin`` = everything but eyeballs, hair, lips, teeth and the boundary.
 
-    Only regions whose inputs are all there are derived, and none that is given already; the ones that VHAP
-    writes out as vertex lists (irises, lip rings, ...) cannot be derived this way.
+    Regions are derived only if all inputs exist and they are not given already; those that VHAP defines as vertex
+    lists (irises, lip rings, ...) cannot be derived.
     """
     known = dict(head.regions)
 
@@ -294,7 +293,7 @@ def with_derived_regions(head: HeadArrays) -> HeadArrays:
 
 
 def region(head: HeadAsset, name: str) -> IntArray:
-    """Vertices of a region. Raises `InputError` where the head has none of that name, or an empty one."""
+    """Vertices of a region. Raises `InputError` if the region does not exist or is empty."""
     if not len(head.regions.get(name, ())):
         known = ", ".join(sorted(head.regions)) or "none"
         remedy = "For a FLAME pickle, give FLAME_masks.pkl as masks=."
@@ -323,5 +322,5 @@ _in_memory: WeakValueDictionary[str, HeadArrays] = WeakValueDictionary()
 
 
 def in_memory(head: HeadArrays, fingerprint: str) -> HeadArrays:
-    """The head of this fingerprint that is in memory already, else ``head``: captures have the same one in a file each."""
+    """The head with the same fingerprint that is already in memory, else ``head``, since captures have copies of one head."""
     return _in_memory.setdefault(fingerprint, head)

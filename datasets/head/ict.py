@@ -35,7 +35,7 @@ LANDMARKS = tuple(f"ibug_{index:02d}" for index in range(68))
 
 JAW_SHAPE = "jawOpen"
 DROPPED_SHAPES = (JAW_SHAPE, "mouthClose")
-"""Not in the expression basis: the jaw joint replaces the first, the second only corrects the first."""
+"""Shapes that are not in the expression basis: the jaw joint replaces the first, which the second only corrects."""
 
 _METRES = 0.01
 _SOFTNESS = 0.004  # metres; see hinge_weights
@@ -109,7 +109,7 @@ def _rigged(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> Hea
     )
     weights = on_grid(_weights(template, jaw_open, hinge, parts, profile), SHARE_BITS)
     correctives = np.zeros((len(template), 3, 36))
-    # The second joint's block: the root has none, the neck has the first.
+    # The block of the second joint; the root has none, the neck the first.
     correctives[:, :, 9:18] = hinge_correctives(hinge, template, jaw_open, weights[:, 2])
     kept = [index for index, name in enumerate(names) if name not in DROPPED_SHAPES]
     return HeadArrays(
@@ -160,7 +160,7 @@ def _weights(
     jaw[parts["teeth_lower"]], jaw[parts["teeth_upper"]] = 1, 0
     on_neck = smoothstep(profile.height(template), profile.neck_base, profile.neck_top)
     inside = np.concatenate([parts["teeth"], parts["gums_and_tongue"], parts["mouth_socket"]])
-    on_neck[inside] = 1  # what is in the mouth hangs on the head, however low it reaches
+    on_neck[inside] = 1  # parts in the mouth follow the head, even if they are low
     still = np.zeros_like(jaw)
     weights = np.stack([1 - on_neck, on_neck * (1 - jaw), on_neck * jaw, still, still], axis=1)
     weights[parts["left_eyeball"]] = [0, 0, 0, 1, 0]
@@ -169,10 +169,10 @@ def _weights(
 
 
 def _regressor(template: FloatArray, hinge: Hinge, parts: Parts, profile: Profile) -> FloatArray:
-    """(5, V) joint regressor: each joint from the vertices around it."""
+    """(5, V) joint regressor from the vertices around each joint."""
     skin = np.concatenate([parts["face_material"], parts["outer_back"]])
     height = profile.height(template[skin])
-    joints: list[tuple[IntArray, FloatArray]] = []  # vertices around each, and where it is
+    joints: list[tuple[IntArray, FloatArray]] = []  # vertices around each joint, and its position
     for level in (profile.neck_base, 0.5 * (profile.neck_base + profile.neck_top)):
         ring = np.unique(skin[np.abs(height - level) < 0.05 * profile.length])
         joints.append((ring, 0.5 * (template[ring].min(0) + template[ring].max(0))))
@@ -188,7 +188,7 @@ def _regressor(template: FloatArray, hinge: Hinge, parts: Parts, profile: Profil
 
 
 def _around_axis(template: FloatArray, skin: IntArray, hinge: Hinge, each_side: int = 60) -> IntArray:
-    """The vertices of the skin nearest to the hinge's axis, as many on either side."""
+    """The skin vertices nearest to the hinge's axis, equally many on either side."""
     distance = np.linalg.norm(template[skin, 1:] - hinge.center[1:], axis=1)
     sides = [skin[template[skin, 0] > 0], skin[template[skin, 0] < 0]]
     distances = [distance[template[skin, 0] > 0], distance[template[skin, 0] < 0]]
@@ -256,7 +256,7 @@ def mesh_parts(
     for name in _MATERIALS:
         if name not in materials or not len(materials[name]):
             raise InputError(file, "material_names", f"triangles of {name}", ", ".join(sorted(materials)))
-    # Behind the face material lie the outer head and, each a piece of its own, the mouth and eye sockets.
+    # Behind the face material are the outer head and, as separate pieces, the mouth and eye sockets.
     back = np.setdiff1d(materials["M_BackHead"], materials["M_Face"])
     outer, *inner = sorted(_pieces(back, faces), key=lambda piece: -template[piece, 1].max())
     sides = [len(np.unique(template[piece, 0] > 0)) for piece in inner]
@@ -294,9 +294,9 @@ def regions_of(
     skin[parts["face_material"]] = True
     x, y, z = template.T
 
-    # From the side the contour runs from the ear down to the chin; the face lies in front of it. The
-    # landmarks sit before the ear, so the line is moved back to it, less and less towards the chin; above
-    # the ear the face reaches as far back as its material.
+    # Seen from the side, the contour runs from the ear to the chin with the face in front of it. The landmarks are in
+    # front of the ear, so the line is moved back, less towards the chin; above the ear the face extends as far back as
+    # its material.
     ear_line, ear_top = points[0, 1], points[0, 1] + 0.05 * length
     contour = points[list(_CONTOUR)[: _CHIN + 1]]
     order = np.argsort(contour[:, 1])
@@ -389,7 +389,7 @@ def fit_hinge(points: FloatArray, moved: FloatArray) -> Hinge:
     Raises
     ------
     ValueError
-        The points hardly turn, so that the motion has no centre.
+        The points hardly rotate, so the motion has no centre.
     """
     plane, target = points[:, 1:], moved[:, 1:]
     middle, target_middle = plane.mean(0), target.mean(0)
@@ -403,10 +403,10 @@ def fit_hinge(points: FloatArray, moved: FloatArray) -> Hinge:
 
 
 def hinge_weights(hinge: Hinge, points: FloatArray, displacement: FloatArray, softness: float) -> FloatArray:
-    """Share of the hinge's motion that each point follows, in [0, 1].
+    """Fraction of the hinge's motion that each point follows, in [0, 1].
 
-    The least-squares factor of the rigid motion that explains the displacement; ``softness`` (metres) damps
-    it where the rigid motion itself is small, near the axis, and the quotient says little.
+    The least-squares factor of the rigid motion that explains the displacement; ``softness`` (metres) damps it near
+    the axis, where the rigid motion is small and the quotient unreliable.
     """
     rigid = hinge.displacement(points)
     share = (rigid * displacement).sum(1) / ((rigid**2).sum(1) + softness**2)
@@ -416,11 +416,10 @@ def hinge_weights(hinge: Hinge, points: FloatArray, displacement: FloatArray, so
 def hinge_correctives(
     hinge: Hinge, points: FloatArray, displacement: FloatArray, weights: FloatArray
 ) -> FloatArray:
-    """(n, 3, 9) pose basis of the hinge's joint: what skinning leaves unexplained of the displacement.
+    """(n, 3, 9) pose basis of the hinge's joint: the displacement not explained by skinning.
 
-    Added to the points before skinning, at the full angle it makes skinning end exactly at
-    ``points + displacement``. It goes with the sine of the angle: half each in the two off-diagonal elements
-    of R - I about x.
+    Added to the points before skinning, it gives exactly ``points + displacement`` at the full angle. It is
+    proportional to the sine of the angle, with one half in each off-diagonal element of R - I about x.
     """
     blended = weights[:, None, None] * (hinge.matrix - np.eye(3)) + np.eye(3)
     shift = weights[:, None] * (hinge.center - hinge.matrix @ hinge.center)

@@ -1,4 +1,4 @@
-"""Load a head model from what it comes as: a FLAME pickle, our npz, or ICT-FaceKit's."""
+"""Load a head model from a FLAME pickle, headbench's npz, or ICT-FaceKit's npz."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .arrays import RING_REGIONS, HeadArrays, read_head, with_derived_regions
 from .ict import ict_head, is_ict
 
 FLAME_IDENTITY_SIZE = 300
-"""Columns of FLAME's ``shapedirs`` that span identity; those after them span expression."""
+"""Number of columns of FLAME's ``shapedirs`` for identity; the remaining ones are expression."""
 
 _ZIP = b"PK\x03\x04"
 
@@ -30,8 +30,8 @@ MASKS_FILE, REGIONS_FILE = "FLAME_masks.pkl", "regions.json"
 EYELID_FILES = ("l_eyelid.npy", "r_eyelid.npy")
 EYELIDS_REMEDY = f"Put {' and '.join(EYELID_FILES)} of Metrical Tracker or SMIRK beside the head model."
 PLACES = (".", "FLAME_masks", "..", "../FLAME_masks")
-"""Where files that belong to a FLAME pickle are looked for, relative to its folder: beside it, as in the repositories of
-VHAP and GaussianAvatars, or a folder above, as in that of SMIRK."""
+"""Folders in which files of a FLAME pickle are searched, relative to the pickle: beside it, as in the repositories of
+VHAP and GaussianAvatars, or one folder above, as in SMIRK."""
 
 
 def load_head(
@@ -86,7 +86,7 @@ def load_head(
     else:
         head = _flame(path, version or flame_version(path))
         masks = masks or _beside(path, MASKS_FILE)
-        own = path.with_name(REGIONS_FILE)  # a name that others use, too
+        own = path.with_name(REGIONS_FILE)  # a common file name
         regions = regions or (own if own.is_file() else None)
         lid = next(filter(None, (_beside(path, name) for name in EYELID_FILES)), None)
         eyelids = eyelids or (lid.parent if lid else None)
@@ -109,7 +109,9 @@ MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".fbx")
 
 def _beside(path: Path, name: str) -> Path | None:
     """A file that belongs to a FLAME pickle, or None."""
-    folders = dict.fromkeys((path.parent, path.resolve().parent))  # that of a link, then that of the file
+    folders = dict.fromkeys(
+        (path.parent, path.resolve().parent)
+    )  # the folder of a link, then that of the file
     files = (folder / place / name for folder in folders for place in PLACES)
     return next(filter(Path.is_file, files), None)
 
@@ -126,7 +128,7 @@ def _with_eyelids(head: HeadArrays, folder: Path, file: Path) -> HeadArrays:
 
 
 def flame_version(path: Path) -> str:
-    """Version of a FLAME pickle by its usual file name, or that of its folder, such as ``FLAME2020/male_model.pkl``.
+    """Version of a FLAME pickle by its usual file or folder name, such as ``FLAME2020/male_model.pkl``.
 
     Raises
     ------
@@ -147,7 +149,7 @@ def flame_version(path: Path) -> str:
         return "flame2020"
     expected = "a name with FLAME's version (generic_model.pkl, flame2020.pkl, flame2023.pkl)"
     found = path.name if not folder else f"{path.parent.name}/{path.name}"
-    remedy = "Rename the file, or in Python give version='flame2020' or 'flame2023'. Their coefficients are not interchangeable."
+    remedy = "Rename the file, or set version='flame2020' or 'flame2023' in Python. Their coefficients are not interchangeable."
     raise InputError(path, "version", expected, repr(found), remedy)
 
 

@@ -57,7 +57,7 @@ class HeadModel(torch.nn.Module):
             )
 
         def basis(name: str, values: Any) -> None:
-            # (V, 3, K) to (K, 3V): the product with coefficients is then one matrix multiplication.
+            # (V, 3, K) to (K, 3V), so that the product with coefficients is one matrix multiplication.
             buffer(name, np.asarray(values).reshape(-1, np.shape(values)[2]).T)
 
         buffer("template", asset.template)
@@ -110,7 +110,7 @@ class HeadModel(torch.nn.Module):
         expression : Tensor
             (B, E).
         rotation, neck, jaw : Tensor
-            (B, 3); ``rotation`` turns about joint 0, not about the origin.
+            (B, 3); ``rotation`` is about joint 0, not about the origin.
         eyes : Tensor
             (B, 6) left, then right.
         translation : Tensor
@@ -118,9 +118,8 @@ class HeadModel(torch.nn.Module):
         static_offset : Tensor | None
             (B, V, 3) or (V, 3), added to the shaped template.
         eyelids : Tensor | None
-            (B, 2) left, right; only for models with eyelid bases. Added after skinning and turned
-            with root and neck, so that lids move rigidly with the head; trackers that have them
-            keep both at rest.
+            (B, 2) left, right; only for models with eyelid bases. Added after skinning and rotated with root and neck,
+            so that lids move rigidly with the head; trackers with eyelids keep both at rest.
         canonical : Tensor | None
             (B, V, 3) output of `canonical` for this identity; replaces ``shape`` and
             ``static_offset``. Saves time if the identity is fixed, because the identity basis is
@@ -180,8 +179,8 @@ class HeadModel(torch.nn.Module):
     ) -> Tensor:
         """Rigid motion of the head, (B, 4, 4): translation after the root's and the neck's rotation.
 
-        What trackers call the head pose: vertices that hang on the neck joint alone move by it, apart from
-        the pose correctives of the neck.
+        This is the head pose of trackers: it moves vertices that follow only the neck joint, apart from the neck's
+        pose correctives.
         """
         joints = self.joints(shape, expression, static_offset)
         still = torch.zeros_like(_rows(rotation, 3, "rotation"))
@@ -194,9 +193,9 @@ class HeadModel(torch.nn.Module):
         return torch.cat([torch.cat([turn.expand(batch, 3, 3), shift[..., None]], dim=-1), last], dim=-2)
 
     def pose_arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
-        """Poses as arguments of `forward`, in this model's dtype and on its device.
+        """Poses as arguments of `forward`, with this model's dtype and device.
 
-        ``eyelids`` is among them only where the model has eyelid bases (zeros for poses that lack them). Raises as
+        ``eyelids`` is included only if the model has eyelid bases (zeros for poses without them). Raises as
         `pose_columns`.
         """
         columns = self.pose_columns(poses)
@@ -230,7 +229,9 @@ class HeadModel(torch.nn.Module):
         if pose.timestep is not None:
             where += f", timestep {pose.timestep}"
         if pose.head_model != self.version:
-            remedy = "Coefficients of one head model mean nothing to another; refit the tracking first."
+            remedy = (
+                "Coefficients of different head models are not interchangeable; refit the tracking first."
+            )
             raise InputError(where, "head_model", repr(self.version), repr(pose.head_model), remedy)
         for name, size in sizes.items():
             found = np.shape(getattr(pose, name))
@@ -240,14 +241,14 @@ class HeadModel(torch.nn.Module):
     def _neutral(
         self, shape: Tensor | None, static_offset: Tensor | None, canonical: Tensor | None
     ) -> Tensor:
-        """(B, V, 3) neutral head, given as one or as identity."""
+        """(B, V, 3) neutral head, given directly or by identity."""
         if (shape is None) == (canonical is None):
             raise ValueError("give the identity once: either shape or canonical")
         if canonical is None:
             assert shape is not None
             return self.canonical(shape, static_offset)
         if static_offset is not None:
-            raise ValueError("canonical already holds the static offset")
+            raise ValueError("canonical already includes the static offset")
         return canonical
 
     def angles(self, rotation: Tensor, neck: Tensor, jaw: Tensor, eyes: Tensor) -> Tensor:
@@ -265,9 +266,10 @@ def pose_feature(rotations: Tensor) -> Tensor:
 
 
 def joint_motions(rotations: Tensor, joints: Tensor, parents: Sequence[int]) -> Tensor:
-    """Rigid motions that the joints give to points that follow them: a point x goes to ``R x + o``.
+    """Rigid motions of points that follow the joints: a point x is moved to ``R x + o``.
 
-    With local rotation Q_j and parent p: R_j = R_p Q_j and o_j = o_p + (R_p - R_j) c_j for a joint that rests at c_j.
+    With local rotation Q_j and parent p: R_j = R_p Q_j and o_j = o_p + (R_p - R_j) c_j for a joint with rest position
+    c_j.
 
     Parameters
     ----------

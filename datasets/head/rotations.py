@@ -61,7 +61,7 @@ def axis_angle_to_quaternion(axis_angle: Tensor) -> Tensor:
 def quaternion_to_axis_angle(quaternion: Tensor) -> Tensor:
     """Axis-angle vectors of length at most pi. (..., 4) to (..., 3); the input need not be of unit length.
 
-    At exactly pi both signs of the axis are right; the one with the given imaginary part is returned.
+    At exactly pi both signs of the axis are valid; the one with the given imaginary part is returned.
     """
     unit = normalize(quaternion, dim=-1)
     unit = torch.where(unit[..., :1] < 0, -unit, unit)
@@ -100,7 +100,7 @@ def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     A rotation matrix gives all products of the quaternion's components, 4 q q^T, without a root. Its row with
     the largest diagonal has length at least 2, so normalising that row is well conditioned everywhere.
     """
-    # Components apart, each contiguous, and no gather: several times faster than rows of four.
+    # Separate contiguous components without a gather are several times faster than rows of four.
     a, b, c, d, e, f, g, h, i = matrix.flatten(-2).movedim(-1, 0).contiguous().unbind(0)
     x, y, z = h - f, c - g, d - b
     p, q, r = b + d, c + g, f + h
@@ -117,14 +117,9 @@ def matrix_to_quaternion(matrix: Tensor) -> Tensor:
         row = tuple(torch.where(above, new, old) for new, old in zip(other, row))  # type: ignore[assignment]
         largest = torch.where(above, value, largest)
     chosen = torch.stack(row)
-    # The diagonal adds up to 4, so its largest entry is 1 at least, whatever the matrix: no division by 0.
+    # The diagonal sums to 4, so its largest entry is at least 1 for any matrix, and there is no division by 0.
     unit = chosen / chosen.square().sum(0).sqrt()
     return torch.where(unit[:1] < 0, -unit, unit).movedim(0, -1).contiguous()
-
-
-def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
-    """Axis-angle vectors of length at most pi of rotation matrices. (..., 3, 3) to (..., 3)."""
-    return quaternion_to_axis_angle(matrix_to_quaternion(matrix))
 
 
 _GENERATORS = np.array(

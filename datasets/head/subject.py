@@ -2,9 +2,9 @@
 
 A tracker of single videos keeps the head still and lets the camera move around it. With M the rigid motion of the
 head (global rotation about the root joint, neck rotation about the neck joint, translation) a camera W in the
-world becomes W M in the head's frame, and the pose keeps expression, jaw, eyes and eyelids alone. Projections of
-vertices that move with the neck joint stay the same, but for the neck's pose correctives; vertices that hang on the
-root (lower neck, shoulders) move with the head, as they do in such methods.
+world becomes W M in the head's frame, and the pose keeps only expression, jaw, eyes and eyelids. Projections of
+vertices that follow the neck joint are unchanged except for the neck's pose correctives; vertices that follow the root
+(lower neck, shoulders) move with the head, as in such methods.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ...bench.contracts import Camera, Clip, FloatArray, HeadAsset, HeadPose
 from .model import HeadModel
 
 BATCH = 64
-"""Poses evaluated at once, which bounds the memory of long sequences."""
+"""Number of poses evaluated at once, to limit memory for long sequences."""
 
 
 class PosedSubject:
@@ -90,7 +90,7 @@ class PosedSubject:
         )
 
     def _arguments(self, poses: Sequence[HeadPose], size: int) -> Iterator[dict[str, torch.Tensor]]:
-        for start in range(0, max(len(poses), 1), size):  # no pose is an error, which the model raises
+        for start in range(0, max(len(poses), 1), size):  # without poses the model raises an error
             yield self._model.pose_arguments(poses[start : start + size])
 
 

@@ -1,6 +1,6 @@
-"""Teeth as GaussianAvatars and VHAP add them: two bent double plates hung from the rings of the lips.
+"""Teeth as in GaussianAvatars and VHAP: two curved double plates attached to the rings of the lips.
 
-Qian et al., "GaussianAvatars", CVPR 2024, supplement; the construction is the one their code follows.
+Qian et al., "GaussianAvatars", CVPR 2024, supplement; the construction follows their code.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ THICKNESS = 1.0
 def with_teeth(arrays: HeadArrays) -> HeadArrays:
     """Append 8 n teeth vertices and 12 (n - 1) triangles, n being the length of the lip rings.
 
-    Upper teeth hang on the neck joint, lower ones on the jaw. They follow the identity as the lips in front
-    of them do (mean of the matching upper and lower lip vertex), and neither expression, pose correctives
-    nor the joint regressor know them. Adds the regions ``teeth``, ``teeth_upper`` and ``teeth_lower``.
+    Upper teeth follow the neck joint, lower ones the jaw. They follow the identity like the lips in front of them
+    (mean of the matching upper and lower lip vertex), and have no expression, pose correctives or influence on joints.
+    Adds the regions ``teeth``, ``teeth_upper`` and ``teeth_lower``.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def with_teeth(arrays: HeadArrays) -> HeadArrays:
 
 
 def with_teeth_where_possible(arrays: HeadArrays) -> HeadArrays:
-    """Append teeth to a head that has none; where it has no lips to hang them on, log why and leave it without."""
+    """Append teeth to a head without them; if the rings of the lips are not found, log the reason and return it unchanged."""
     if "teeth" in arrays.regions:
         return arrays
     try:
@@ -110,7 +110,7 @@ def _positions(upper: FloatArray, lower: FloatArray) -> FloatArray:
 def _triangles(columns: int, towards_left: bool) -> IntArray:
     """Triangles of the six strips, seen from outside counter-clockwise, as indices into the new vertices.
 
-    In the order of GaussianAvatars, whose splats are bound to triangles by number and turn with their first edge.
+    In the order of GaussianAvatars, whose splats are bound to triangles by index and rotate with their first edge.
     """
     block = {name: index * columns + np.arange(columns) for index, name in enumerate(ROWS)}
     strips = []
@@ -130,7 +130,7 @@ def _triangles(columns: int, towards_left: bool) -> IntArray:
 def _strip(first: IntArray, second: IntArray, *, falling: bool) -> IntArray:
     """Quads between two rows in two triangles each; the diagonal flips at the middle for symmetry.
 
-    The triangles face the viewer for whom the rows run to the left and ``first`` is above ``second``. ``falling``:
+    The triangles face a viewer who sees the rows run to the left with ``first`` above ``second``. ``falling``:
     the first half's diagonals run from ``first`` to the next of ``second``.
     """
     a, next_a, b, next_b = first[:-1], first[1:], second[:-1], second[1:]
@@ -208,7 +208,7 @@ def _depth_of_lips(asset: HeadAsset, edges: IntArray) -> IntArray:
     """(V,) edges between each vertex of the lips and their outer border; -1 elsewhere. ``edges`` has both directions."""
     lips = np.isin(np.arange(len(asset.template)), asset.regions["lips"])
     border = np.unique(edges[lips[edges[:, 0]] & ~lips[edges[:, 1]], 0])
-    if not len(border):  # a mesh of lips alone
+    if not len(border):  # a mesh of only lips
         border = np.flatnonzero(lips)
     # The inner border, towards the mouth, is the narrower one.
     outer = max(_pieces(edges, border, len(lips)), key=lambda piece: np.ptp(asset.template[piece, 0]))
@@ -251,6 +251,6 @@ def _pick(asset: HeadAsset, rim: IntArray, across: np.ndarray) -> IntArray:
     picked: list[int] = []
     for done, target in enumerate(across):
         first = picked[-1] + 1 if picked else 0
-        last = len(order) - (len(across) - done)  # leave enough for those to come
+        last = len(order) - (len(across) - done)  # leave enough for the following ones
         picked.append(first + int(np.argmin(np.abs(x[first : last + 1] - target))))
     return order[picked]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class InspectSettings(CaptureOptions):
-    """Which capture, and how much of it to show."""
+    """Capture to inspect, and number of frames to show."""
 
     clip: Annotated[str, tyro.conf.Positional]
     """Capture, in a layout that a reader knows; of the reader ga a UNION folder, a sequence folder, or the union's."""
@@ -35,7 +35,7 @@ class InspectSettings(CaptureOptions):
     """Rows of overlays."""
 
     cameras: int = 4
-    """Columns of overlays: held-out cameras first, then evenly over the rig."""
+    """Number of columns of overlays: held-out cameras first, then evenly over the rig."""
 
 
 PICTURE, NUMBERS = "inspection.png", "inspection.json"
@@ -44,7 +44,7 @@ PICTURE, NUMBERS = "inspection.png", "inspection.json"
 def inspect(settings: InspectSettings, progress: Progress = no_progress) -> CommandResult:
     """Plot the contents of a capture: camera rig, splits, tracked mesh over images, motion by sequence.
 
-    Raises `InputError` for a capture that the reader refuses (``headbench lint`` then reports all that is wrong),
+    Raises `InputError` for a capture that the reader refuses (``headbench lint`` reports all faults),
     for a clip without training frames that are not excluded, and for counts below 1.
     """
     from ..images import write_image
@@ -76,7 +76,7 @@ def inspect(settings: InspectSettings, progress: Progress = no_progress) -> Comm
 def summary(
     clip: CaptureClip, splits: Sequence[SplitRow], sequences: Sequence[SequenceRow], space: ExpressionSpace
 ) -> dict[str, Any]:
-    """Everything the picture shows, as plain values."""
+    """All values of the figure, as plain types."""
     record = clip.steps[0].parameters if clip.steps else {}
     held_out = {key.camera for key in clip.splits.get("novel_view", ())}
     return {

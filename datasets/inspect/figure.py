@@ -1,4 +1,4 @@
-"""The picture of a capture: camera rig, splits, tracked mesh on images, motion."""
+"""The figure of a capture: camera rig, splits, tracked mesh on images, motion."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WIDTH = 16.0
 """Width of the figure, inches."""
 
 OVERLAY_HEIGHT = 2.8
-"""Most that an overlay is high, inches."""
+"""Maximum height of an overlay, inches."""
 
 OVERLAY_PIXELS = 560
 MESH_OPACITY = 0.72
@@ -32,10 +32,10 @@ FRUSTUM_M = 0.10
 """Length of a drawn frustum."""
 
 SIGMA_BARS = 40
-"""Coefficients whose standard deviation is shown: the leading ones matter."""
+"""Number of leading coefficients whose standard deviation is shown."""
 
 MAX_SEQUENCES = 16
-_FAR_M = 100.0  # from so far the head's picture is orthographic to a thousandth
+_FAR_M = 100.0  # at this distance the projection is orthographic to a thousandth
 _HEAD_PIXELS_PER_M = 1200
 
 
@@ -49,7 +49,7 @@ def draw_figure(
     cameras: int,
     progress: Progress = no_progress,
 ) -> ByteArray:
-    """(H, W, 3) picture of a clip: up to ``timesteps`` rows and ``cameras`` columns of overlays."""
+    """(H, W, 3) figure of a clip: up to ``timesteps`` rows and ``cameras`` columns of overlays."""
     columns, rows = pick_cameras(clip, cameras), pick_timesteps(clip, space, timesteps)
     widest = max((clip.cameras[name].width / clip.cameras[name].height for name in columns), default=1.0)
     overlay_height = min(OVERLAY_HEIGHT, (WIDTH - 1.6) / max(1, len(columns)) / (2 * widest))
@@ -179,7 +179,7 @@ def _corner_rays(camera: Camera) -> FloatArray:
 
 
 def _head_picture(head: FloatArray, faces: IntArray) -> ByteArray:
-    """(H, W, 4) orthographic picture of exactly the head's bounding box, clear beside the head."""
+    """(H, W, 4) orthographic image of the head's bounding box, transparent beside the head."""
     low, high = head[:, :2].min(axis=0), head[:, :2].max(axis=0)
     width, height = np.maximum(1, np.ceil(_HEAD_PIXELS_PER_M * (high - low))).astype(int).tolist()
     scale = np.array([width, height]) / (high - low) * _FAR_M
@@ -194,7 +194,7 @@ def _head_picture(head: FloatArray, faces: IntArray) -> ByteArray:
 
 
 def _short_names(names: list[str]) -> dict[str, str]:
-    """The shortest ends of the names, of at least two characters, that tell them apart."""
+    """The shortest unique suffixes of the names, of at least two characters."""
     longest = max(map(len, names), default=0)
     for length in range(2, longest + 1):
         short = {name: name[-length:] for name in names}
@@ -225,7 +225,7 @@ def _facts(clip: CaptureClip) -> list[tuple[str, str]]:
 
 
 def pick_cameras(clip: CaptureClip, count: int) -> list[str]:
-    """Up to ``count`` camera ids: one held-out first, then evenly over the others in the order of the rig."""
+    """Up to ``count`` camera ids: a held-out one first, then evenly over the others in the order of the rig."""
     held_out = _held_out(clip)
     first = [name for name in clip.cameras if name in held_out][:1]
     others = [name for name in clip.cameras if name not in first]
@@ -280,7 +280,7 @@ def _draw_overlays(
     columns: Sequence[str],
     progress: Progress,
 ) -> None:
-    figure.suptitle("tracked mesh on images: its outline, and itself", x=0.01, ha="left", fontsize=11)
+    figure.suptitle("tracked mesh on images: outline and shaded", x=0.01, ha="left", fontsize=11)
     held_out, grid = _held_out(clip), figure.subplots(len(rows), len(columns), squeeze=False)
     meshes = PosedSubject.of(clip).meshes([clip.poses[timestep] for timestep, _ in rows])
     tests = {key.timestep for key in clip.splits.get("self_reenactment", ())}
@@ -305,7 +305,7 @@ def _draw_overlays(
 def _cell(
     clip: CaptureClip, key: FrameKey | None, camera: Camera, mesh: FloatArray, height: int
 ) -> ByteArray:
-    """Both overlays of a frame side by side; a light grey field where the camera did not record it."""
+    """Both overlays of a frame side by side; a light grey field if the camera did not record it."""
     if key is None:
         width = max(1, round(camera.width * height / camera.height))
         return np.full((height, 2 * width, 3), 238, dtype=np.uint8)
@@ -347,7 +347,7 @@ def _draw_motion(
 
 
 def _draw_sequences(jaw: Axes, reach: Axes, rows: Sequence[SequenceRow]) -> None:
-    """Ranges of each sequence as bars, from least to largest, with a mark at the median."""
+    """Ranges of each sequence as bars from minimum to maximum, with a mark at the median."""
     shown = rows if len(rows) <= MAX_SEQUENCES else rows[: MAX_SEQUENCES - 1]
     for place, row in enumerate(shown):
         colour = HELD_OUT if row.held_out else TRAIN
@@ -377,7 +377,7 @@ def _draw_sequences(jaw: Axes, reach: Axes, rows: Sequence[SequenceRow]) -> None
 
 
 def space_summary(space: ExpressionSpace) -> str:
-    """One sentence on how rich the training faces are and how new the test's."""
+    """One sentence on the variety of the training faces and the novelty of the test faces."""
     components = "1 component explains" if space.kept == 1 else f"{space.kept} components explain"
     parts = [f"{components} {KEPT_VARIANCE:.0%} of the training faces"]
     if space.novelty_mm:

@@ -1,4 +1,4 @@
-"""Numbers of a capture: what the splits hold and how faces move in each sequence."""
+"""Statistics of a capture: content of the splits and motion of the face in each sequence."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class SplitRow:
 
 @dataclass(frozen=True)
 class SequenceRow:
-    """How one sequence moves. Excluded timesteps are counted and otherwise left out.
+    """Motion of one sequence. Excluded timesteps are only counted.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class ExpressionSpace:
     scores_mm : FloatArray
         (T, K) root-mean-square displacement of the face's vertices along each component.
     explained : FloatArray
-        (K,) share of the training variance.
+        (K,) fraction of the training variance.
     novelty_mm : Mapping[int, float]
         RMS distance of the face to the nearest training face, by held-out timestep.
     novelty : Mapping[str, Novelty]
@@ -113,7 +113,7 @@ def split_rows(clip: CaptureClip) -> list[SplitRow]:
 
 
 def sequence_rows(clip: CaptureClip) -> list[SequenceRow]:
-    """One row per sequence, in the order of timesteps; two where its end is held out, as of a video of one camera."""
+    """One row per sequence, in the order of timesteps; two if its end is held out, as in a video of one camera."""
     held_out = {key.timestep for key in clip.splits.get("self_reenactment", ())}
     excluded = {key.timestep for key in clip.excluded}
     groups: dict[str, set[int]] = {}
@@ -164,14 +164,14 @@ def _largest_turn(poses: Sequence[HeadPose]) -> float:
 
 
 def _reach(clip: CaptureClip, expressions: FloatArray) -> FloatArray:
-    """(T,) metres that the farthest-moving vertex moves by expression alone."""
+    """(T,) largest displacement of a vertex by expression alone, metres."""
     basis = clip.head.expression_basis
     matrix = np.asarray(basis, dtype=np.float64).reshape(-1, basis.shape[2])
     return np.array([np.linalg.norm((matrix @ e).reshape(-1, 3), axis=1).max() for e in expressions])
 
 
 def expression_space(clip: CaptureClip) -> ExpressionSpace:
-    """The `ExpressionSpace` of a clip. Exact, and done in the space of coefficients: never V x T numbers at once."""
+    """The `ExpressionSpace` of a clip. It is computed exactly in the space of coefficients, without V x T values in memory."""
     excluded = {key.timestep for key in clip.excluded}
     test = {key.timestep for key in clip.splits.get("self_reenactment", ())}
     timesteps = [t for t in sorted(clip.poses) if t not in excluded]
@@ -184,7 +184,7 @@ def expression_space(clip: CaptureClip) -> ExpressionSpace:
     _, singular, axes = np.linalg.svd(centred[~held_out], full_matrices=False)
     variance = singular**2
     scores = centred @ axes.T
-    # A component's sign is arbitrary; the larger half of its skew points to the right.
+    # The sign of a component is arbitrary; the skew is made positive.
     scores = scores * np.where((scores[~held_out] ** 3).sum(axis=0) < 0, -1.0, 1.0)
     nearest = {
         t: float(np.linalg.norm(train - face, axis=1).min())

@@ -1,4 +1,4 @@
-"""The errors of the linter that make every result of a capture meaningless, looked for in a few frames before a run."""
+"""Checks of a few frames before a run for errors that make every result of a capture meaningless."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
     from ..head.arrays import HeadArrays
 
 CODES = ("HB503", "HB504", "HB505", "HB701")
-"""The head behind the cameras, upside down, or far off; the mesh beside the subject. What else the linter finds makes
-numbers wrong, not void."""
+"""Codes for a head behind the cameras, upside down or far away, and for a mesh beside the subject. Other findings of
+the linter make numbers inaccurate, not meaningless."""
 FRAMES = 12
-"""Frames that are decoded, spread over timesteps and cameras."""
+"""Number of decoded frames, spread over timesteps and cameras."""
 MOST = 1000
-"""Frames that they are chosen of."""
+"""Number of candidate frames."""
 
 
 def errors(clip: Clip) -> list[str]:
     """Errors of the linter for a clip: code, fault and remedy of each error in `CODES`."""
     if clip.head is None:
-        return []  # a capture of something else, for methods that need no head
+        return []  # a capture without a head, for methods that need none
     keys = sorted({key for part in clip.splits.values() for key in part})
     keys = keys[:: max(1, len(keys) // MOST)]
     entries = {_entry(clip, key): key for key in keys}
@@ -76,7 +76,7 @@ def errors(clip: Clip) -> list[str]:
 
 
 def _entry(clip: Clip, key: FrameKey) -> FrameEntry:
-    """A clip's frame as the layout would state it; the key stands for paths."""
+    """A clip's frame as an entry of the layout, with the key in place of paths."""
     camera = clip.cameras[key.camera]
     return FrameEntry(
         file=Path(clip.subject),

@@ -1,10 +1,10 @@
-"""Measurements of each camera on a few timesteps, which the rules on cameras compare with one another.
+"""Measurements of each camera on a few timesteps, for the rules that compare cameras.
 
-A point of the skin has nearly the same brightness in every camera that sees it. So the brightness that the vertices of
-the tracked face pick up from one camera is compared with the median over the other cameras: the image offset at which
-both correlate best says how far the camera's calibration is off, that correlation says whether it is this camera's
-calibration at all, and the change of the offset with the head's motion says whether the camera is synchronous. Unlike
-outlines, this does not depend on hair, which lies outside of the mesh.
+A point of the skin has nearly the same brightness in every camera that sees it. The brightness at the vertices of the
+tracked face in one camera is therefore compared with the median over the other cameras: the image offset with the
+highest correlation measures the error of the camera's calibration, the correlation shows whether the calibration
+belongs to this camera, and the change of the offset with the head's motion shows whether the camera is synchronous.
+Unlike outlines, this does not depend on hair outside of the mesh.
 """
 
 from __future__ import annotations
@@ -29,31 +29,32 @@ TIMESTEPS = 8
 """Timesteps to measure on."""
 
 WORKING_HEIGHT = 400
-"""Images are compared at most this many pixels high."""
+"""Maximum height of compared images, pixels."""
 
 MAX_LAG = 3
 """Maximum number of frames by which a camera may be late or early."""
 
 REACH = 0.1
-"""Largest offset that is searched for, as a share of the working height."""
+"""Maximum searched offset, as a fraction of the working height."""
 
 MOST_VERTICES, FEWEST_VERTICES = 1200, 40
 
 FINE_SIGMAS = (1.0, 2.0)
-"""Fine details are those between Gaussian filters of these standard deviations, working pixels."""
+"""Standard deviations of the Gaussian filters whose difference gives fine details, working pixels."""
 
 FACING = 0.4
-"""Least cosine between a vertex's normal and the direction to the camera."""
+"""Minimum cosine between a vertex's normal and the direction to the camera."""
 
 DOUBT_MATCH, DOUBT_OFFSET = 0.1, 0.01
-"""Cameras whose correlation is so much below the median, or whose offset is further from it than this share of the
-height, are measured against the others and are no measure for them; other cameras' calibrations are tried on them."""
+"""Cameras with a correlation this much below the median, or an offset farther from it than this fraction of the
+height, are compared with the others but not used as a reference; other cameras' calibrations are tested on them."""
 
 STILL_SHARE, MOVING_LEVELS = 0.1, 2.0
-"""A picture is frozen where it changes by less than this share of the others' median change, if that is so much."""
+"""A camera is frozen if its image changes by less than the first fraction of the others' median change, which must be
+at least the second value."""
 
 FEWEST_CAMERAS = 3
-"""With two cameras nothing says which of them is wrong."""
+"""Minimum number of cameras; with two it is unknown which one is wrong."""
 
 _NOT_SKIN = ("mouth_socket", "left_eyeball", "right_eyeball", "teeth")
 _CANDIDATES = 6
@@ -61,7 +62,7 @@ _CANDIDATES = 6
 
 @dataclass(frozen=True)
 class CameraFacts:
-    """Measurements of one camera. Those that could not be made are NaN.
+    """Measurements of one camera; NaN if not available.
 
     Attributes
     ----------
@@ -173,7 +174,7 @@ def measure_cameras(
 
 
 def frozen(facts: Mapping[str, CameraFacts]) -> list[str]:
-    """Cameras that show one picture all the time while the others' pictures change."""
+    """Cameras whose image never changes while the others' images change."""
     motion = {c: f.motion for c, f in facts.items() if f.contrast >= BLANK_LEVELS and np.isfinite(f.motion)}
     typical = float(np.median([*motion.values()])) if len(motion) >= FEWEST_CAMERAS else 0.0
     if typical < MOVING_LEVELS:
@@ -182,7 +183,7 @@ def frozen(facts: Mapping[str, CameraFacts]) -> list[str]:
 
 
 def _doubted(facts: Mapping[str, CameraFacts]) -> list[str]:
-    """Cameras that match worse, or elsewhere, than most."""
+    """Cameras that match worse, or at another offset, than most."""
     measured = {camera: f for camera, f in facts.items() if np.isfinite(f.match)}
     if not measured:
         return []
@@ -202,9 +203,9 @@ def _pick_timesteps(
     parameters: Mapping[int, Parameters],
     count: int,
 ) -> dict[int, list[int]]:
-    """Timesteps to measure on and, by the lag from -`MAX_LAG` to `MAX_LAG`, the timesteps whose poses stand for it.
+    """Timesteps to measure and, for each lag from -`MAX_LAG` to `MAX_LAG`, the timesteps of the poses.
 
-    Out of each of ``count`` equal parts of the capture the timestep with the fastest head.
+    From each of ``count`` equal parts of the capture, the timestep with the fastest head motion is selected.
     """
     sequences: dict[str, set[int]] = defaultdict(set)
     for entry in entries:
@@ -229,7 +230,7 @@ def _posed(parameters: Mapping[int, Parameters], timestep: int) -> bool:
 def _speed(
     subject: TrackedSubject | None, parameters: Mapping[int, Parameters], around: Sequence[int]
 ) -> float:
-    """Mean distance in metres that vertices move over the timesteps around one; -1 at the end of a sequence."""
+    """Mean motion of vertices over the timesteps around each one, metres; -1 at the ends of a sequence."""
     before, after = around[MAX_LAG + 1], around[MAX_LAG - 1]
     if subject is None or before < 0 or after < 0:
         return -1.0
@@ -269,7 +270,7 @@ def _plain(shots: Sequence[_Shot]) -> CameraFacts:
 
 
 class _Table:
-    """Brightness that the face's vertices pick up, by camera and timestep."""
+    """Brightness at the face's vertices, by camera and timestep."""
 
     def __init__(
         self,
@@ -323,7 +324,7 @@ class _Table:
         return _typical(rows)
 
     def _even_out(self) -> None:
-        """Bring the cameras' exposures to one."""
+        """Equalise the cameras' exposures."""
         everything = _median(list(self.values.values()))
         for camera, values in self.values.items():
             both = np.isfinite(values) & np.isfinite(everything)
@@ -365,7 +366,7 @@ class _Table:
         )
 
     def _lag(self, camera: str, offsets: Mapping[int, FloatArray]) -> tuple[int, float, float, FloatArray]:
-        """The lag that leaves the offsets over time most alike, how much they change without and with it, their median."""
+        """The lag with the most constant offsets over time, their variation without and with it, and their median."""
         residuals = {}
         for lag in range(-MAX_LAG, MAX_LAG + 1):
             rest = []
@@ -435,7 +436,7 @@ def _typical(rows: Sequence[tuple[FloatArray, np.ndarray]]) -> FloatArray:
 
 
 def _median(rows: Sequence[FloatArray]) -> FloatArray:
-    """Median over rows without NaN; NaN where all are. No row at all is one that is empty."""
+    """Median over rows, ignoring NaN; NaN if all are."""
     if not rows:
         return np.empty(0)
     stack = np.sort(np.stack(rows), axis=0)  # NaN last
@@ -446,14 +447,14 @@ def _median(rows: Sequence[FloatArray]) -> FloatArray:
 
 
 class _Register(NamedTuple):
-    """Best correlation of an image with wanted brightness, and the offset in pixels at which it is reached."""
+    """Maximum correlation of an image with a target brightness, and its offset in pixels."""
 
     score: float
     offset: FloatArray
 
 
 def _register(picked: _Picked, wanted: FloatArray, reach: float = REACH, levels: int = 3) -> _Register | None:
-    """Search offsets up to ``reach`` of the image's height, in ``levels`` ever finer grids."""
+    """Search offsets up to ``reach`` of the image's height, in ``levels`` successively finer grids."""
     usable = picked.seen & np.isfinite(wanted)
     if usable.sum() < FEWEST_VERTICES:
         return None

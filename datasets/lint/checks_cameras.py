@@ -1,4 +1,4 @@
-"""HB5xx: where cameras stand, how they look, and how their pixels are counted."""
+"""HB5xx: positions, orientations and pixel coordinates of cameras."""
 
 from __future__ import annotations
 
@@ -21,34 +21,34 @@ from .rules import Hit, at, rule, several, some
 
 SAME_PLACE_M = 1e-3
 SAME_TURN = 2e-3
-"""Cameras closer than this in position (metres) and in every rotation entry are one."""
+"""Cameras closer than this in position (metres) and in every rotation entry are identical."""
 
 NEAR_M, FAR_M = 0.15, 10.0
-"""Distances of a head from a camera between which heads are recorded, metres."""
+"""Range of plausible distances of a head from a camera, metres."""
 
 OFF_CENTRE = 0.25
-"""Share of the image's side from which a principal point is suspiciously far from the centre."""
+"""Fraction of the image's side above which the offset of a principal point is suspicious."""
 
 TELLING_PX = 1.0
-"""From this offset of cy on the two readings are so far apart (twice as much) that outlines may accuse one."""
+"""Minimum offset of cy for the comparison of outlines; the two conventions differ by twice as much."""
 
 TELLING_AGREEMENT = 0.1
-"""Outlines that agree less under both readings of cy are not of one head: the fault is another."""
+"""Minimum agreement of outlines; below it for both conventions of cy, there is another fault."""
 
 EXACT = 1e-4
-"""Pixels; a principal point this close to (w - 1) / 2 was computed as that."""
+"""Pixels; a principal point this close to (w - 1) / 2 is assumed to be computed as such."""
 
 
 @rule("HB501", "error", of_layout=True)
 def _not_rigid(evidence: Evidence) -> Iterator[Hit]:
-    """A camera's matrix is no rigid motion.
+    """A camera's matrix is not a rigid motion.
 
     Write camera-to-world with a right-handed rotation and no scale; put scale into the world instead.
     """
     broken = [error for error in evidence.frame_faults if error.key.endswith(".transform_matrix")]
     if broken:
         text = (
-            f"{several(len(broken), 'frame')} with a transform_matrix that is no rigid motion: "
+            f"{several(len(broken), 'frame')} with a transform_matrix that is not a rigid motion: "
             f"{broken[0].found}"
         )
         yield Hit(text, broken[0].file, broken[0].key)
@@ -56,7 +56,7 @@ def _not_rigid(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB502", "error")
 def _same_camera(evidence: Evidence) -> Iterator[Hit]:
-    """Two cameras are one.
+    """Two cameras are identical.
 
     Correct the calibration, or drop one: with one held out, a novel view is a training view.
     """
@@ -70,7 +70,7 @@ def _same_camera(evidence: Evidence) -> Iterator[Hit]:
             same = difference[:3, 3].max() < SAME_PLACE_M and difference[:3, :3].max() < SAME_TURN
             if same and (one, other) not in seen:
                 seen.add((one, other))
-                text = f"cameras {one} and {other} stand at the same place and look the same way"
+                text = f"cameras {one} and {other} have the same position and orientation"
                 yield Hit(text, *at(views[other], "transform_matrix"))
 
 
@@ -78,7 +78,7 @@ def _same_camera(evidence: Evidence) -> Iterator[Hit]:
 def _moving(evidence: Evidence) -> Iterator[Hit]:
     """A camera moves within a sequence.
 
-    Cameras of the layout stand still; for a moving camera move the head instead.
+    Cameras of the layout are static; for a moving camera move the head instead.
     """
     first: dict[tuple[str, str], FrameEntry] = {}
     moved: dict[str, FrameEntry] = {}
@@ -101,7 +101,7 @@ def behind(evidence: Evidence) -> list[str]:
 
 
 def upside_down(evidence: Evidence) -> list[str]:
-    """Cameras that see the head upside down, in most of their frames."""
+    """Cameras that show the head upside down in most of their frames."""
     seen: dict[str, list[float]] = {}
     for view in evidence.views:
         if view.mesh is not None and view.mesh.depth > 0:
@@ -137,14 +137,14 @@ def _cameras(evidence: Evidence, cameras: Iterable[str], what: str) -> Iterator[
 
 
 def implausible_distance(evidence: Evidence) -> float | None:
-    """Median distance of the head from the cameras, metres, where no capture is made at such a distance."""
+    """Median distance of the head from the cameras, metres, if it is implausible."""
     distances = [view.mesh.distance for view in evidence.views if view.mesh is not None]
     median = float(np.median(distances)) if distances else NEAR_M
     return None if NEAR_M <= median <= FAR_M else median
 
 
 def misplaced(evidence: Evidence) -> bool:
-    """Whether cameras are so wrong that images and mesh cannot be compared."""
+    """Whether errors of cameras prevent a comparison of images and mesh."""
     return bool(behind(evidence) or upside_down(evidence) or implausible_distance(evidence) is not None)
 
 
@@ -166,7 +166,7 @@ def _size(evidence: Evidence, entry: FrameEntry) -> tuple[int, int] | None:
 
 
 def _contradicted(evidence: Evidence) -> list[tuple[str, FrameEntry, float]]:
-    """Cameras whose focal length is not the one their angle of view implies, and that one in pixels."""
+    """Cameras whose focal length differs from that implied by their angle of view, and the latter in pixels."""
     wrong = []
     for camera, entry in first_entries(evidence).items():
         size = _size(evidence, entry)
@@ -195,7 +195,7 @@ def _focal(evidence: Evidence) -> Iterator[Hit]:
 def principal_offsets(evidence: Evidence) -> dict[str, FloatArray]:
     """(2,) pixels from the image's centre to the stated principal point, by camera; cameras that state one.
 
-    The vertical offset is as stated: where cy counts from the bottom, positive is up.
+    The vertical offset is as stated: if cy is measured from the bottom, positive is up.
     """
     offsets: dict[str, FloatArray] = {}
     for camera, entry in first_entries(evidence).items():
@@ -208,9 +208,9 @@ def principal_offsets(evidence: Evidence) -> dict[str, FloatArray]:
 
 @rule("HB507", "warning")
 def _far_principal_point(evidence: Evidence) -> Iterator[Hit]:
-    """A principal point lies far from the centre.
+    """A principal point is far from the centre.
 
-    Scale and crop cx, cy with the images, or make sure that the crop is meant.
+    Scale and crop cx, cy with the images, or make sure that the crop is intended.
     """
     entries = first_entries(evidence)
     for camera, offset in principal_offsets(evidence).items():
@@ -246,7 +246,7 @@ def _convention(evidence: Evidence) -> str | None:
 
 @rule("HB509", "warning", of_layout=True)
 def _centred(evidence: Evidence) -> Iterator[Hit]:
-    """The stated principal point is dropped.
+    """The stated principal point is ignored.
 
     Declare "top" or "bottom", unless the loss of GaussianAvatars' centred camera is to be reproduced.
     """
@@ -254,7 +254,7 @@ def _centred(evidence: Evidence) -> Iterator[Hit]:
     worst = max((float(np.linalg.norm(o)) for o in offsets.values()), default=0.0)
     if _convention(evidence) == "centre" and worst > 0.5:
         yield Hit(
-            f"the principal point is taken at the image's centre, the JSONs state it up to {worst:.2f} px off",
+            f"the principal point is assumed at the image's centre, the JSONs state it up to {worst:.2f} px off",
             evidence.folder / layout.DECLARATION_FILE,
             "cy",
         )
@@ -264,8 +264,7 @@ def _centred(evidence: Evidence) -> Iterator[Hit]:
 def _ignored(evidence: Evidence) -> Iterator[Hit]:
     """Official code would centre the principal point.
 
-    GaussianAvatars and what is derived from it ignore cx, cy: their renders are shifted by as much against
-    the images.
+    GaussianAvatars and derived code ignore cx, cy: their renders are shifted by this offset.
     """
     offsets = principal_offsets(evidence)
     worst = max((float(np.linalg.norm(o)) for o in offsets.values()), default=0.0)
@@ -278,7 +277,7 @@ def _ignored(evidence: Evidence) -> Iterator[Hit]:
 
 
 def cy_evidence_views(evidence: Evidence) -> list[OutlineView]:
-    """Views whose outlines may tell where cy counts from, with their cameras read from the top."""
+    """Views for comparing outlines, with cameras whose cy is measured from the top."""
     views = []
     for view in evidence.views:
         mesh, path = view.mesh, view.entry.mask or view.entry.image
@@ -292,9 +291,9 @@ def cy_evidence_views(evidence: Evidence) -> list[OutlineView]:
 
 @rule("HB511", "error", of_layout=True)
 def _other_edge(evidence: Evidence) -> Iterator[Hit]:
-    """Cy counts from the other edge.
+    """Cy is measured from the other edge.
 
-    Declare the other convention: VHAP counts from the bottom since November 2024, from the top before.
+    Declare the other convention: VHAP measures from the bottom since November 2024, from the top before.
     """
     convention = _convention(evidence)
     matters = any(abs(offset[1]) > TELLING_PX for offset in principal_offsets(evidence).values())

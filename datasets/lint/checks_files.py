@@ -1,4 +1,4 @@
-"""HB1xx: what is there and what is not. HB2xx: what is held out and seen in training all the same."""
+"""HB1xx: existing and missing files. HB2xx: held-out data in training."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from .views import Thumbnail, near_duplicates
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 GA_WIDTH = 1600
-"""Wider images are rescaled by the code of GaussianAvatars, unless it is told otherwise."""
+"""Wider images are rescaled by the code of GaussianAvatars by default."""
 
 
 def _faults(errors: Iterable[InputError], noun: str) -> Iterator[Hit]:
-    """One hit for faults of one kind in one place: same key and same expectation, whatever the file."""
+    """One hit for faults of one kind: same key and same expectation, in any file."""
     groups: dict[tuple[str, str], list[InputError]] = defaultdict(list)
     for error in errors:
         groups[(error.key.rpartition(".")[2], error.expected)].append(error)
@@ -38,9 +38,9 @@ def _faults(errors: Iterable[InputError], noun: str) -> Iterator[Hit]:
 def _refused(evidence: Evidence) -> Iterator[Hit]:
     """The reader refuses the capture.
 
-    Fix what the other findings name; `headbench run` would stop at this one.
+    Fix the other findings first; `headbench run` stops at this one.
     """
-    # A fault that another rule reports is left to that rule (see `apply` for those at the same place).
+    # Faults reported by another rule are skipped (see `apply` for those at the same place).
     error = evidence.refusal
     reported = not {"HB103", "HB116"} & {*evidence.settings.ignore}
     missing = error is not None and any(str(fault.file) in error.found for fault in evidence.file_faults)
@@ -71,9 +71,9 @@ def _broken_frame(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB103", "error")
 def _missing_file(evidence: Evidence) -> Iterator[Hit]:
-    """A file is missing, cut off or damaged.
+    """A file is missing, truncated or damaged.
 
-    Copy or export the file again; a copy that was broken off leaves such files.
+    Copy or export the file again; interrupted copies leave such files.
     """
     groups: dict[tuple[str, str], list[InputError]] = defaultdict(list)
     elsewhere = _absolute_elsewhere(evidence)
@@ -98,7 +98,7 @@ def _missing_file(evidence: Evidence) -> Iterator[Hit]:
 
 
 def _absolute_elsewhere(evidence: Evidence) -> dict[str, tuple[FrameEntry, str]]:
-    """Files that are named by absolute paths and are not there, with the frame and the key that name them."""
+    """Missing files with absolute paths, with the frame and the key that name them."""
     found: dict[str, tuple[FrameEntry, str]] = {}
     for entry in evidence.entries:
         named = {"file_path": entry.image, "fg_mask_path": entry.mask, "flame_param_path": entry.parameters}
@@ -112,8 +112,8 @@ def _absolute_elsewhere(evidence: Evidence) -> dict[str, tuple[FrameEntry, str]]
 def _absolute_paths(evidence: Evidence) -> Iterator[Hit]:
     """Paths are absolute and of another machine.
 
-    Write paths relative to the folder of the JSON, such as ../SEQUENCE/images/00000_00.png: an export that was copied
-    keeps them.
+    Write paths relative to the folder of the JSON, such as ../SEQUENCE/images/00000_00.png, which stay valid when the
+    export is copied.
     """
     found = _absolute_elsewhere(evidence)
     if found:
@@ -126,7 +126,7 @@ def _absolute_paths(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB104", "error", of_layout=True)
 def _wrong_size(evidence: Evidence) -> Iterator[Hit]:
-    """An image or mask is of another size than stated.
+    """An image or mask has another size than stated.
 
     Scale the intrinsics and w, h with the images, or export both at one size.
     """
@@ -153,7 +153,7 @@ def _wrong_size(evidence: Evidence) -> Iterator[Hit]:
 def _holes(evidence: Evidence) -> Iterator[Hit]:
     """Frames are missing from the grid of timesteps and cameras.
 
-    Export the missing frames, or leave the timestep out altogether and say why.
+    Export the missing frames, or exclude the timestep with a reason.
     """
     slots = {Slot(e.timestep, e.camera_index) for e in evidence.entries} | evidence.unread
     for folder, timesteps in evidence.sequences.items():
@@ -171,9 +171,9 @@ def _holes(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB106", "error", of_layout=True)
 def _gap(evidence: Evidence) -> Iterator[Hit]:
-    """Timesteps do not count from 0 without a gap.
+    """Timesteps are not numbered from 0 without a gap.
 
-    Renumber timesteps: readers of the layout index parameters by them, and a gap shifts all behind it.
+    Renumber timesteps: readers of the layout index parameters by them, and a gap shifts all following ones.
     """
     present = {e.timestep for e in evidence.entries} | {slot.timestep for slot in evidence.unread}
     gaps = [
@@ -189,9 +189,9 @@ def _gap(evidence: Evidence) -> Iterator[Hit]:
 def _frozen(evidence: Evidence) -> Iterator[Hit]:
     """Timesteps repeat the images of the one before.
 
-    Drop the repeated timesteps: frozen video counts one moment many times.
+    Remove the repeated timesteps: frozen video counts one moment many times.
     """
-    # Consecutive timesteps whose images are the same files' content in every camera that has both.
+    # Consecutive timesteps with identical images in every camera that has both.
     images, frozen = evidence.contents, []
     for timesteps in evidence.sequences.values():
         for before, after in pairwise(timesteps):
@@ -205,9 +205,9 @@ def _frozen(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB108", "error", of_layout=True)
 def _stray_exclusion(evidence: Evidence) -> Iterator[Hit]:
-    """An exclusion names a timestep that is not there.
+    """An exclusion names a timestep that does not exist.
 
-    Correct the timestep: probably counted within a sequence, or before the timesteps were renumbered.
+    Correct the timestep: it was probably numbered within a sequence, or before timesteps were renumbered.
     """
     if evidence.declaration is None:
         return
@@ -236,7 +236,7 @@ def _unreasoned(evidence: Evidence) -> Iterator[Hit]:
 def _short_test(evidence: Evidence) -> Iterator[Hit]:
     """A test sequence is short.
 
-    Hold out a longer sequence: a mean over a few timesteps says little, and official code of GaussianAvatars
+    Hold out a longer sequence: a mean over a few timesteps is unreliable, and official code of GaussianAvatars
     fails with fewer than 10 test frames.
     """
     excluded = set(evidence.declaration.excluded) if evidence.declaration else set()
@@ -257,7 +257,7 @@ def _short_test(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB111", "warning")
 def _empty_split(evidence: Evidence) -> Iterator[Hit]:
-    # A file that does not read, or whose frames do not, is another fault.
+    # An unreadable file, or one with unreadable frames, is another fault.
     """A split is empty. A video of one camera has no novel views to hold out.
 
     Hold out a camera for novel views and a sequence for self-reenactment.
@@ -275,9 +275,9 @@ def _empty_split(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB112", "note", of_layout=True)
 def _undeclared(evidence: Evidence) -> Iterator[Hit]:
-    """The capture leaves its conventions unsaid.
+    """The capture does not declare its conventions.
 
-    Write headbench.json beside the JSONs (see the README), so that nothing has to be guessed.
+    Write headbench.json beside the JSONs (see the README), so that nothing has to be inferred.
     """
     if evidence.declaration is None and not evidence.declaration_faults:
         yield Hit(
@@ -289,13 +289,13 @@ def _undeclared(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB113", "note", of_layout=True)
 def _orphans(evidence: Evidence) -> Iterator[Hit]:
-    """Images lie there that no split names.
+    """Images are in no split.
 
-    Delete them, or add them to a split, if they were to be used.
+    Delete them, or add them to a split if they should be used.
     """
     named = {entry.image for entry in evidence.entries}
     folders = {entry.image.parent for entry in evidence.entries}
-    # Frames that do not parse name images too, and which is not known.
+    # Frames that do not parse refer to unknown images.
     if evidence.unread or evidence.frame_faults or evidence.json_faults:
         return
     known = {path.resolve() for path in named}
@@ -314,7 +314,7 @@ def _orphans(evidence: Evidence) -> Iterator[Hit]:
 def _uneven_masks(evidence: Evidence) -> Iterator[Hit]:
     """Some frames have a mask and some have none.
 
-    Export all masks: regions and masked metrics would cover a part of the frames only.
+    Export all masks: regions and masked metrics would cover only a part of the frames.
     """
     bare = [entry for entry in evidence.entries if entry.mask is None]
     share = len(bare) / max(1, len(evidence.entries))
@@ -327,7 +327,7 @@ def _uneven_masks(evidence: Evidence) -> Iterator[Hit]:
 def _size_limit(evidence: Evidence) -> Iterator[Hit]:
     """Images are wider than GaussianAvatars' limit.
 
-    Its code rescales images wider than 1,600 pixels unless given -r 1; align the size beforehand.
+    Its code rescales images wider than 1,600 pixels without -r 1; align the size beforehand.
     """
     wide = [path for path, info in evidence.headers.items() if info.width > GA_WIDTH]
     if wide:
@@ -342,9 +342,9 @@ def _size_limit(evidence: Evidence) -> Iterator[Hit]:
 def _same_images(evidence: Evidence) -> Iterator[Hit]:
     """The same image is in two splits.
 
-    Take it out of one: a method is measured on what it was trained on.
+    Remove it from one: a method would be evaluated on its training data.
     """
-    # By content, hence also where one file is listed twice.
+    # By content, which includes files that are listed twice.
     dead = dead_cameras(evidence)  # all of their images are the same
     contents: dict[str, dict[str, FrameEntry]] = {}
     for split, part in evidence.splits.items():
@@ -367,7 +367,7 @@ def _same_images(evidence: Evidence) -> Iterator[Hit]:
 def _near_images(evidence: Evidence) -> Iterator[Hit]:
     """Images of two splits are nearly the same.
 
-    Look at the pair; where one is the other saved again or shifted by a frame, fix the split.
+    Inspect the pair; if one is a re-saved copy of the other or shifted by a frame, fix the split.
     """
     if unit_range(evidence):
         return  # levels 0 and 1 are all nearly the same
@@ -424,7 +424,7 @@ def _test_cameras(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB205", "error")
 def _twice(evidence: Evidence) -> Iterator[Hit]:
-    """A frame stands twice in one split.
+    """A frame occurs twice in one split.
 
     Delete the second entry: it would be trained on or counted twice.
     """
@@ -438,7 +438,7 @@ def _twice(evidence: Evidence) -> Iterator[Hit]:
             seen.add(slot)
         if twice:
             text = (
-                f"{several(len(twice), 'frame')} of {split} stand there twice, such as timestep "
+                f"{several(len(twice), 'frame')} of {split} occur twice, such as timestep "
                 f"{twice[0].timestep} of camera {twice[0].camera_id}"
             )
             yield Hit(text, twice[0].file, twice[0].where)

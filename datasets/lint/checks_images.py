@@ -1,7 +1,7 @@
-"""HB3xx: backgrounds and masks. HB4xx: colours that went through the wrong conversion.
+"""HB3xx: backgrounds and masks. HB4xx: wrong colour conversions.
 
-Roots before branches: a check says nothing of frames whose fault another one names already, so that an inverted
-mask is not reported as a wrong background too.
+A check skips frames whose fault another check reports, so that an inverted mask is not also reported as a wrong
+background.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from .rules import Hit, rule, several, some
 from .views import BACKGROUND_LEVELS, MaskFacts, ViewFacts
 
 MOST = 0.5
-"""Share of the looked-at frames from which a fault is one of the export, not of single frames."""
+"""Fraction of the inspected frames from which a fault is one of the export, not of single frames."""
 
 DIRTY = 0.02
-"""Share of pixels outside the mask that may differ from the background."""
+"""Fraction of pixels outside the mask that may differ from the background."""
 
 FRINGES = (0.65, 1.5)
 """Fringes between these are a clean composite, see `MaskFacts.fringe`."""
@@ -78,11 +78,11 @@ def _faulty_masks(evidence: Evidence, is_faulty: Callable[[MaskFacts], bool], wh
 
 @rule("HB307", "error")
 def _unit_masks(evidence: Evidence) -> Iterator[Hit]:
-    """A mask holds 0 and 1 out of 255.
+    """A mask has values 0 and 1 instead of 255.
 
     Multiply it by 255 before saving.
     """
-    yield from _faulty_masks(evidence, _unit_mask, "the mask holds 0 and 1 alone, out of 255,")
+    yield from _faulty_masks(evidence, _unit_mask, "the mask has only the values 0 and 1 out of 255,")
 
 
 @rule("HB304", "error")
@@ -98,7 +98,7 @@ def _empty_masks(evidence: Evidence) -> Iterator[Hit]:
 def _full_masks(evidence: Evidence) -> Iterator[Hit]:
     """A mask is full.
 
-    Run the matting again; a mask of 255 everywhere is what a failed matting leaves.
+    Run the matting again; failed matting gives a mask of 255 everywhere.
     """
     yield from _faulty_masks(evidence, _full, "the mask covers the whole image")
 
@@ -109,14 +109,14 @@ def _inverted_masks(evidence: Evidence) -> Iterator[Hit]:
 
     Invert it: 255 is the subject.
     """
-    yield from _faulty_masks(evidence, _inverted, "the mask covers the background and leaves out the subject")
+    yield from _faulty_masks(evidence, _inverted, "the mask covers the background and not the subject")
 
 
 @rule("HB308", "error")
 def _blank_images(evidence: Evidence) -> Iterator[Hit]:
-    """An image is of one colour.
+    """An image has a single colour.
 
-    Export the frame again, or exclude it with a reason; leave a camera out of which every image is so.
+    Export the frame again, or exclude it with a reason; remove cameras with only such images.
     """
     if unit_range(evidence):
         return
@@ -146,8 +146,8 @@ def _level(evidence: Evidence, camera: str) -> float:
 
 
 def outside_colours(evidence: Evidence) -> list[tuple[ViewFacts, np.ndarray, float]]:
-    """Frames that show what they were composited on: the median colour there, (3,), and the share of pixels
-    there that are not of the declared background's colour. Images with alpha show none."""
+    """Frames with a visible background: its median colour, (3,), and the fraction of its pixels that differ from the
+    declared one. Images with alpha have none."""
     found = []
     for view in evidence.views:
         if view.error is not None or view.has_alpha or view.blank:
@@ -165,9 +165,9 @@ def _foreign(evidence: Evidence, colour: np.ndarray) -> bool:
 
 @rule("HB301", "error")
 def _wrong_background(evidence: Evidence) -> Iterator[Hit]:
-    """Images are not on the declared background.
+    """Images have another background than declared.
 
-    Declare the background they are on, or composite them on the declared one.
+    Declare their background, or composite them on the declared one.
     """
     if unit_range(evidence) or limited_range(evidence):
         return
@@ -189,8 +189,8 @@ def _wrong_background(evidence: Evidence) -> Iterator[Hit]:
 def _dirty_background(evidence: Evidence) -> Iterator[Hit]:
     """The background is not clean outside the mask.
 
-    Composite with the mask that is stored, or store the one that was used: masked metrics and alpha losses
-    see what the mask denies.
+    Composite with the stored mask, or store the one that was used: masked metrics and alpha losses use pixels outside
+    the mask.
     """
     if unit_range(evidence) or limited_range(evidence):
         return
@@ -235,10 +235,10 @@ def _fringes(evidence: Evidence) -> Iterator[Hit]:
 
 
 def limited_range(evidence: Evidence) -> bool:
-    """Whether levels lie within video's limited range, 16 to 235, and something shows that this is no chance.
+    """Whether levels are within video's limited range, 16 to 235, with evidence that this is not by chance.
 
-    They reach both ends, in whole images or (where the background was put in afterwards) in the subject alone;
-    or the background has the level that the declared one has in that range.
+    The evidence is that levels reach both ends, in whole images or (if the background was replaced) in the subject
+    alone, or that the background has the limited-range level of the declared one.
     """
     views = [view for view in evidence.views if view.error is None and not view.blank]
     if not views:
@@ -264,10 +264,10 @@ def _spans_limited(levels: tuple[int, int]) -> bool:
 
 
 SWAPPED_LEVELS = 10
-"""Skin is redder than blue in every light a capture is made in; by this much the other way round is a swap."""
+"""Minimum excess of blue over red of skin that indicates swapped channels."""
 
 APART_LEVELS = 30
-"""Difference between a camera's skin colour and the others' from which they are not calibrated to each other."""
+"""Difference between the skin colour of a camera and the others above which they are not calibrated to each other."""
 
 
 @rule("HB401", "error")
@@ -285,7 +285,7 @@ def _limited(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB402", "error")
 def _unit(evidence: Evidence) -> Iterator[Hit]:
-    """Images hold levels 0 and 1 alone.
+    """Images have only levels 0 and 1.
 
     Multiply by 255 and round before saving as 8 bits.
     """
@@ -308,7 +308,7 @@ def _grey(evidence: Evidence) -> Iterator[Hit]:
 
 
 def skin_by_camera(evidence: Evidence) -> dict[str, np.ndarray]:
-    """Median colour of the face's visible skin, (3,) levels, by camera; cameras that see enough of the face."""
+    """Median colour of the face's visible skin, (3,) levels, by camera, for cameras that see enough of the face."""
     colours: dict[str, list[np.ndarray]] = defaultdict(list)
     faulty = faulty_cameras(evidence)
     for view in (view for view in evidence.views if view.entry.camera_id not in faulty):
@@ -345,7 +345,7 @@ def _uncalibrated(evidence: Evidence) -> Iterator[Hit]:
 
     Apply the recording's colour calibration; some loaders compute it and return the uncorrected image.
     """
-    # Brightness differs with the light's direction, so only the balance between channels is compared.
+    # Brightness depends on the light's direction, so only the balance between channels is compared.
     skin = skin_by_camera(evidence)
     swapped = _swapped_cameras(evidence)
     balance = {c: v - v.mean() for c, v in skin.items() if c not in swapped}
@@ -366,7 +366,7 @@ def _uncalibrated(evidence: Evidence) -> Iterator[Hit]:
 def _lossy(evidence: Evidence) -> Iterator[Hit]:
     """Ground truth is lossy.
 
-    Export PNG: metrics against JPEG reward its artefacts, and another name does not make a JPEG a PNG.
+    Export PNG: metrics against JPEG reward its artefacts, and renaming a JPEG does not make it a PNG.
     """
     lossy = [path for path in evidence.digests if _is_jpeg(path)]
     if lossy:

@@ -1,4 +1,5 @@
-"""HB513 and on: one camera against the others of its capture. Limits come from the spread over the cameras."""
+"""HB513 and following: comparison of each camera with the others of its capture. Limits are based on the spread over
+the cameras."""
 
 from __future__ import annotations
 
@@ -13,26 +14,26 @@ from .rules import Hit, at, rule, several, some
 from .views import BLANK_LEVELS
 
 TELLING_MATCH = 0.4
-"""Median correlation over the cameras from which their images can be compared at all."""
+"""Minimum median correlation over the cameras for comparing their images."""
 
 BETTER = 0.05
 """Margin of the correlation by which another camera's calibration must match better."""
 
 LEAST_OFFSET = (1.5, 0.01)
-"""Smallest limit of an offset: working pixels, and share of the image's height."""
+"""Minimum limit of an offset: working pixels, and fraction of the image's height."""
 
 LEAST_POOR, LEAST_SOFT, LEAST_UNSTEADY = 0.3, 0.6, 0.5
-"""Smallest distances of the limit from the median: correlation, factors of two in contrast, pixels over time."""
+"""Minimum distances of the limits from the median: correlation, factors of two in contrast, pixels over time."""
 
 SYNCHRONOUS = 0.6
-"""A lag has to lower the change of the offsets over time to this share."""
+"""Maximum ratio of the change of the offsets over time with and without a lag."""
 
 OFFSET_SPREADS, SPREADS = 4, 6
 """Limits in median absolute deviations, of offsets in the plane and of single numbers."""
 
 
 def blank_cameras(evidence: Evidence) -> list[str]:
-    """Cameras all of whose images that were looked at are of one colour."""
+    """Cameras whose inspected images all have a single colour."""
     seen: dict[str, list[bool]] = {}
     for view in evidence.views:
         if view.error is None:
@@ -43,7 +44,7 @@ def blank_cameras(evidence: Evidence) -> list[str]:
 
 
 def frozen_cameras(evidence: Evidence) -> list[str]:
-    """Cameras that show one picture all the time while the others' pictures change."""
+    """Cameras whose image never changes while the others' images change."""
     blank = blank_cameras(evidence)
     return [camera for camera in frozen(evidence.cameras) if camera not in blank]
 
@@ -54,7 +55,7 @@ def dead_cameras(evidence: Evidence) -> set[str]:
 
 
 def _compared(evidence: Evidence) -> Mapping[str, CameraFacts]:
-    """Cameras that can be compared with each other; none where their images do not match under any offset."""
+    """Cameras that can be compared with each other; none if their images do not match at any offset."""
     dead = dead_cameras(evidence)
     found = {c: f for c, f in evidence.cameras.items() if c not in dead and np.isfinite(f.match)}
     if len(found) < FEWEST_CAMERAS or np.median([f.match for f in found.values()]) < TELLING_MATCH:
@@ -63,8 +64,8 @@ def _compared(evidence: Evidence) -> Mapping[str, CameraFacts]:
 
 
 def _astray(evidence: Evidence) -> dict[str, tuple[float, float]]:
-    """Cameras that show the face elsewhere than the others, or not where it is projected at all: the distance of their
-    offset from the others' in pixels, and its limit."""
+    """Cameras that show the face at another offset than the others, or not at its projection: distance of their offset
+    from the others' in pixels, and its limit."""
     facts = _compared(evidence)
     if not facts:
         return {}
@@ -90,7 +91,7 @@ def exchanged_cameras(evidence: Evidence) -> dict[str, str]:
 
 
 def _spread(values: Mapping[str, float], least: float) -> tuple[float, float]:
-    """Median, and the distance from it at which the limit lies."""
+    """Median, and distance of the limit from it."""
     found = np.array([*values.values()])
     middle = float(np.median(found))
     return middle, max(least, SPREADS * float(np.median(np.abs(found - middle))))
@@ -130,7 +131,7 @@ def late_cameras(evidence: Evidence) -> dict[str, float]:
 
 
 def shifted_cameras(evidence: Evidence) -> dict[str, tuple[float, float]]:
-    """Cameras astray for no other reason: how far their offset is from the others' in pixels, and its limit."""
+    """Displaced cameras without another fault: distance of their offset from the others' in pixels, and its limit."""
     taken = {*exchanged_cameras(evidence), *blurred_cameras(evidence), *late_cameras(evidence)}
     return {c: found for c, found in _astray(evidence).items() if c not in taken}
 
@@ -165,7 +166,7 @@ def _place(evidence: Evidence, camera: str) -> tuple[Path, str]:
 def _exchanged(evidence: Evidence) -> Iterator[Hit]:
     """A camera's images fit another camera's calibration.
 
-    Make sure which serial number belongs to which images, and give these cameras each other's calibration.
+    Check which serial number belongs to which images, and exchange the calibrations of these cameras.
     """
     found = exchanged_cameras(evidence)
     pairs = {tuple(sorted((c, other))) for c, other in found.items() if found.get(other) == c}
@@ -193,8 +194,8 @@ def _exchanged(evidence: Evidence) -> Iterator[Hit]:
 def _shifted(evidence: Evidence) -> Iterator[Hit]:
     """A camera's calibration does not fit its images.
 
-    Calibrate this camera again, or leave it out: it was moved or turned after the calibration, or its matrix is another
-    recording's.
+    Calibrate this camera again, or remove it: it was moved or rotated after the calibration, or its matrix belongs to
+    another recording.
     """
     facts, found = _compared(evidence), shifted_cameras(evidence)
     if not found:
@@ -223,7 +224,7 @@ def _shifted(evidence: Evidence) -> Iterator[Hit]:
 def _late(evidence: Evidence) -> Iterator[Hit]:
     """A camera is not synchronous with the others.
 
-    Shift this camera's images by these frames (its trigger or its video's start differs), or leave the camera out.
+    Shift this camera's images by these frames (its trigger or its video's start differs), or remove the camera.
     """
     facts, found = _compared(evidence), late_cameras(evidence)
     if found:
@@ -241,7 +242,7 @@ def _late(evidence: Evidence) -> Iterator[Hit]:
 def _frozen_camera(evidence: Evidence) -> Iterator[Hit]:
     """A camera is frozen.
 
-    Export this camera's images again, or leave the camera out: it shows one picture at every timestep.
+    Export this camera's images again, or remove the camera: it has the same image at every timestep.
     """
     found = frozen_cameras(evidence)
     if found:
@@ -259,8 +260,8 @@ def _frozen_camera(evidence: Evidence) -> Iterator[Hit]:
 def _blurred(evidence: Evidence) -> Iterator[Hit]:
     """A camera is blurred.
 
-    Leave the camera out, or keep it out of the held-out views: it is out of focus or was scaled up, and what is trained
-    on it or measured against it is blurred.
+    Remove the camera, or do not hold it out: it is out of focus or upscaled, which blurs results trained on it or
+    measured against it.
     """
     facts, found = _compared(evidence), blurred_cameras(evidence)
     if found:

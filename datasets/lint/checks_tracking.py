@@ -1,4 +1,4 @@
-"""HB6xx: the head model and the tracked parameters. HB7xx: the tracked mesh against the images."""
+"""HB6xx: head model and tracked parameters. HB7xx: tracked mesh compared with the images."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ from .rules import Hit, rule, several, some, spans
 from .views import ViewFacts
 
 STILL = 1e-4
-"""Radians, or coefficients: what moves by less over a capture does not move."""
+"""Radians, or coefficients: smaller changes over a capture count as none."""
 
 FEW = 5
-"""Timesteps from which something that never moves is remarkable."""
+"""Minimum number of timesteps to report parameters that never change."""
 
 REACH_M = 0.05
-"""Metres; no face moves so far by expression alone, without jaw and head."""
+"""Metres; implausible displacement of a face by expression alone, without jaw and head."""
 
 JUMP_M, JUMP_TIMES = 0.03, 6.0
 """A step of the face is a jump if it is longer than this and than this multiple of the sequence's median."""
 
 WORSE = 1.05
-"""Expressions that fit the images by so much worse than none are not these images' expressions."""
+"""Ratio above which expressions that fit worse than none do not belong to the images."""
 
 UNTRAINED = 0.25
-"""Share of a test's expressions that training does not show from which its results are extrapolation."""
+"""Fraction of test expressions outside of training above which results are extrapolation."""
 
 CHANGE = 1e-4
 
 
 @rule("HB601", "error", of_layout=True)
 def _version(evidence: Evidence) -> Iterator[Hit]:
-    """The head model is not the one the capture was tracked with.
+    """The head model differs from the one used for tracking.
 
-    Give the declared version, or refit the tracking: coefficients of FLAME 2020 and 2023 are not
-    interchangeable, though they are as many.
+    Give the declared version, or refit the tracking: coefficients of FLAME 2020 and 2023 are not interchangeable,
+    although their numbers are equal.
     """
     for error in evidence.head_faults:
         if error.key == "head_model":
@@ -62,7 +62,7 @@ def _version(evidence: Evidence) -> Iterator[Hit]:
 def _sequence_versions(evidence: Evidence) -> Iterator[Hit]:
     """Sequences were tracked with different head models.
 
-    Refit one of them, or keep them in captures of their own.
+    Refit one of them, or keep them in separate captures.
     """
     if evidence.declaration is None:
         return
@@ -71,7 +71,7 @@ def _sequence_versions(evidence: Evidence) -> Iterator[Hit]:
         try:
             other = layout.Declaration.read(folder) if folder.is_dir() else None
         except InputError:
-            continue  # the union's own declaration counts; that of a sequence is read for its version alone
+            continue  # the union's declaration is used; only the version of a sequence's declaration is read
         if other is not None and other.head_model != evidence.declaration.head_model:
             others[other.head_model] = folder
     if others:
@@ -87,7 +87,7 @@ def _sequence_versions(evidence: Evidence) -> Iterator[Hit]:
 def _no_head(evidence: Evidence) -> Iterator[Hit]:
     """The head model is missing or broken.
 
-    Give its path with --head, or put it where headbench.json says.
+    Give its path with --head, or save it at the path in headbench.json.
     """
     for error in evidence.head_faults:
         if error.key != "head_model":
@@ -127,9 +127,9 @@ def _not_finite(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB605", "warning", of_layout=True)
 def _short_vectors(evidence: Evidence) -> Iterator[Hit]:
-    """There are fewer coefficients than the head model has.
+    """There are fewer coefficients than in the head model.
 
-    Make sure that the tracker used a cut basis of this very model, and not another one.
+    Make sure that the tracker used a truncated basis of this model, and not another model.
     """
     if evidence.subject is None:
         return
@@ -146,7 +146,7 @@ def _short_vectors(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB606", "warning")
 def _eyelids(evidence: Evidence) -> Iterator[Hit]:
-    """Eyelids are tracked that the head model lacks.
+    """The head model lacks the tracked eyelids.
 
     Give the model the tracker used (FLAME 2020 with eyelids, in MICA's tracker), or refit.
     """
@@ -165,8 +165,8 @@ def _eyelids(evidence: Evidence) -> Iterator[Hit]:
 def _still_jaw(evidence: Evidence) -> Iterator[Hit]:
     """The jaw never moves.
 
-    Make sure of the version: in FLAME 2023 without jaw rotation the mouth opens by expression, and its
-    coefficients are those of no other model.
+    Check the version: in FLAME 2023 without jaw rotation the mouth opens by expression, and its coefficients fit no
+    other model.
     """
     if evidence.subject is None or evidence.subject.head.skinning_weights[:, 2].max() < 0.5:
         return
@@ -174,7 +174,7 @@ def _still_jaw(evidence: Evidence) -> Iterator[Hit]:
     jaws = np.array([p.pose.jaw for p in poses if p.pose])
     if len(poses) >= FEW and np.ptp(jaws, axis=0).max() < STILL:
         yield Hit(
-            f"the jaw never turns over {several(len(poses), 'timestep')}", poses[0].path.parent, "jaw_pose"
+            f"the jaw never rotates over {several(len(poses), 'timestep')}", poses[0].path.parent, "jaw_pose"
         )
 
 
@@ -193,10 +193,10 @@ def _still_expression(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB616", "note")
 def _untrained_expressions(evidence: Evidence) -> Iterator[Hit]:
-    """The test's expressions are unlike those of training.
+    """Test expressions differ from those of training.
 
-    Record or train on more expressions, or read the results as extrapolation: what a method does there, no training frame
-    shows.
+    Record or train on more expressions, or regard the results as extrapolation: no training frame has such
+    expressions.
     """
     if evidence.subject is None:
         return
@@ -225,7 +225,7 @@ def _untrained_expressions(evidence: Evidence) -> Iterator[Hit]:
 def _far_expression(evidence: Evidence) -> Iterator[Hit]:
     """Expressions are larger than faces allow.
 
-    Make sure of the version and of the coefficients' scale (standard deviations, metres).
+    Check the version and the scale of the coefficients (standard deviations, metres).
     """
     far = {t: reach for t, reach in expression_reach(evidence).items() if reach > REACH_M}
     if far:
@@ -241,7 +241,7 @@ def _far_expression(evidence: Evidence) -> Iterator[Hit]:
 def _changing_identity(evidence: Evidence) -> Iterator[Hit]:
     """Identity changes over time.
 
-    Track with one identity for all sequences, or take the union apart.
+    Track with one identity for all sequences, or split the union.
     """
     posed = evidence.posed
     if not posed:
@@ -260,9 +260,9 @@ def _changing_identity(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB610", "note", of_layout=True)
 def _dynamic(evidence: Evidence) -> Iterator[Hit]:
-    """Dynamic offsets are left out.
+    """Dynamic offsets are ignored.
 
-    Nothing, if methods are to be driven by coefficients; their tracking is then a little coarser.
+    None, if methods are driven by coefficients; tracking is then slightly coarser.
     """
     largest = max((p.dynamic_m for p in evidence.parameters.values()), default=0.0)
     if largest > 0:
@@ -273,7 +273,7 @@ def _dynamic(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB611", "warning")
 def _repeated(evidence: Evidence) -> Iterator[Hit]:
-    """Tracking stands still while images go on.
+    """Tracking is constant while images change.
 
     Track these timesteps again, or leave them out with a reason.
     """
@@ -296,7 +296,7 @@ def _repeated(evidence: Evidence) -> Iterator[Hit]:
 def _jumps(evidence: Evidence) -> Iterator[Hit]:
     """Tracking jumps.
 
-    Look at the overlay (headbench inspect); track these timesteps again, or leave them out with a reason.
+    Inspect the overlay (headbench inspect); track these timesteps again, or exclude them with a reason.
     """
     for folder, (timesteps, steps) in face_steps(evidence).items():
         if len(steps) < FEW:
@@ -315,8 +315,8 @@ def _jumps(evidence: Evidence) -> Iterator[Hit]:
 def _unexplained(evidence: Evidence) -> Iterator[Hit]:
     """Expressions fit the images worse than a face at rest.
 
-    Make sure of the head model's version (FLAME 2020 and 2023 are not interchangeable), and that parameters
-    and images are of the same timesteps; refit the tracking to the model that is to be used.
+    Check the head model's version (FLAME 2020 and 2023 are not interchangeable), and that parameters and images belong
+    to the same timesteps; refit the tracking to the model to be used.
     """
     fit = evidence.expression_fit
     if fit is None or misplaced(evidence) or mesh_misses(evidence) or fit.camera in faulty_cameras(evidence):
@@ -330,10 +330,10 @@ def _unexplained(evidence: Evidence) -> Iterator[Hit]:
 
 
 OUTSIDE = 0.15
-"""Share of the face's vertices outside the foreground from which a frame's mesh misses it."""
+"""Fraction of the face's vertices outside the foreground above which a frame's mesh misses it."""
 
 SMALL = 0.2
-"""Area of the mesh over that of the foreground from which the mesh is too small, or the mask shows more."""
+"""Ratio of the areas of mesh and foreground below which the mesh is too small or the mask too large."""
 
 
 def _laid(evidence: Evidence) -> list[tuple[ViewFacts, MeshFacts, float]]:
@@ -352,7 +352,7 @@ def _laid(evidence: Evidence) -> list[tuple[ViewFacts, MeshFacts, float]]:
 
 
 def mesh_misses(evidence: Evidence) -> bool:
-    """Whether the face of the mesh falls outside the foreground in most frames."""
+    """Whether the face of the mesh is outside the foreground in most frames."""
     laid = _laid(evidence)
     return bool(laid) and float(np.median([outside for _, _, outside in laid])) > OUTSIDE
 
@@ -361,7 +361,7 @@ def mesh_misses(evidence: Evidence) -> bool:
 def _missed(evidence: Evidence) -> Iterator[Hit]:
     """The tracked mesh misses the subject.
 
-    Look at the overlay (headbench inspect): wrong cameras, intrinsics not scaled with the images, units,
+    Inspect the overlay (headbench inspect) for wrong cameras, intrinsics not scaled with the images, units,
     another subject's tracking, or parameters shifted by some timesteps.
     """
     if mesh_misses(evidence):
@@ -398,9 +398,9 @@ def _missed_once(evidence: Evidence) -> Iterator[Hit]:
 
 @rule("HB703", "warning")
 def _small(evidence: Evidence) -> Iterator[Hit]:
-    """The mesh is small beside the foreground.
+    """The mesh is small compared with the foreground.
 
-    Make sure of the units; where the mask shows shoulders, cut it below the neck.
+    Check the units; if the mask includes shoulders, cut it below the neck.
     """
     sizes = [mesh.size for _, mesh, _ in _laid(evidence) if mesh.size is not None]
     if sizes and np.median(sizes) < SMALL:
@@ -415,8 +415,8 @@ _BATCH = 32
 
 
 def face_steps(evidence: Evidence) -> dict[str, tuple[list[int], FloatArray]]:
-    """By sequence folder: timesteps that have a pose, (n,), and the mean distance in metres that the face's
-    vertices move from each to the next, (n - 1,)."""
+    """By sequence folder: timesteps with a pose, (n,), and mean displacement of the face's vertices between successive
+    ones, metres, (n - 1,)."""
     if evidence.subject is None:
         return {}
     face = evidence.subject.head.regions.get("face", np.arange(len(evidence.subject.head.template)))
@@ -433,7 +433,7 @@ def face_steps(evidence: Evidence) -> dict[str, tuple[list[int], FloatArray]]:
 
 
 def expression_reach(evidence: Evidence) -> dict[int, float]:
-    """Farthest that a vertex moves by the expression coefficients alone, metres, by timestep."""
+    """Largest displacement of a vertex by expression coefficients alone, metres, by timestep."""
     if evidence.subject is None:
         return {}
     basis = np.asarray(evidence.subject.head.expression_basis, dtype=np.float64)

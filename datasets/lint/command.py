@@ -26,9 +26,9 @@ _WIDTH = 100
 def lint(settings: LintSettings, progress: Progress = no_progress) -> CommandResult:
     """Check a capture for faults that make a comparison unfair or wrong; --list explains the codes.
 
-    Passed without errors; with ``strict``, without warnings too.
+    Passes if there are no errors; with ``strict``, also no warnings.
 
-    Raises `InputError` where there is no capture to look at, or a code to ignore does not exist.
+    Raises `InputError` if there is no capture, or a code to ignore does not exist.
     """
     from .catalogue import RULES
 
@@ -55,7 +55,7 @@ def lint(settings: LintSettings, progress: Progress = no_progress) -> CommandRes
 
 
 def lint_capture(settings: LintSettings, progress: Progress = no_progress) -> tuple[Evidence, list[Finding]]:
-    """CommandResult for a capture, worst first, and what they rest on."""
+    """Findings for a capture, most severe first, and the amount of inspected data."""
     from ..ga.reader import find_capture
     from ..open import find_reader
     from .catalogue import RULES
@@ -74,7 +74,7 @@ def lint_capture(settings: LintSettings, progress: Progress = no_progress) -> tu
 
 
 def _finite(values: dict[str, Any]) -> dict[str, Any]:
-    """Measurements with None for those that could not be made."""
+    """Measurements with None for unavailable ones."""
     return {
         key: value if isinstance(value, str) or _is_finite(value) else None for key, value in values.items()
     }
@@ -126,7 +126,7 @@ def _report(evidence: Evidence, findings: Sequence[Finding], passed: bool) -> st
         text = "They look at files of the GaussianAvatars/VHAP layout, and another reader read this capture."
         lines += _filled("", f"Skipped {several(len(skipped), 'check')}: {', '.join(skipped)}. {text}")
     if not passed:
-        lines.append("Not fit for a comparison as it is.")
+        lines.append("Not suitable for a comparison without changes.")
     return "\n".join(lines)
 
 

@@ -1,7 +1,7 @@
-"""Everything of a capture that can be read, and what could not: the ground the linter's checks stand on.
+"""Readable content of a capture and read errors, the input of the linter's checks.
 
-Unlike `read_capture`, which stops at the first fault, this reads frame by frame and file by file and goes on
-behind each fault, so that one broken frame does not hide what else is wrong.
+Unlike `read_capture`, which stops at the first fault, this reads frame by frame and file by file and continues after
+each fault, so that one broken frame does not hide other faults.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Evidence:
     splits : Mapping[str, tuple[FrameEntry, ...]]
         Frames that could be read, by split.
     unread : frozenset[Slot]
-        Slots of frames that a JSON lists and that could not be read.
+        Slots of frames listed in a JSON that could not be read.
     declaration_faults, json_faults, frame_faults, file_faults, head_faults : Sequence[InputError]
         Reasons why content could not be read.
     headers : Mapping[Path, ImageInfo]
@@ -107,7 +107,7 @@ class Evidence:
         return tuple(entry for part in self.splits.values() for entry in part)
 
     def split_file(self, split: str) -> Path:
-        """The file that states a split; the capture where its layout is another reader's."""
+        """The file that defines a split; the capture for layouts of other readers."""
         return self.folder / layout.SPLIT_FILES[split] if self.of_layout else self.folder
 
     @cached_property
@@ -127,12 +127,12 @@ class Evidence:
 
     @cached_property
     def posed(self) -> Sequence[Parameters]:
-        """Parameters that give a pose."""
+        """Parameters with a pose."""
         return [parameters for parameters in self.parameters.values() if parameters.pose is not None]
 
     @cached_property
     def contents(self) -> Mapping[int, Mapping[str, str]]:
-        """Digest of each image by timestep and camera id; of those that are there."""
+        """Digest of each existing image by timestep and camera id."""
         found: dict[int, dict[str, str]] = defaultdict(dict)
         for entry in self.entries:
             if entry.image in self.digests:
@@ -141,7 +141,7 @@ class Evidence:
 
 
 def gather(folder: Path, settings: LintSettings, progress: Progress = no_progress) -> Evidence:
-    """Read all that can be read of a capture."""
+    """Read all readable content of a capture."""
     declaration, declaration_faults = _read_declaration(folder)
     splits, unread, json_faults, frame_faults = _read_splits(folder)
     entries = [entry for part in splits.values() for entry in part]
@@ -178,7 +178,7 @@ def gather(folder: Path, settings: LintSettings, progress: Progress = no_progres
 def gather_clip(
     folder: Path, clip: CaptureClip, settings: LintSettings, progress: Progress = no_progress
 ) -> Evidence:
-    """Evidence from a clip of any reader; the checks of the layout's own files need more."""
+    """Evidence from a clip of any reader, without the layout's files."""
     entries = {key: _entry_of(folder, clip, key) for part in clip.splits.values() for key in part}
     headers = {
         path: ImageInfo(clip.cameras[key.camera].width, clip.cameras[key.camera].height, 3)
@@ -250,7 +250,7 @@ def _looked_at(
 
 
 def _entry_of(folder: Path, clip: CaptureClip, key: FrameKey) -> FrameEntry:
-    """A clip's frame as the layout would state it; the key stands for paths that are not there."""
+    """A clip's frame as an entry of the layout, with the key in place of paths."""
     camera, files = clip.cameras[key.camera], clip.files[key]
     on_disk = files.image is not None and not clip.pixel_steps
     image = files.image if on_disk and files.image is not None else Path(str(key))
@@ -313,7 +313,7 @@ def _read_splits(
 
 
 def _slot(frame: Any) -> set[Slot]:
-    """Slot of a frame that does not parse, empty where it does not even say that."""
+    """Slot of a frame that does not parse; empty if it is unknown."""
     if not isinstance(frame, dict):
         return set()
     timestep, camera = frame.get("timestep_index"), frame.get("camera_index", 0)
@@ -331,7 +331,7 @@ def _probe(
             headers[path] = probe_image(path)
         except InputError as error:
             faults.append(error)
-        except ValueError as error:  # a name no file can have
+        except ValueError as error:  # an impossible file name
             faults.append(InputError(path, "", "an image file", str(error)))
         progress(done, len(paths), "reading image headers")
     return headers, faults
@@ -340,7 +340,7 @@ def _probe(
 def _find_head(
     folder: Path, declaration: layout.Declaration | None, settings: LintSettings
 ) -> tuple[HeadArrays | None, list[InputError]]:
-    """The head, also where its version is not the declared one: the geometry can still be looked at."""
+    """The head, also if its version is not the declared one, since its geometry can still be checked."""
     try:
         return find_head(folder, declaration, settings.head), []
     except InputError as error:

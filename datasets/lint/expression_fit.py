@@ -1,10 +1,9 @@
-"""Whether the expression coefficients explain the images, whatever head model they are said to belong to.
+"""Test whether the expression coefficients explain the images with a head model.
 
-FLAME 2020 and 2023 have as many coefficients each, and the same coefficients make another face in the other; no
-number in the files shows the mix-up. Images do. A point of the skin keeps its colour over time, but for shading.
-So the colours that the mesh's vertices pick up from the images of one camera vary less with the expression than
-with a face at rest (jaw, head and eyes moving as tracked), if the expression is right. With the coefficients of
-another basis, of other timesteps or of other units they vary more.
+FLAME 2020 and 2023 have equal numbers of coefficients with different meanings, and no number in the files reveals a
+mix-up, but images do. A point of the skin keeps its colour over time, apart from shading. So colours at the mesh's
+vertices in the images of one camera vary less with the correct expression than with a face at rest (jaw, head and eyes
+moving as tracked). With the coefficients of another basis, of other timesteps or of other units they vary more.
 """
 
 from __future__ import annotations
@@ -29,22 +28,22 @@ FRAMES = 16
 """Frames to judge by."""
 
 FEWEST_FRAMES, FEWEST_VERTICES = 6, 50
-"""With less nothing is said."""
+"""Minimum amount of data for a result."""
 
 FACING = 0.5
-"""Least cosine between a vertex's normal and the direction to the camera."""
+"""Minimum cosine between a vertex's normal and the direction to the camera."""
 
 MOVES_PX = 0.5
-"""Vertices whose projection the expression never moves by so much tell nothing."""
+"""Minimum motion of a vertex's projection by expression, for vertices that are compared."""
 
 _NOT_SKIN = ("mouth_socket", "left_eyeball", "right_eyeball", "teeth")
 
 
 class ExpressionFit(NamedTuple):
-    """Variance over time of the face's colours with the expression, over that with a face at rest.
+    """Ratio of the variances over time of the face's colours with the expression and with a face at rest.
 
     ``mean`` and ``median`` compare the mean and the median over ``vertices`` vertices in ``frames`` frames of
-    ``camera``: below 1 where the expression explains the images.
+    ``camera``: below 1 if the expression explains the images.
     """
 
     camera: str
@@ -55,7 +54,7 @@ class ExpressionFit(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """Geometric mean of both: the mean sees the few vertices that move much, the median the many."""
+        """Geometric mean of both: the mean is dominated by the few vertices that move much, the median by the others."""
         return math.sqrt(self.mean * self.median)
 
 
@@ -146,7 +145,7 @@ def _pick(
 def _compare(camera: str, moving: Sequence[_Picked], resting: Sequence[_Picked]) -> ExpressionFit | None:
     if len(moving) < FEWEST_FRAMES:
         return None
-    # Only what both see is compared, so that neither gains by looking elsewhere.
+    # Only vertices visible in both are compared.
     seen = np.array([one.seen & other.seen for one, other in zip(moving, resting)])
     moved = np.array(
         [np.linalg.norm(one.pixels - other.pixels, axis=1) for one, other in zip(moving, resting)]
@@ -168,7 +167,7 @@ def _compare(camera: str, moving: Sequence[_Picked], resting: Sequence[_Picked])
 
 
 def _variance(picked: Sequence[_Picked], seen: np.ndarray) -> FloatArray:
-    """(F,) variance of each vertex's colour over the frames that see it, mean over channels."""
+    """(F,) variance of each vertex's colour over the frames in which it is visible, mean over channels."""
     weight = seen[..., None].astype(np.float64)
     colours = np.array([one.colours for one in picked])
     count = np.maximum(weight.sum(axis=0), 1)

@@ -1,5 +1,5 @@
-"""Tracked parameters read file by file, and how the tracked mesh lies in a frame: before the camera, upright, on the
-silhouette, on skin."""
+"""Tracked parameters read file by file, and the tracked mesh compared with a frame: position, orientation, silhouette,
+skin."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Parameters:
 
 
 class TrackedSubject(PosedSubject):
-    """The head with the identity of the first timestep that reads, teeth appended if its files have them."""
+    """The head with the identity of the first readable timestep, with teeth if its files have them."""
 
     def __init__(self, tracking: Tracking) -> None:
         super().__init__(tracking.head, tracking.shape, tracking.static_offset)
@@ -109,12 +109,12 @@ def read_parameters(
 
 
 def not_finite(arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
-    """Names of the arrays that hold NaN or infinite numbers."""
+    """Names of the arrays with NaN or infinite numbers."""
     return tuple(name for name, array in arrays.items() if not _is_finite(array))
 
 
 def _numbers(array: np.ndarray | None) -> np.ndarray:
-    """The array where it holds finite numbers, else an empty one."""
+    """The array if its numbers are finite, else an empty one."""
     usable = array is not None and array.dtype.kind in "fiu" and _is_finite(array)
     return array if array is not None and usable else np.empty(0)
 
@@ -128,7 +128,7 @@ def _largest(array: np.ndarray) -> float:
 
 
 FACE = ("face", "forehead", "nose")
-"""Regions that neither hair nor cloth should cover: their mesh must lie within the foreground."""
+"""Regions that neither hair nor cloth should cover, whose mesh must be inside the foreground."""
 
 NOT_SKIN = ("lips", "eye_region", "left_eyeball", "right_eyeball", "mouth_socket", "teeth")
 
@@ -137,7 +137,7 @@ SLACK = 0.04
 image."""
 
 WORKING_HEIGHT = 400
-"""Meshes are filled at most this many pixels high: what is asked of them is coarse."""
+"""Maximum height of filled meshes in pixels, since only coarse values are needed."""
 
 MIN_SKIN_PIXELS = 12
 
@@ -190,7 +190,7 @@ def lay_mesh(
     turn = camera.world_to_camera[:3, :3]
     centre = vertices.mean(axis=0)
     towards = camera.center - centre
-    # Where the template's axes point for the posed mesh, by the face, in rows.
+    # Axes of the template for the posed mesh, estimated from the face, in rows.
     face = _members(subject, FACE)
     head = rigid_alignment(vertices[face], subject.head.template[face])[:3, :3]
     distance = float(np.linalg.norm(towards))
@@ -208,7 +208,7 @@ def lay_mesh(
 
 
 def _members(subject: TrackedSubject, names: tuple[str, ...]) -> IntArray:
-    """Vertices of the regions by these names; all vertices where the head has none of them."""
+    """Vertices of the regions with these names; all vertices if the head has none of them."""
     regions = [subject.head.regions[name] for name in names if name in subject.head.regions]
     return np.unique(np.concatenate(regions)) if regions else np.arange(len(subject.head.template))
 

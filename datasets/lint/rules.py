@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from .evidence import Evidence
 
 Severity = Literal["error", "warning", "note"]
-"""error: numbers of this capture would be wrong or it cannot be read; warning: they may be; note: know this."""
+"""error: results of this capture would be wrong or it cannot be read; warning: they may be wrong; note: information."""
 
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 
 class Hit(NamedTuple):
-    """One fault that a check saw: what, and where."""
+    """A fault found by a check, and its place."""
 
     message: str
     file: Path | str = ""
@@ -102,11 +102,11 @@ def apply(
 
 
 REFUSAL = "HB100"
-"""The one rule that says what `read_capture` says, whatever it is."""
+"""The rule that reports the error of `read_capture`."""
 
 
 def _said_again(finding: Finding, findings: Sequence[Finding]) -> bool:
-    """Whether it is the reader's refusal, and another rule reports an error at the same place."""
+    """Whether it is the error of the reader and another rule reports an error at the same place."""
     return finding.code == REFUSAL and any(
         other.code != REFUSAL
         and other.severity == "error"
@@ -121,14 +121,14 @@ def several(count: int, noun: str) -> str:
 
 
 def some(names: Iterable[Any], limit: int = 4) -> str:
-    """The first few names, and how many more there are."""
+    """The first few names, and the number of others."""
     names = [str(name) for name in names]
     rest = len(names) - limit
     return ", ".join(names[:limit]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def spans(numbers: Iterable[int], limit: int = 4) -> str:
-    """Whole numbers as runs: "0-3, 7, 9-10"."""
+    """Integers as ranges: "0-3, 7, 9-10"."""
     runs: list[list[int]] = []
     for number in sorted(set(numbers)):
         if runs and number == runs[-1][1] + 1:
@@ -139,7 +139,7 @@ def spans(numbers: Iterable[int], limit: int = 4) -> str:
 
 
 def _relative(file: Path | str, base: Path | None) -> str:
-    """Path below ``base``, without detours by way of ".."; anything else as it is."""
+    """Path relative to ``base`` if it is below it, without ".."; other paths are unchanged."""
     if base is None or not str(file):
         return str(file)
     path = Path(os.path.normpath(file))

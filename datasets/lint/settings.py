@@ -13,13 +13,13 @@ from ..options import CaptureOptions
 
 @dataclass(frozen=True)
 class LintSettings(CaptureOptions):
-    """What to look at, and how strictly."""
+    """Capture to check, and strictness."""
 
     clip: Annotated[str, tyro.conf.Positional] = ""
     """Capture, in a layout that a reader knows; of the reader ga a UNION folder, a sequence folder, or the union's."""
 
     strict: bool = False
-    """Exit with 1 on warnings too."""
+    """Exit with 1 also for warnings."""
 
     ignore: tuple[str, ...] = ()
     """Codes not to report, such as HB406."""
@@ -31,10 +31,10 @@ class LintSettings(CaptureOptions):
     """Frames to decode for the checks of colour, masks and tracking, spread over timesteps and cameras."""
 
     duplicates: int = 600
-    """Images to decode in the search for near-duplicates between splits. Equal files are found among all."""
+    """Number of images to decode in the search for near-duplicates between splits. Identical files are searched among all images."""
 
     camera_timesteps: int = 8
-    """Timesteps on which each camera is measured against the others; 0 leaves that out."""
+    """Number of timesteps on which each camera is compared with the others; 0 skips this."""
 
     thorough: bool = False
     """Decode every image, instead of --views and --duplicates, and measure cameras on 32 timesteps instead of

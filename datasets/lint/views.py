@@ -1,8 +1,8 @@
-"""Decoded sample frames as a few numbers each, and near-duplicates among images.
+"""Statistics of decoded sample frames, and search for near-duplicate images.
 
-Frames of one camera look much alike, so a perceptual hash alone accuses too many. The hash is a difference hash (signs
-of horizontal steps of brightness); a pair that it proposes counts where the thumbnails differ by less than what saving
-an image again changes.
+Frames of one camera are similar, so a perceptual hash alone gives false positives. The hash is a difference hash
+(signs of horizontal steps of brightness); a candidate pair counts if the thumbnails differ by less than re-saving an
+image changes.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from ..images import read_image, read_mask
 from .mesh import MeshFacts, Parameters, TrackedSubject, lay_mesh
 
 BACKGROUND_LEVELS = 12
-"""A pixel is of the background's colour where no channel differs by more; JPEG changes flat areas by less."""
+"""Maximum difference of any channel of background pixels; JPEG changes flat areas by less."""
 
 BLANK_LEVELS = 2.0
-"""Images with less `structure` are of one colour."""
+"""Images with less `structure` have a single colour."""
 
 SENSOR_NOISE = 20.0
-"""Levels; what varies more from pixel to pixel is a texture."""
+"""Levels; larger variation from pixel to pixel is texture."""
 
 FAR = 0.02
-"""Distance from the foreground, as a share of the image's height, from which a pixel should be background."""
+"""Minimum distance of background pixels from the foreground, as a fraction of the image's height."""
 
 SOFT = (0.25, 0.75)
-"""Coverage of the pixels that tell how a mask was composited."""
+"""Range of coverage of soft pixels, which show how a mask was composited."""
 
 MIN_FRINGE_PIXELS = 12
 
@@ -78,7 +78,7 @@ class ViewFacts:
     low, high : int
         Minimum and maximum level of any pixel's channels.
     subject_low, subject_high : int
-        The same over pixels that the subject covers wholly.
+        The same over pixels fully covered by the subject.
     corners : FloatArray | None
         Median colour (3,) of the upper corners.
     corners_off : float
@@ -111,7 +111,7 @@ class ViewFacts:
 
 
 def pick_views(entries: Sequence[FrameEntry], count: int) -> list[FrameEntry]:
-    """Up to ``count`` frames, evenly spaced over timesteps, the camera changing from one to the next."""
+    """Up to ``count`` frames, evenly spaced over timesteps, with alternating cameras."""
     groups: dict[int, list[FrameEntry]] = {}
     for entry in sorted(entries, key=lambda e: (e.timestep, e.camera_index)):
         groups.setdefault(entry.timestep, []).append(entry)
@@ -125,7 +125,7 @@ def pick_views(entries: Sequence[FrameEntry], count: int) -> list[FrameEntry]:
 
 
 def entry_camera(entry: FrameEntry, info: ImageInfo, cy: CyConvention) -> Camera:
-    """Camera of a frame as its own entry has it, in its own sequence's world."""
+    """Camera of a frame from its entry, in the world of its sequence."""
     intrinsics = intrinsics_from_json(entry.intrinsics, info.width, info.height, cy)
     return Camera(
         entry.camera_id, info.width, info.height, intrinsics, extrinsics_from_json(entry.camera_to_world)
@@ -166,7 +166,7 @@ def inspect_views(
     *,
     progress: Progress = no_progress,
 ) -> list[ViewFacts]:
-    """Decode frames and note what the checks need; the pixels themselves are let go."""
+    """Decode frames and keep the facts needed by the checks, without the pixels."""
     found = []
     for done, entry in enumerate(entries, start=1):
         progress(done, len(entries), "looking at frames")
@@ -225,7 +225,7 @@ def _facts(
 
 
 def _blank(image: ByteArray, shown: np.ndarray, off: np.ndarray) -> bool:
-    """Whether the subject's pixels are of one colour, and not of the background's (where a mask is wrong)."""
+    """Whether the subject's pixels have a single colour other than the background's (which indicates a wrong mask)."""
     grey = image.astype(np.float32).mean(axis=2)
     if structure(grey, np.ones_like(shown)) < BLANK_LEVELS:
         return True
@@ -257,7 +257,7 @@ def _fringe(image: ByteArray, mask: ByteArray, ground: FloatArray) -> float | No
     nearby = cv2.blur(colours * inner[..., None], (size, size)) / np.maximum(weight, 1e-6)[..., None]
     expected = alpha * nearby.mean(axis=2)
     added = (colours - (1 - alpha)[..., None] * ground.astype(np.float32)).mean(axis=2)
-    # A dark subject adds next to nothing, whatever was done to it.
+    # A dark subject adds almost nothing to soft pixels.
     telling = (alpha > SOFT[0]) & (alpha < SOFT[1]) & (weight > 0.05) & (expected > 0.1 * 255 * alpha)
     if telling.sum() < MIN_FRINGE_PIXELS:
         return None
@@ -268,20 +268,20 @@ SIDE = 32
 """Thumbnails are square with this many pixels a side."""
 
 HASH_DISTANCE = 0.1
-"""Largest share of hash bits in which a near-duplicate may differ."""
+"""Maximum fraction of different hash bits of near-duplicates."""
 
 LEVELS = 2.0
 """Largest `difference` between two thumbnails of near-duplicates, 8-bit levels."""
 
 SUBJECT_LEVELS = 4.0
-"""A thumbnail's pixel shows the subject where it differs from the upper corners by more."""
+"""Minimum difference of a thumbnail's pixel from the upper corners for the subject."""
 
 _BLOCK = 2048
 
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """A frame made small.
+    """Thumbnail of a frame.
 
     Attributes
     ----------
@@ -321,7 +321,7 @@ def make_thumbnails(
         try:
             image = image_of(entry)
         except InputError:
-            continue  # damaged inside: the decoded views and the reader report that
+            continue  # damaged images are reported by other checks
         found.append(_shrink(name, entry, image))
     return found
 
@@ -329,7 +329,7 @@ def make_thumbnails(
 def _shrink(split: str, entry: FrameEntry, image: np.ndarray) -> Thumbnail:
     small = cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float32)
     grey = small.mean(axis=2)
-    # What is declared may be wrong; what lies in the corners is what there is.
+    # The declared background may be wrong, so the corners are used.
     ground = np.median([small[0, 0], small[0, -1], small[1, 0], small[1, -1]], axis=0)
     bits = np.where(np.diff(grey, axis=1) > 1, 1.0, -1.0).astype(np.float32).ravel()
     return Thumbnail(split, entry, grey, bits, np.abs(small - ground).max(axis=2) > SUBJECT_LEVELS)
@@ -353,8 +353,8 @@ def near_duplicates(
 def difference(one: Thumbnail, other: Thumbnail) -> float:
     """95th percentile of the absolute difference, in levels, over the pixels that show the subject in either.
 
-    A face that moves differs much in few places, an image saved again little in all. Infinite where neither shows
-    anything, as empty frames are no evidence of anything.
+    A moving face differs strongly in few places, a re-saved image slightly everywhere. Infinite if both frames are
+    empty, since these are no evidence.
     """
     shown = one.shown | other.shown
     if not shown.any():
@@ -363,8 +363,8 @@ def difference(one: Thumbnail, other: Thumbnail) -> float:
 
 
 def structure(grey: FloatArray, shown: np.ndarray) -> float:
-    """Standard deviation in levels of an image (H, W) over the pixels ``shown``, after smoothing and without what white
-    noise leaves of it: about 0 for noise alone."""
+    """Standard deviation in levels of a smoothed image (H, W) over the pixels ``shown``, minus that expected from
+    white noise: about 0 for pure noise."""
     if not shown.any():
         shown = np.ones_like(shown)
     size = max(3, len(grey) // 24)

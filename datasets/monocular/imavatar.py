@@ -1,15 +1,14 @@
-"""Read the captures of IMavatar, PointAvatar and those that took their preprocessing over::
+"""Read captures of IMavatar, PointAvatar and methods with the same preprocessing::
 
     <subject>/<video>/flame_params.json     frames, intrinsics, shape_params
     <subject>/<video>/image/12.png          colours with the room behind them
     <subject>/<video>/mask/12.png           the subject
     <subject>/<video>/semantic              not used; nor are `bbox` and `flame_keypoints`
 
-Both are taken as IMavatar's own loader and renderer take them: ``world_mat`` maps the world to a camera that looks
-along -z with y up (so the focal length stands there negative), FLAME is four times its size in it, intrinsics are shares of
-the image's size (of 512 pixels in an older form), and pixel (0, 0) has its centre at (0, 0), half a pixel from ours.
-Masks are cut at one half, and what they leave out is white. Pose is axis-angle: root, neck, jaw, left and right eye;
-FLAME 2020.
+Conventions are those of IMavatar's loader and renderer: ``world_mat`` maps the world to a camera that looks along -z
+with y up (so the focal length is negative), FLAME is scaled by four, intrinsics are fractions of the image's size (of
+512 pixels in an older form), and pixel (0, 0) has its centre at (0, 0), half a pixel from here. Masks are thresholded
+at one half, and pixels outside are white. Pose is axis-angle: root, neck, jaw, left and right eye; FLAME 2020.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from .track import Track, VideoFrame, coefficients, frame_number, ordered
 
 PARAMETERS = "flame_params.json"
 SCALE = 4.0
-"""FLAME's size in IMavatar's world, over its own."""
+"""Scale of FLAME in IMavatar's world."""
 OLD_SIZE = 512
 """Image size of intrinsics in the older form, pixels."""
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -54,14 +53,14 @@ class _Document:
 
 
 def videos(root: Path) -> list[Path]:
-    """Folders of a subject's videos: the folder itself, or those below it."""
+    """Folders of a subject's videos: the folder itself, or its subfolders."""
     if _lists_frames(root / PARAMETERS):
         return [root]
     return sorted(file.parent for file in root.glob(f"*/{PARAMETERS}") if _lists_frames(file))
 
 
 def _lists_frames(path: Path) -> bool:
-    """Whether a file of that name is IMavatar's, which lists frames, or is damaged: LAM's has arrays by name."""
+    """Whether a file of that name is IMavatar's, which lists frames, or damaged; LAM's has arrays by name."""
     if not path.is_file():
         return False
     try:
@@ -142,7 +141,7 @@ def _K(path: Path, intrinsics: tuple[float, float, float, float], info: ImageInf
         expected = "a negative and a positive focal length, as IMavatar's preprocessing writes them"
         raise InputError(path, "intrinsics", expected, f"{intrinsics[0]:g} and {intrinsics[1]:g}")
     check_numbers(path, "intrinsics", values, 1e6)
-    # A pixel's centre is half a pixel further from the edge than its index.
+    # The centre of a pixel is at its index plus one half.
     return np.array([[-values[0], 0, values[2] + 0.5], [0, values[1], values[3] + 0.5], [0, 0, 1]])
 
 

@@ -1,4 +1,4 @@
-"""Read the folders that INSTA trains on, made of Metrical Tracker's output by INSTA's ``generate.sh``::
+"""Read training folders of INSTA, which ``generate.sh`` makes from Metrical Tracker's output::
 
     transforms_train.json, transforms_test.json (or transforms.json alone), transforms_val.json
     images/00012.png            straight alpha; without, matted/00012.png has it
@@ -9,9 +9,9 @@
     depth, seg_mask             not used
 
 ``transform_matrix`` is camera-to-world with OpenCV's axes, in metres; unlike in GaussianAvatars' JSONs of the same names
-no axis is flipped. The world is FLAME's own, in which root and neck rest. Identity is in no parameter file: it
-follows from ``canonical.obj``, and what else is missing from the meshes (see `mesh_fit`). The tracker's eyelids are
-in the meshes alone and taken from there where the head model has a basis for them.
+no axis is flipped. The world is that of FLAME with root and neck at rest. Identity is not in a parameter file: it is
+fitted to ``canonical.obj``, and other missing parameters to the meshes (see `mesh_fit`). The tracker's eyelids are
+only in the meshes and fitted if the head model has a basis for them.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ VIDEO = "video"
 CHECKED_MESHES = 50
 """Number of meshes of a video that are compared with complete parameters, enough to include a blink."""
 WORST_VERTEX = 1e-3
-"""Metres that a vertex may lie from a mesh without a warning that eyelids are lost; they move by up to 9 mm."""
+"""Maximum distance of a vertex from a mesh without a warning about lost eyelids, which move by up to 9 mm, metres."""
 MAX_TEXT = 2**16
 
 
@@ -78,7 +78,7 @@ class _Document(_Intrinsics):
 
 @dataclass(frozen=True, eq=False)
 class _Source:
-    """A frame's files, and what the JSON says of it."""
+    """A frame's files and JSON entry."""
 
     where: tuple[Path, str]
     number: int
@@ -90,7 +90,7 @@ class _Source:
 
 
 def is_insta(root: Path) -> bool:
-    """Whether a folder looks like one: coefficients as text, and frames."""
+    """Whether a folder has this layout: coefficients as text, and frames."""
     return (root / EXPRESSIONS).is_dir() and any((root / file).is_file() for file in _files())
 
 
@@ -147,7 +147,7 @@ def _source(root: Path, path: Path, where: str, frame: _Frame, document: _Docume
             f"{where}.timestep_index",
             "a frame of INSTA's, which has none",
             "VHAP's export of meshes",
-            "Its meshes hold no jaw or eye rotation: export the tracking again with --flame-mode param.",
+            "Its meshes have no jaw or eye rotation: export the tracking again with --flame-mode param.",
         )
     if not frame.file_path:
         raise InputError(path, f"{where}.file_path", "the file of an image", "none")
@@ -175,7 +175,7 @@ def _source(root: Path, path: Path, where: str, frame: _Frame, document: _Docume
 def _intrinsics(
     path: Path, where: str, frame: _Frame, document: _Document, width: int, height: int
 ) -> FloatArray:
-    """(3, 3) K; an entry of the frame goes before the document's."""
+    """(3, 3) K; entries of the frame take precedence over the document's."""
     given = {
         name: own if own is not None else getattr(document, name)
         for name, own in ((name, getattr(frame, name)) for name in _Intrinsics.__dataclass_fields__)
@@ -200,7 +200,7 @@ def _intrinsics(
 
 
 class _Meshes:
-    """Poses of frames, from text files where they are there and from meshes where not."""
+    """Poses of frames, from text files if they exist and otherwise from meshes."""
 
     def __init__(
         self, root: Path, head: HeadArrays, fit: MeshFit, shape: FloatArray, sources: list[_Source]
@@ -217,7 +217,7 @@ class _Meshes:
         self.files: set[Path] = set()
 
     def pose(self, source: _Source) -> HeadPose:
-        """Pose of a frame in FLAME's own world."""
+        """Pose of a frame in FLAME's world."""
         head, stem = self._head, source.expression.stem
         expression = coefficients(
             source.expression, "", self._numbers(source.expression), head.expression_basis.shape[2]
@@ -261,8 +261,7 @@ class _Meshes:
         }
 
     def _rotations(self, path: Path, count: int) -> FloatArray | None:
-        """Concatenated axis-angle vectors from 6D rotations or axis-angle in a file; None if they are
-        missing."""
+        """Concatenated axis-angle vectors from 6D rotations or axis-angle in a file; None if they are missing."""
         if not path.is_file():
             return None
         values = self._numbers(path)

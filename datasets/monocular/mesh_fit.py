@@ -1,8 +1,7 @@
-"""Identity, jaw, eyes and eyelids from meshes that the head model made: what a layout leaves out of its parameters.
+"""Fit of identity, jaw, eyes and eyelids to meshes of the head model, for parameters missing in a layout.
 
-The meshes are FLAME's own, vertex by vertex, so that this is the inversion of a known function and no tracking: on
-meshes written with eight digits it gives back the parameters to about 1e-6. What remains says whether the head model is
-the one that the meshes were made with.
+The meshes have FLAME's vertices, so this inverts a known function: for meshes with eight digits it recovers the
+parameters to about 1e-6. The residual shows whether the head model is the one of the meshes.
 """
 
 from __future__ import annotations
@@ -25,19 +24,20 @@ from ..head.model import HeadModel
 MAX_BYTES = 2**26
 """Maximum bytes of a mesh file; FLAME's takes 0.6 MB."""
 WORST_DISTANCE = 1e-4
-"""Metres that the middle vertex may lie from the mesh: rounding leaves 1e-8, another head model of the same topology
-1e-3, and lids that the head model has no basis for move fewer than half of the vertices."""
+"""Maximum median distance of vertices from the mesh, metres: rounding gives 1e-8, another head model of the same
+topology 1e-3, and lids without a basis in the head model move fewer than half of the vertices."""
 
 _VERTEX = re.compile(rb"^v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
 _TURNING = [JOINT_NAMES.index(name) for name in ("jaw", "left_eye", "right_eye")]
 _STEP, _SMALL, _MOST_STEPS = 1e-6, 1e-9, 30
 _TOGETHER = 32  # meshes posed at once
 _ROWS = 200
-"""Vertices of each joint and lid that decide; rounding to eight digits needs no more."""
+"""Number of vertices used for each joint and lid, enough for rounding to eight digits."""
 
 
 def read_vertices(path: Path, count: int) -> FloatArray:
-    """(V, 3) vertices of a Wavefront OBJ; faces are not read, since programs simplify them and keep the vertices.
+    """(V, 3) vertices of a Wavefront OBJ; faces are not read, since programs simplify them without changing the
+    vertices.
 
     Raises `InputError` for a file that is missing, or has another number of vertices than ``count``.
     """
@@ -77,7 +77,7 @@ class Pose(NamedTuple):
 
 
 class MeshFit:
-    """Inverts a head model whose root and neck are at rest."""
+    """Inverts a head model with root and neck at rest."""
 
     def __init__(self, head: HeadArrays) -> None:
         self._model = HeadModel(head, dtype=torch.float64)
@@ -92,7 +92,7 @@ class MeshFit:
         self._rows: IntArray = np.unique(np.concatenate(picked))
 
     def fit_identity(self, mesh: FloatArray) -> Identity:
-        """Shape coefficients, jaw and eyes of a (V, 3) mesh without expression, by Gauss and Newton's method."""
+        """Shape coefficients, jaw and eyes of a (V, 3) mesh without expression, by the Gauss-Newton method."""
         basis = np.moveaxis(self._shape_basis, 2, 0)
         size = len(basis)
         shape, turns = np.zeros(size), np.zeros(9)
@@ -169,7 +169,7 @@ def _middle(left: FloatArray) -> float:
 
 
 def check_distance(file: Path, distance: float, version: str) -> None:
-    """Raise `InputError` where a mesh lies further from the head than rounding explains."""
+    """Raise `InputError` if a mesh is farther from the head than rounding explains."""
     if not distance <= WORST_DISTANCE:
         expected = (
             f"a mesh that head model {version} makes, its middle vertex within {1e3 * WORST_DISTANCE:g} mm"

@@ -41,7 +41,7 @@ it."""
 
 
 def find_videos(root: Path) -> list[Path]:
-    """Subjects under ``root``: the folder itself, or the folders in it; an IMavatar subject holds its videos."""
+    """Subjects under ``root``: the folder itself, or its subfolders; an IMavatar subject contains its videos."""
     if is_insta(root) or videos(root):
         return [root]
     if not root.is_dir():
@@ -69,8 +69,8 @@ def read_video(
 ) -> CaptureClip:
     """Read a tracked video, or all videos of one subject in IMavatar's layout.
 
-    Timesteps count the frames in the order of their names, videos one behind the other. What is held out of a video
-    that is trained on becomes a sequence of its own, ``video-held-out``.
+    Timesteps number the frames in the order of their names, one video after the other. Held-out frames of a training
+    video become a separate sequence, ``video-held-out``.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def _read_track(root: Path, head: HeadArrays, progress: Progress) -> Track:
 def _split(
     root: Path, keys: Sequence[FrameKey], track: Track, frames: int | None, sequences: Sequence[str]
 ) -> tuple[dict[str, tuple[FrameKey, ...]], str]:
-    """Splits, and in words what is held out. Keys are in the order of names."""
+    """Splits and a description of the held-out frames. Keys are in the order of names."""
     if frames is not None and sequences:
         raise InputError(root, "held_out_frames", "either held_out_frames or held_out_sequences", "both")
     if sequences:
@@ -190,7 +190,7 @@ def _split(
         held = track.held_out
         named = [(frame.sequence, frame.number) in held for frame in track.frames]
         splits = _parts(keys, named)
-        words = f"{sum(named)} frames, as the folder's own split has it"
+        words = f"{sum(named)} frames, according to the folder's split"
     else:
         count, words = _last(len(keys), frames)
         splits = _parts(keys, [index >= len(keys) - count for index in range(len(keys))])
@@ -204,7 +204,7 @@ def _split(
 
 
 def _sequences(splits: Mapping[str, Sequence[FrameKey]]) -> dict[FrameKey, FrameKey]:
-    """Sequence name of each frame: the held-out part of a training video is a sequence of its own."""
+    """Sequence name of each frame; the held-out part of a training video is a separate sequence."""
     trained = {key.sequence for key in splits["train"]}
     names = {key: key for part in splits.values() for key in part}
     for key in splits["self_reenactment"]:
@@ -234,7 +234,7 @@ def _parts(keys: Sequence[FrameKey], held_out: Sequence[bool]) -> dict[str, tupl
 
 
 def _masked(clip: CaptureClip, hard: bool) -> CaptureClip:
-    """Images that show the room behind the subject are composited by their masks."""
+    """Composite images with a visible room behind the subject using their masks."""
     bare = frozenset(key for key, files in clip.files.items() if files.image != files.mask)
     if not bare:
         return clip

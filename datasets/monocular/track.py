@@ -1,7 +1,7 @@
-"""Common representation of the layouts of tracked videos: frames with a camera and a pose each.
+"""Common representation of tracked videos: frames with a camera and a pose each.
 
-In these layouts the head stands still, or nearly so, and every frame has a camera of its own. A clip has one camera,
-and the head moves before it: `fix_camera` turns the one into the other.
+In these layouts the head is static, or nearly so, and every frame has its own camera. A clip has one camera and a
+moving head: `fix_camera` converts the former to the latter.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from ..head.arrays import HeadArrays
 from ..head.model import HeadModel
 
 SAME_INTRINSICS = 1e-3
-"""Largest difference of intrinsics that are one camera's, pixels."""
+"""Maximum difference of the intrinsics of one camera, pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class VideoFrame:
-    """One frame as its layout has it, in this project's units and axes.
+    """One frame of a layout, in this project's units and axes.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Track:
     files : frozenset[Path]
         All files that were read, except images.
     notes : Mapping[str, Any]
-        What the layout leaves open, and the choice that was made.
+        Properties that the layout does not define, and the choices made.
     """
 
     frames: Sequence[VideoFrame]
@@ -83,7 +83,7 @@ class Track:
 
 
 def ordered(root: Path, frames: Sequence[VideoFrame]) -> list[VideoFrame]:
-    """Frames by name. Raises `InputError` for none, and for two of one name."""
+    """Frames by name. Raises `InputError` if there are none, or two with the same name."""
     if not frames:
         raise InputError(root, "frames", "at least one frame", "none")
     found: dict[tuple[str, int], VideoFrame] = {}
@@ -108,12 +108,12 @@ def frame_number(file: Path, entry: str, stem: str) -> int:
 def fix_camera(
     frames: Sequence[VideoFrame], head: HeadArrays, shape: FloatArray, subject: str
 ) -> tuple[Camera, dict[int, HeadPose]]:
-    """One camera, that of the first frame, and by index the poses that show in it what each frame's own camera shows.
+    """The camera of the first frame, and by index the poses that give the same view in it as each frame's own camera.
 
     With W the camera of a frame and W0 the first, the head moves by M = W0^-1 W: its global rotation becomes R_M R, and
     since that turns about joint 0 at J (which moves with the expression) its translation R_M (J + t) + t_M - J.
 
-    Raises `InputError` where frames differ in image size or intrinsics.
+    Raises `InputError` if frames differ in image size or intrinsics.
     """
     first = frames[0].camera
     for frame in frames:
@@ -152,9 +152,9 @@ def fix_camera(
 
 
 def coefficients(file: Path, entry: str, values: FloatArray, size: int) -> FloatArray:
-    """Coefficients as a vector of ``size``: padded with zeros, and cut where what is cut is zero.
+    """Coefficients as a vector of ``size``: padded with zeros, or truncated if the remainder is zero.
 
-    Raises `InputError` where the head model lacks a direction that is used.
+    Raises `InputError` if the head model lacks a used direction.
     """
     if np.any(values[size:]):
         expected = f"at most {size} coefficients, which the head model has, or zeros behind them"

@@ -48,7 +48,7 @@ def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progres
 
 
 def _check_named(settings: PrepareSettings, subjects: list[str]) -> None:
-    """Raise `InputError` where a name stands for subjects of which none is there."""
+    """Raise `InputError` if a name stands for subjects of which none exists."""
     from .recording import participants
 
     known = participants(Path(settings.root))

@@ -1,4 +1,4 @@
-"""Unions that were exported elsewhere: checked, and joined for the paper's split.
+"""Check of unions exported elsewhere, and joining for the paper's split.
 
 GaussianAvatars' download holds, per subject, a ``UNION10`` folder and its sequence folders, FREE among them;
 the union's own test sequence is another one.
@@ -56,9 +56,9 @@ class UnionReport:
 def check_unions(
     root: Path, subjects: Sequence[str], *, rejoin: bool = False, progress: Progress = no_progress
 ) -> CommandResult:
-    """Check the union of each subject under ``root``; with ``rejoin`` write those of the paper's split too.
+    """Check the union of each subject under ``root``; with ``rejoin`` also write those of the paper's split.
 
-    Passed where every subject has one and all are whole.
+    Passes if every subject has one and all are complete.
     """
     if not root.is_dir():
         raise InputError(root, "", "a folder of UNION folders", "a file" if root.exists() else "nothing")
@@ -110,7 +110,7 @@ def _report(root: Path, subject: str, rejoin: bool) -> UnionReport:
 
 
 def _find(root: Path, subject: str) -> Path:
-    """The subject's union; one of the paper's split that we wrote earlier does not count."""
+    """The subject's union, except one of the paper's split written by headbench."""
     fitting = [
         path
         for path in sorted(root.glob("UNION*"))
@@ -135,7 +135,7 @@ def _notes(subject: str, test: Sequence[str], entries: dict[str, list[FrameEntry
     if not any(expected == name or expected.startswith(f"{name}-") for name in test):
         notes.append(f"test holds {', '.join(test) or 'nothing'}; VHAP's rule would hold out {expected}")
     views = {entry.camera_id for entry in entries["novel_view"]}
-    # Older exports name cameras by their index alone.
+    # Older exports name cameras only by index.
     indices = {entry.camera_index for entry in entries["novel_view"]}
     if views and NOVEL_VIEW_CAMERA not in views and indices != {FRONTAL_INDEX}:
         notes.append(f"novel views are of {', '.join(sorted(views))}, not of the frontal {NOVEL_VIEW_CAMERA}")
@@ -150,7 +150,7 @@ _REJOINED = "_rejoined"
 def rejoin_union(root: Path, subject: str, entries: Sequence[FrameEntry], free: str) -> str:
     """Write the union of the paper's split beside the others: all sequences of a union, and FREE as the test.
 
-    Returns the folder's name. Raises `InputError` where FREE is not there.
+    Returns the folder's name. Raises `InputError` if FREE does not exist.
     """
     if not free:
         expected = f"a sequence folder {subject}_{TEST_SEQUENCE}_..., exported with its parameters"

@@ -1,6 +1,6 @@
-"""Stream the frames of many cameras side by side, each on one thread, one frame at a time, and write their images.
+"""Stream the frames of many cameras in parallel, each on one thread, one frame at a time, and write their images.
 
-Decoding, shrinking and encoding all happen in OpenCV with the interpreter's lock released, so threads do.
+Threads are sufficient because OpenCV releases the interpreter's lock for decoding, shrinking and encoding.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ class RawFrame(NamedTuple):
 
     number: int
     bgr: ByteArray
-    """(H, W, 3), channels in OpenCV's order: what follows shrinks the image first and reorders less."""
+    """(H, W, 3), channels in OpenCV's order, since reordering after shrinking is cheaper."""
     mask: ByteArray | None
     """(H, W) foreground coverage."""
 
 
 def read_frames(view: RecordedView, numbers: Sequence[int]) -> Iterator[RawFrame]:
-    """Decode the frames with these ascending numbers; memory holds one at a time.
+    """Decode the frames with these ascending numbers, one at a time.
 
-    Raises `InputError` where a frame does not decode, or a video ends before the count its index declares.
+    Raises `InputError` if a frame does not decode, or a video ends before the number of frames in its index.
     """
     if view.video is None:
         for number in numbers:
@@ -94,9 +94,9 @@ class _Stream:
 def write_images(
     jobs: Sequence[SequenceJob], *, workers: int = 0, progress: Progress = no_progress
 ) -> tuple[int, int]:
-    """Write what is missing; return how many images were written and how many were there already.
+    """Write missing images; return the numbers of written and existing images.
 
-    An image that is there and whole is kept. The first error stops all streams and is raised; what was written
+    Complete existing images are kept. The first error stops all streams and is raised; what was written
     stays, and another call continues with it.
     """
     streams = [_missing(job, index) for job in jobs for index in range(len(job.cameras))]
@@ -148,7 +148,7 @@ def _run(stream: _Stream, reports: queue.SimpleQueue, stop: threading.Event) -> 
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn an error of the system into an `InputError` that names the file, the reason and how to go on."""
+    """Convert a system error to an `InputError` with file, reason and remedy."""
     try:
         yield
     except OSError as error:
@@ -173,5 +173,5 @@ def _missing(job: SequenceJob, index: int) -> _Stream:
 
 
 def file_names(folder: Path) -> set[str]:
-    """Names in a folder, none where it is not there."""
+    """Names in a folder; none if it does not exist."""
     return set(os.listdir(folder)) if folder.is_dir() else set()

@@ -1,4 +1,4 @@
-"""Names in NeRSemble's folders, and which subjects, sequences and cameras the field evaluates on.
+"""Names in NeRSemble's folders, and the usual subjects, sequences and cameras for evaluation.
 
 Sources: "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations"
 (CVPR 2025), section 4 and supplement, for the subjects and the split by FREE; VHAP's union export for the ten
@@ -15,10 +15,10 @@ from os import PathLike
 from ...bench.errors import InputError
 
 FULL_SIZE = (2200, 3208)
-"""Width and height that a calibration refers to where it does not say."""
+"""Default width and height of a calibration."""
 
 FPS = 73.0
-"""Frames per second of the released videos; what the container says is not reliable."""
+"""Frames per second of the released videos; the value in the container is not reliable."""
 
 BACKGROUND = "BACKGROUND"
 TONGUE_SEQUENCES = ("EXP-6-tongue-1", "EXP-7-tongue-2")
@@ -61,10 +61,10 @@ def numbered(stem: str) -> tuple[str, int] | None:
 
 
 def match_sequence(file: str | PathLike[str], wanted: str, available: Iterable[str]) -> str:
-    """The available sequence of that name, or the only one whose name starts so.
+    """The available sequence with that name or unique prefix.
 
-    A prefix that ends where a name has a hyphen goes before others: ``SEN-1`` would be ``SEN-1-...`` and not
-    ``SEN-10-...``. Raises `InputError` where none or several fit.
+    Prefixes that end before a hyphen are preferred: ``SEN-1`` is ``SEN-1-...`` and not ``SEN-10-...``. Raises
+    `InputError` if none or several fit.
     """
     names = sorted(set(available))
     if wanted in names:
@@ -84,7 +84,7 @@ ABLATION_SUBJECT = "306"
 """Subject of the paper's Table 4; not one of the nine."""
 
 SUBJECT_NAMES = {"paper": SUBJECTS, "ablation": (ABLATION_SUBJECT,)}
-"""Names that stand for several subjects."""
+"""Names of groups of subjects."""
 
 NOVEL_VIEW_CAMERA = "222200037"
 """The frontal camera, held out for novel views."""

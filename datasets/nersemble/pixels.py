@@ -57,7 +57,7 @@ _BEYOND_LINEAR: dict[int, tuple[str, ...]] = {
 }
 
 POLYNOMIALS = {count: (*_CHANNELS, *beyond) for count, beyond in _BEYOND_LINEAR.items()}
-"""Terms by their number, each a product of channels ("rrg" is R R G, "" the constant 1): the augmented
+"""Terms by their count, each a product of channels ("rrg" is R R G, "" the constant 1): the augmented
 matrices of Cheung, Westland, Connah, Ripamonti (2004), in colour-science's order."""
 
 
@@ -72,8 +72,8 @@ _LINEAR = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
 _LINEAR.flags.writeable = False
 
 _STEPS = 2**16 - 1
-"""Steps of linear values in `_ENCODED`. Where sRGB is steepest a level spans 20 of them, so that results are within
-0.53 levels of the exact ones instead of 0.5."""
+"""Steps of linear values in `_ENCODED`. A level spans at least 20 steps, so results are within 0.53 levels of the
+exact ones instead of 0.5."""
 
 _ENCODED = (
     np.rint(255 * linear_to_srgb((np.arange(_STEPS + 1) / _STEPS).reshape(1, -1, 1))).astype(np.uint8).ravel()
@@ -173,10 +173,9 @@ def prepare_pixels(
 ) -> tuple[ByteArray, ByteArray | None]:
     """Shrink a frame by averaging areas, correct its colours, put it on white.
 
-    With a mask a, what the foreground adds to the frame is averaged, so that nothing but foreground takes part
-    in the correction. Given the still B of the empty set, that is I - (1 - a) B, within [0, a]: the background
-    that shines through soft edges is taken away. Without, it is a I, as VHAP has it, and edges keep a share
-    a (1 - a) of the background. Colours are corrected at the small size, as VHAP does.
+    With a mask a, only the contribution of the foreground is averaged and corrected. With the still B of the empty
+    set, it is I - (1 - a) B, within [0, a], which removes the background from soft edges. Without it, it is a I, as in
+    VHAP, and edges keep a fraction a (1 - a) of the background. Colours are corrected at the small size, as VHAP does.
 
     Parameters
     ----------
@@ -216,9 +215,9 @@ def _foreground_share(bgr: ByteArray, mask: ByteArray, still: ByteArray | None) 
 
 
 def read_still(path: Path, size: tuple[int, int]) -> ByteArray:
-    """Still of the empty set as OpenCV decodes it, brought to the frames' (width, height).
+    """Still of the empty set as OpenCV decodes it, resized to the frames' (width, height).
 
-    Raises `InputError` where it does not decode.
+    Raises `InputError` if it does not decode.
     """
     still = read_bgr(path)
     return cv2.resize(still, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)

@@ -33,7 +33,7 @@ CY: layout.CyConvention = "bottom"
 """Origin of the principal point in VHAP's exports."""
 
 IMAGES_VERSION = 1
-"""Counted up when the same recording and settings make other images than before."""
+"""Increased when the same recording and settings give other images than before."""
 
 _USUAL_HEAD = "flame2023"
 _FLAME_VERSIONS = ("flame2020", _USUAL_HEAD, "flame2023_no_jaw")
@@ -50,8 +50,7 @@ class SequenceJob:
     corrections : Mapping[str, Correction]
         Colour correction by serial; empty for none.
     stills : Mapping[str, Path]
-        Images of the empty set by serial, used to remove its light from soft edges; empty to skip
-        this.
+        Images of the empty set by serial, used to remove its light from soft edges; empty to skip this.
     tracked : TrackedSequence | None
         Parameters, or None if there are none yet.
     """
@@ -78,8 +77,7 @@ class SequenceJob:
 
     @cached_property
     def images_fingerprint(self) -> str:
-        """Digest of what decides the images and cameras: calibration, settings, and the files the frames come
-        from, by name and size."""
+        """Digest of the inputs of images and cameras: calibration, settings, and source files by name and size."""
         views = {
             serial: [(path.name, path.stat().st_size) for path in view.files]
             for serial, view in self.recorded.views.items()
@@ -98,7 +96,7 @@ class SequenceJob:
 
 @dataclass(frozen=True, eq=False)
 class PreparationPlan:
-    """One subject to prepare: its sequences, those held out among them, and its head model if there is one."""
+    """One subject to prepare: its sequences, the held-out ones, and its head model, if any."""
 
     subject: str
     jobs: Sequence[SequenceJob]
@@ -119,7 +117,7 @@ class PreparationPlan:
 
 
 def plan_subject(settings: PrepareSettings, subject: str) -> PreparationPlan:
-    """Read everything about one subject but its pixels. Raises `InputError` for the first fault."""
+    """Read everything about one subject except its pixels. Raises `InputError` for the first fault."""
     one = participant(Path(settings.root), subject)
     out = Path(os.path.abspath(settings.out))
     calibration = read_calibration(one.calibration_file)
@@ -170,7 +168,7 @@ def plan_subject(settings: PrepareSettings, subject: str) -> PreparationPlan:
 
 
 def _head_version(settings: PrepareSettings, head: HeadArrays | None) -> str:
-    """Version a capture is declared for: that of the head model given, or else a known one by name."""
+    """Declared head model version of a capture: that of the given head model, or else a known name."""
     stated = settings.head_model
     if head is not None:
         if stated not in ("", head.version):

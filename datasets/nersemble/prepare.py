@@ -1,9 +1,9 @@
 """Prepare a subject: images, cameras, parameters and splits in the GaussianAvatars/VHAP layout.
 
 Each sequence folder holds a record (`RECORD_FILE`) of what its images and its metadata were made from. A call
-continues what an earlier one left, does nothing where all is there, refuses to mix images of other settings,
-and writes parameters and JSONs anew when the tracking has changed. JSONs go first and come back last, so that
-no folder reads as a capture while it is half written.
+continues an earlier one, does nothing if everything exists, refuses to mix images of other settings, and rewrites
+parameters and JSONs when the tracking has changed. JSONs are deleted first and written last, so that no incomplete
+folder is read as a capture.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ BACKUP_FILE = "transforms_backup.json"
 """Frames and cameras before tracking: no parameters, no shift."""
 
 _READABLE = (*layout.SPLIT_FILES.values(), layout.ALL_FRAMES_FILE)
-"""Files a folder is read as a capture by."""
+"""Files that identify a folder as a capture."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ class SubjectResult:
 def prepare(
     plans: Sequence[PreparationPlan], *, workers: int = 0, progress: Progress = no_progress
 ) -> list[SubjectResult]:
-    """Prepare subjects. Raises `InputError` before the first image where a folder holds something else, and in
-    mid-run for videos that end early and for a full disk; another call then continues."""
+    """Prepare subjects. Raises `InputError` before the first image if a folder has other content, and during the run
+    for truncated videos and a full disk; another call then continues."""
     with ExitStack() as stack:
         for plan in plans:  # one by one: other subjects of the same folder may be prepared elsewhere
             stack.enter_context(locked(plan.union, beside=True))
@@ -114,12 +114,14 @@ def _prepare(plans: Sequence[PreparationPlan], workers: int, progress: Progress)
 
 
 def _checked_state(job: SequenceJob) -> SequenceState:
-    """The record of a job's folder. Raises `InputError` where its images were made from something else."""
+    """The record of a job's folder. Raises `InputError` if its images were made from other inputs."""
     path = job.folder / RECORD_FILE
     if not path.exists():
         if (job.folder / "images").is_dir() and any((job.folder / "images").iterdir()):
             found = "images of unknown origin"
-            raise InputError(job.folder, "images", "a folder of ours, or an empty one", found, _ELSEWHERE)
+            raise InputError(
+                job.folder, "images", "a folder written by this command, or an empty one", found, _ELSEWHERE
+            )
         return SequenceState()
     value = read_json(path)
     texts = all(isinstance(value.get(key), str) for key in ("images", "metadata"))
@@ -234,12 +236,12 @@ def _write_tracked(job: SequenceJob, tracked: TrackedSequence, declaration: layo
 
 
 def _is_readable(job: SequenceJob) -> bool:
-    """Whether the folder reads as a capture: images, parameters and JSONs are there."""
+    """Whether the folder is a capture with images, parameters and JSONs."""
     return all((job.folder / name).exists() for name in _READABLE)
 
 
 def _write_union(plan: PreparationPlan) -> dict[str, int]:
-    """Write the union where every sequence is tracked, unless it is there; frames per split."""
+    """Write the union if every sequence is tracked and it does not exist; returns the number of frames per split."""
     if not all(_is_readable(job) for job in plan.jobs):
         return {}
     train = [job for job in plan.jobs if job.recorded.name not in plan.test]

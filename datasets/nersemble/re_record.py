@@ -1,7 +1,7 @@
-"""Turn a capture, a synthetic one as a rule, back into the raw recording and tracking it could have come from.
+"""Convert a capture, usually a synthetic one, to a corresponding raw recording and tracking.
 
-Names and keys are those of the real files. Participants get numbers from 900 up and a marker file, so that nobody
-takes them for recorded people.
+Names and keys are those of the real files. Participants get numbers from 900 up and a marker file, to distinguish them
+from recorded people.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ def re_record(
 ) -> list[str]:
     """Write a clip's frames, cameras and parameters as a raw recording under ``root``; return its sequences.
 
-    The recording shows the subject before a grey wall (`studio`), where the clip has masks. Frames become images
-    with masks, as VHAP's preprocessing leaves them, or without ``masks`` videos of three frames per timestep,
-    of which a reader keeps the first. Parameters go under ``tracking``, in the world that VHAP turns the
-    calibration into. Excluded frames are written like the others.
+    The recording shows the subject in front of a grey wall (`studio`) if the clip has masks. Frames become images
+    with masks, as written by VHAP's preprocessing, or without ``masks`` videos of three frames per timestep,
+    of which a reader keeps the first. Parameters are written under ``tracking``, in the aligned world of VHAP.
+    Excluded frames are written like the others.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def studio(camera: Camera) -> ByteArray:
 
 
 def _before_wall(clip: CaptureClip, key: FrameKey) -> ByteArray:
-    """The frame with the clip's background exchanged for the wall, exactly, by its mask."""
+    """The frame with the clip's background exactly replaced by the wall, using its mask."""
     image, mask = clip.image(key), clip.mask(key)
     if mask is None:
         return image
@@ -110,7 +110,7 @@ def _before_wall(clip: CaptureClip, key: FrameKey) -> ByteArray:
 
 
 def _turned_pose(clip: CaptureClip, pose: HeadPose, turn: FloatArray) -> HeadPose:
-    """The pose in a world turned about its origin; the head itself turns about its root joint."""
+    """The pose in a world rotated about its origin; the head rotates about its root joint."""
     head = clip.head
     shaped = head.template + head.shape_basis @ clip.shape + head.expression_basis @ pose.expression
     root = head.joint_regressor[0] @ (shaped + clip.static_offset)
@@ -122,7 +122,7 @@ def _turned_pose(clip: CaptureClip, pose: HeadPose, turn: FloatArray) -> HeadPos
 Release = Literal["v2", "v1", "paper2023"]
 
 SYNTHETIC_IDS = 900
-"""Participants from this number on are synthetic."""
+"""Participants with this and higher numbers are synthetic."""
 
 MARKER_FILE = "SYNTHETIC.txt"
 _MARKER = "Synthetic recordings in NeRSemble's layout, written by headbench. No person was recorded.\n"
@@ -165,9 +165,9 @@ class RecordingWriter:
         return parent / sequence
 
     def write_calibration(self) -> None:
-        """Write ``camera_params.json``: one intrinsic matrix where all cameras share it, else one per camera.
+        """Write ``camera_params.json``: one intrinsic matrix if all cameras share it, else one per camera.
 
-        ``height`` and ``width`` are stated where they are not those of the real recordings.
+        ``height`` and ``width`` are stated if they differ from those of the real recordings.
         """
         write_text(self.root / MARKER_FILE, _MARKER)
         first = self.cameras[0]

@@ -9,7 +9,7 @@ second release                 first release, parts merged        the ten sequen
 =============================  =================================  ======================================
 
 The benchmark toolkit's folders read as the second release. Parts of the first release that were not merged
-(``sequence_SEQ_part-N/ID/SEQ``) are found too. Nothing is decoded here; `sequence` looks into the videos.
+(``sequence_SEQ_part-N/ID/SEQ``) are found too. Nothing is decoded here; `sequence` inspects the videos.
 
 ``camera_params.json`` holds world-to-camera matrices with OpenCV axes in metres, and one intrinsic matrix for all
 cameras (raw recordings) or one per camera (the benchmark's cropped videos); no lens distortion.
@@ -78,9 +78,9 @@ class Participant:
             raise InputError(error.file, error.key, error.expected, error.found, remedy) from None
 
     def corrections(self, sequence: str, serials: Iterable[str]) -> dict[str, Correction]:
-        """Colour correction by serial; empty where the recording has no colour calibration.
+        """Colour correction by serial; empty if the recording has no colour calibration.
 
-        Raises `InputError` where there is one, but not for all of ``serials``.
+        Raises `InputError` if there is one, but not for all of ``serials``.
         """
         if self.colour_file is not None:
             entries = read_json(self.colour_file)
@@ -112,7 +112,7 @@ def participants(root: Path) -> dict[str, Participant]:
 
 
 def participant(root: Path, subject: str) -> Participant:
-    """One participant, with calibration. Raises `InputError` where the recording lacks either."""
+    """One participant, with calibration. Raises `InputError` if the recording lacks either."""
     known = participants(root)
     if subject not in known:
         raise InputError(root, "subject", f"one out of {', '.join(known)}", subject)
@@ -212,7 +212,7 @@ class Calibration:
         return Camera(serial, *output, K, self.world_to_camera[serial])
 
     def aligned(self) -> Calibration:
-        """The same cameras in a world with the mean camera looking along -z and +y up, as VHAP turns it.
+        """The same cameras in a world with the mean camera looking along -z and +y up, as in VHAP.
 
         The mean of all camera-to-world rotations is orthonormalised column by column (x, y, z); with its
         second and third columns negated it is the new basis. No translation, no scale. All cameras of the
@@ -230,7 +230,7 @@ class Calibration:
 
 
 def _gram_schmidt(matrix: FloatArray) -> FloatArray | None:
-    """Orthonormal columns, each what the former ones leave of it; None where nothing is left."""
+    """Orthonormal columns by Gram-Schmidt; None if they are linearly dependent."""
     columns: list[FloatArray] = []
     for column in matrix.T:
         rest = column - sum((np.dot(column, known) * known for known in columns), np.zeros(3))

@@ -1,7 +1,7 @@
-"""One recorded sequence: which frames each camera has, checked before anything is decoded.
+"""One recorded sequence: frames of each camera, checked before anything is decoded.
 
-A whole mp4 file is told from a truncated one by its boxes, each with its size in front (ISO/IEC 14496-12, 4.2):
-a file cut short either lacks its index (``moov``) or has a box that reaches beyond the end.
+Truncated mp4 files are detected by their boxes, which start with their size (ISO/IEC 14496-12, 4.2): a truncated file
+either lacks its index (``moov``) or has a box that extends beyond the end.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Source = Literal["auto", "video", "images"]
 """Source of the frames: videos, or images beside them; "auto" uses images if they come with masks."""
 
 EVERY_OF_73 = 3
-"""Every third frame of 73 per second makes the 24.33 per second that "24 fps" stands for."""
+"""Every third frame of 73 per second gives the 24.33 frames per second of "24 fps"."""
 
 _TRUNCATED = "Fetch the file again."
 _FRAME_FOLDER = re.compile(r"frame_(\d+)")
@@ -83,10 +83,10 @@ class RecordedView:
 
 @dataclass(frozen=True, eq=False)
 class RecordedSequence:
-    """One sequence: its views by serial, all with the same frames, and the frames that were chosen.
+    """One sequence: its views by serial, all with the same frames, and the selected frames.
 
-    ``numbers`` are frame numbers of the source; timestep t of a prepared capture is ``numbers[t]``. ``uncut``
-    has those too that were chosen but are left out, as not all cameras have them.
+    ``numbers`` are frame numbers of the source; timestep t of a prepared capture is ``numbers[t]``. ``uncut`` also has
+    selected frames that are skipped because not all cameras have them.
     """
 
     subject: str
@@ -112,7 +112,7 @@ def read_sequence(
     every: int | None = None,
     cut: bool = False,
 ) -> RecordedSequence:
-    """Look into a sequence and check that all of it is there.
+    """Inspect a sequence and check that it is complete.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def read_sequence(
 
 
 def _collect(folder: Path, serials: Sequence[str], source: Source) -> tuple[dict[str, RecordedView], int]:
-    """Unchecked views by serial (sizes still unknown), and which frames to keep by default."""
+    """Unchecked views by serial (sizes unknown), and the frames to keep by default."""
     nested = _frame_folders(folder)
     if nested and source != "video":
         return nested, EVERY_OF_73
@@ -203,7 +203,7 @@ def _image_views(
 
 
 def _numbered(folder: Path, serials: Sequence[str]) -> dict[str, dict[int, Path]]:
-    """Files of VHAP's preprocessing, which drops the serial where it ran on one camera."""
+    """Files of VHAP's preprocessing, which omits the serial for a single camera."""
     found: dict[str, dict[int, Path]] = {}
     for path in entries(folder):
         parsed = numbered(path.stem) if path.suffix.lower() in _IMAGE_SUFFIXES else None
@@ -233,7 +233,7 @@ def _frame_folders(folder: Path) -> dict[str, RecordedView]:
 
 
 def _checked(folder: Path, view: RecordedView | None, serial: str, source: Source) -> RecordedView:
-    """The view with its size and count, after a look at every file's header."""
+    """The view with its size and count, from the headers of all files."""
     if view is None:
         kind = "a video" if source == "video" else "frames"
         remedy = "Fetch them, or name the cameras to use."
@@ -265,7 +265,7 @@ def probe_video(path: Path) -> tuple[int, tuple[int, int]]:
         size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
     finally:
         capture.release()
-    # An index of a few bytes can declare any number and size; a frame takes some bytes at least.
+    # A small index can declare any number and size, but a frame takes at least some bytes.
     if not 1 <= count <= path.stat().st_size or min(size) < 1 or size[0] * size[1] > MAX_PIXELS:
         found = f"{count} frames of {size[0]}x{size[1]} pixels"
         raise InputError(path, "", f"a video with frames of at most {MAX_PIXELS} pixels", found)
@@ -273,9 +273,9 @@ def probe_video(path: Path) -> tuple[int, tuple[int, int]]:
 
 
 def open_video(path: Path) -> cv2.VideoCapture:
-    """Open a video on one decoding thread: streams run side by side. Raises `InputError` where it will not.
+    """Open a video on one decoding thread, since streams run in parallel. Raises `InputError` on failure.
 
-    Pixels are as they are stored, whatever rotation the file asks viewers for.
+    Pixels are read as stored, without the rotation in the file's metadata.
     """
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
@@ -285,8 +285,8 @@ def open_video(path: Path) -> cv2.VideoCapture:
 
 
 def _image_size(files: Iterable[Path], wanted: tuple[int, int] | None = None) -> tuple[int, int]:
-    """The size that all files have. ``wanted`` is that of the images the files are masks of; without it most
-    files decide, so that one of another size is the one to be blamed."""
+    """The size of all files. ``wanted`` is the size of the images of masks; without it the most frequent size is
+    expected, so that an error names the deviating file."""
     sizes = {path: (info.width, info.height) for path in files for info in (probe_image(path),)}
     size = wanted or Counter(sizes.values()).most_common(1)[0][0]
     for path, found in sizes.items():
@@ -308,7 +308,7 @@ def _same_mask(path: Path, mask: tuple[int, tuple[int, int]], frames: tuple[int,
 def _common_numbers(
     folder: Path, views: Mapping[str, RecordedView], cut: bool
 ) -> tuple[list[int], list[int]]:
-    """Frames that all cameras have, and those that any has; ascending."""
+    """Frames of all cameras, and frames of any camera; ascending."""
     numbers = {serial: set(view.numbers) for serial, view in views.items()}
     everything = set.union(*numbers.values())
     common = set.intersection(*numbers.values())

@@ -13,7 +13,7 @@ from ..options import CaptureOptions
 
 @dataclass(frozen=True)
 class PrepareSettings:
-    """What to prepare, from where, and how."""
+    """Settings of the preparation."""
 
     root: str = ""
     """Folder with raw recordings: the one that holds the participants' folders."""
@@ -28,34 +28,33 @@ class PrepareSettings:
     """"free" holds out FREE for self-reenactment; "union10" holds out one of the ten sequences by VHAP's seeded
     rule. The frontal camera is held out for novel views either way."""
     tracking: str = ""
-    """Folder with VHAP's results. Without it images and cameras are written; call again once there is one."""
+    """Folder with VHAP's results. Without it images and cameras are written; run again when tracking is available."""
     head: str = ""
     """Head model the tracking belongs to (flame2023.pkl, or npz): checked against it, never copied if FLAME's."""
     head_model: str = ""
     """Version of the head model the tracking belongs to; default: that of --head, or flame2023 without --head."""
     cameras: str = ""
-    """Serials separated by commas; default: all the calibration has."""
+    """Serials separated by commas; default: all in the calibration."""
     downscale: int = 4
     """Width and height are divided by this, averaging areas; 4 makes 550x802 of 2200x3208."""
     source: Literal["auto", "video", "images"] = "auto"
-    """What to take where a sequence has both; "auto" takes images where they come with masks."""
+    """Source if a sequence has both; "auto" uses images if they have masks."""
     every: int = 0
     """Frame stride; 0 stands for 3 with the 73-per-second videos and 1 with VHAP's images."""
     colour: Literal["auto", "none"] = "auto"
     """"auto" corrects colours where the recording has a calibration for that; "none" never."""
     edges: Literal["unblend", "plain"] = "unblend"
-    """Soft edges with masks: "unblend" takes the light of the BACKGROUND still out, where there are stills; "plain"
-    multiplies by the mask, as VHAP does, and leaves fringes."""
+    """Soft edges with masks: "unblend" removes the light of the BACKGROUND still, if there is one; "plain" multiplies
+    by the mask, as VHAP does, which leaves fringes."""
     cut: bool = False
-    """Keep the frames that all cameras have where they differ, instead of an error; tracking of all frames is cut
-    with them."""
+    """If cameras have different frames, keep the common ones instead of raising an error; tracking is cut accordingly."""
     workers: int = 0
     """Number of cameras processed at a time; 0 stands for one per processor core."""
     check: bool = False
-    """Only look whether everything needed is there."""
+    """Only check whether all required files exist."""
     union_root: str = ""
     """Instead of preparing, check captures exported elsewhere: a folder of UNION folders, such as GaussianAvatars'
-    download. Of the other options only --subjects and --rejoin go with it."""
+    download. Only --subjects and --rejoin can be combined with it."""
     rejoin: bool = False
     """With --union-root, also write unions of the paper's split (FREE held out) beside them; copies nothing."""
 
@@ -84,7 +83,7 @@ class PrepareSettings:
 
 @dataclass(frozen=True)
 class RecordSettings(CaptureOptions):
-    """What to write as a raw recording."""
+    """Settings of the raw recording."""
 
     capture: tyro.conf.Positional[str]
     """Synthetic capture: a UNION folder, as `headbench synth` writes them."""
@@ -92,6 +91,6 @@ class RecordSettings(CaptureOptions):
     """Folder to write: recording/ is for --root of `headbench prepare nersemble`, tracking/ for --tracking,
     head_model.npz for --head."""
     release: Literal["v2", "v1", "paper2023"] = "v2"
-    """Whose folders: of the second release, of the first, or of the 2023 paper."""
+    """Layout: of the second release, the first, or the 2023 paper."""
     frames: Literal["images", "video"] = "images"
-    """"images" with masks, as VHAP's preprocessing leaves them, or "video" without."""
+    """"images" with masks, as written by VHAP's preprocessing, or "video" without."""

@@ -1,4 +1,4 @@
-"""Tracked FLAME parameters as VHAP writes them: found by subject and sequence, read and checked."""
+"""Tracked FLAME parameters of VHAP, found by subject and sequence, and validated."""
 
 from __future__ import annotations
 
@@ -57,8 +57,7 @@ class TrackedSequence:
         return {**rows, "translation": moved.astype(np.float32), **self.constant}
 
     def canonical(self) -> dict[str, FloatArray]:
-        """``canonical_flame_param.npz``: zeros except for identity, static offset and an open jaw
-        (float64)."""
+        """``canonical_flame_param.npz``: zeros except for identity, static offset and an open jaw (float64)."""
         zeros = {
             key: np.zeros_like(values[:1]) for key, values in self.frames.items() if key != "dynamic_offset"
         }
@@ -70,8 +69,8 @@ def read_tracked(
 ) -> TrackedSequence:
     """Read ``tracked_flame_params_*.npz`` and check it against the frames and, where given, the head model.
 
-    ``kept`` says of each frame before a cut whether it is among the ``timesteps``; parameters of all those frames
-    are cut with them.
+    ``kept`` is whether each frame before a cut is among the ``timesteps``; parameters of all frames are cut
+    accordingly.
 
     Raises `InputError` for a file of another tracker, missing arrays, wrong shapes, numbers that are not finite or beyond
     `MAX_MAGNITUDE`, a number of timesteps other than ``timesteps``, and coefficients that the head model has no basis for.
@@ -101,8 +100,8 @@ def find_tracked(root: Path, subject: str, sequence: str) -> Path | None:
     """Final parameters of a sequence under VHAP's output folder; None if there are none.
 
     Looks in folders named as VHAP's scripts name them (``074_EMO-1_v16_DS4_wBg_staticOffset``) or plainly
-    ``074_EMO-1-shout+laugh``, takes the latest dated run inside, and its last epoch. Raises `InputError` where
-    two folders fit.
+    ``074_EMO-1-shout+laugh``, uses the latest dated run inside, and its last epoch. Raises `InputError` if two folders
+    fit.
     """
     folders = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
     fitting = []
@@ -126,7 +125,7 @@ def _results(folder: Path) -> Iterator[tuple[str, int, Path]]:
 def _cut(
     path: Path, arrays: dict[str, np.ndarray], timesteps: int, kept: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """The arrays with the rows of the frames that were kept, where they have rows for all frames."""
+    """The arrays with only the rows of kept frames, if they have rows for all frames."""
     rows = arrays["translation"].shape[:1] if "translation" in arrays else ()
     if rows == (len(kept),):
         moving = {*POSE_SIZES, "expr", "dynamic_offset", "eyelids"}
@@ -163,7 +162,7 @@ def _floats(
         if array.ndim and shape[0] is not None and array.shape[0] != shape[0]:
             remedy = "Track the very frames that are prepared (mind every, and the frames VHAP extracted)."
         raise InputError(path, key, f"numbers of shape {wanted}", f"{array.dtype} {array.shape}", remedy)
-    with np.errstate(over="ignore"):  # what overflows becomes infinite and is refused
+    with np.errstate(over="ignore"):  # overflow gives infinity, which is refused
         values = array.astype(np.float32)
     check_numbers(path, key, values, MAX_MAGNITUDE)
     return values
@@ -185,7 +184,7 @@ def _check_head(
 
 
 def _rows(path: Path, frames: Mapping[str, FloatArray], head: HeadArrays | None) -> int:
-    """Vertices of the tracked mesh, for a static offset of zeros, which GaussianAvatars insists on."""
+    """Number of vertices of the tracked mesh, for a static offset of zeros, which GaussianAvatars requires."""
     if "dynamic_offset" in frames:
         return frames["dynamic_offset"].shape[1]
     if head is not None:

@@ -1,9 +1,9 @@
-"""Expression clusters of a performance, so that rare expressions are trained on as often as common ones.
+"""Expression clusters of a performance, for training on rare expressions as often as on common ones.
 
 "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations"
 (CVPR 2025, arXiv 2504.14967), class-balanced sampling: spectral clustering of the unposed training meshes
-under the mean vertex distance of the face. The published code draws on training timesteps alone, so nothing
-leaks; it compares all pairs, and its k-means starts at random. Its behaviour is ``variant="official"``.
+under the mean vertex distance of the face. The published code uses only training timesteps, so there is no leak; it
+compares all pairs, and its k-means starts at random. Its behaviour is ``variant="official"``.
 
 Both embeddings, of all pairs and of a few columns of the similarity matrix (Nyström), are those of scikit-learn's
 `SpectralClustering` with a precomputed affinity: leading eigenvectors of D^-1/2 (S - I) D^-1/2, each row divided by
@@ -31,12 +31,12 @@ from ..head.subject import PosedSubject, pose_in_head_frame
 
 DEFAULT_CLASSES = 16
 LANDMARK_LIMIT = 500
-"""Timesteps up to which all pairs are compared; beyond, at most as many landmarks stand for all."""
+"""Maximum number of timesteps for comparing all pairs; more timesteps are represented by at most as many landmarks."""
 
 LANDMARK_TOLERANCE = 0.01
 """Fraction of the largest distance within which every face has a landmark, if their number permits it."""
 
-_DIGITS = 6  # relative distances that are equal to this number of digits belong to one face
+_DIGITS = 6  # number of digits to which relative distances of one face are equal
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +94,9 @@ def cluster_expressions(
 ) -> ExpressionClusters:
     """Cluster the training timesteps of a clip by the shape of the face.
 
-    Up to ``limit`` timesteps all pairs are compared. Beyond, farthest-point landmarks stand for all and the
-    clustering is Nyström's (see `spectral`); memory then grows with T times ``limit`` and T times the size of a
-    face, never with T squared. There are never more classes than distinct faces (landmarks, beyond ``limit``).
+    Up to ``limit`` timesteps all pairs are compared. Above that, farthest-point landmarks represent all and the
+    Nyström method is used (see `spectral`); memory then grows with T times ``limit`` and T times the size of a face,
+    never with T squared. There are never more classes than distinct faces (landmarks, beyond ``limit``).
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def cluster_by_distance(
     seed: int = 0,
     variant: Literal["paper", "official"] = "paper",
 ) -> tuple[IntArray, FloatArray]:
-    """Spectral clustering under the similarity 1 - d / max d, of all pairs or from the distances to landmarks alone.
+    """Spectral clustering with the similarity 1 - d / max d, from all pairs or only from distances to landmarks.
 
     Parameters
     ----------
@@ -184,14 +184,14 @@ FACE_REGION, EYE_REGION = "face", "eye_region"
 EYE_WEIGHT = 2.0
 
 _BLOCK = 16
-"""Meshes compared with one at a time: few enough for their differences to stay in the processor's cache."""
+"""Number of meshes compared with one at a time, so that their differences fit in the processor's cache."""
 
 
 class Landmarks(NamedTuple):
-    """Meshes that stand for all."""
+    """Landmark meshes."""
 
     indices: IntArray
-    """(m,) which meshes they are, in the order of choice; distinct."""
+    """(m,) indices of the landmarks, distinct, in the order of selection."""
     distances: FloatArray
     """(N, m) float32 distance of every mesh to each of them, metres."""
     radius: float
@@ -201,8 +201,8 @@ class Landmarks(NamedTuple):
 def expression_displacements(clip: Clip, timesteps: Sequence[int]) -> FloatArray:
     """(T, 3, F) float32 displacements of the face's F vertices from the neutral face, metres.
 
-    Meshes keep jaw, eyes and expression and lose rotation, neck and translation; vertices of the eye region
-    count `EYE_WEIGHT` times. Raises `InputError` where the head has no region "face".
+    Meshes have jaw, eyes and expression, but no rotation, neck and translation; vertices of the eye region have weight
+    `EYE_WEIGHT`. Raises `InputError` if the head has no region "face".
     """
     vertices, weights = _face_vertices(clip.head)
     subject = PosedSubject.of(clip, torch.float32)
@@ -235,7 +235,7 @@ def mean_vertex_distances(meshes: FloatArray) -> FloatArray:
 def farthest_meshes(
     meshes: FloatArray, limit: int, *, seed: int = 0, tolerance: float = 0.0, progress: Progress = no_progress
 ) -> Landmarks:
-    """Greedy farthest-point sampling: from a mesh drawn at random, each time the one farthest from those chosen.
+    """Greedy farthest-point sampling, starting from a random mesh.
 
     By the triangle inequality the distance of any two meshes differs from that of their landmarks by the sum of
     their distances to these, at most twice the radius. Memory grows with N times ``limit``, never with N squared.
@@ -274,7 +274,7 @@ def _distances_to(meshes: FloatArray, mesh: FloatArray) -> FloatArray:
     for start in range(0, len(meshes), _BLOCK):
         block = meshes[start : start + _BLOCK]
         delta, norm = difference[: len(block)], length[: len(block)]
-        # Differences first: the product form |a|^2 - 2ab + |b|^2 loses what sets neighbouring frames apart.
+        # The product form |a|^2 - 2ab + |b|^2 would lose the differences between neighbouring frames.
         np.subtract(block, mesh, out=delta)
         np.einsum("nkf,nkf->nf", delta, delta, out=norm)
         np.mean(np.sqrt(norm, out=norm), axis=1, out=result[start : start + _BLOCK])
@@ -292,7 +292,7 @@ SIMILARITY_FLOOR = 1e-6
 """The farthest pair has similarity 0; the floor keeps a graph of few distinct items connected."""
 
 START_LIMIT = 2000
-"""Items from which classes start: a hierarchy takes memory by their number squared."""
+"""Maximum number of items for the hierarchy of initial classes, whose memory grows with the square of their number."""
 
 _RANK_TOLERANCE = 1e-9  # eigenvalues of the landmarks' block below this part of the largest are noise
 _SMALL_FACTOR = 4  # with fewer landmarks than this times the classes, Lanczos has no room: solve densely
@@ -335,7 +335,7 @@ def nystrom_embedding(columns: FloatArray, landmarks: IntArray, classes: int) ->
     sign = np.sign(values[kept])
     diagonal = np.square(factor) @ sign
     degree = factor @ (sign * factor.sum(axis=0)) - diagonal
-    # Approximate degrees are positive in all but the strangest graphs; never below a single weakest link.
+    # Approximate degrees may be negative in rare cases; they are limited to a single weakest link.
     scale = 1 / np.sqrt(np.maximum(degree, SIMILARITY_FLOOR))
 
     def apply(vector: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
-"""Leave labelled frames out of every split: FLAME has no tongue, so frames that show one are not compared.
+"""Exclude labelled frames from every split, such as frames with the tongue, which FLAME lacks.
 
-Labels come as JSON ({"<timestep>": "<reason>"}), or as the YAML that ``headbench prepare tongue`` writes, which says what a
-detector decided, why, and what people decided instead. One file serves several subjects::
+Labels are JSON ({"<timestep>": "<reason>"}), or the YAML of ``headbench prepare tongue``, which has the detector's
+decisions with their reasons, and manual overrides. One file can have several subjects::
 
     format: headbench-exclusions-1
     subjects:
@@ -12,8 +12,8 @@ detector decided, why, and what people decided instead. One file serves several 
         frames:
           57: {sequence: FREE, score: 61.2, excluded: true, reason: '...'}
 
-The section ``overrides`` is people's: it wins, and a detector that writes the file again keeps it. ``keep`` keeps
-a frame; any other text leaves it out and is the reason.
+The section ``overrides`` has manual decisions: it takes precedence, and is kept when the detector rewrites the file.
+``keep`` keeps a frame; any other text excludes it and is the reason.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def exclude_timesteps(
 
 
 def exclude_given(clip: Clip, exclude: Mapping[int, str] | str | Path | None) -> CaptureClip:
-    """Leave out what a reader's setting ``exclude`` names, for a clip of any reader.
+    """Exclude the timesteps of a reader's setting ``exclude`` from a clip of any reader.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def read_reasons(path: Path, clip: CaptureClip) -> dict[int, str]:
                 f"subjects.{clip.subject}.frames.{timestep}.sequence",
                 f"{sequences[timestep]}, as the capture has it",
                 frame.sequence,
-                "The file was made for a capture that numbers its timesteps otherwise.",
+                "The file was made for a capture with another numbering of timesteps.",
             )
     return decided.reasons()
 
@@ -162,7 +162,7 @@ class Exclusions:
     Attributes
     ----------
     threshold : float
-        Minimum score of frames that are left out.
+        Minimum score of excluded frames.
     basis : str
         How the threshold was found.
     cameras : tuple[str, ...]
@@ -170,7 +170,7 @@ class Exclusions:
     frames : Mapping[int, FrameDecision]
         Decision by timestep.
     overrides : Mapping[int, str]
-        Manual decision by timestep: "keep", or the reason to leave the frame out.
+        Manual decision by timestep: "keep", or the reason to exclude the frame.
     """
 
     threshold: float
@@ -180,7 +180,7 @@ class Exclusions:
     overrides: Mapping[int, str] = field(default_factory=dict)
 
     def reasons(self) -> dict[int, str]:
-        """Reason by timestep that is left out, overrides applied."""
+        """Reason by excluded timestep, with overrides applied."""
         found = {t: frame.reason for t, frame in self.frames.items() if frame.excluded}
         found |= {t: word for t, word in self.overrides.items() if word != KEEP}
         return {t: found[t] for t in sorted(found) if self.overrides.get(t) != KEEP}
@@ -208,11 +208,11 @@ def write_exclusions(path: Path, subjects: Mapping[str, Exclusions]) -> None:
 
 @dataclass(frozen=True)
 class _Subject:
-    """A subject's entry as the file has it."""
+    """A subject's entry in the format of the file."""
 
     threshold: float
     frames: dict[NonNegativeInt, FrameDecision]
-    overrides: dict[NonNegativeInt, str] | None = None  # as left by who deletes the last line
+    overrides: dict[NonNegativeInt, str] | None = None  # if a user deleted the last line
     threshold_from: str = ""
     unit: str = UNIT
     cameras: tuple[str, ...] = ()
@@ -225,9 +225,9 @@ class _File:
 
 
 def read_exclusions(path: Path) -> dict[str, Exclusions]:
-    """Read the file: decisions by subject. Raises `InputError` for anything that is not one."""
+    """Read decisions by subject. Raises `InputError` for invalid files."""
     if not path.exists():
-        remedy = "Make one with `headbench prepare tongue`."
+        remedy = "Create it with `headbench prepare tongue`."
         raise InputError(path, "", "a file of exclusions", "no such file", remedy)
     content = checked(read_yaml(path), _File, path)
     return {

@@ -1,4 +1,4 @@
-"""Pictures of jaw bases and expression clusters; after Figures 7 and 8 of the paper that `jaw_bases` names."""
+"""Figures of jaw bases and expression clusters, similar to Figures 7 and 8 of the paper cited in `jaw_bases`."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from ..mesh_pictures import draw_mesh, portrait_camera
 from .clusters import ExpressionClusters
 from .jaw_bases import DEFAULT_COUNT, jaw_bases, jaw_quaternions, jaw_weights, leaks
 
-_YAW = 0.35  # radians; a little from the side, so that the jaw's depth shows
+_YAW = 0.35  # radians; slightly from the side, to show the jaw's depth
 _MESH_SIZE = (268, 352)  # width, height, pixels
 _JAW_COLUMNS, _CLUSTER_COLUMNS = 8, 4
 
 
 class JawFindings(NamedTuple):
-    """Jaw bases of a clip and how its poses lie among them."""
+    """Jaw bases of a clip, and their coverage of its poses."""
 
     bases: FloatArray
     """(n, 4) unit quaternions, real part first."""
     angles: FloatArray
     """(n, 3) their rotation vectors, degrees: opening, to the side, twist."""
     shares: FloatArray
-    """(n,) share of the training timesteps whose largest weight is on the basis."""
+    """(n,) fraction of the training timesteps whose largest weight is on the basis."""
     largest_gap: float
     """Largest angle, degrees, between a training pose and the basis nearest to it."""
     train: FloatArray
@@ -60,7 +60,7 @@ class JawFindings(NamedTuple):
 def find_jaw_bases(
     clip: CaptureClip, count: int = DEFAULT_COUNT, *, variant: Literal["paper", "official"] = "paper"
 ) -> JawFindings:
-    """Find the bases of a clip and what of its poses they cover."""
+    """Find the bases of a clip and their coverage of its poses."""
     bases = jaw_bases(clip, count, variant=variant)
     train = clip.timesteps("train")
     held_out = [t for t in clip.timesteps("self_reenactment") if t not in set(train)]
@@ -80,7 +80,7 @@ def find_jaw_bases(
 
 
 def draw_jaw_bases(clip: CaptureClip, found: JawFindings) -> ByteArray:
-    """(H, W, 3) picture: the bases as meshes, and where they lie among the poses of the performance."""
+    """(H, W, 3) figure: the bases as meshes, and their positions among the poses of the performance."""
     rows = -(-len(found.bases) // _JAW_COLUMNS)
     neutral = next(iter(clip.poses.values()))
     still = replace(neutral, expression=np.zeros_like(neutral.expression), eyes=np.zeros(6), eyelids=None)
@@ -106,7 +106,7 @@ def draw_jaw_bases(clip: CaptureClip, found: JawFindings) -> ByteArray:
 
 def _scatter(axes: Axes, found: JawFindings) -> None:
     """Opening against sideways angle: training poses, held-out poses, bases by number."""
-    near = found.bases[:, 0] > np.cos(np.pi / 4)  # a half turn would leave no room for anything else
+    near = found.bases[:, 0] > np.cos(np.pi / 4)  # a half turn would dominate the scale
     for angles, colour, name in ((found.held_out, HELD_OUT, "held-out"), (found.train, TRAIN, "training")):
         axes.scatter(angles[:, 0], angles[:, 1], s=14, color=colour, label=f"{len(angles)} {name} poses")
     axes.scatter(
@@ -173,7 +173,7 @@ def draw_strips(axes: Axes, sequences: Mapping[str, Sequence[int]]) -> None:
 
 
 def frontal_key(clip: CaptureClip, timestep: int) -> FrameKey:
-    """Training frame of a timestep whose camera the face looks at most directly."""
+    """Training frame of a timestep from the most frontal camera."""
     pose = clip.poses[timestep]
     facing = Rotation.from_rotvec(np.asarray(pose.rotation, dtype=np.float64)).apply([0.0, 0.0, 1.0])
 
@@ -190,12 +190,12 @@ def cluster_colour(rank: int) -> tuple[float, float, float]:
 
 
 def unposed_meshes(clip: Clip, poses: Sequence[HeadPose]) -> FloatArray:
-    """(N, V, 3) meshes that keep expression, jaw, eyes and eyelids and lose rotation, neck and translation."""
+    """(N, V, 3) meshes with expression, jaw, eyes and eyelids, without rotation, neck and translation."""
     return PosedSubject.of(clip, torch.float32).meshes([pose_in_head_frame(pose) for pose in poses])
 
 
 def draw_meshes(clip: Clip, meshes: FloatArray, width: int, height: int) -> list[ByteArray]:
-    """Draw each of (N, V, 3) meshes with one camera; the camera shows the faces of all of them."""
+    """Draw each of (N, V, 3) meshes with a common camera that shows all faces."""
     face = meshes[:, clip.head.regions.get("face", np.arange(meshes.shape[1]))]
     camera = portrait_camera(face.reshape(-1, 3).astype(np.float64), width, height, yaw=_YAW)
     return [draw_mesh(mesh, np.asarray(clip.head.faces), camera) for mesh in meshes]

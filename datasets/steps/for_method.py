@@ -1,4 +1,4 @@
-"""A clip in the form that a method needs: the steps that lead there, in order, and the way back.
+"""Conversion of a clip to the requirements of a method, and of its renders back.
 
 Found by the harness as the entry point of `headbench.adaptation`, see `headbench.bench.engine.adaptation`.
 """
@@ -26,7 +26,7 @@ from .resolution import align_clip, alignments
 
 
 def clip_for_method(source: Clip, needs: MethodNeeds, heads: Mapping[str, str]) -> Adaptation:
-    """Check that a clip can be brought into the form needed, and return what does it.
+    """Check that a clip can be converted to the requirements of a method, and return the conversion.
 
     The order is: tracking refitted to a head model the method accepts, images aligned to its size, views joined
     into one video.
@@ -68,7 +68,7 @@ def _adapt(
 
 
 def _target(clip: CaptureClip, accepted: tuple[str, ...], heads: Mapping[str, str]) -> HeadArrays:
-    """The first head model the method accepts that is at hand."""
+    """The first available head model that the method accepts."""
     for version in accepted:
         if version in heads:
             head = find_head(Path(heads[version]).parent, None, heads[version])
@@ -87,11 +87,11 @@ def _target(clip: CaptureClip, accepted: tuple[str, ...], heads: Mapping[str, st
 
 
 class SingleVideo(NamedTuple):
-    """A clip as one video, and which frame of the source each of its frames is."""
+    """A clip as one video, and the source frame of each of its frames."""
 
     clip: CaptureClip
     """The video. Its timesteps are frame numbers: first all training frames, then those of the other splits, then
-    those left out. No two frames share a timestep or a camera."""
+    excluded ones. No two frames share a timestep or a camera."""
     keys: Mapping[FrameKey, FrameKey]
     """Key in the video by key in the source."""
 
@@ -100,10 +100,9 @@ def as_single_video(clip: CaptureClip) -> SingleVideo:
     """Concatenate the views of a clip into one video: all of the first camera, then all of the next.
 
     This is how the paper gave multi-view captures to GaussianBlendshapes. Training frames come first and are
-    numbered without a gap; frames of other splits have later numbers and are in no way part of the video, they keep
-    their pose and camera so that they can be rendered. The head's rigid motion moves into the cameras (see
-    `head.subject`): every frame has a camera of its own, named after the one that recorded it, and a pose without
-    rotation, neck and translation.
+    numbered without a gap; frames of other splits have later numbers; they are not part of the video, but keep pose
+    and camera for rendering. The head's rigid motion moves into the cameras (see `head.subject`): every frame has its
+    own camera, named after the one that recorded it, and a pose without rotation, neck and translation.
     """
     order = _order(clip)
     width = len(str(len(order) - 1))
@@ -115,7 +114,7 @@ def as_single_video(clip: CaptureClip) -> SingleVideo:
     poses, cameras = {}, {}
     motions = dict(zip(timesteps, PosedSubject.of(clip).motions([clip.poses[t] for t in timesteps])))
     for key, new in keys.items():
-        # A pose of its own, so that what a method refines belongs to this frame alone.
+        # A separate pose, so that refinement by a method affects only this frame.
         still = pose_in_head_frame(clip.poses[key.timestep])
         poses[new.timestep] = replace(still, timestep=new.timestep)
         camera = camera_in_head_frame(clip.cameras[key.camera], motions[key.timestep])

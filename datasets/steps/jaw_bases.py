@@ -1,9 +1,9 @@
 """Jaw bases: a few jaw rotations that span those of a performance, and the weights of a pose on them.
 
 "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations"
-(CVPR 2025, arXiv 2504.14967), section on feature lines. The paper's code draws the bases from validation and
-test poses and seeds them with a half turn; here they come from training poses alone and are seeded with the
-identity. The published behaviour is ``variant="official"``.
+(CVPR 2025, arXiv 2504.14967), section on feature lines. The paper's code selects the bases from validation and test
+poses and seeds them with a half turn; here they are selected only from training poses and seeded with the identity.
+The published behaviour is ``variant="official"``.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from ...bench.contracts import Clip, FloatArray, HeadPose
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 HALF_TURN = (0.0, 0.0, 0.0, 1.0)
-"""Real part first: half a turn about z. The published code meant the identity, real part last."""
+"""Real part first: half a turn about z. The published code intended the identity, with the real part last."""
 
 DEFAULT_COUNT = 16
 DISTINCT_ANGLE = np.radians(0.25)
-"""Rotations nearer than this, in radians, count as one: a tenth of the jaw's smallest visible motion."""
+"""Rotations nearer than this, in radians, count as equal: a tenth of the jaw's smallest visible motion."""
 
 TGA_TEST_STRIDE = 16
 """The published code takes every 16th test frame: with 16 cameras, each timestep once."""
 
 
 def leaks(variant: str) -> tuple[str, ...]:
-    """Test data that the bases have seen, for records of results."""
+    """Description of the leak of test data, for records of results."""
     return ("jaw bases drawn from held-out poses (published behaviour)",) if variant == "official" else ()
 
 
@@ -42,7 +42,7 @@ def jaw_quaternions(poses: Sequence[HeadPose]) -> FloatArray:
 def farthest_quaternions(
     candidates: FloatArray, seed: Sequence[float], count: int, *, tolerance: float = 0.0
 ) -> FloatArray:
-    """Greedy farthest-point sampling by 1 - |<p, q>|: ``seed``, then each time the candidate farthest from all chosen.
+    """Greedy farthest-point sampling by 1 - |<p, q>|, starting with ``seed``.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def jaw_bases(
 ) -> FloatArray:
     """Jaw bases of a clip, (n, 4) unit quaternions with the real part first, n <= ``count``.
 
-    Fewer than ``count`` where the performance has fewer jaw rotations that differ by more than
+    There are fewer than ``count`` if the performance has fewer jaw rotations that differ by more than
     `DISTINCT_ANGLE`.
 
     Parameters

@@ -1,7 +1,7 @@
-"""Masks: compositing on any background, nothing below the neck.
+"""Masks: compositing on any background, and removal of pixels below the neck.
 
-Straight alpha throughout: a pixel of coverage a, foreground colour F and background B shows a F + (1 - a) B, in
-display-referred colours, as the field's tools composite.
+Straight alpha throughout: the colour of a pixel with coverage a, foreground colour F and background B is a F + (1 - a)
+B, in display-referred colours, as in other tools.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ SOFTNESS = 0.005
 """Standard deviation of the edge below the neck, in image widths: VHAP blurs with a Gaussian kernel 3 % wide,
 which reaches about three deviations to either side."""
 
-_SIDEWAYS = 0.3  # foreshortening of the neck, against that of the head, beyond which its sides give no line
+_SIDEWAYS = (
+    0.3  # limit of the neck's foreshortening relative to the head's, beyond which its sides define no line
+)
 
 
 def composite(foreground: FloatArray, coverage: FloatArray, background: Ground) -> FloatArray:
@@ -35,10 +37,10 @@ def composite(foreground: FloatArray, coverage: FloatArray, background: Ground) 
 
 
 def recomposite(image: FloatArray, coverage: FloatArray, old: Ground, new: Ground) -> FloatArray:
-    """Exchange the background of a composited image.
+    """Replace the background of a composited image.
 
-    What the foreground contributes, image - (1 - a) old, lies between 0 and a for any real colour and is clamped to
-    that, so that rounding of the image or a background that was not quite ``old`` cannot shine through.
+    The contribution of the foreground, image - (1 - a) old, is between 0 and a for any real colour and clamped to this
+    range, so that rounding of the image or a slightly different background has no effect.
     """
     share = coverage[..., None]
     contribution = np.clip(image - (1 - share) * np.asarray(old, dtype=image.dtype), 0, share)
@@ -46,7 +48,7 @@ def recomposite(image: FloatArray, coverage: FloatArray, old: Ground, new: Groun
 
 
 def set_background(clip: CaptureClip, background: Sequence[float]) -> CaptureClip:
-    """The clip on another background. Raises `InputError` where a frame has no mask."""
+    """The clip on another background. Raises `InputError` if a frame has no mask."""
     colour = check_colour(background)
     if np.array_equal(colour, clip.background):
         return clip
@@ -54,7 +56,7 @@ def set_background(clip: CaptureClip, background: Sequence[float]) -> CaptureCli
     parameters = {"background": colour.tolist(), "was": np.asarray(clip.background).tolist()}
     straight = all(files.image is not None and files.mask == files.image for files in clip.files.values())
     if straight and not clip.pixel_steps:
-        # Straight colours on file: composited on the new background at once, without rounding in between.
+        # Straight-alpha files are composited directly on the new background, without intermediate rounding.
         return clip.derive("set_background", parameters, background=colour)
     old = np.asarray(clip.background, dtype=np.float32)
 
@@ -84,10 +86,10 @@ class NeckLine:
 
 
 def mask_below_neck(clip: CaptureClip, *, softness: float = SOFTNESS) -> CaptureClip:
-    """Turn what lies below the tracked neck into background, in images and masks, as VHAP's "below line" does.
+    """Replace everything below the tracked neck by background, in images and masks, like VHAP's "below line".
 
     The line goes through the projected front of the neck's lower boundary, parallel to the line through its left
-    and right; its edge is Gaussian. Trackers end there, and clothes below it move in ways no head model explains.
+    and right; its edge is Gaussian. Head models end there and do not explain the motion of clothes below it.
 
     Parameters
     ----------
@@ -119,7 +121,7 @@ def mask_below_neck(clip: CaptureClip, *, softness: float = SOFTNESS) -> Capture
         height, width = pixels.image.shape[:2]
         weights = line.weights(width, height, softness * width)
         coverage = None if pixels.coverage is None else pixels.coverage * weights
-        # a w F + (1 - a w) B equals w (a F + (1 - a) B) + (1 - w) B: no need to know F.
+        # a w F + (1 - a w) B equals w (a F + (1 - a) B) + (1 - w) B, which does not need F.
         return FramePixels(composite(pixels.image, weights, ground), coverage)
 
     return clip.derive_pixels("mask_below_neck", {"softness": softness, "anchors": anchors.tolist()}, cut)
@@ -145,8 +147,7 @@ def neck_anchors(head: HeadAsset) -> IntArray:
 def neck_line(camera: Camera, anchors: FloatArray) -> NeckLine | None:
     """The line in an image, given the (4, 3) world positions of `neck_anchors`; None where one is behind it.
 
-    Seen from the side the left and right of the neck fall together and say nothing; the line is then perpendicular
-    to the head's height.
+    Seen from the side, the left and right of the neck coincide; the line is then perpendicular to the head's height.
     """
     points = anchors @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     if points[:, 2].min() <= 0:
@@ -179,6 +180,4 @@ def _check_masks(clip: CaptureClip, step: str) -> None:
     bare = [key for key in clip.files if not clip.has_mask(key)]
     if bare:
         found = f"{len(bare)} without, such as {bare[0]}"
-        raise InputError(
-            step, "masks", "a mask for every frame", found, "The step needs a mask to work with."
-        )
+        raise InputError(step, "masks", "a mask for every frame", found, "The step requires masks.")

@@ -1,8 +1,7 @@
-"""Resolution alignment: a clip at the size that a method declares, and renders back at the protocol's size.
+"""Resolution alignment: resizes a clip to a method's image size, and renders back to the protocol's size.
 
-Image coordinates count from the top left corner of the top left pixel, so that an image of another size covers the
-same extent and coordinates scale without an offset: x' = x * width' / width. Colours are resampled as they are
-stored (display-referred), which is what the field's tools do.
+Image coordinates are measured from the top left corner of the top left pixel, so that coordinates scale without an
+offset: x' = x * width' / width. Colours are resampled as stored (display-referred), as in other tools.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ class Resize:
 
 @dataclass(frozen=True)
 class PixelBox:
-    """A box of an image in whole pixels; where it reaches beyond the image there is background."""
+    """A box of an image in whole pixels, padded with background outside the image."""
 
     left: int
     top: int
@@ -57,9 +56,9 @@ class Alignment:
 
     @classmethod
     def of(cls, source: Size, rule: ResolutionRule) -> Alignment:
-        """Apply a rule to an image size. Moves that change nothing are left out.
+        """Apply a rule to an image size. Operations without effect are omitted.
 
-        A side that is no multiple of the divisor is rounded down, and its pixels grow by the rest.
+        A side that is not a multiple of the divisor is rounded down, which makes its pixels slightly larger.
         """
         moves: list[Resize | PixelBox] = []
         width, height = source
@@ -94,7 +93,7 @@ class Alignment:
         return camera
 
     def image(self, image: FloatArray, background: Sequence[float] | FloatArray) -> FloatArray:
-        """Align a composited float32 image (H, W, 3) in [0, 1]; boxes fill up with ``background``.
+        """Align a composited float32 image (H, W, 3) in [0, 1]; boxes are padded with ``background``.
 
         Coverage is aligned the same way as (H, W, 1) on background 0.
         """
@@ -107,10 +106,9 @@ class Alignment:
         return image
 
     def restore(self, render: FloatArray, background: Sequence[float] | FloatArray) -> FloatArray:
-        """Bring an (H, W, 3) render of the aligned view back to the source's size, in one antialiased resizing.
+        """Convert an (H, W, 3) render of the aligned view to the source's size, in one antialiased resizing.
 
-        What a crop cut off becomes ``background``. Raises `InputError` for a render that is not of
-        `aligned_size`.
+        Cropped parts become ``background``. Raises `InputError` for a render of another size than `aligned_size`.
         """
         _check_size("render", self.aligned_size, (render.shape[1], render.shape[0]))
         boxes = [move for move in self.moves if isinstance(move, PixelBox)]
@@ -120,7 +118,7 @@ class Alignment:
 
 
 def take_box(image: FloatArray, box: PixelBox, background: Sequence[float] | FloatArray) -> FloatArray:
-    """Cut a box out of an image (H, W, C); (C,) ``background`` where the box reaches beyond it."""
+    """Crop a box from an image (H, W, C), padded with (C,) ``background``."""
     height, width = image.shape[:2]
     if (box.left, box.top, box.width, box.height) == (0, 0, width, height):
         return image
@@ -142,8 +140,8 @@ def alignments(cameras: Mapping[str, Camera], rule: ResolutionRule) -> dict[str,
 def align_clip(clip: CaptureClip, rule: ResolutionRule) -> CaptureClip:
     """The clip at the size of a rule: images and masks resized when they are read, intrinsics with them.
 
-    The composited image is resized, not straight colours and coverage apart: what lies under zero coverage is
-    arbitrary and must not bleed into edges. A clip that a rule leaves as it is comes back itself.
+    The composited image is resized instead of straight colours, because colours with zero coverage are arbitrary and
+    must not bleed into edges. A clip that a rule does not change is returned unchanged.
     """
     plans = alignments(clip.cameras, rule)
     if not any(plan.moves for plan in plans.values()):
@@ -178,17 +176,16 @@ def _check_size(what: str, expected: Size, found: Size) -> None:
 
 
 MAX_SIDE = 32767
-"""Longest side of an image here; OpenCV's own resizing goes no further."""
+"""Maximum side of an image, the limit of OpenCV's resizing."""
 
 
 def resize_image(image: FloatArray, width: int, height: int) -> FloatArray:
     """Resize a float32 image (H, W) or (H, W, C).
 
-    Where both sides shrink by whole factors every pixel is the mean of the block it covers. Otherwise the kernel is
-    Keys' cubic (a = -1/2, "Cubic convolution interpolation for digital image processing", 1981), widened by the
-    factor where a side shrinks, so that nothing aliases; it reproduces linear ramps and overshoots at edges by up to
-    some per cent: clamp where that matters. Weights that would fall outside the image are left out and the rest
-    renormalised.
+    If both sides shrink by whole factors, every pixel is the mean of its block. Otherwise the kernel is
+    Keys' cubic (a = -1/2, "Cubic convolution interpolation for digital image processing", 1981), widened by the factor
+    when a side shrinks, to avoid aliasing; it reproduces linear ramps and overshoots at edges by up to some per cent,
+    so clamp if necessary. Weights outside the image are dropped and the rest renormalised.
 
     Raises
     ------

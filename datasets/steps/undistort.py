@@ -1,4 +1,4 @@
-"""Lens distortion taken out of images, so that a pinhole camera describes them.
+"""Removal of lens distortion from images, so that a pinhole camera describes them.
 
 Lenses are named and parametrised as COLMAP does (its ``sensor/models.h``), which shares OpenCV's formulas. Pixel
 coordinates have the centre of the top left pixel at (0.5, 0.5), in COLMAP as here.
@@ -55,7 +55,7 @@ class Lens:
     height: int
 
     def __post_init__(self) -> None:
-        """Refuse what describes no lens."""
+        """Raise `InputError` for an invalid lens."""
         if self.model not in _PARAMETERS:
             raise InputError("lens", "model", f"one of {', '.join(_PARAMETERS)}", repr(self.model))
         names = _PARAMETERS[self.model].split()
@@ -76,15 +76,15 @@ class Lens:
 
     @property
     def distorts(self) -> bool:
-        """Whether there is anything to undo: a fisheye lens without coefficients still bends lines."""
+        """Whether the lens has distortion; a fisheye lens without coefficients also does."""
         return self._fisheye or bool(self._coefficients.any())
 
     def map_from(self, K: FloatArray, width: int, height: int) -> FloatArray:
-        """(height, width, 2) float32: where each pixel of a pinhole image lies in the distorted one, in pixels.
+        """(height, width, 2) float32 position of each pixel of a pinhole image in the distorted one, pixels.
 
-        Far outside the calibrated view a polynomial may fold back into the image; such places are put outside.
+        Far outside the calibrated view a polynomial may fold back into the image; such positions are moved outside.
         """
-        # OpenCV counts from the centre of the top left pixel.
+        # OpenCV's origin is the centre of the top left pixel.
         half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         undo = cv2.fisheye.initUndistortRectifyMap if self._fisheye else cv2.initUndistortRectifyMap
         arguments = (self.K - half, self._coefficients, np.eye(3), np.asarray(K, np.float64) - half)
@@ -108,9 +108,9 @@ class Lens:
 
 
 def _unfolded(places: FloatArray, K: FloatArray) -> np.ndarray:
-    """(H, W) bool: where a map keeps its orientation, as far as that reaches from the principal point.
+    """(H, W) bool: connected region around the principal point in which a map keeps its orientation.
 
-    Beyond a ring where the lens's polynomial runs backwards it may run forwards again, mirrored twice.
+    Outside a ring in which the lens's polynomial decreases it may increase again, mirrored twice.
     """
     height, width = places.shape[:2]
     if min(width, height) < 2:
@@ -135,7 +135,7 @@ def undistort_image(image: FloatArray, places: FloatArray, background: FloatArra
 
 
 def undistort_clip(clip: CaptureClip, lenses: Mapping[str, Lens]) -> CaptureClip:
-    """The clip with distortion taken out of images and masks; pixels that no lens saw are background.
+    """The clip with distortion removed from images and masks; pixels outside the distorted image are background.
 
     Each different lens holds a map of 8 bytes per pixel while the clip lives.
 

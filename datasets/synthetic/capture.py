@@ -1,7 +1,7 @@
 """Make a synthetic capture: plan every subject, render what is missing, write the layout.
 
-A folder belongs to one set of settings. Each image is written whole or not at all and depends on nothing but
-those settings, so a killed run continues where it stopped and ends with the same capture.
+A folder belongs to one set of settings. Each image is written atomically and depends only on those settings, so a
+killed run continues and gives the same capture.
 
 Every file has the same bytes on every x86-64 machine, with any number of threads (see `rounding` and `panels`).
 """
@@ -69,7 +69,7 @@ def synthesize(
     execution: Execution | None = None,
     progress: Progress = no_progress,
 ) -> list[Path]:
-    """Photograph ``subjects`` performing heads and write them as captures; return their union folders.
+    """Render ``subjects`` heads with a performance and write them as captures; return their union folders.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ Job = tuple[str, int, tuple[str, ...]]
 def _render_missing(
     out: Path, plan: SubjectPlan, work: list[Job], workers: int | None
 ) -> Iterator[tuple[str, int]]:
-    """Render the jobs; give (sequence, number of images) as each is written."""
+    """Render the jobs; yield (sequence, number of images) after each."""
     images = sum(len(cameras) for _, _, cameras in work)
     small = images * plan.settings.size[0] * plan.settings.size[1] < _SMALL
     count = min(workers or (1 if small else processor_count()), len(work))
@@ -183,7 +183,7 @@ def _render_missing(
             yield futures[future][0], len(futures[future][2])
     except BaseException:
         for process in multiprocessing.active_children():
-            process.kill()  # else the images that they are at would be waited for
+            process.kill()  # otherwise unfinished images would be waited for
         raise
     finally:
         pool.shutdown(cancel_futures=True)
@@ -206,7 +206,7 @@ def _render(job: Job) -> None:
 
 
 def _run_all(out: Path, plans: Sequence[SubjectPlan], execution: Execution) -> None:
-    """Have an executor render the subjects that lack pictures. Raises `HeadbenchError` where one failed."""
+    """Render the subjects with missing images by an executor. Raises `HeadbenchError` if one failed."""
     from ...bench.executors.schedule import Schedule
 
     root = out.resolve() / TASKS  # which nothing reads as a capture
@@ -230,7 +230,7 @@ def _run_all(out: Path, plans: Sequence[SubjectPlan], execution: Execution) -> N
 
 
 def render_subject(task: Task, report: Callable[[str], None]) -> None:
-    """Render what is missing of a subject, as an executor's task, with the threads that it was given."""
+    """Render the missing images of a subject, as an executor's task with its number of threads."""
     given = task.arguments
     settings = SyntheticSettings(**{**given["settings"], "size": tuple(given["settings"]["size"])})
     out = Path(given["out"])
@@ -252,7 +252,7 @@ def _left(plan: SubjectPlan) -> list[Job]:
 
 
 def _missing(plan: SubjectPlan, sequence: str, timestep: int) -> tuple[str, ...]:
-    """Cameras whose image or mask is not there, or not whole."""
+    """Cameras with a missing or incomplete image or mask."""
 
     def whole(camera: str) -> bool:
         place, writer = (sequence, timestep, camera), plan.writer
@@ -294,11 +294,11 @@ def _manifest(settings: SyntheticSettings, head: str) -> dict[str, Any]:
 
 
 def _check_pictures(pictures: Path, wanted: Mapping[str, Any]) -> None:
-    """Refuse pictures of settings that differ in more than what trackers see."""
+    """Refuse images whose settings differ in more than tracking."""
     manifest = pictures / MANIFEST
     found = read_json(manifest)
     tracking = {"tracking_error", "tracking_noise"}
-    for key in {**wanted, **found}.keys() - tracking - {"head"}:  # what a head is called is no matter
+    for key in {**wanted, **found}.keys() - tracking - {"head"}:  # the name of the head does not matter
         if found.get(key) != wanted.get(key):
             raise InputError(manifest, key, f"{wanted.get(key)!r}, as asked for", f"{found.get(key)!r}")
 
@@ -323,7 +323,7 @@ def _take_over(pictures: Path, out: Path, plans: Sequence[SubjectPlan]) -> None:
 
 
 def _claim(out: Path, wanted: Mapping[str, Any]) -> None:
-    """Mark the folder as the capture's that ``wanted`` describes, or refuse one that is another's."""
+    """Mark the folder as that of the capture with settings ``wanted``, or refuse the folder of another capture."""
     manifest, readme = out / MANIFEST, out / "README.txt"
     if manifest.exists():
         found = read_json(manifest)

@@ -30,11 +30,11 @@ class SynthSettings(ExecutionOptions):
     out: str
     """Folder to write."""
     subjects: int = 1
-    """How many heads; each differs in shape, skin, hair."""
+    """Number of heads; each differs in shape, skin, hair."""
     cameras: int = 16
-    """2 to 16 views; the frontal one is always there and is held out as the novel view."""
+    """2 to 16 views; the frontal one is always included and held out as the novel view."""
     timesteps: int = 60
-    """Frames per camera, shared out over the sequences; FREE is held out for self-reenactment."""
+    """Frames per camera, distributed over the sequences; FREE is held out for self-reenactment."""
     size: str = "275x401"
     """Width x height of the images in pixels, for example 550x802 (NeRSemble at a quarter)."""
     head: str = "procedural"
@@ -45,11 +45,11 @@ class SynthSettings(ExecutionOptions):
     """Noise on the tracked parameters, as a fraction of their standard deviation."""
     performance: Literal["full", "parts", "expressions", "still"] = "full"
     """`parts` plays every sequence and holds out three parts of FREE, each scored as a sequence: seen, recombined and
-    beyond the range of training. `expressions` leaves out jaw and tongue, `still` moves only head, neck and eyes."""
+    beyond the range of training. `expressions` has no jaw and tongue motion, `still` moves only head, neck and eyes."""
     dynamics: float = 1.0
-    """Scales what expressions do to skin beyond moving it (wrinkles, blush), 0 to 3."""
+    """Scale of wrinkles and blush, 0 to 3."""
     tracking_error: float = 0.0
-    """Level of the errors that trackers make: shrunk and mixed expressions, drift; 1 is 0.5 to 1 mm on the face, 2 to 3 mm
+    """Level of simulated tracking errors: shrunk and mixed expressions, drift; 1 is 0.5 to 1 mm on the face, 2 to 3 mm
     on lips and lids. 0 to 4."""
 
 

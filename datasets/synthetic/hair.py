@@ -49,7 +49,7 @@ STYLES = {
     "long": Style(0.180, 0.0120, 900, 0.0140, 0.0060, 0.90, 0.80, 0.75, 0.14, 0.010),
 }
 
-_TOO_SHORT_TO_HANG = 0.02  # metres; such hair cannot hang into the face
+_TOO_SHORT_TO_HANG = 0.02  # metres; shorter hair cannot reach the face
 
 # Hairline: height above the brows (m) by azimuth from the front (degrees), for a head of average size.
 _AZIMUTH = np.radians([0.0, 25.0, 42.0, 54.0, 63.0, 74.0, 84.0, 100.0, 118.0, 180.0])
@@ -200,13 +200,13 @@ def _sample(
     return rng.choice(len(faces), count, p=chance / chance.sum())
 
 
-Field = Callable[[FloatArray, float], FloatArray]
+GrowthField = Callable[[FloatArray, float], FloatArray]
 """Growth direction (n, 3) at points (n, 3), for a share in [0, 1] of the strand's length."""
 
 
 @dataclass(frozen=True, eq=False)
 class Strands:
-    """Ribbons at rest. ``root`` (n,) numbers the strand of each vertex."""
+    """Ribbons at rest. ``strand`` (n,) is the number of each vertex's strand."""
 
     vertices: FloatArray
     faces: IntArray
@@ -214,7 +214,7 @@ class Strands:
     strand: IntArray
 
     def joined(self, other: Strands) -> Strands:
-        """Both, the strands of ``other`` numbered after these."""
+        """Concatenation; the strands of ``other`` are numbered after these."""
         return Strands(
             np.concatenate([self.vertices, other.vertices]),
             np.concatenate([self.faces, other.faces + len(self.vertices)]),
@@ -226,13 +226,13 @@ class Strands:
 def grow(
     roots: FloatArray,
     lengths: FloatArray,
-    field: Field,
+    field: GrowthField,
     keep_out: Callable[[FloatArray, float], FloatArray],
     segments: int,
 ) -> FloatArray:
     """Polylines (n, segments + 1, 3) from ``roots`` along ``field``, each of its own length.
 
-    ``keep_out(points, share)`` moves points that sank into the head back out of it.
+    ``keep_out(points, share)`` moves points inside the head out of it.
     """
     path = [roots]
     step = (lengths / segments)[:, None]

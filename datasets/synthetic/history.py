@@ -1,7 +1,7 @@
-"""State of the skin over a sequence: hysteresis of folds, delay of blood flow, lips that dry.
+"""State of the skin over a sequence: hysteresis of folds, delay of blood flow, drying of lips.
 
-A state is a function of the exact controls of a sequence up to its moment, which begins at rest, and of nothing that a tracker
-stores: tracked parameters alone do not determine it.
+A state is a function of the exact controls of a sequence up to a timestep, starting at rest. Tracked parameters alone
+do not determine it.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Rendering by the light of large panels: meshes and a camera to an image and a foreground mask.
 
-Light is gathered at the vertices, once a pose, and shared by all cameras: from each of eight panels by rays to all of its area,
-from dim surroundings, and from what other surfaces send on (one bounce). A pixel takes albedo times light, and the panels'
-reflections; eyes mirror what a traced ray finds. The compiled kernel draws on nothing that IEEE 754 does not round exactly, so
-pictures have the same bytes on every processor and with any number of threads.
+Light is computed at the vertices once per pose for all cameras: from each of eight panels by rays to its whole area,
+from dim surroundings, and from other surfaces (one bounce). The colour of a pixel is albedo times light plus
+reflections of the panels; eyes reflect the hit of a traced ray. The compiled kernel uses only operations that IEEE 754
+rounds exactly, so images have the same bytes on every processor and with any number of threads.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ KERNEL = Kernel("headbench.datasets.synthetic._light", "The renderer of syntheti
 
 MOST_PANELS = 8
 SURROUNDINGS = (0.25, 0.25, 0.25)
-"""Radiance of everything around that is no panel."""
+"""Radiance of the surroundings outside the panels."""
 
 MIRRORS = ("eye",)
 """Materials that show sharp reflections, whatever their roughness."""
@@ -60,8 +60,8 @@ MATERIALS: Mapping[str, Material] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Panel:
-    """A rectangle that shines evenly from one side.
+class AreaLight:
+    """A rectangular area light that emits evenly on one side.
 
     ``center``, ``half_width``, ``half_height``: (3,) metres, its corners are ``center ± half_width ± half_height``;
     ``normal`` (3,) unit, towards what it lights; ``radiance`` (3,) linear RGB.
@@ -82,7 +82,7 @@ def sample_count(wanted: int) -> int:
 
 
 def default_samples(width: int, height: int) -> int:
-    """Samples that hold two renders of a frame at 40 dB: the pixels of small images see more detail each.
+    """Number of samples for 40 dB between two renders of a frame; pixels of small images contain more detail.
 
     Measured on two subjects, frontal and from the side: 25 give 43 to 47 dB at 48 x 70, 16 give 43 to 47 dB at 144 x 208.
     """
@@ -95,10 +95,11 @@ def rig_middle(frontal: Camera) -> FloatArray:
     return rotation[2] * CAMERA_DISTANCE - (rotation * shift[:, None]).sum(axis=0)
 
 
-def panels(middle: FloatArray) -> tuple[Panel, ...]:
+def panels(middle: FloatArray) -> tuple[AreaLight, ...]:
     """Eight diffused panels around ``middle`` (3,): four above the cameras, two below them, two at the sides.
 
-    NeRSemble's rig has eight LED panels with diffusers (Kirschstein et al. 2023, section 3); sizes and places are ours.
+    NeRSemble's rig has eight LED panels with diffusers (Kirschstein et al. 2023, section 3); sizes and positions are
+    chosen here.
     """
     placed = (
         # azimuth and elevation in degrees, distance, width and height in metres, strength, tint
@@ -126,14 +127,14 @@ def _panel(
     distance: float,
     size: tuple[float, float],
     radiance: FloatArray,
-) -> Panel:
+) -> AreaLight:
     (a, e), (width, height) = place, size
     outward = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
     right = np.array([np.cos(a), 0.0, -np.sin(a)])
     up = np.cross(outward, right)
     outward, right, up = (on_grid(axis, ANGLE_BITS) for axis in (outward, right, up))
     center = on_grid(middle + distance * outward, LENGTH_BITS)
-    return Panel(center, 0.5 * width * right, 0.5 * height * up, -outward, radiance)
+    return AreaLight(center, 0.5 * width * right, 0.5 * height * up, -outward, radiance)
 
 
 def window(camera: Camera, points: FloatArray) -> tuple[slice, slice]:
@@ -154,7 +155,7 @@ def window(camera: Camera, points: FloatArray) -> tuple[slice, slice]:
 
 
 class PanelTracer:
-    """A scene lit by panels, whose meshes keep their triangles and may move and change colour from frame to frame.
+    """A scene lit by panels; meshes have constant triangles and may change positions and colours.
 
     Parameters
     ----------
@@ -171,7 +172,7 @@ class PanelTracer:
 
     def __init__(
         self,
-        lights: Sequence[Panel],
+        lights: Sequence[AreaLight],
         samples: int,
         threads: int = 1,
         seed: int = 0,

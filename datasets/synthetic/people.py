@@ -1,4 +1,4 @@
-"""Who is recorded: every tone of skin, age, hair style and beard, with glasses or without."""
+"""Traits of the subjects: skin tone, age, hair style, beard and glasses."""
 
 from __future__ import annotations
 

@@ -81,8 +81,8 @@ class Translation:
 Face = Mapping[str, float]
 
 Kind = Literal["full", "parts", "expressions", "still"]
-"""How much of the performance is played: all; all, with FREE in the parts of `FREE_PARTS`, each a sequence; without jaw and
-tongue; head, neck and gaze alone."""
+"""Kind of performance: full; full with FREE in the parts of `FREE_PARTS`, each a sequence; without jaw and tongue;
+only head, neck and gaze."""
 
 _JAW = ("jaw_open", "jaw_side", "tongue_out")
 _MUTED: Mapping[Kind, frozenset[str]] = {
@@ -97,7 +97,7 @@ HELD_OUT = "FREE"
 """The sequence kept for self-reenactment; its parts begin with this."""
 
 TONGUE = "tongue out"
-"""Why a frame is left out of a comparison: no head model of FLAME's layout has a tongue."""
+"""Reason for the exclusion of frames: no head model of FLAME's layout has a tongue."""
 
 TONGUE_SHOWS = 0.6
 """`Performed.excluded` begins here for a subject without its own: see `parts.share_that_shows`."""

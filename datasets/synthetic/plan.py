@@ -39,14 +39,14 @@ from .tracking import with_tracking_error, with_tracking_noise
 from .volume import tracked_volume
 
 FIRST_SUBJECT = 900
-"""Synthetic subjects count from here: no participant of NeRSemble has such a number."""
+"""First number of synthetic subjects; participants of NeRSemble have smaller ones."""
 
 _IDENTITY_SPREAD = 0.65  # standard deviations of the identity basis; 1 would draw rare faces too often
 _LOOK_BELOW = 0.004  # metres below the middle of the head
 
 
 EDITION = 2
-"""Edition of the content: captures of one edition and the same settings have the same content."""
+"""Version of the content: captures of one version and the same settings have the same content."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class SyntheticSettings:
 
 @dataclass(frozen=True, eq=False)
 class SubjectPlan:
-    """One subject's plan. ``poses`` are exact, by sequence; what is stored may have tracking noise."""
+    """One subject's plan. ``poses`` are exact, by sequence; stored ones may have tracking noise."""
 
     index: int
     person: Person

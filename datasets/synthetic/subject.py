@@ -1,4 +1,4 @@
-"""One subject with skin, hair, eyes and mouth: from a head pose and activations to the meshes to render."""
+"""One subject with skin, hair, eyes and mouth: meshes to render for a head pose and activations."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _DETAIL = ((0.085, 0.0018), (0.13, 0.0035), (np.inf, 0.007))
 
 @dataclass(frozen=True, eq=False)
 class PosedMesh:
-    """A mesh to render: ``vertices`` (n, 3), ``albedo`` (n, 3) and ``gloss`` (n,) of one moment, where they change."""
+    """A mesh to render: ``vertices`` (n, 3), and ``albedo`` (n, 3) and ``gloss`` (n,) if they change."""
 
     vertices: FloatArray
     albedo: FloatArray | None
@@ -299,8 +299,7 @@ def _weights_on(corners: IntArray, parents: IntArray, weights: FloatArray) -> Fl
 def _split(
     triangles: IntArray, owner: IntArray, middle: IntArray, position: FloatArray
 ) -> tuple[IntArray, IntArray]:
-    """Replace each triangle by 1 to 4, depending on which of its edges (01, 12, 20) have a midpoint (>=
-    0)."""
+    """Replace each triangle by 1 to 4, depending on which of its edges (01, 12, 20) have a midpoint (>= 0)."""
     count = (middle >= 0).sum(axis=1)
     done, whose = [triangles[count == 0]], [owner[count == 0]]
 

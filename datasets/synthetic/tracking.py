@@ -1,8 +1,8 @@
-"""Errors of the stored tracking: what a tracker of real recordings gets wrong, at a chosen level.
+"""Simulated errors of the stored tracking at a chosen level.
 
-Trackers fit a regularised model to images: coefficients are drawn towards zero, a basis that is not the face's own takes one
-expression for a mix of others, and what is left drifts from frame to frame. Lips and lids suffer most: they move fastest and
-have the fewest vertices. Images always show the exact poses.
+Trackers fit a regularised model to images: coefficients are biased towards zero, a basis that does not match the face
+represents an expression by a mix of others, and the remaining error drifts from frame to frame. Lips and lids suffer
+most: they move fastest and have the fewest vertices. Images always show the exact poses.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def with_tracking_error(
     level: float,
     seed: int,
 ) -> dict[str, list[HeadPose]]:
-    """Poses as a tracker would give them; drift starts again in each sequence.
+    """Poses with simulated tracking errors; drift is independent in each sequence.
 
     Parameters
     ----------

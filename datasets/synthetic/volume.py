@@ -1,4 +1,4 @@
-"""Hair in the tracked mesh: what a tracker with vertex offsets, such as VHAP, would make of hair, beard and sagging skin.
+"""Static offset of hair, beard and sagging skin, as from a tracker with vertex offsets such as VHAP.
 
 VHAP fits one offset a vertex to all frames under a Laplacian penalty: the hair's volume without its locks. Here it is a part of
 the mean thickness of hair over the head model's own vertices, smoothed over its edges.

@@ -1,4 +1,4 @@
-"""Avatars in one pose as files of splats that viewers open, and what each file loses."""
+"""Export of avatars in one pose as splat files for viewers, and the loss of quality."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from .views import FIELD_OF_VIEW, direction_of, orbit_camera
 from .web.bake import Source
 
 VIEWS = ((0.0, 0.0), (0.6, 0.0), (-0.6, 0.2))
-"""Azimuth and elevation, radians, from which the loss is measured."""
+"""Azimuth and elevation, radians, of the views in which the loss is measured."""
 SIZE = 400
 
 
 def open_splats(settings: AvatarOptions) -> tuple[StoredAvatar, SplatAvatar]:
-    """The stored avatar that a command names, and the avatar, loaded.
+    """The stored avatar named by a command, and the loaded avatar.
 
-    Raises `InputError` as `open_avatar` and `StoredAvatar.load` do, and for an avatar that is not one of splats.
+    Raises `InputError` as `open_avatar` and `StoredAvatar.load` do, and for an avatar without splats.
     """
     stored = open_avatar(Path(settings.avatar), settings.method)
     avatar = stored.load()
@@ -59,7 +59,7 @@ def export_sog(settings: ExportSogSettings, progress: Progress = no_progress) ->
 def export_pose(settings: ExportOptions, name: str, progress: Progress) -> CommandResult:
     """Write an avatar in one pose in a format of `FORMATS`, read it back, and compare.
 
-    Raises `InputError` for a folder that holds no avatar of splats, and for a timestep that the capture lacks;
+    Raises `InputError` for a folder without an avatar of splats, and for a timestep that the capture lacks;
     `UnavailableError` where the format's library is not installed.
     """
     out, form = Path(settings.out), FORMATS[name]
@@ -75,7 +75,7 @@ def export_pose(settings: ExportOptions, name: str, progress: Progress) -> Comma
     data |= {"bytes": out.stat().st_size, "psnr": lost}
     words = "its own spherical harmonics"
     if colours.residual is not None:
-        # Splats that hardly show would hide how far off those are that do.
+        # Nearly invisible splats would hide the error of visible ones.
         weight = splats.opacities / max(float(splats.opacities.sum()), 1e-12)
         residual = colours.residual
         data["residual_rms"] = float(np.sqrt((weight * residual.numpy() ** 2).sum()))
@@ -87,8 +87,7 @@ def export_pose(settings: ExportOptions, name: str, progress: Progress) -> Comma
 
 
 def _least_psnr(avatar: SplatAvatar, pose: HeadPose, found: StoredSplats) -> float:
-    """Minimum PSNR over `VIEWS`, dB: the file's splats rendered by this package against the avatar's frames,
-    on white."""
+    """Minimum PSNR over `VIEWS`, dB: the file's splats rendered by this package against the avatar's frames, on white."""
     source = Source(avatar, pose, np.zeros(3), np.zeros((4, 3)))
     extent = np.quantile(source.seen(pose).means, (0.005, 0.995), axis=0)
     distance = float((extent[1] - extent[0]).max()) / np.tan(np.radians(FIELD_OF_VIEW))
@@ -123,7 +122,7 @@ def _pose(settings: ExportOptions, head: HeadAsset, progress: Progress) -> HeadP
 
 
 def neutral_pose(head: HeadAsset) -> HeadPose:
-    """Nothing moved: zero expression, rotations and translation."""
+    """Neutral pose: zero expression, rotations and translation."""
     zero = np.zeros(3, np.float32)
     return HeadPose(
         head.version,

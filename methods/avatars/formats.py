@@ -1,4 +1,4 @@
-"""File formats of splats: PLY and binary glTF in full precision, SOG by a library."""
+"""File formats of splats: PLY and binary glTF in full precision, SOG through a library."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ OPACITY_MARGIN = 1e-6  # logits stay finite
 
 
 class StoredSplats(NamedTuple):
-    """Splats in the world, float32: (N, 3) means, (N, 4) quaternions wxyz, (N, 3) scales, (N,) opacities, and harmonics along
-    world directions, (N, 3) and (N, 3, 15)."""
+    """Splats in world space, float32: (N, 3) means, (N, 4) quaternions wxyz, (N, 3) scales, (N,) opacities, and
+    harmonics along world directions, (N, 3) and (N, 3, 15)."""
 
     means: Tensor
     quats: Tensor
@@ -101,7 +101,7 @@ HARMONICS = [(degree, number) for degree in range(4) for number in range(2 * deg
 def _write_glb(path: Path, splats: StoredSplats) -> None:
     harmonics = torch.cat([splats.dc[:, :, None], splats.rest], dim=2)
     plain = (0.5 + C0 * splats.dc).clamp(0, 1)
-    # Points for viewers that draw no splats: linear, as glTF's colours are.
+    # Points for viewers without support for splats; linear, as glTF's colours are.
     linear = torch.where(plain <= 0.04045, plain / 12.92, ((plain + 0.055) / 1.055) ** 2.4)
     attributes = {
         "POSITION": splats.means,
@@ -200,7 +200,7 @@ def _write_sog(path: Path, splats: StoredSplats) -> None:
 
 
 def _marked(content: bytes) -> bytes:
-    """The same archive, whose meta.json names headbench and the digital source type."""
+    """The archive with headbench and the digital source type in its meta.json."""
     out = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(content)) as source, zipfile.ZipFile(out, "w") as target:
         for name in source.namelist():
@@ -209,7 +209,7 @@ def _marked(content: bytes) -> bytes:
                 meta = json.loads(member)
                 meta["asset"] = {"generator": f"{tool()}, GaussForge", "note": note(RENDER)}
                 member = json.dumps(meta, separators=(",", ":")).encode()
-            # A fixed time, so that equal avatars give equal files.
+            # A fixed time makes files of equal avatars equal.
             target.writestr(zipfile.ZipInfo(name), member)
     return out.getvalue()
 

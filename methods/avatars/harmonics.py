@@ -1,4 +1,4 @@
-"""Spherical harmonics that come closest to colours known by direction."""
+"""Fit of spherical harmonics to view-dependent colours."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from .views import camera_at, visibility
 
 DEGREE = 3
 FAR_M = 1e3
-"""Distance from which all splats are seen along one direction."""
+"""Distance of a camera that sees all splats along one direction."""
 HIDDEN = 0.005
-"""Least weight of a direction, in parts of that from which a splat shows most: where it is hidden it was hardly trained."""
-BLOCK = 4096  # splats whose normal equations are solved at once
+"""Minimum weight of a direction relative to the largest: a splat is hardly trained where it is hidden."""
+BLOCK = 4096  # splats per batch of normal equations
 
 
 class Harmonics(NamedTuple):
-    """Coefficients in 3DGS' order, and how well they fit."""
+    """Coefficients in 3DGS order, and the error of the fit."""
 
     dc: Tensor
     """(N, 3)."""
     rest: Tensor
     """(N, 3, 15)."""
     residual: Tensor | None
-    """(N,) root of the weighted mean squared error over directions and channels, in colour units; None where nothing was fitted."""
+    """(N,) root of the weighted mean squared error over directions and channels, in colour units; None if nothing was fitted."""
 
 
 def harmonics_of(avatar: SplatAvatar, pose: HeadPose, directions: int) -> Harmonics:
-    """Colours of an avatar's splats in a pose along world directions: its own harmonics, or such as are fitted to its colours."""
+    """Harmonics of an avatar's splats in a pose along world directions: its own, or harmonics fitted to its colours."""
     if isinstance(avatar, HarmonicAvatar):
         dc, rest = map(torch.from_numpy, avatar.harmonics(pose))
         return Harmonics(dc, rest, None)
@@ -60,7 +60,8 @@ def sphere(count: int) -> Tensor:
 def turn_harmonics(dc: Tensor, rest: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
     """Harmonics along world directions, (N, 3) and (N, 3, 15), of harmonics along the splats' own directions.
 
-    A turned harmonic is a sum of those of its degree: found from as many directions as decide it, exact to rounding.
+    A rotated harmonic is a sum of harmonics of its degree; it is found from as many directions as coefficients, exact
+    to rounding.
 
     Parameters
     ----------
@@ -93,7 +94,7 @@ def fit_harmonics(radiance: Callable[[Tensor], Tensor], weights: Tensor, directi
     weights : Tensor
         (N, M) weights of the directions, see `visibility`; at least `HIDDEN` is used.
     """
-    # 3DGS looks harmonics up along the way from the camera to the splat.
+    # 3DGS evaluates harmonics along the direction from the camera to the splat.
     basis = sh_basis(-directions, DEGREE)
     colors = torch.stack([radiance(direction) for direction in directions], dim=1) - 0.5  # (N, M, 3)
     count = coefficient_count(DEGREE)

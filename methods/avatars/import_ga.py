@@ -39,7 +39,7 @@ FLAME_PARAM_FILE = "flame_param.npz"
 
 @dataclass(frozen=True)
 class HeadSettings:
-    """Settings of readers that an import without a capture takes for its head model."""
+    """Reader settings used for the head model by an import without a capture."""
 
     masks: str | None = None
     regions: str | None = None
@@ -50,7 +50,7 @@ class HeadSettings:
 def import_avatar(settings: ImportGASettings, progress: Progress = no_progress) -> CommandResult:
     """Import a GaussianAvatars PLY, with its flame_param.npz or its capture, as an avatar of the method ga.
 
-    Raises `InputError` for a file that does not fit, and for a folder that holds something already.
+    Raises `InputError` for invalid files and for an output folder that is not empty.
     """
     ply, out = Path(settings.ply), Path(settings.out)
     ours = {AVATAR_FILE, LOCK_FILE, SUBJECT_FILE, HEAD_FILE, PLY_FILE, DRIVING_FILE}
@@ -59,7 +59,7 @@ def import_avatar(settings: ImportGASettings, progress: Progress = no_progress) 
         raise other
     head, subject, refined, notes = _identity(settings, ply, progress)
     splats, binding = read_ga_splats(ply, len(head.faces), "cpu")
-    # The splats are written after the rest: those of this import, killed at its end, or others.
+    # The splats are written last: this import was killed at its end, or they are from another one.
     if (out / PLY_FILE).exists():
         there, on = read_ga_splats(out / PLY_FILE, len(head.faces), "cpu")
         if not (binding.equal(on) and all(splats[name].equal(there[name]) for name in splats)):
@@ -84,7 +84,7 @@ def import_avatar(settings: ImportGASettings, progress: Progress = no_progress) 
 def _identity(
     settings: ImportGASettings, ply: Path, progress: Progress
 ) -> tuple[HeadArrays, Subject, RefinedTracking | None, dict[str, str]]:
-    """Head model, subject and refined tracking of an import, and what to say of them."""
+    """Head model, subject and refined tracking of an import, and a description of them."""
     beside = ply.with_name(FLAME_PARAM_FILE)
     given = settings.flame_param or (str(beside) if beside.is_file() else "none")
     path = None if given == "none" else Path(given)
@@ -132,16 +132,16 @@ def _identity(
 
 
 def _refined(clip: CaptureClip, tracking: Tracking, path: Path) -> RefinedTracking | None:
-    """The poses that training refined, in the clip's world: those of its training timesteps; none in a file of one pose.
+    """Poses refined in training, in the clip's world coordinates; none for a file with one pose.
 
-    GaussianAvatars numbers the rows by ``timestep_index`` and leaves each sequence in its own world.
+    GaussianAvatars numbers the rows by ``timestep_index`` and keeps each sequence in its own world coordinates.
     """
     timesteps = sorted({key.timestep for key in clip.splits["train"]})
     if len(tracking.poses) == 1 < len(timesteps):
         return None
     if timesteps[-1] not in tracking.poses:
         expected = f"a row for every training timestep, {timesteps[-1] + 1} at least"
-        raise InputError(path, "expr", expected, f"{len(tracking.poses)}", "It is of another capture.")
+        raise InputError(path, "expr", expected, f"{len(tracking.poses)}", "It belongs to another capture.")
     recorded = clip.steps[0].parameters.get("sequence_shifts_m", {}) if clip.steps else {}
     sequence = {key.timestep: key.sequence for key in clip.splits["train"]}
     tracked = [clip.poses[timestep] for timestep in timesteps]

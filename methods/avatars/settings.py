@@ -13,7 +13,7 @@ from ...datasets.options import CaptureOptions
 
 @dataclass(frozen=True)
 class AvatarOptions(CaptureOptions):
-    """Which avatar is written, and where to."""
+    """Avatar to export and output file."""
 
     avatar: AvatarFolder
 
@@ -26,7 +26,7 @@ class AvatarOptions(CaptureOptions):
 
 @dataclass(frozen=True)
 class ExportOptions(AvatarOptions):
-    """Which pose of which avatar is written."""
+    """Avatar and pose to export."""
 
     capture: str | None = None
     """Capture with the pose to write; without one the pose is neutral."""
@@ -35,7 +35,7 @@ class ExportOptions(AvatarOptions):
     """Timestep of the capture; default: the first of its training frames."""
 
     directions: int = 96
-    """Viewing directions, even over the sphere, at which colours that are not spherical harmonics are sampled."""
+    """Number of viewing directions, evenly spread over the sphere, in which colours other than spherical harmonics are sampled."""
 
     dependent = (DependentOptions(("timestep", "reader", "head", "cy", "set"), "capture"),)
 
@@ -58,12 +58,12 @@ class ExportGlbSettings(ExportOptions):
 
 @dataclass(frozen=True)
 class ExportSogSettings(ExportOptions):
-    """Write an avatar in one pose as SOG, which web viewers open: about a sixth of a PLY's bytes. Needs gaussforge (extra `formats`)."""
+    """Write an avatar in one pose as SOG, for web viewers, in about a sixth of a PLY's bytes. Needs gaussforge (extra `formats`)."""
 
 
 @dataclass(frozen=True)
 class ImportGASettings(CaptureOptions):
-    """Make an avatar of a GaussianAvatars PLY, and of the flame_param.npz beside it or the capture it was trained on."""
+    """Import a GaussianAvatars PLY with the flame_param.npz beside it or the capture it was trained on."""
 
     ply: tyro.conf.Positional[str]
     """The PLY, with a column binding_0 (`point_cloud/iteration_<N>/point_cloud.ply`)."""
@@ -76,10 +76,10 @@ class ImportGASettings(CaptureOptions):
 
     flame_param: str | None = None
     """The parameters that the official repository stored with the splats, of one timestep or of all; default: the file
-    flame_param.npz beside the PLY, if there is one. "none" leaves it out."""
+    flame_param.npz beside the PLY, if there is one. "none" ignores it."""
 
     subject: str = ""
-    """Name of the subject, without --capture, which names it."""
+    """Name of the subject, if there is no --capture."""
 
     dependent = (
         DependentOptions(("reader", "cy"), "capture"),

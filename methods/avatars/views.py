@@ -1,4 +1,4 @@
-"""Views of splats from around them, and how much each splat contributes to a view."""
+"""Views of splats from all around, and the contribution of each splat to a view."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from ..splats import rasterize
 FIELD_OF_VIEW = 30.0
 """Field of view of the cameras of `orbit_camera`, degrees."""
 SIZE = 128
-"""Pixels along a side of a picture by which `visibility` looks at splats."""
+"""Image size of `visibility`, pixels."""
 
 
 def contribution(splats: Splats, camera: Camera) -> Tensor:
     """(N,) blending weights of each splat, summed over all pixels of one view.
 
     The weight of a splat in a pixel is its alpha times the transmittance in front of it; the sum over pixels is the
-    derivative of the sum of a one-channel image by the splat's colour. As importance for pruning: Fang and Wang,
-    "Mini-Splatting", ECCV 2024, section 4.
+    derivative of the sum of a one-channel image by the splat's colour. Used as importance for pruning by Fang and
+    Wang, "Mini-Splatting", ECCV 2024, section 4.
     """
     view = view_of(camera, "cpu")
     geometry = splats.means, splats.quats, splats.scales, splats.opacities
@@ -36,7 +36,7 @@ def contribution(splats: Splats, camera: Camera) -> Tensor:
 
 
 def visibility(splats: Splats, directions: FloatArray) -> Tensor:
-    """(N, M) how much each splat shows from (M, 3) unit vectors to the camera, in parts of where it shows most."""
+    """(N, M) visibility of each splat from (M, 3) unit vectors to the camera, relative to its maximum."""
     middle = splats.means.mean(axis=0)
     radius = float(np.quantile(np.linalg.norm(splats.means - middle, axis=1), 0.99))
     distance = max(radius, 1e-3) / np.tan(np.radians(FIELD_OF_VIEW / 2))
@@ -53,14 +53,14 @@ def direction_of(azimuth: float, elevation: float) -> FloatArray:
 
 
 def camera_at(place: FloatArray) -> Camera:
-    """A camera that is only asked where it is: at (3,) metres."""
+    """A camera of which only the position is used, (3,) metres."""
     motion = np.eye(4)
     motion[:3, 3] = -np.asarray(place, np.float64)
     return Camera("place", 8, 8, np.eye(3), motion)
 
 
 def orbit_camera(direction: FloatArray, distance: float, target: FloatArray, size: int) -> Camera:
-    """A square view of a target, upright, from (3,) a unit vector to the camera that does not point straight up."""
+    """An upright square view of a target; (3,) unit vector to the camera, not vertical."""
     ahead = -np.asarray(direction, np.float64)
     right = np.cross(ahead, [0.0, 1.0, 0.0])
     right /= np.linalg.norm(right)

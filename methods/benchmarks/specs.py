@@ -14,7 +14,7 @@ SPLATS = BenchmarkSpec(
 
 AVATAR = BenchmarkSpec(
     name="avatar",
-    summary="a frame of an avatar of ours beside one of ga: time by size, threads and stage",
+    summary="a frame of an avatar of method ours compared with ga: time by size, threads and stage",
     speed=f"{_HERE}.avatar:speed",
 )
 

@@ -15,7 +15,7 @@ from ..ga.method import GAAvatar
 from ..ours.avatar import OursAvatar
 from ..ours.config import OursConfig
 from ..ours.field import initial_parameters, line_box, plane_box
-from ..ours.storage import Field
+from ..ours.storage import StoredField
 from ..shared.avatar_files import Subject
 from ..shared.schedule import numpy_generator, torch_generator
 from ..shared.subject_mesh import SubjectMesh
@@ -115,7 +115,7 @@ def untrained_avatar(head: HeadAsset, count: int) -> OursAvatar:
         "line_box": torch.stack(list(line_box(mesh.canonical))),
         "jaw_bases": torch.from_numpy(jaw_quaternions(poses).astype(np.float32)),
     }
-    return OursAvatar([], mesh, subject, Field(tensors, config.lines.dynamic), "cpu")
+    return OursAvatar([], mesh, subject, StoredField(tensors, config.lines.dynamic), "cpu")
 
 
 def random_poses(head: HeadAsset, count: int, *, seed: int = 0) -> list[HeadPose]:

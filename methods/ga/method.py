@@ -21,7 +21,7 @@ from ..ops.harmonics import (
     initial_coefficients,
     occupied_degree,
 )
-from ..ops.mesh import Frames
+from ..ops.mesh import TriangleFrames
 from ..ops.splats import activate, to_world
 from ..shared.avatar_files import (
     SUBJECT_FILE,
@@ -45,7 +45,7 @@ from .spec import GA as SPEC
 from .storage import PLY_FILE, read_ga_splats, write_ga_splats
 
 DRIVING_FILE = "driving.npz"
-STORED_DEGREE = 3  # the PLY layout has room for degree 3, whatever degree was trained
+STORED_DEGREE = 3  # the PLY layout has degree 3, whatever degree was trained
 POSES = ("rotation", "neck", "jaw", "eyes")
 
 
@@ -63,13 +63,13 @@ class GAAppearance:
         self._degree_every = 1
 
     def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
-        """Spherical harmonics: nearly zero at degree 0, zero above."""
+        """Initial spherical harmonics: nearly zero at degree 0, zero above."""
         rates = {"sh_dc": self._config.sh_dc_lr, "sh_rest": self._config.sh_rest_lr}
         initial = initial_coefficients(count, STORED_DEGREE, torch_generator(self._seed, "sh"))
         return {name: (value.to(self._device), rates[name]) for name, value in initial.items()}
 
     def parameters(self) -> dict[str, tuple[Tensor, float]]:
-        """The tracked values of the training timesteps, (T, n) each, where they are refined."""
+        """The tracked values of the training timesteps, (T, n) each, if they are refined."""
         if not self._config.refine_tracking:
             return {}
         config = self._config
@@ -78,10 +78,10 @@ class GAAppearance:
         return {name: (self.tracked[name].clone(), rates[name]) for name in TRACKED}
 
     def begin(self, timeline: Timeline) -> None:
-        """Fit the steps of the harmonics' degree to the run."""
+        """Scale the schedule of the harmonics' degree to the run."""
         self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
 
-    def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
+    def frames(self, timestep: int, optimiser: Optimiser) -> TriangleFrames:
         """Triangle frames; differentiable in the refined tracking."""
         row = self._row[timestep]
         if not self._config.refine_tracking:
@@ -90,9 +90,15 @@ class GAAppearance:
         return self._mesh.frames(self._mesh.posed(self._at(row) | refined))
 
     def place(
-        self, frames: Frames, binding: Tensor, view: View, timestep: int, optimiser: Optimiser, iteration: int
+        self,
+        frames: TriangleFrames,
+        binding: Tensor,
+        view: View,
+        timestep: int,
+        optimiser: Optimiser,
+        iteration: int,
     ) -> ShadedSplats:
-        """Colour by direction from the camera; opacity as it is."""
+        """Colours by direction from the camera, and unchanged opacities."""
         world = to_world(frames, binding, optimiser["means"], optimiser["log_scales"], optimiser["quats"])
         degree = min(self._config.sh_degree, iteration // self._degree_every)
         vectors = world.means - view.center
@@ -100,7 +106,7 @@ class GAAppearance:
         return ShadedSplats(world, colors, torch.sigmoid(optimiser["opacities"]), None)
 
     def refined(self, subject: str, optimiser: Optimiser) -> RefinedTracking | None:
-        """Tracking before and after, or None where it was left alone."""
+        """Tracking before and after refinement, or None if it is not refined."""
         if not self._config.refine_tracking:
             return None
         before = {name: self.tracked[name].cpu().numpy() for name in TRACKED}
@@ -108,7 +114,7 @@ class GAAppearance:
         return RefinedTracking(subject, np.array(self.timesteps), before, after)
 
     @torch.no_grad()
-    def _tracked_frames(self, row: int) -> Frames:
+    def _tracked_frames(self, row: int) -> TriangleFrames:
         return self._mesh.frames(self._mesh.posed(self._at(row)))
 
     def _at(self, row: int) -> dict[str, Tensor]:
@@ -118,8 +124,8 @@ class GAAppearance:
 class GAAvatar(StoredSplatAvatar):
     """A trained GaussianAvatars head.
 
-    Files: ``point_cloud.ply`` in GaussianAvatars' layout and ``subject.npz`` count as storage; beside them lie
-    the shared head model, and the refined tracking of the training timesteps, which is driving signal.
+    Files: ``point_cloud.ply`` in GaussianAvatars' layout and ``subject.npz`` count as storage. The folder also has the
+    shared head model and the refined tracking of the training timesteps, which is part of the driving signal.
 
     Attributes
     ----------

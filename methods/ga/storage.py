@@ -1,4 +1,4 @@
-"""GaussianAvatars' file: the PLY its viewers open."""
+"""GaussianAvatars' PLY file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ channel), logit of opacity, log-scales, quaternion wxyz, triangle."""
 
 
 def write_ga_splats(path: Path, splats: dict[str, Tensor], binding: Tensor) -> None:
-    """Write splats in GaussianAvatars' layout, or with fewer columns where the harmonics are of a lower degree.
+    """Write splats in GaussianAvatars' layout, with fewer columns for harmonics of a lower degree.
 
     Triangle indices are exact in float32 up to 2^24.
     """
@@ -53,8 +53,8 @@ def write_ga_splats(path: Path, splats: dict[str, Tensor], binding: Tensor) -> N
 def read_ga_splats(path: Path, face_count: int, device: str) -> tuple[dict[str, Tensor], Tensor]:
     """Read what GaussianAvatars or `write_ga_splats` wrote: per-splat tensors by name, and the binding.
 
-    Harmonics of degree 0 to 2 are filled up with zeros. Raises `InputError` for another layout, a number of harmonics
-    that is of no degree, or a triangle the mesh does not have.
+    Harmonics of degree 0 to 2 are padded with zeros. Raises `InputError` for another layout, a number of harmonics
+    that corresponds to no degree, or a triangle that the mesh does not have.
     """
     normals = ("nx", "ny", "nz")
     rest_names = tuple(name for name in COLUMNS if name.startswith("f_rest_"))
@@ -80,7 +80,7 @@ def read_ga_splats(path: Path, face_count: int, device: str) -> tuple[dict[str, 
 
 
 def _rest_count(path: Path) -> int:
-    """Coefficients per channel above degree 0 that a file has: those of degree 0, 1, 2 or 3."""
+    """Number of coefficients per channel above degree 0 in a file of degree 0, 1, 2 or 3."""
     found = sum(name.startswith("f_rest_") for name in read_names(path))
     counts = [3 * (coefficient_count(degree) - 1) for degree in range(4)]
     if found not in counts:

@@ -27,8 +27,8 @@ from .points import SurfacePoints, full_barycentric
 class GBSAvatar(StoredSplatAvatar):
     """A trained head: neutral splats, differences for expressions, and the joints that move them.
 
-    Files: ``avatar.safetensors`` and ``subject.npz`` count as storage; beside them lies the shared head model, with
-    teeth. What the mesh says of the splats is computed from these when loaded.
+    Files: ``avatar.safetensors`` and ``subject.npz`` count as storage. The folder also has the shared head model with
+    teeth. Values derived from the mesh are computed when the avatar is loaded.
     """
 
     def __init__(self, folder: Path, rig: Rig, stored: Stored, device: str):
@@ -67,7 +67,7 @@ class GBSAvatar(StoredSplatAvatar):
 
 AVATAR_FILE = "avatar.safetensors"
 EXPRESSIONS = "expressions"
-"""Key of the file's metadata: how many leading expressions there may be differences for."""
+"""Key of the file's metadata: number of leading expressions that may have differences."""
 
 GEOMETRY = {"means": 3, "log_scales": 3, "quats": 4, "opacities": 1, "sh_dc": 3}
 """First columns of the (N, 14 + 3 R) float32 table of neutral splats; R harmonics above degree 0 by channel follow."""
@@ -112,8 +112,8 @@ def write_avatar(
 ) -> None:
     """Write an avatar as safetensors, exact.
 
-    Of each splat: 4 (14 + 3 R) bytes of neutral attributes, 12 of its surface point, a bit for each expression, and
-    4 C bytes for each expression that moves it: 12,055 bytes with all harmonics and all of 50 expressions.
+    A splat takes 4 (14 + 3 R) bytes for neutral attributes, 12 for its surface point, a bit for each expression, and 4
+    C bytes for each expression that moves it: 12,055 bytes with all harmonics and all of 50 expressions.
     """
     count = len(neutral["means"])
     columns = [neutral[name].reshape(count, -1) for name in (*GEOMETRY, "sh_rest")]
@@ -155,7 +155,7 @@ def _rest(splats: Tensor) -> int:
 
 
 def _check(path: Path, tensors: Mapping[str, Tensor], face_count: int, expressions: int) -> IntArray:
-    """(N, K) which expressions move which splat. Raises `InputError` at the first tensor that does not fit."""
+    """(N, K) whether an expression moves a splat. Raises `InputError` for the first tensor that does not fit."""
     sizes = check_tensors(path, tensors, MEMBERS, {"bytes": -(-expressions // 8)})
     splats, triangles = tensors["splats"], tensors["triangles"]
 

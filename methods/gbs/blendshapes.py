@@ -1,4 +1,4 @@
-"""Neutral splats plus differences, weighted by expression coefficients, carried by a pose."""
+"""Neutral splats plus differences, weighted by expression coefficients and moved by a pose."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..shared.subject_mesh import SubjectMesh
 from .points import SurfacePoints
 
 LARGEST_SCALE = 0.1
-"""Metres; training removes neutral splats that are larger, and no expression makes one so."""
+"""Maximum size of a splat, metres: training removes larger neutral splats, and expressions are clamped to it."""
 SMALLEST_SCALE = 1e-7
 
 
@@ -60,7 +60,7 @@ class Entries(NamedTuple):
         return cls(starts, owners, expressions, weights, torch.arange(len(owners), device=counts.device))
 
     def shares(self, coefficients: Tensor) -> Tensor:
-        """(M,) with which rows count in a pose of (K,) coefficients."""
+        """(M,) weights of the rows in a pose of (K,) coefficients."""
         return self.weights * coefficients.index_select(0, self.expressions)
 
     def sum(self, differences: Tensor, coefficients: Tensor) -> Tensor:
@@ -94,7 +94,7 @@ class _SumEntries(torch.autograd.Function):
 
 
 class PosedAttributes(NamedTuple):
-    """Splats of a pose in the world: geometry, (N,) opacities, harmonics, and the (N, 3, 3) turn of their axes."""
+    """Splats of a pose in the world: geometry, (N,) opacities, harmonics, and the (N, 3, 3) rotation of their axes."""
 
     world: WorldSplats
     opacities: Tensor
@@ -174,12 +174,12 @@ class PointMotions(NamedTuple):
 
     @classmethod
     def of(cls, rows: Tensor) -> PointMotions:
-        """Part the columns of `PARTS`."""
+        """Split into the columns of `PARTS`."""
         return cls(*(part.contiguous() for part in rows.split(list(PARTS.values()), dim=1)))
 
 
 class Rig:
-    """Points on the surface of a subject, moved as FLAME moves it but for expressions beyond the first K.
+    """Points on the surface of a subject, moved as FLAME moves it, without expressions beyond the first K.
 
     Parameters
     ----------
@@ -248,7 +248,7 @@ class Rig:
         if "eyelids" in arguments and model.eyelid_matrix is not None:
             lids = (arguments["eyelids"][0] @ model.eyelid_matrix).view(-1, 3)
             offset = offset + self.at_points(lids) @ (rotations[0, 0] @ rotations[0, 1]).t()
-        # By way of the quaternion it is a rotation to rounding, however far the blended transforms were from one.
+        # Through the quaternion it is a rotation to rounding, however far the blended transforms are from one.
         quaternion = matrix_to_quaternion(nearest_rotation(linear.view(-1, 3, 3), SKINNING_STEPS))
         rotation, product = quaternion_to_matrix(quaternion).flatten(1), left_products(quaternion).flatten(1)
         turn = (self.turns @ coefficients).view(-1, 4)[self.turned]
@@ -268,7 +268,7 @@ SMALLEST = 1e-12
 
 
 def deformation_gradients(rest: Tensor, moved: Tensor) -> Tensor:
-    """(..., 3, 3) linear maps that take each triangle, with its normal, to where it has moved.
+    """(..., 3, 3) linear maps from each triangle, with its normal, to its moved position.
 
     A fourth vertex off the triangle at n / sqrt(|n|), n being the cross product of its edges, makes the map unique
     (Sumner and Popovic, eq. 1 to 3). It takes a point x of the rest triangle's plane to ``Q (x - v0) + v0'``. A
@@ -310,10 +310,10 @@ def nearest_rotation(matrices: Tensor, steps: int) -> Tensor:
 
 
 def initial_rotations(vertices: Tensor, basis: Tensor, faces: Tensor) -> Tensor:
-    """(F, 4, K) quaternions, less the one of no rotation: how each expression at coefficient 1 turns each triangle.
+    """(F, 4, K) quaternions of the rotation of each triangle by each expression at coefficient 1, minus the identity.
 
-    Times the quaternion of a splat at its start they are the published initial differences of rotation; differences
-    add up over expressions, and the sum is normalised.
+    Multiplied by the initial quaternion of a splat they are the published initial differences of rotation; differences
+    are summed over expressions, and the sum is normalised.
 
     Parameters
     ----------
@@ -337,11 +337,11 @@ def initial_rotations(vertices: Tensor, basis: Tensor, faces: Tensor) -> Tensor:
 def consistency_mask(
     head: HeadArrays, vertices: FloatArray, expressions: int, floor: float, full: float
 ) -> FloatArray:
-    """(F, K) weight, not negative, with which an expression may change the splats of a triangle.
+    """(F, K) non-negative weights of the changes of a triangle's splats by an expression.
 
-    max(0, (D - floor) / (full - floor)), not bounded above, where D is how far an expression at coefficient 1 moves
-    the triangle's centroid. The back of the head is held in place first (a rigid motion in an expression is none of
-    its own), and the neck never moves.
+    max(0, (D - floor) / (full - floor)), not bounded above, where D is the displacement of the triangle's centroid by
+    an expression at coefficient 1. Rigid motion in an expression is removed first by aligning the back of the head,
+    and the neck never moves.
 
     Parameters
     ----------
@@ -352,7 +352,7 @@ def consistency_mask(
     floor, full : float
         Displacements where the mask starts and where it is 1, metres.
     """
-    # Teeth have no expressions of their own; held in place with the scalp they would seem to have.
+    # Teeth have no expressions; the alignment of the scalp would give them some.
     still, neck, teeth = (
         head.regions.get(name, np.empty(0, np.int64)) for name in ("scalp", "neck", "teeth")
     )
@@ -371,7 +371,7 @@ def consistency_mask(
 
 
 def entries_of(mask: FloatArray, triangles: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
-    """The mask at points of the surface without its zeros: (P,) counts, and (M,) expressions and weights in order."""
+    """Non-zero values of the mask at points of the surface: (P,) counts, and (M,) expressions and weights in order."""
     at_points = mask[triangles]
     _, columns = np.nonzero(at_points)
     return (at_points > 0).sum(1), columns, at_points[at_points > 0]

@@ -13,10 +13,10 @@ from ..shared.config import Capacity, DensifiedTraining
 
 @dataclass(frozen=True)
 class BlendshapeTraining(DensifiedTraining):
-    """Training of the neutral splats; lengths are metres, the extent of the scene is 1.
+    """Training of the neutral splats; lengths are in metres, the extent of the scene is 1.
 
-    Opacities are never reset. The published code also means to remove splats of a radius above 20 pixels, but clears
-    the radii before it looks at them, as 3DGS does, so that there is no such rule here.
+    Opacities are never reset. The published code also intends to remove splats of a radius above 20 pixels, but clears
+    the radii before the test, as 3DGS does; there is no such rule here.
     """
 
     schedule_length: int = 40_000
@@ -42,8 +42,8 @@ class GBSConfig:
         Initial number of splats on the head and on each row of teeth; upper limits if
         ``sample_spacing`` is set.
     sample_spacing : float
-        Initial distance of neighbouring splats in pixels, on average over the training cameras: more
-        splats than images can resolve are not required. 0 uses ``samples`` unchanged, as published.
+        Initial distance of neighbouring splats in pixels, on average over the training cameras.
+         0 uses ``samples`` unchanged, as published.
     expressions : int
         Number of leading expression coefficients with differences; all, if there are fewer.
     sh_degree, sh_every, min_sh_every : int
@@ -109,4 +109,4 @@ class GBSConfig:
         if not 0 <= self.difference_sh_degree <= self.sh_degree <= 3:
             raise ValueError("sh_degree must be 0 to 3, and difference_sh_degree not above it")
         if not 0 <= self.mask_floor_mm < self.mask_full_mm:
-            raise ValueError("mask_floor_mm must be at least 0 and below mask_full_mm")
+            raise ValueError("mask_floor_mm must be at least 0 and less than mask_full_mm")

@@ -1,4 +1,4 @@
-"""Points spread evenly over a triangle mesh, each known by its triangle and its place in it."""
+"""Points spread evenly over a triangle mesh, given by triangle and barycentric coordinates."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from ..shared.schedule import numpy_generator
 from .config import GBSConfig
 
 CANDIDATES = 20
-"""Random points drawn for each that is kept."""
+"""Number of random candidates per accepted point."""
 RADIUS = 0.77
-"""Distance between Poisson-disk samples, where as many as asked for fill a surface of that area, over the root of the
-area per sample; measured between 1,000 and 50,000 samples of a head."""
+"""Distance between Poisson-disk samples that fill a surface, relative to the square root of the area per sample;
+measured between 1,000 and 50,000 samples of a head."""
 NEIGHBOURS = 3
 SMALLEST_SQUARE = 1e-7
 """Square metres; the minimum mean squared distance to neighbours, as published."""
@@ -47,10 +47,10 @@ def poisson_disk(
 ) -> SurfacePoints:
     """About ``count`` points on some triangles of a mesh, no two of them close: blue noise.
 
-    Dart throwing over random candidates: each is kept unless one kept before it is nearer than the radius (Cook,
-    "Stochastic Sampling in Computer Graphics", TOG 1986, section 4). The number found is within a few per cent of the one
-    asked for. Equal arguments give equal points, which MeshLab's sampling does not: it draws from a generator that every
-    call of the process moves on.
+    Dart throwing over random candidates: a candidate is rejected if an accepted one is nearer than the radius (Cook,
+    "Stochastic Sampling in Computer Graphics", TOG 1986, section 4). The number found is within a few per cent of
+    ``count``. Equal arguments give equal points, unlike MeshLab's sampling, which uses a generator shared by the
+    process.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ ROWS = ("teeth_upper", "teeth_lower")
 LOWER_TEETH_WEIGHTS = (0.0131, 0.0426, 0.9443)
 """Root, neck and jaw, in the published code."""
 MARGIN = 1.1
-"""The mouth's room over the extent of the teeth at rest."""
+"""Size of the mouth cylinder relative to the extent of the teeth at rest."""
 
 
 class MouthCylinder(NamedTuple):
@@ -104,19 +104,19 @@ class MouthCylinder(NamedTuple):
     half_height: float
 
     def violation(self, points: Tensor) -> Tensor:
-        """Mean over (N, 3) points of the squared distances by which they leave it, sideways and upwards."""
+        """Mean over (N, 3) points of the squared distances outside the cylinder, horizontally and vertically."""
         x, y, z = (points - self.center).unbind(1)
-        # The floor keeps the root's gradient finite on the axis, where it does not count.
+        # The floor keeps the gradient of the square root finite on the axis, where the penalty is zero.
         outward = (x * x + z * z).clamp_min(1e-12).sqrt() - self.radius
         upward = y.abs() - self.half_height
         return (torch.relu(outward).square() + torch.relu(upward).square()).mean()
 
 
 def with_mouth(head: HeadAsset, config: GBSConfig) -> HeadArrays:
-    """The head with teeth (regions `ROWS`), and with what the published code does otherwise than the paper.
+    """The head with teeth (regions `ROWS`), and with the configured deviations of the published code from the paper.
 
-    Clips bring the same teeth for all methods; a head without gets them here. The paper's teeth are two billboards of
-    fixed size in FLAME's mouth; these plates follow the lips of any head.
+    Clips have the same teeth for all methods; a head without teeth gets them here. The paper's teeth are two
+    billboards of fixed size in FLAME's mouth; these plates follow the lips of any head.
     """
     arrays = with_teeth_where_possible(head_arrays(head))
     if config.lower_teeth_variant == "official" and "teeth_lower" in arrays.regions:
@@ -134,15 +134,15 @@ def padded_offset(offset: FloatArray, vertices: int) -> FloatArray:
 
 
 def rows_of_teeth(head: HeadArrays) -> list[IntArray]:
-    """Triangles of the upper and of the lower teeth, if there are teeth."""
+    """Triangles of the upper and the lower teeth, if there are teeth."""
     return [faces_in_region(head, name) for name in ROWS if name in head.regions]
 
 
 def mouth_cylinder(vertices: FloatArray) -> MouthCylinder:
-    """The room for teeth at rest, given their (n, 3) vertices.
+    """The cylinder around the teeth at rest, given their (n, 3) vertices.
 
-    The upright cylinder about the middle of the teeth that holds them all, with `MARGIN`. The published one, of radius
-    27.3 mm and half height 21.6 mm, is cut to FLAME's mouth.
+    The upright cylinder about the middle of the teeth that contains them all, with `MARGIN`. The published one, of
+    radius 27.3 mm and half height 21.6 mm, is made for FLAME's mouth.
     """
     low, high = vertices.min(0), vertices.max(0)
     center = 0.5 * (low + high)

@@ -1,4 +1,4 @@
-"""Training of GaussianBlendshapes: the neutral splats and their differences, together."""
+"""Joint training of the neutral splats and the differences of GaussianBlendshapes."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from .points import SurfacePoints, mouth_cylinder, poisson_disk, rows_of_teeth, 
 
 DIFFERENCES = "differences"
 RATE = 1e-6
-"""Learning rate of the table of differences; each column is scaled by its own rate over this one. Small, so that
-gradients by the table are not scaled down to where Adam's epsilon counts."""
+"""Learning rate of the table of differences; each column is scaled by the ratio of its own rate to this one. It is
+small, so that gradients of the table do not become as small as Adam's epsilon."""
 
 
 class StartingPoints(NamedTuple):
@@ -47,8 +47,7 @@ class StartingPoints(NamedTuple):
     points, spacing : SurfacePoints, np.ndarray
         N points, and the distances to their neighbours, metres.
     part : np.ndarray
-        (N,) part of each point, in ascending order: 0 for the head, then a number for each row of
-        teeth.
+        (N,) part of each point, ascending: 0 for the head, then a number for each row of teeth.
     """
 
     points: SurfacePoints
@@ -57,9 +56,9 @@ class StartingPoints(NamedTuple):
 
 
 class GBSTraining(SplatTrainer):
-    """A `Trainable`: neutral splats in metres and the learnt differences of those that expressions move.
+    """A `Trainable`: neutral splats in metres and the learned differences of those that expressions move.
 
-    Differences lie in one table, a row for each splat and expression whose consistency mask is not zero.
+    Differences are in one table with a row for each splat and expression whose consistency mask is not zero.
 
     Attributes
     ----------
@@ -119,12 +118,12 @@ class GBSTraining(SplatTrainer):
         self._of_splats: tuple[Tensor, BoundedCache[tuple[PointMotions, Tensor]]] | None = None
 
     def begin(self, timeline: Timeline) -> None:
-        """Fit schedules to the length of the run."""
+        """Scale schedules to the length of the run."""
         super().begin(timeline)
         self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
 
     def loss(self, iteration: int, index: int) -> Tensor:
-        """Photometric loss of one image, alpha against the mask, and teeth that leave the mouth."""
+        """Photometric loss of one image, alpha loss, and penalty on teeth outside the mouth."""
         key, config, optimiser = self.keys[index], self._config, self.optimiser
         view = self._views[key.camera]
         image, coverage = self._on_background(self._images.get(iteration, index))
@@ -145,7 +144,7 @@ class GBSTraining(SplatTrainer):
         return loss
 
     def _teeth(self) -> Sequence[Tensor]:
-        """Splats of each row of teeth that has any, as they are now bound."""
+        """Splats of each non-empty row of teeth in the current binding."""
         if self._of_teeth is None or self._of_teeth[0] is not self.binding:
             part = self._part.index_select(0, self.binding)
             rows = [(part == row).nonzero().squeeze(1) for row in range(1, self._rows + 1)]
@@ -166,7 +165,7 @@ class GBSTraining(SplatTrainer):
 
     @property
     def entries(self) -> Entries:
-        """The differences of the splats as they are now bound."""
+        """The differences of the splats in the current binding."""
         binding = self.binding
         if self._entries is None or self._entries[0] is not binding:
             rows = rows_of_tables(self._counts, binding)
@@ -175,14 +174,14 @@ class GBSTraining(SplatTrainer):
         return self._entries[1]
 
     def merged_differences(self) -> Tensor:
-        """(M, C) what is added at coefficient 1: as trained, times the mask."""
+        """(M, C) differences at coefficient 1: trained values times the mask."""
         table = self.optimiser[DIFFERENCES].detach() * self._column_scales
         return table * self.entries.weights[:, None]
 
     def _on_background(self, image: Tensor) -> tuple[Tensor, Tensor | None]:
-        """(H, W, 3) colours on the background of training, and (H, W) coverage if there are masks.
+        """(H, W, 3) colours on the training background, and (H, W) coverage if there are masks.
 
-        A mask takes the background that the image was recorded on out of it.
+        If there is a mask, the recorded background is replaced.
         """
         if not self._masked:
             return image, None
@@ -250,7 +249,7 @@ def starting_points(
 
 
 def sample_count(clip: Clip, config: GBSConfig, area: float, middle: np.ndarray) -> int:
-    """Splats on the head at the start: those configured, or as many as the training images tell apart."""
+    """Initial number of splats on the head: as configured, or as many as the training images resolve."""
     if not config.sample_spacing:
         return config.samples
     sizes = []

@@ -35,13 +35,13 @@ DRIVING_FILE = "driving.npz"
 class GHAAvatar:
     """A trained head of Gaussians.
 
-    Files: ``avatar.safetensors`` and ``subject.npz`` count as storage; beside them lie the shared head model, and the
-    corrected head poses of the training timesteps, which are driving signal.
+    Files: ``avatar.safetensors`` and ``subject.npz`` count as storage. The folder also has the shared head model and
+    the corrected head poses of the training timesteps, which are part of the driving signal.
 
     Parameters
     ----------
     driver : Driver
-        On the CPU for any device of the tensors, because it computes little.
+        On the CPU for any device of the tensors, because its work is small.
     """
 
     def __init__(
@@ -81,8 +81,8 @@ class GHAAvatar:
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """Render one frame. Raises `InputError` where the pose is of another head model.
 
-        Super-resolution knows the background that was trained on alone; where the splats leave some of it to be seen,
-        the difference to the one asked for is added.
+        Super-resolution knows only the training background; its difference to the requested one is added where the
+        splats leave it visible.
         """
         trained = self._tensors["background"]
         with torch_on_one_thread(bool(instruction_sets())):
@@ -101,7 +101,7 @@ class GHAAvatar:
 
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
-        """Splats of a pose in the world, coloured as they are before super-resolution; the view does not matter."""
+        """Splats of a pose in the world with their colours before super-resolution, which do not depend on the view."""
         splats = self._posed(pose)
         colors = None if camera is None else splats.features[:, :3].clamp(0, 1)
         world = splats.world._replace(quats=F.normalize(splats.world.quats, dim=1))
@@ -128,7 +128,7 @@ class GHAAvatar:
 
 AVATAR_FILE = "avatar.safetensors"
 CONFIG = "config"
-"""Key of the file's metadata: the settings that decide how the tensors are used, as JSON."""
+"""Key of the file's metadata: the settings of rendering, as JSON."""
 
 RENDERING = (
     "unit",
@@ -147,15 +147,16 @@ RENDERING = (
     "displacement_scale",
     "attribute_scale",
 )
-"""Settings that rendering depends on."""
-
-FRAME = ("origin", "center", "background", "expression_scale", "code_low", "code_high")
-"""Small tensors: (3,) metres, (3,) metres, (3,) colour that was trained on, (E,) divisors of the expression code, (E,) bounds of it
-that colour and attributes follow."""
+"""Settings that affect rendering."""
 
 
 def write_avatar(path: Path, config: GHAConfig, tensors: Mapping[str, Tensor]) -> None:
-    """Write the tensors of points, networks, landmarks and `FRAME`. Points with features are one (N, 11 + F) table."""
+    """Write the tensors of points, networks and landmarks, and the small ones.
+
+    Points with features are one (N, 11 + F) table. The small tensors are ``origin`` and ``center`` (3,), metres;
+    ``background`` (3,), the training background; ``expression_scale`` (E,), divisors of the expression code; and
+    ``code_low`` and ``code_high`` (E,), the bounds of the code for colours and attributes.
+    """
     table = torch.cat(
         [tensors[name].reshape(len(tensors["points"]), -1) for name in (*POINTS, "features")], 1
     )
@@ -167,9 +168,9 @@ def write_avatar(path: Path, config: GHAConfig, tensors: Mapping[str, Tensor]) -
 
 
 def read_avatar(path: Path, expression_size: int, device: str) -> tuple[GaussianHead, dict[str, Tensor]]:
-    """Read what `write_avatar` wrote: the networks and their tensors, points apart again.
+    """Read what `write_avatar` wrote: the networks and their tensors, and those of the points.
 
-    Raises `InputError` where the file is damaged, or a tensor is missing, does not fit the settings, or is not finite
+    Raises `InputError` if the file is damaged, or a tensor is missing, does not fit the settings, or is not finite
     float32.
     """
     tensors, metadata = read_safetensors(path)
@@ -188,7 +189,7 @@ def read_avatar(path: Path, expression_size: int, device: str) -> tuple[Gaussian
         **dict.fromkeys(of_code, (expression_size,)),
     }
     members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in shapes.items()}
-    # Where nothing bounds the code, these are float32's largest numbers.
+    # Without bounds of the code, these are float32's largest numbers.
     members |= dict.fromkeys(("code_low", "code_high"), Member("f", (expression_size,), dtype="f4"))
     check_tensors(path, tensors, members)
     if not len(tensors["landmarks"]) or not (tensors["expression_scale"] > 0).all():

@@ -25,7 +25,7 @@ class GHAConfig:
         from which only head pose has (0.1 and 0.25 units squared are 3.2 and 5 cm).
     start : Literal['sphere', 'mesh']
         Shape that the signed distance is fitted to before the mesh phase: "sphere", as published, or
-        "mesh", the tracked mesh, which saves iterations of a short run.
+        "mesh", the tracked mesh, which saves iterations in a short run.
     start_steps : int
         Number of steps of that fit.
     grid_vertices : int
@@ -171,7 +171,7 @@ class GHAConfig:
         if not 0 < self.final_rate <= 1:
             raise ValueError(f"final_rate must lie in (0, 1], found {self.final_rate}")
         if not self.sr_widths or min(self.sr_widths) < 1:
-            raise ValueError(f"sr_widths must name one width at least, all above 0, found {self.sr_widths}")
+            raise ValueError(f"sr_widths must have at least one width, all above 0, found {self.sr_widths}")
         if self.max_points is not None and self.max_points < 1:
             raise ValueError(f"max_points must be at least 1 or null, found {self.max_points}")
         if not self.unit > 0 or not self.angle_unit > 0:

@@ -1,7 +1,7 @@
-"""The driving signal as GHA takes it: an expression code, and the rigid motion of the head with its own code.
+"""The driving signal of GHA: an expression code, and the rigid motion of the head with a code.
 
-The published model knows a face model without joints. Here the expression code is expression, jaw and eyes (and
-eyelids, where the head model has them), and the rigid motion is the one that the head model's root and neck give.
+The published model uses a face model without joints. Here the expression code is expression, jaw and eyes (and
+eyelids, if the head model has them), and the rigid motion is that of the head model's root and neck.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class HeadMotion(NamedTuple):
 
     rotation: Tensor  # (3, 3) canonical frame to world
     translation: Tensor  # (3,) of the canonical frame's origin, metres
-    code: Tensor  # (6,) axis-angle and translation from `Driver.center`, what networks see of it
+    code: Tensor  # (6,) axis-angle and translation from `Driver.center`, the input of the networks
     quaternion: Tensor  # (4,) of the rotation
 
 
@@ -120,7 +120,7 @@ class Driver:
             codes = codes / self.expression_scale
         signals = []
         for t in range(len(codes)):
-            # One at a time, so that a pose gives the same bits in any company.
+            # One at a time, so that the result of a pose does not depend on the batch.
             joints = self.model.joints(expression=arguments["expression"][t : t + 1], **self._identity)
             rigid = {name: arguments[name][t] for name in ("rotation", "neck", "translation")}
             signals.append(Signal(codes[t], **rigid, joints=joints[0, :2]))
@@ -170,26 +170,26 @@ def code_size(head: HeadAsset) -> int:
 
 
 def _principal(axis_angle: Tensor) -> Tensor:
-    """The same rotations with angles of at most pi, so that a turn too many is nothing new to a network."""
+    """The same rotations with angles of at most pi, so that equal rotations are equal inputs of a network."""
     return quaternion_to_axis_angle(axis_angle_to_quaternion(axis_angle))
 
 
 FACIAL = ("face", "lips", "eye_region", "nose", "forehead", "left_ear", "right_ear")
-"""Regions that the published landmarks and mesh points cover."""
+"""Regions covered by the published landmarks and mesh points."""
 
 
 def landmark_vertices(head: HeadAsset, neutral: FloatArray, count: int) -> IntArray:
-    """Vertices of the face of the (V, 3) neutral head, each the farthest from those before it; all, if they are fewer.
+    """Vertices of the face of the (V, 3) neutral head by farthest-point sampling; all, if they are fewer.
 
     The published points are 66 detected landmarks and each hundredth vertex of the tracked face; farthest points cover
-    the same surface evenly on any head model. Raises `InputError` where the head has no face region.
+    the same surface evenly on any head model. Raises `InputError` if the head has no face region.
     """
     if "face" not in head.regions:
         known = ", ".join(sorted(head.regions)) or "no regions"
         raise InputError(f"head model {head.version!r}", "regions", "a region 'face'", known)
     facial = np.unique(np.concatenate([head.regions[name] for name in FACIAL if name in head.regions]))
     points = np.asarray(neutral, np.float64)[facial]
-    # Farthest from the middle first: a start that needs no choice.
+    # The first point is the farthest from the middle, which needs no random start.
     chosen = [int(np.argmax(np.square(points - points.mean(0)).sum(1)))]
     nearest = np.full(len(points), np.inf)
     while len(chosen) < min(count, len(points)):
@@ -201,8 +201,8 @@ def landmark_vertices(head: HeadAsset, neutral: FloatArray, count: int) -> IntAr
 def mouth_box(lips: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Centre and half sides, (3,) each, of the box for points inside the mouth.
 
-    Its centre is the mean of the (L, 3) lip points, but as far back as the hindmost of them; its half sides are 0.8
-    of their largest distance from that centre along each axis, as published.
+    Its centre is the mean of the (L, 3) lip points in x and y, and the hindmost of them in depth; its half sides are
+    0.8 of their largest distance from that centre along each axis, as published.
     """
     center = lips.mean(0)
     center[2] = lips[:, 2].min()
@@ -221,8 +221,8 @@ def influences(
 ) -> tuple[Influence, Influence]:
     """Influence of expression and of head pose on (N, 3) points; their weights add up to 1.
 
-    Expression rules up to ``near_squared`` from the nearest of the (L, 3) landmarks, pose from ``far_squared`` on,
-    and in between the weights are linear in the squared distance.
+    Only expression has an effect up to ``near_squared`` from the nearest of the (L, 3) landmarks, only pose from
+    ``far_squared`` on; in between the weights are linear in the squared distance.
     """
     with torch.no_grad():
         # |a - b|^2 without |a|^2, which is the same for all landmarks of a point. `min` is three times as fast as
@@ -238,32 +238,32 @@ def influences(
 
 
 class TrainingScene(NamedTuple):
-    """A clip made ready.
+    """A clip prepared for training.
 
-    ``rest`` is the subject's neutral head with the jaw open by the configured angle: what the neutral surface is to be.
-    Colour and attributes follow the expression code within its bounds.
+    ``rest`` is the subject's neutral head with the jaw open by the configured angle, the target of the neutral
+    surface. Colour and attributes follow the expression code within its bounds.
     """
 
     clip: Clip
     driver: Driver
     keys: tuple[FrameKey, ...]  # training frames
     timesteps: list[int]  # of the training frames, ascending
-    row: Mapping[int, int]  # place of each timestep
+    row: Mapping[int, int]  # index of each timestep
     signals: list[Signal]  # by row
     tracked: Mapping[str, Tensor]  # driving arguments by name, (T, n) each
     views: Mapping[str, View]  # training cameras
     background: Tensor  # (3,)
     rest: Tensor  # (V, 3) canonical units
     landmark_rows: IntArray  # (L,) vertices of the head model
-    expression_scale: Tensor  # (E,) that expression codes are divided by
+    expression_scale: Tensor  # (E,) divisors of expression codes
     code_low: Tensor  # (E,)
     code_high: Tensor  # (E,)
     device: str
     seed: int
 
     def frame(self) -> dict[str, Tensor]:
-        """What an avatar keeps of it: origin of the canonical frame, centre of the head's motion, background, scale of the
-        expression."""
+        """Tensors stored in an avatar: origin of the canonical frame, centre of the head's motion, background, scale
+        and bounds of the expression code."""
         return {
             "origin": self.driver.origin,
             "center": self.driver.center,
@@ -275,7 +275,7 @@ class TrainingScene(NamedTuple):
 
 
 def training_scene(clip: Clip, config: GHAConfig, device: str, seed: int) -> TrainingScene:
-    """Make a clip ready. Raises `InputError` where its head model has no face region."""
+    """Prepare a clip. Raises `InputError` if its head model has no face region."""
     subject = Subject.of(clip)
     identity = (clip.head, subject.shape, subject.static_offset)
     plain = Driver(*identity, np.zeros(3), 1.0, None, device)
@@ -315,8 +315,8 @@ def training_scene(clip: Clip, config: GHAConfig, device: str, seed: int) -> Tra
 
 
 def bounds(codes: Tensor, margin: float | None) -> tuple[Tensor, Tensor]:
-    """(E,) lowest and highest values of (T, E) codes, each pushed out by ``margin`` of the range between them; without
-    a margin, the largest numbers there are."""
+    """(E,) lowest and highest values of (T, E) codes, extended by ``margin`` times their range; without a margin, the
+    largest float32 numbers."""
     if margin is None:
         largest = torch.full_like(codes[0], torch.finfo(codes.dtype).max)
         return -largest, largest

@@ -1,4 +1,5 @@
-"""The head of Gaussians: points with features, posed by the controllers, splatted as features, brought to full size."""
+"""The head of Gaussians: points with features are posed, splatted as feature images, and enlarged by
+super-resolution."""
 
 from __future__ import annotations
 
@@ -23,11 +24,10 @@ POINTS = {"points": 3, "log_scales": 3, "quats": 4, "opacities": 1}
 logit."""
 
 LARGEST_LOG_SCALE = 2.0
-"""Maximum size of a Gaussian in canonical units, however far an expression is outside of the training
-range."""
+"""Maximum size of a Gaussian in canonical units, also for expressions far outside the training range."""
 
 REACH = 2
-"""Pixels of the feature image around a drawn one that super-resolution may still colour."""
+"""Distance from a drawn pixel, in pixels of the feature image, that super-resolution may colour."""
 
 COVERED = 1e-3
 """Alpha above which a pixel of the feature image counts as drawn."""
@@ -64,7 +64,7 @@ class PointInputs(NamedTuple):
 
 @dataclass(frozen=True)
 class GaussianHead:
-    """The networks of the Gaussian phase and what they do. Tensors come by name: `POINTS`, "features", "landmarks"."""
+    """The networks of the Gaussian phase. Tensors are given by name: `POINTS`, "features", "landmarks"."""
 
     config: GHAConfig
     controllers: Controllers
@@ -82,8 +82,7 @@ class GaussianHead:
         return {n: s for mlp in self.controllers.of_gaussians for n, s in mlp.shapes().items()} | shapes
 
     def inputs(self, tensors: Weights) -> PointInputs:
-        """Values shared by all poses: inputs of the networks that depend only on the points and their
-        features."""
+        """Inputs of the networks that depend only on the points and their features, for all poses."""
         c, points = self.config, tensors["points"]
         parts = influences(points, tensors["landmarks"].detach(), c.near_squared, c.far_squared)
         return PointInputs(parts, encode(points), torch.tanh(tensors["features"]))
@@ -96,10 +95,10 @@ class GaussianHead:
         noise: Tensor | None = None,
         inputs: PointInputs | None = None,
     ) -> FeatureSplats:
-        """Pose all Gaussians; differentiable in every tensor but the landmarks and bounds, and in the motion.
+        """Pose all Gaussians; differentiable in the motion and in every tensor except the landmarks and bounds.
 
-        Colour and attributes see the expression code within the bounds "code_low" and "code_high", and (E,) ``noise``
-        on it. ``inputs`` are known beforehand where the tensors do not change.
+        Colour and attributes depend on the expression code, clamped to "code_low" and "code_high", plus (E,)
+        ``noise``. ``inputs`` may be computed beforehand if the tensors do not change.
         """
         c, nets = self.config, self.controllers
         points = tensors["points"]
@@ -120,7 +119,7 @@ class GaussianHead:
         return FeatureSplats(WorldSplats(means, quats, sizes), opacities, colors)
 
     def draw(self, splats: FeatureSplats, camera: Camera, background: Tensor) -> FeatureImage:
-        """Splat the features for a camera of the full size; their background is (3,) colour, then ones."""
+        """Splat the features for a camera of full size; their background is a (3,) colour, then ones."""
         world = splats.world
         view = view_of(feature_camera(camera, self.config.upscale), str(world.means.device))
         rendering = rasterize(
@@ -134,24 +133,23 @@ class GaussianHead:
     def sharpen(
         self, tensors: Weights, drawn: FeatureImage, background: Tensor, *, bounded: bool = False
     ) -> Tensor:
-        """(u h, u w, 3) image of a feature image; ``background`` where nothing is drawn near.
+        """(u h, u w, 3) image of a feature image; ``background`` far from drawn pixels.
 
-        ``bounded`` keeps the memory for large images small, without gradients.
+        ``bounded`` limits memory for large images; it supports no gradients.
         """
         network = self.super_resolution.bounded if bounded else self.super_resolution
         return network(tensors, drawn, background)
 
 
 def feature_background(background: Tensor, channels: int) -> Tensor:
-    """(C,) features where nothing is drawn: the (3,) colour, then ones."""
+    """(C,) features of the background: the (3,) colour, then ones."""
     features = background.new_ones(channels)
     features[:3] = background
     return features
 
 
 def feature_camera(camera: Camera, upscale: int) -> Camera:
-    """The camera of the feature image: ``upscale`` times smaller, its image padded at the right and below to whole
-    pixels."""
+    """The camera of the feature image: ``upscale`` times smaller, its image padded at the right and below to whole pixels."""
     if upscale == 1:
         return camera
     width, height = -(-camera.width // upscale), -(-camera.height // upscale)
@@ -172,22 +170,23 @@ def enlarged(values: Tensor, factor: int) -> Tensor:
 VARIANCE_FLOOR = 1e-5
 
 AT_ONCE = 2**24
-"""Numbers of the largest tensor up to which images are computed whole, and of a strip above (64 MiB of float32)."""
+"""Size of the largest tensor up to which images are computed whole, and size of a strip above it (64 MiB of
+float32)."""
 
 
 @dataclass(frozen=True)
 class SuperResolution:
     """Blocks of two 3x3 convolutions, each normalised over the image and rectified; a 1x1 convolution; a sigmoid.
 
-    The first block works at the size of the features, each further one at twice the size before it.
+    The first block works at the size of the features, each further one at twice the previous size.
 
     Attributes
     ----------
     widths : tuple[int, ...]
         Channels of the blocks.
     residual : bool
-        Whether to add to the splatted colours, enlarged bilinearly, as far as something is drawn,
-        instead of making colours; there is no sigmoid then, and the initial output is zero.
+        Whether to add to the splatted colours, enlarged bilinearly and weighted by their alpha, instead of replacing
+        them; there is no sigmoid then, and the initial output is zero.
     """
 
     channels: int
@@ -196,7 +195,7 @@ class SuperResolution:
 
     @property
     def upscale(self) -> int:
-        """Size of the output over that of the input."""
+        """Ratio of output size to input size."""
         return 2 ** (len(self.widths) - 1)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -217,8 +216,8 @@ class SuperResolution:
         return tensors
 
     def __call__(self, weights: Weights, drawn: FeatureImage, background: Tensor) -> Tensor:
-        """(u H, u W, 3) colours of an (H, W) feature image, within (0, 1) without ``residual``; ``background`` where
-        nothing is drawn near."""
+        """(u H, u W, 3) colours of an (H, W) feature image, within (0, 1) without ``residual``; ``background`` far
+        from drawn pixels."""
         values = drawn.features
         for block in range(len(self.widths)):
             if block:
@@ -235,8 +234,8 @@ class SuperResolution:
     ) -> Tensor:
         """The same output without gradients, in bounded memory, in strips of rows.
 
-        By calling, where no tensor there has more than ``at_once`` numbers. Otherwise no more than a block's output and
-        that of the block before exist at a time, beside strips of so many numbers.
+        The image is computed whole if no tensor has more than ``at_once`` elements. Otherwise only the outputs of a
+        block and of the previous one exist at a time, and strips of at most ``at_once`` elements.
         """
         features = drawn.features
         height, width = features.shape[:2]
@@ -304,7 +303,7 @@ def posed(
     Parameters
     ----------
     rotation, translation : Tensor
-        (3, 3) and (3,) of the canonical frame.
+        (3, 3) and (3,), the motion of the canonical frame.
     turn : Tensor
         (4, 4), matrix of multiplication by the rotation's quaternion.
     points, moves : Tensor
@@ -312,7 +311,7 @@ def posed(
     log_scales, quats, opacities : Tensor
         (N, 3), (N, 4) and (N,) logits, canonical.
     changes : Tensor
-        (N, 8) changes of them by the networks, before their factor.
+        (N, 8) changes of these by the networks, before their factor.
     """
     unit = config.unit
     scale, quat, faint = (config.attribute_scale * changes).split(list(ATTRIBUTES), dim=1)
@@ -335,17 +334,17 @@ def _resized(values: Tensor, size: Sequence[int], *, align_corners: bool) -> Ten
 def normalised_convolution(values: Tensor, weight: Tensor) -> Tensor:
     """(H, W, D) 3x3 convolution, padded with zeros, of an (H, W, C) image by (D, C, 3, 3) weights, each channel normalised
     to mean 0 and variance 1 over the image, and rectified."""
-    # The image's memory has the channels last; a convolution is faster where the weights' have, too.
+    # Channels are last in the image's memory; convolution is faster if they are also last in the weights'.
     weight = weight.contiguous(memory_format=torch.channels_last)
     raw = F.conv2d(values.permute(2, 0, 1)[None], weight, padding=1)
-    # Of one image, instance normalisation is what batch normalisation does, and torch's kernel for it takes an image of one
-    # pixel too (which becomes 0).
+    # Instance normalisation of a single image equals batch normalisation, whose torch kernel also accepts an image of
+    # one pixel (which becomes 0).
     normalised = torch.native_batch_norm(raw, None, None, None, None, True, 0.0, VARIANCE_FLOOR)[0]
     return F.relu(normalised)[0].permute(1, 2, 0)
 
 
 Reader = Callable[[int, int], Tensor]
-"""Rows from the first number to before the second of an image, (1, C, rows, W)."""
+"""(1, C, rows, W) rows of an image, from the first number to before the second."""
 
 
 def _convolved(read: Reader, height: int, weight: Tensor, rows: int) -> Tensor:
@@ -360,7 +359,7 @@ def _convolved(read: Reader, height: int, weight: Tensor, rows: int) -> Tensor:
 
 
 def _convolve_in_place(raw: Tensor, weight: Tensor, rows: int) -> None:
-    """Replace a raw output by that of the next layer, which has as many channels."""
+    """Replace a raw output by that of the next layer, which has the same number of channels."""
     read, height = _activated(raw), raw.shape[2]
     above = None
     for first in range(0, height, rows):
@@ -373,7 +372,7 @@ def _convolve_in_place(raw: Tensor, weight: Tensor, rows: int) -> None:
 
 
 def _activated(raw: Tensor) -> Reader:
-    """Rows of a raw output, each channel normalised by the present image's statistics, and rectified."""
+    """Rows of a raw output, each channel normalised by the statistics of the current image, and rectified."""
     variances, means = zip(*(torch.var_mean(plane, correction=0) for plane in raw[0]))
     mean = torch.stack(means)[:, None, None]
     scale = (torch.stack(variances)[:, None, None] + VARIANCE_FLOOR).rsqrt()
@@ -385,7 +384,7 @@ def _activated(raw: Tensor) -> Reader:
 
 
 def _doubled(read: Reader, height: int) -> Reader:
-    """Rows of the image of ``height`` rows that ``read`` gives, at twice its size: bilinear, corners on corners."""
+    """Rows of the image of ``height`` rows from ``read`` at twice its size: bilinear, aligned corners."""
 
     def read_doubled(first: int, last: int) -> Tensor:
         step = (height - 1) / (2 * height - 1)

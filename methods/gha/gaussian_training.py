@@ -1,4 +1,4 @@
-"""The Gaussian phase: points, networks, super-resolution and head poses from single images."""
+"""The Gaussian phase: training of points, networks, super-resolution and head poses on single images."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from .tracked_motion import TrackedMotion
 
 NEIGHBOURS = 3
 SMALLEST_SQUARED = 1e-7
-"""Squared distance to neighbours that a first scale stands for at least."""
+"""Minimum squared distance to neighbours for initial scales."""
 
 ZOOM = (0.8, 1.25)
 """Range of the random rescaling before super-resolution."""
 
 ALMOST_ONE = 1 - 1e-6
-"""Features of the mesh are kept within this, so that their inverse tanh is finite."""
+"""Features of the mesh are clamped to this, so that their inverse tanh is finite."""
 
 
 class GaussianTraining:
-    """A `Trainable` that starts from a trained mesh head: ``mesh`` has its networks' tensors and landmarks."""
+    """A `Trainable` that starts from a trained mesh head; ``mesh`` has its network tensors and landmarks."""
 
     def __init__(
         self, scene: TrainingScene, head: GaussianHead, mesh_head: MeshHead, mesh: Weights, sampler: Sampler
@@ -77,17 +77,17 @@ class GaussianTraining:
         return self._optimiser
 
     def tensors(self) -> dict[str, Tensor]:
-        """Points, networks and landmarks: what an avatar is made of."""
+        """Tensors of the avatar: points, networks and landmarks."""
         names = [name for name in self._rates if name != "corrections"]
         landmarks = self._fixed["landmarks"]
         return {**{name: self._optimiser[name].detach() for name in names}, "landmarks": landmarks}
 
     def begin(self, timeline: Timeline) -> None:
-        """Fit schedules to the length of the run."""
+        """Scale schedules to the length of the run."""
         self._timeline = timeline
 
     def loss(self, iteration: int, index: int) -> Tensor:
-        """L1 at the splatted size, L1 and SSIM at the full one."""
+        """L1 at the splatted size, L1 and SSIM at full size."""
         scene, head, config = self._scene, self._head, self._config
         key = scene.keys[index]
         row = scene.row[key.timestep]
@@ -117,7 +117,7 @@ class GaussianTraining:
         return loss
 
     def _noise(self, signal: Signal, iteration: int) -> Tensor | None:
-        """(E,) noise for the code that colour and attributes see, where it is asked for."""
+        """(E,) noise on the expression code of colour and attributes, if configured."""
         if not self._config.expression_noise:
             return None
         generator = torch_generator(self._scene.seed, "gha-expression", iteration)
@@ -137,7 +137,7 @@ class GaussianTraining:
         return {"optimiser": self._optimiser.state()}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` gave."""
+        """Restore what `state` returned."""
         self._optimiser.load_state(state["optimiser"])
 
     def note(self) -> str:
@@ -155,7 +155,7 @@ def first_points(
 ) -> dict[str, Tensor]:
     """Gaussians on the neutral surface of the mesh phase, with its features, and some inside the mouth.
 
-    Raises `InputError` where the mesh phase ended without a surface.
+    Raises `InputError` if the mesh phase ended without a surface.
     """
     device = scene.device
     grid = grid_about(scene.rest, config, device, finer=2 if config.subdivide else 1)
@@ -203,17 +203,15 @@ def reduced(image: Tensor, factor: int, variant: str) -> Tensor:
 
 
 class Zoom(NamedTuple):
-    """A rescaling of the splatted image, and what is cut out of it or where it is put, in whole pixels."""
+    """A rescaling of the splatted image, and the position of the crop or of the padded image, in whole pixels."""
 
-    factor: float  # of both sides; a whole number of pixels in height, as published
+    factor: float  # factor for both sides; the height is a whole number of pixels, as published
     size: tuple[int, int]  # rows and columns of the rescaled image
-    start: tuple[
-        int, int
-    ]  # first row and column cut out of it; minus those that it is put at where it is the smaller
+    start: tuple[int, int]  # first row and column of the crop; negative for the position of a smaller image
 
     @classmethod
     def of(cls, shape: Sequence[int], draws: Sequence[float]) -> Zoom:
-        """From three numbers in [0, 1): of the factor within `ZOOM`, of the row and of the column."""
+        """From three numbers in [0, 1) for the factor within `ZOOM`, the row and the column."""
         height, width = shape
         factor = int(height * (ZOOM[0] + (ZOOM[1] - ZOOM[0]) * draws[0])) / height
         size = (round(height * factor), int(width * factor))
@@ -227,9 +225,9 @@ class Zoom(NamedTuple):
 def zoomed(
     drawn: FeatureImage, target: Tensor, zoom: Zoom, background: Tensor
 ) -> tuple[FeatureImage, Tensor]:
-    """Feature image and ground truth rescaled alike, and cut or padded to their size before.
+    """Feature image and ground truth rescaled alike, and cropped or padded to their original size.
 
-    By the nearest pixel, as published; what is padded is the (3,) ``background``, as where nothing is drawn.
+    Uses the nearest pixel, as published; padding is the (3,) ``background``.
     """
     upscale = target.shape[0] // drawn.alpha.shape[0]
     outside = feature_background(background, drawn.features.shape[2])
@@ -239,7 +237,7 @@ def zoomed(
 
 
 def _zoomed(values: Tensor, zoom: Zoom, upscale: int, outside: Tensor) -> Tensor:
-    """The (H, W, C) image, with (C,) ``outside`` where it has nothing."""
+    """The (H, W, C) image, padded with (C,) ``outside``."""
 
     def places(size: int, rescaled: int, start: int) -> tuple[Tensor, Tensor]:
         place = torch.arange(size, device=values.device) + upscale * start
@@ -254,7 +252,7 @@ def _zoomed(values: Tensor, zoom: Zoom, upscale: int, outside: Tensor) -> Tensor
 
 
 def _padded(image: Tensor, camera: Camera, upscale: int, background: Tensor) -> Tensor:
-    """(u h, u w, 3): the image with background to the right and below, up to whole pixels of the feature image."""
+    """(u h, u w, 3): the image padded with background at the right and below to whole pixels of the feature image."""
     right, below = -camera.width % upscale, -camera.height % upscale
     if not right and not below:
         return image

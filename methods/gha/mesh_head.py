@@ -1,4 +1,4 @@
-"""The mesh head that starts the Gaussians: a neutral surface from a network, moved and coloured by the controllers."""
+"""The mesh head that initialises the Gaussians: a neutral surface from a network, moved and coloured by networks."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from .driving import HeadMotion, Signal, influences
 from .networks import Controllers, Mlp, Weights, encode, encode_pose
 
 OFFSET_CELLS = 0.3
-"""Reach of the grid's vertices in cells, before two tanh: published are 1/128 units in a grid of about 0.026."""
+"""Maximum offset of the grid's vertices in cells, before two tanh; published: 1/128 units in a grid of about 0.026."""
 
 CHUNK = 65_536
-"""Vertices of the grid evaluated at once where no gradient is asked for."""
+"""Vertices of the grid evaluated at once without gradients."""
 
 DISC_RADIUS, DISC_THICKNESS, DISC_OPACITY = 0.6, 0.1, 0.95
-"""Standard deviations of a vertex's disc in roots of its area, its thickness in radii, and its opacity."""
+"""Standard deviation of a vertex's disc relative to the square root of its area, thickness relative to the radius, and
+opacity."""
 
 
 class NeutralSurface(NamedTuple):
@@ -37,7 +38,7 @@ class NeutralSurface(NamedTuple):
 
 @dataclass(frozen=True)
 class MeshHead:
-    """The networks of the mesh phase. ``geometry`` gives distance, offset (3) and features of a place."""
+    """The networks of the mesh phase. ``geometry`` gives distance, offset (3) and features at a point."""
 
     config: GHAConfig
     controllers: Controllers
@@ -52,18 +53,18 @@ class MeshHead:
 
     @property
     def networks(self) -> tuple[Mlp, ...]:
-        """All that the mesh phase trains."""
+        """All networks trained in the mesh phase."""
         return self.geometry, *self.controllers.of_mesh
 
     def distance(self, weights: Weights, places: Tensor) -> Tensor:
-        """(N,) signed distance, within (-1, 1), positive outside, of (N, 3) canonical places."""
+        """(N,) signed distance, within (-1, 1), positive outside, at (N, 3) canonical points."""
         return torch.tanh(self.geometry(weights, encode(places), outputs=1))[:, 0]
 
     def surface(self, weights: Weights, grid: TetGrid) -> NeutralSurface:
         """The neutral surface on a grid; differentiable in the geometry network.
 
-        Only vertices of tetrahedra that the surface passes have an effect on it, so only they take part in what is
-        differentiated; which ones those are is found without gradients.
+        Only vertices of tetrahedra that the surface crosses affect it. They are found without gradients, and only they
+        are differentiated.
         """
         with torch.no_grad():
             parts = [self.distance(weights, chunk) for chunk in grid.vertices.split(CHUNK)]
@@ -92,8 +93,8 @@ class MeshHead:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """(V, 3) vertices in the world, (V, 3) colours, and the mean squared displacement.
 
-        As published, the pose network sees the vertices that the expression network moved, and a sigmoid makes the
-        colours. Without it (``residual``) the Gaussians, which have none, start with the mesh's colours.
+        As published, the input of the pose network is the vertices moved by the expression network, and colours pass a
+        sigmoid. Without it (``residual``) the Gaussians, which have none, start with the mesh's colours.
         """
         c, nets = self.config, self.controllers
         near, far = influences(surface.vertices, landmarks, c.near_squared, c.far_squared)
@@ -113,11 +114,11 @@ class MeshHead:
 
 
 def vertex_discs(vertices: Tensor, faces: Tensor) -> WorldSplats:
-    """A flat Gaussian for each vertex, in the surface and of its share of it: how the mesh is drawn.
+    """A flat Gaussian for each vertex, tangential to the surface and of its share of the area, to draw the mesh.
 
-    The published mesh phase draws triangles. Discs that touch are the same surface to our renderer, give gradients for
-    colours, silhouette and positions alike, and are what the mesh is to become. Their size and direction follow the
-    mesh without gradients of their own; positions are the (V, 3) vertices, metres, differentiable.
+    The published mesh phase draws triangles. Touching discs give the same surface in this renderer, with gradients for
+    colours, silhouette and positions, and are the initial Gaussians. Only positions, the (V, 3) vertices in metres,
+    are differentiable; size and direction follow the mesh without gradients.
     """
     with torch.no_grad():
         corners = vertices.index_select(0, faces.reshape(-1)).view(-1, 3, 3)
@@ -133,7 +134,7 @@ def vertex_discs(vertices: Tensor, faces: Tensor) -> WorldSplats:
 
 
 def _turn_z_to(directions: Tensor) -> Tensor:
-    """(N, 4) quaternions wxyz, of any length, that turn the z axis to (N, 3) directions, or to the opposite of those
+    """(N, 4) quaternions wxyz, of any length, that rotate the z axis to (N, 3) directions, or to the opposite of those
     that point down: a disc has no sides, and half a turn would be undetermined."""
     unit = torch.nn.functional.normalize(directions, dim=1)
     x, y, z = torch.where(unit[:, 2:] < 0, -unit, unit).unbind(1)
@@ -153,10 +154,10 @@ class TetGrid(NamedTuple):
 
 
 class Crossings(NamedTuple):
-    """The zero surface as places on edges; whatever the grid's vertices carry can be interpolated to it."""
+    """The zero surface as points on edges, to which values at the grid's vertices can be interpolated."""
 
     ends: Tensor  # (K, 2) int64 vertices of the grid, one edge per surface vertex
-    weights: Tensor  # (K,) of the second end, in [0, 1]; differentiable in the distances
+    weights: Tensor  # (K,) weight of the second end, in [0, 1]; differentiable in the distances
     faces: Tensor  # (F, 3) int64, counter-clockwise seen from where the distance is positive
 
     def interpolate(self, values: Tensor) -> Tensor:
@@ -168,8 +169,8 @@ class Crossings(NamedTuple):
 def tet_grid(low: np.ndarray, high: np.ndarray, spacing: float, device: str = "cpu") -> TetGrid:
     """Fill a box with the tetrahedra of a body-centred cubic lattice.
 
-    Inside, all are congruent, and their edges differ by a factor of 1.15 only, which makes the surface nearly as good
-    as the grid is fine. At the box's sides pyramids are cut in two. The box grows at ``high`` to whole cubic cells.
+    Inside, all are congruent, and their edges differ only by a factor of 1.15. At the box's sides pyramids are cut in
+    two. The box is extended at ``high`` to whole cubic cells.
     """
     cells = np.maximum(np.ceil((np.asarray(high) - low) / spacing - 1e-9), 1).astype(np.int64)
     corner_shape, total = cells + 1, int(np.prod(cells + 1))
@@ -211,14 +212,14 @@ def tet_grid(low: np.ndarray, high: np.ndarray, spacing: float, device: str = "c
 
 
 def spacing_for(low: np.ndarray, high: np.ndarray, count: int) -> float:
-    """Spacing at which a box holds about ``count`` vertices: two to a cell."""
+    """Spacing at which a box has about ``count`` vertices, two per cell."""
     return float((2 * np.prod(np.asarray(high, np.float64) - low) / count) ** (1 / 3))
 
 
 def marching_tetrahedra(distance: Tensor, tets: Tensor) -> Crossings:
-    """The surface where a (V,) distance, positive outside, given at the vertices of `TetGrid` is zero, linear between them.
+    """Zero surface of a (V,) distance, positive outside, at the vertices of `TetGrid`, interpolated linearly.
 
-    Empty where nothing changes sign. A closed surface inside the grid is watertight: faces share the vertices of common
+    Empty without a change of sign. A closed surface inside the grid is watertight: faces share the vertices of common
     edges.
     """
     inside = distance.detach() < 0
@@ -242,8 +243,8 @@ def marching_tetrahedra(distance: Tensor, tets: Tensor) -> Crossings:
 def _cases(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """(16, 2, 3) edges of the triangles of each case, (16,) their number, and `EDGES`; bit k says that corner k is inside.
 
-    Each polygon is laid through the middles of its edges in a tetrahedron of positive volume and turned so that its
-    normal points away from the corners inside.
+    Each polygon connects the middles of its edges in a tetrahedron of positive volume, ordered so that its normal
+    points away from the corners inside.
     """
     place = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=np.float64)
     table, counts = np.zeros((16, 2, 3), np.int64), np.zeros(16, np.int64)

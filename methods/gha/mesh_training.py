@@ -1,4 +1,4 @@
-"""The mesh phase: a neutral surface, its motion and its colours from images, silhouettes and tracked landmarks."""
+"""The mesh phase: training of a neutral surface, its motion and its colours on images, silhouettes and landmarks."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ COLOR, SILHOUETTE, DISPLACEMENT, DISTANCE, SMOOTHNESS = 0.1, 0.1, 0.01, 0.1, 100
 """Published weights of the losses, except that of the landmarks, which is a setting."""
 
 MARGIN = 0.3
-"""Canonical units around the neutral mesh that the grid covers."""
+"""Margin of the grid around the neutral mesh, canonical units."""
 
 SPHERE_BATCH, SPHERE_RATES = 8_192, (1e-3, 1e-3)
-"""Places in a step of the fit to a sphere, and its first and last learning rate, as published."""
+"""Points in a step of the fit to a sphere, and its first and last learning rate, as published."""
 
 MESH_PLACES, MESH_BATCH, MESH_RATES = 100_000, 2_048, (5e-3, 5e-4)
-"""Places whose distance to the tracked mesh is known, how many of them a step of the fit to it takes, and its rates."""
+"""Number of points with known distance to the tracked mesh, points in a step of the fit to it, and its learning
+rates."""
 
 NEAR, FAR = 0.1, 0.3
-"""Canonical units: how far most of those places are from the mesh, and the distance that none exceeds."""
+"""Canonical units: distance of most of those points from the mesh, and their maximum distance."""
 
 
 class MeshTraining:
-    """A `Trainable`: one iteration sees several views of one timestep.
+    """A `Trainable`; one iteration uses several views of one timestep.
 
     Parameters
     ----------
     fitted : bool
-        Whether the start must still be fitted to the sphere or the tracked mesh; False for a resumed
-        run.
+        Whether to fit the initial surface to the sphere or the tracked mesh; False for a resumed run.
     """
 
     def __init__(self, scene: TrainingScene, head: MeshHead, *, fitted: bool):
@@ -81,7 +81,7 @@ class MeshTraining:
         return self._optimiser
 
     def begin(self, timeline: Timeline) -> None:
-        """Nothing changes in the course of this phase."""
+        """This phase has no schedules."""
 
     def loss(self, iteration: int, index: int) -> Tensor:
         """Loss of some views of the timestep that training image ``index`` belongs to."""
@@ -133,7 +133,7 @@ class MeshTraining:
         return {"optimiser": self._optimiser.state()}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` gave."""
+        """Restore what `state` returned."""
         self._optimiser.load_state(state["optimiser"])
 
     def note(self) -> str:
@@ -147,14 +147,14 @@ class MeshTraining:
         return F.mse_loss(expressed, self._tracked_landmarks[row])
 
     def _timesteps(self, iteration: int, row: int) -> list[int]:
-        """The timestep of the images, and others, drawn without replacement."""
+        """The timestep of the images and others, drawn without replacement."""
         generator = torch_generator(self._scene.seed, "gha-landmarks", iteration)
         order = torch.randperm(len(self._scene.timesteps), generator=generator).tolist()
         others = [other for other in order if other != row]
         return [row, *others[: self._config.landmark_timesteps - 1]]
 
     def _views(self, iteration: int, key: FrameKey) -> list[FrameKey]:
-        """The frame asked for, and others of its timestep, drawn without replacement."""
+        """The given frame and others of its timestep, drawn without replacement."""
         others = [other for other in self._cameras_of[key.timestep] if other != key]
         generator = torch_generator(self._scene.seed, "gha-views", iteration)
         order = torch.randperm(len(others), generator=generator).tolist()
@@ -163,7 +163,7 @@ class MeshTraining:
     def _target(self, key: FrameKey) -> tuple[View, Tensor, Tensor | None, Tensor]:
         """View, (H, W, 3) image and (H, W) coverage at the phase's size, and the (3,) background of the image.
 
-        Black, as published, where a mask takes the background out of the image.
+        The background is black, as published, if there is a mask to remove the recorded one.
         """
         scene = self._scene
         camera = scene.clip.cameras[key.camera]
@@ -179,7 +179,7 @@ class MeshTraining:
         return view, recomposited(image, coverage, scene.background, black), coverage[..., 0], black
 
     def _fitted(self, initial: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The geometry network after it learnt the distances of the start."""
+        """The geometry network fitted to the distances of the initial surface."""
         head, config, seed = self._head, self._config, self._scene.seed
         low, high = self.grid.vertices.amin(0), self.grid.vertices.amax(0)
 
@@ -201,15 +201,15 @@ class MeshTraining:
 
 
 def grid_about(neutral: Tensor, config: GHAConfig, device: str, *, finer: int = 1) -> TetGrid:
-    """A grid about the (V, 3) neutral mesh, ``finer`` times as fine as configured."""
+    """A grid around the (V, 3) neutral mesh, ``finer`` times as fine as configured."""
     points = neutral.detach().cpu().double().numpy()
     low, high = points.min(0) - MARGIN, points.max(0) + MARGIN
     return tet_grid(low, high, spacing_for(low, high, config.grid_vertices) / finer, device)
 
 
 def roughness(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Mean squared component of the uniform Laplacian: how far vertices are from the mean of their neighbours."""
-    # Along each edge of a closed surface two triangles run, in opposite directions, so one direction will do.
+    """Mean squared component of the uniform Laplacian, the offset of vertices from the mean of their neighbours."""
+    # Each edge of a closed surface belongs to two triangles in opposite directions, so one direction is enough.
     start, stop = faces.t().reshape(-1), faces.roll(-1, 1).t().reshape(-1)
     sums = torch.zeros_like(vertices).index_add(0, start, vertices.index_select(0, stop))
     counts = vertices.new_zeros(len(vertices)).index_add(0, start, vertices.new_ones(len(start)))
@@ -233,14 +233,14 @@ def _reduced(image: np.ndarray, height: int, width: int, device: str) -> Tensor:
 
 
 def _distances(scene: TrainingScene, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """(P, 3) places, most of them near the tracked mesh at rest, and their (P,) distances to it, up to `FAR`."""
+    """(P, 3) points, most of them near the tracked mesh at rest, and their (P,) distances to it, up to `FAR`."""
     head, vertices = scene.clip.head, scene.rest.cpu().double().numpy()
     bounding = outer_vertices(vertices, np.asarray(head.faces), head.regions)
     known = TangentDistance(vertices, np.asarray(head.faces), bounding)
     generator = torch_generator(scene.seed, "gha-start")
     anywhere = low + (high - low) * torch.rand(MESH_PLACES // 4, 3, generator=generator).to(low)
     count = MESH_PLACES - len(anywhere)
-    # Close to the surface the distance must be right, and the closer the more of the places.
+    # Points are denser near the surface, where the distance must be accurate.
     rows = torch.as_tensor(bounding)[torch.randint(len(bounding), (count,), generator=generator)]
     away = torch.randn(count, 3, generator=generator) * torch.rand(count, 1, generator=generator)
     places = torch.cat([scene.rest[rows.to(low.device)] + NEAR * away.to(low), anywhere])
@@ -252,8 +252,7 @@ FOLDER, RESULT_FILE = "mesh", "mesh.safetensors"
 
 
 class MeshResult(NamedTuple):
-    """Result of the mesh phase: its tensors by name, iterations done, and seconds spent, including those of
-    its start."""
+    """Result of the mesh phase: its tensors by name, iterations done, and seconds spent, including those of its start."""
 
     tensors: Mapping[str, Tensor]
     iterations: int
@@ -272,7 +271,7 @@ def mesh_phase(scene: TrainingScene, head: MeshHead, fit: Fit) -> MeshResult:
 
 
 def remove_mesh_phase(out: Path) -> None:
-    """Take away what the mesh phase left; the avatar no longer needs it."""
+    """Remove the files of the mesh phase, which the avatar no longer needs."""
     folder = out / FOLDER
     for name in (RESULT_FILE, CHECKPOINT):
         (folder / name).unlink(missing_ok=True)

@@ -1,15 +1,15 @@
-"""Gaussian Head Avatar: Gaussians moved and coloured by networks, drawn as features, brought to full size.
+"""Gaussian Head Avatar: Gaussians moved and coloured by networks, drawn as features, enlarged by super-resolution.
 
 Xu et al., "Gaussian Head Avatar: Ultra High-fidelity Head Avatar via Dynamic Gaussians", CVPR 2024.
 
-Two phases. A mesh head (signed distance in a tetrahedral grid, controllers for motion and colour) gives neutral points
-with features; Gaussians start there, keep the controllers, and get a super-resolution network. The budget is parted
-between them as published.
+There are two phases. A mesh head (signed distance in a tetrahedral grid, networks for motion and colour) gives neutral
+points with features. Gaussians start from these, keep the networks, and get a super-resolution network. The budget is
+divided between the phases as published.
 
-What is our own: the tracked head model stands for the published face model (`driving`), the mesh is drawn with discs
-(`mesh_head.vertex_discs`), 1 - SSIM stands for LPIPS (`GHAConfig.structure_weight`), pixels that nothing is drawn near
-are background. Short presets scale with the capture (`presets`), without resizing it, and let the head model teach the
-deformation (`tracked_motion`).
+Differences from the paper: the tracked head model replaces the published face model (`driving`), the mesh is drawn
+with discs (`mesh_head.vertex_discs`), 1 - SSIM replaces LPIPS (`GHAConfig.structure_weight`), and pixels far from
+drawn ones are background. Short presets scale with the capture (`presets`), without resizing it, and fit the
+deformation to the head model's (`tracked_motion`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from ...bench.contracts import Budget, Progress
 from ..shared.avatar_files import TRACKED, RefinedTracking, Subject, finish_fit
-from ..shared.loop import Fit, Outcome, train
+from ..shared.loop import Fit, TrainingSummary, train
 from ..shared.method import TrainedMethod
 from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import torch_on_one_thread
@@ -72,7 +72,7 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
         training = GaussianTraining(scene, head, mesh_head, mesh.tensors, sampler)
         budget = within(second, fit.budget, mesh.seconds)
         try:
-            outcome = train(
+            summary = train(
                 training,
                 sampler,
                 replace(fit, budget=budget, progress=_phase_progress(fit.progress, mesh.iterations, 0)),
@@ -85,11 +85,11 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
         tensors = training.tensors()
         write_avatar(out / AVATAR_FILE, config, {**tensors, **scene.frame()})
         corrected(scene, training.optimiser["corrections"].detach()).save(out / DRIVING_FILE)
-        whole = Outcome(
-            mesh.iterations + outcome.iterations,
-            mesh.iterations + outcome.planned,
-            mesh.seconds + outcome.seconds,
-            [(mesh.iterations + at, value) for at, value in outcome.losses],
+        whole = TrainingSummary(
+            mesh.iterations + summary.iterations,
+            mesh.iterations + summary.planned,
+            mesh.seconds + summary.seconds,
+            [(mesh.iterations + at, value) for at, value in summary.losses],
         )
         counts = {"splats": len(tensors["points"]), "mesh_iterations": mesh.iterations}
         finish_fit(fit, whole, Subject.of(clip), clip.head, **counts)
@@ -109,7 +109,7 @@ def _phase_progress(progress: Progress, before: int, after: int) -> Progress:
 
 
 def parted(budget: Budget, fraction: float) -> tuple[Budget, Budget]:
-    """The budgets of the mesh phase and the Gaussian phase, of one iteration at least."""
+    """The budgets of the mesh phase and the Gaussian phase, at least one iteration each."""
     first, second = {}, {}
     if budget.iterations is not None:
         first["iterations"] = max(1, round(fraction * budget.iterations))
@@ -121,14 +121,14 @@ def parted(budget: Budget, fraction: float) -> tuple[Budget, Budget]:
 
 
 def within(part: Budget, whole: Budget, spent: float) -> Budget:
-    """The budget of a part, cut to what the ``spent`` seconds leave of the whole; a millisecond if they leave none."""
+    """The budget of a phase, limited to the seconds of the whole that are not ``spent``; at least a millisecond."""
     if part.seconds is None or whole.seconds is None:
         return part
     return replace(part, seconds=min(part.seconds, max(whole.seconds - spent, 1e-3)))
 
 
 def corrected(scene: TrainingScene, corrections: Tensor) -> RefinedTracking:
-    """The tracking of the training timesteps with (T, 6) learnt corrections of rotation and translation."""
+    """The tracking of the training timesteps with (T, 6) learned corrections of rotation and translation."""
     before = {name: scene.tracked[name].cpu().numpy() for name in TRACKED}
     turn, shift = corrections.cpu().split(3, dim=1)
     after = dict(before)

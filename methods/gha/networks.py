@@ -1,8 +1,8 @@
 """Small networks over points and one condition, as functions of named tensors.
 
-The published networks take each point's inputs side by side with a condition (expression, pose) that is the same for
-all points. Here the condition's part of a layer is computed once and added as a bias: the same numbers for a fraction
-of the work.
+The published networks concatenate each point's inputs with a condition (expression, pose) that is the same for all
+points. Here the condition's part of a layer is computed once and added as a bias, which gives the same result with
+less work.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Weights(Protocol):
 
 @dataclass(frozen=True)
 class Mlp:
-    """A perceptron with a skip connection of its inputs: at layer ``len(widths) // 2``, after the hidden values.
+    """An MLP with an input skip connection at layer ``len(widths) // 2``, concatenated after the hidden values.
 
     Attributes
     ----------
@@ -43,8 +43,8 @@ class Mlp:
     hidden, outputs : tuple[int, ...], int
         Widths of the layers.
     zero_condition_weights : bool
-        Whether the condition's weights are initially zero. Conditions that training never shows then
-        have no effect, instead of a random one.
+        Whether the condition's weights are initially zero. Conditions that do not occur in training then have no
+        effect, instead of a random one.
     zero_initialised : bool
         Whether the last layer is initially zero.
     """
@@ -66,10 +66,6 @@ class Mlp:
     def _skip_layer(self) -> int:
         """Index of the layer with the input skip connection; 0 for a single layer."""
         return len(self.widths) // 2 if self.hidden else 0
-
-    def takes_inputs(self, layer: int) -> bool:
-        """Whether a layer receives the inputs, after the values of the previous layer, if any."""
-        return layer in (0, self._skip_layer)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of every tensor, by name."""
@@ -173,7 +169,7 @@ class Controllers:
 
     @property
     def of_mesh(self) -> tuple[Mlp, ...]:
-        """Those that the mesh phase trains."""
+        """The networks trained in the mesh phase."""
         return self.expression_color, self.pose_color, self.expression_deform, self.pose_deform
 
     @property
@@ -210,7 +206,7 @@ class Controllers:
 
 
 def encoded_size(size: int) -> int:
-    """Numbers that an encoding makes of ``size``."""
+    """Size of the encoding of ``size`` values."""
     return size * ENCODING_SIZE // 3
 
 

@@ -47,7 +47,7 @@ SHORT: dict[str, Any] = {
     "final_rate": 0.1,
     "augment": False,
 }
-"""Short presets scale with the capture, for CPUs (README.md)."""
+"""Settings of the short presets, which scale with the capture, for CPUs (README.md)."""
 
 SHORT_PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {

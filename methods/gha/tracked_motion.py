@@ -1,7 +1,7 @@
-"""The head model's motion of the face, which the deformation network is fitted to.
+"""The head model's motion of the face, to which the deformation network is fitted.
 
-The published network learns motion from landmarks and images of thousands of timesteps. A short clip shows few of the
-directions of the expression code; the head model that tracked it moves its face in all of them.
+The published network learns motion from landmarks and images of thousands of timesteps. A short clip contains few of
+the directions of the expression code; its head model moves the face in all of them.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from .driving import TrainingScene, influences
 from .networks import Mlp, Weights, encode
 
 TURNING = ("left_eyeball", "right_eyeball")
-"""Regions left out: gaze turns them under the lids, where one field of displacements has no room for both."""
+"""Excluded regions: eyeballs rotate under the lids, and one displacement field cannot represent both."""
 
 CODES, CODES_AT_ONCE = 512, 32
-"""Expression codes kept, and how many of them one draw takes."""
+"""Number of stored expression codes, and of those in one draw."""
 
 POINTS_AT_ONCE = 64
 
@@ -35,26 +35,28 @@ RATES = (5e-3, 5e-4)
 """First and last learning rate of the fit before the mesh phase."""
 
 SHARE_TRACKED, AROUND_TRACKED = 0.5, 0.3
-"""Share of the codes that lie about those of training timesteps, and their standard deviation there; the others are
-standard normal."""
+"""Fraction of the codes that are drawn around those of training timesteps, and their standard deviation; the others
+are standard normal."""
 
 STILL = 0.02
-"""Canonical units (2 mm of the published 0.1 m) of motion below which an error counts no more for being relative."""
+"""Motion in canonical units (2 mm of the published 0.1 m) below which relative errors get no larger weight."""
 
 
 class TrackedMotion(NamedTuple):
-    """Displacements of the head model's n vertices where expression alone rules, by expression codes."""
+    """Displacements of the head model's n vertices that only expression moves, by expression code."""
 
     encoded: Tensor  # (n, 27) positional encoding of the vertices at rest (`TrainingScene.rest`)
     codes: Tensor  # (K, E) expression codes
     moves: Tensor  # (K, n, 3) displacements from rest, canonical units
-    weights: Tensor  # (n,) one over each vertex's mean squared motion, so that lids count beside a jaw
+    weights: (
+        Tensor  # (n,) inverse of each vertex's mean squared motion, so that lids count as much as the jaw
+    )
     scale: float  # of the network's outputs
 
     @classmethod
     @torch.no_grad()
     def of(cls, scene: TrainingScene, config: GHAConfig) -> TrackedMotion:
-        """Codes about those of the training timesteps and random ones, with what they do to the head model."""
+        """Codes around those of the training timesteps and random ones, with their displacements of the head model."""
         rows = _rows(scene, config)
         tracked = torch.stack([signal.expression for signal in scene.signals])
         generator = torch_generator(scene.seed, "gha-motion-codes")
@@ -71,8 +73,7 @@ class TrackedMotion(NamedTuple):
         return cls(encode(rest), codes, every, weights, config.displacement_scale)
 
     def error(self, network: Mlp, weights: Weights, generator: torch.Generator) -> Tensor:
-        """Mean squared error of the network's displacements, relative to the vertices' motion, over a draw of codes
-        and vertices."""
+        """Mean squared error of the network's displacements, relative to the vertices' motion, over a draw of codes and vertices."""
         device = self.codes.device
         rows = to_device(torch.randint(self.encoded.shape[0], (POINTS_AT_ONCE,), generator=generator), device)
         drawn = to_device(torch.randint(len(self.codes), (CODES_AT_ONCE,), generator=generator), device)
@@ -90,7 +91,7 @@ class TrackedMotion(NamedTuple):
 
 
 def _rows(scene: TrainingScene, config: GHAConfig) -> Tensor:
-    """Vertices within the landmarks' undivided rule."""
+    """Vertices near the landmarks, on which only expression has an effect."""
     near, _ = influences(scene.rest, scene.rest[scene.landmark_rows], config.near_squared, config.far_squared)
     ruled = torch.zeros(len(scene.rest), dtype=torch.bool, device=scene.rest.device)
     ruled[near.rows[near.weights == 1]] = True
@@ -107,10 +108,10 @@ def fitted(
     steps: int,
     rates: tuple[float, float],
 ) -> dict[str, Tensor]:
-    """A network's tensors after a number of steps of Adam; ``initial`` has them and may have others.
+    """A network's tensors after a number of steps of Adam; ``initial`` may also have other tensors.
 
-    ``loss`` is of the tensors and the number of the step, from 1; ``rates`` are the learning rate of the first half of
-    the steps, and the one that it falls to, log-linearly, in the second.
+    ``loss`` takes the tensors and the number of the step, from 1; ``rates`` are the learning rate of the first half of
+    the steps and the final one, log-linear over the second half.
     """
     names = list(network.shapes())
     weights = Optimiser(
@@ -127,19 +128,19 @@ def fitted(
 
 
 INNER_PARTS = ("teeth", "mouth_socket")
-"""Regions behind the skin: what lies about them says nothing of inside and outside."""
+"""Regions behind the skin, which do not separate inside from outside."""
 
 FACING, FORWARD = ("left_eyeball", "right_eyeball", "eye_region"), 0.3
-"""Regions that bound the head by what faces forward of them (least component of the normals along z): eyeballs fill the
-lids' opening, but their backs, and the inner sides of lids, lie behind the skin."""
+"""Regions of which only forward-facing parts bound the head (minimum component of the normals along z): eyeballs fill
+the lids' opening, but their backs, and the inner sides of lids, are behind the skin."""
 
 
 class TangentDistance:
     """Distance to the nearest vertex, signed by the side of its tangent plane that a point is on; positive outside.
 
-    Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992, section 3.3. Where a mesh ends (the
-    neck's lower edge) its walls continue, which is what a bust wants. ``faces`` are counter-clockwise seen from outside;
-    (K,) ``keep`` are the vertices that count.
+    Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992, section 3.3. At the border of a mesh
+    (the neck's lower edge) its walls continue, as needed for a bust. ``faces`` are counter-clockwise seen from
+    outside; (K,) ``keep`` are the vertices that count.
     """
 
     def __init__(self, vertices: FloatArray, faces: IntArray, keep: IntArray):
@@ -148,15 +149,15 @@ class TangentDistance:
         self._tree = cKDTree(self._points)
 
     def __call__(self, places: FloatArray) -> FloatArray:
-        """(N,) distances of (N, 3) places."""
+        """(N,) distances of (N, 3) points."""
         distance, nearest = self._tree.query(places)
         side = np.einsum("ni,ni->n", places - self._points[nearest], self._normals[nearest])
         return np.where(side < 0, -distance, distance)
 
 
 def outer_vertices(vertices: FloatArray, faces: IntArray, regions: Mapping[str, IntArray]) -> IntArray:
-    """(K,) vertices of an unposed head that bound it: all but `INNER_PARTS` and what does not face forward of
-    `FACING`."""
+    """(K,) vertices of an unposed head that bound it: all except `INNER_PARTS` and the parts of `FACING` that do not
+    face forward."""
     bounding = np.ones(len(vertices), bool)
     for name in INNER_PARTS:
         bounding[regions.get(name, [])] = False

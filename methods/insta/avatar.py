@@ -37,14 +37,12 @@ from .rendering import (
 from .warp import mouth_triangles
 
 RAYS_AT_ONCE = 1 << 15
-ROUND_SAMPLES = (
-    4  # at most: without gradients looking at the transmittance costs less than samples that are hidden
-)
-MIDDLE = 0.5  # of a step: where samples lie when nothing is left to chance
+ROUND_SAMPLES = 4  # maximum; without gradients, testing the transmittance costs less than hidden samples
+MIDDLE = 0.5  # fraction of a step: position of samples without random jitter
 
 
 class InstaAvatar:
-    """A trained head: a canonical field, the space where there is density, and the mesh that carries rays to it."""
+    """A trained head: a canonical field, the space with density, and the mesh that maps rays to it."""
 
     def __init__(
         self,
@@ -106,7 +104,7 @@ class InstaAvatar:
         return [self._folder / name for name in (FIELD_FILE, SETTINGS_FILE, SUBJECT_FILE)]
 
     def _posed(self, pose: HeadPose) -> PosedSurface:
-        """The surface of a pose; that of the last is kept, as several cameras often look at one."""
+        """The surface of a pose; the last one is cached, since several cameras often render one pose."""
         key = pose_key(pose)
         if self._last is None or self._last[0] != key:
             vertices = self._mesh.posed(self._mesh.arguments([pose]))
@@ -120,7 +118,7 @@ OCCUPIED = "occupied"
 
 
 def read_settings(path: Path) -> InstaConfig:
-    """Read the settings as JSON. Raises `InputError` for settings that are unknown or out of range."""
+    """Read settings from JSON. Raises `InputError` for settings that are unknown or out of range."""
     try:
         config: InstaConfig = build(InstaConfig, read_json(path), str(path))
     except InputError:
@@ -131,7 +129,7 @@ def read_settings(path: Path) -> InstaConfig:
 
 
 def write_field(path: Path, parameters: Mapping[str, Tensor], occupied: np.ndarray) -> None:
-    """Write parameters, and (X, Y, Z) occupancy."""
+    """Write parameters and (X, Y, Z) occupancy."""
     arrays = {name: value.detach().cpu().half().numpy() for name, value in parameters.items()}
     bits = np.packbits(occupied.reshape(-1))
     write_arrays(path, {**arrays, OCCUPIED: bits})
@@ -140,9 +138,9 @@ def write_field(path: Path, parameters: Mapping[str, Tensor], occupied: np.ndarr
 def read_field(
     path: Path, architecture: Architecture, size: tuple[int, ...], device: str
 ) -> tuple[dict[str, Tensor], np.ndarray]:
-    """Read what `write_field` wrote: float32 parameters, and flat numbers of occupied cells.
+    """Read what `write_field` wrote: float32 parameters, and flat indices of occupied cells.
 
-    Raises `InputError` where an array is missing, not finite or of another shape or type.
+    Raises `InputError` for an array that is missing, not finite or of another shape or type.
     """
     shapes = architecture.shapes()
     cells = math.prod(size)
@@ -155,13 +153,13 @@ def read_field(
 class RayColors(NamedTuple):
     """Result of rays, as float32 numpy arrays."""
 
-    color: np.ndarray  # (R, 3) not yet composited on anything
+    color: np.ndarray  # (R, 3) not composited on a background
     transmittance: np.ndarray  # (R,)
     samples: int
 
 
 class Inference:
-    """A trained field in a space, ready to be looked at.
+    """A trained field in a space, prepared for rendering.
 
     Parameters
     ----------
@@ -215,7 +213,7 @@ class Inference:
         return module.Trained(levels, arrays["table"], low, box.side, *prior, density, color)
 
     def _starts(self, condition: Tensor) -> np.ndarray:
-        """(2, units) that the conditions add to the first layer: outside the mouth, where all are one, and at it."""
+        """(2, units) contributions of the conditions to the first layer: outside the mouth, where all are one, and at the mouth."""
         weight = self.parameters["density_0"].detach().numpy()
         width = self.field.architecture.conditions
         conditions = np.stack([np.ones(width, np.float32), condition[:width].numpy().astype(np.float32)])

@@ -9,7 +9,7 @@ from typing import Literal
 INSTANT_NGP_STEP = math.sqrt(3) / 1024
 SMALLEST = 1e-12
 THICKEST = 1.0
-"""Metres of a shell on one side of the surface."""
+"""Maximum thickness of the shell on one side of the surface, metres."""
 STEP_MIN = 1e-5
 MOST = {
     "levels": 32,
@@ -31,13 +31,13 @@ MOST = {
 class InstaConfig:
     """INSTA (Zielonka, Bolkart, Thies, CVPR 2023). The defaults are the published values, with these exceptions.
 
-    Density is confined to a shell about the mesh (the program marches a whole cube), so hair may stand off the tracked
-    surface by ``shell_outside`` and no more. The occupancy at the mouth is probed with the coefficients of training
-    frames (there with ones), rows of the hash table that an iteration does not touch decay with the others' moments
-    (there they are left out), rays stop at a transmittance of 1e-3 (there 1e-2 when rendering), and an iteration's rays
-    come from ``images_per_iteration`` images.
+    Density is limited to a shell around the mesh (the official program marches a whole cube), so hair may be at most
+    ``shell_outside`` away from the tracked surface. The occupancy at the mouth is sampled with the coefficients of
+    training frames (official: with ones). Rows of the hash table without a gradient are updated by Adam like the
+    others (official: they are skipped). Rays stop at a transmittance of 1e-3 (official: 1e-2 when rendering), and an
+    iteration's rays come from ``images_per_iteration`` images.
 
-    Moments in training (``..._from``) are on the scale of ``schedule_length`` and mapped to the budget at hand.
+    Iterations (``..._from``) are on the scale of ``schedule_length`` and mapped to the budget.
 
     Attributes
     ----------
@@ -53,9 +53,8 @@ class InstaConfig:
         triangle belongs to the mouth. Elsewhere it receives ones.
     density_bias, prior_depth, prior_scale : float
         The logarithm of the density per metre is offset by ``density_bias - min(distance /
-        prior_scale, prior_depth)``, with the distance from the mesh in metres. Not published (0
-        there): a short run cannot find the surface in its time, and so starts with a density that is
-        highest at the mesh.
+        prior_scale, prior_depth)``, with the distance from the mesh in metres. Not published (0 there): a short run
+        cannot find the surface, so it starts with a density that is highest at the mesh.
     step : float
         Metres between samples of a ray.
     shell_outside, shell_inside : float
@@ -148,7 +147,7 @@ class InstaConfig:
             raise ValueError(f"level_features must be 1, 2, 4 or 8, found {self.level_features}")
         if not 1 <= self.log2_table <= 24:
             raise ValueError(f"log2_table must lie between 1 and 24, found {self.log2_table}")
-        # An avatar's settings come from a file: none may ask for more memory than any use of it needs.
+        # Settings of an avatar come from a file, so these limits bound memory.
         for name, most in MOST.items():
             if getattr(self, name) > most:
                 raise ValueError(f"{name} must be at most {most}, found {getattr(self, name)}")

@@ -18,7 +18,7 @@ from .config import InstaConfig
 
 SH_DEGREE = 3  # 16 basis functions; the published program calls that degree 4
 DIRECTIONS = (SH_DEGREE + 1) ** 2
-LOG_DENSITY_MAX = 15.0  # of its gradient, as published; keeps a sample's thickness finite
+LOG_DENSITY_MAX = 15.0  # limit of its gradient, as published; keeps a sample's thickness finite
 
 Parameters = Mapping[str, Tensor]
 
@@ -43,7 +43,7 @@ class Prior(NamedTuple):
 
     @classmethod
     def of(cls, config: InstaConfig) -> Prior:
-        """The prior of a configuration."""
+        """The density prior of a configuration."""
         return cls(config.density_bias, config.prior_depth, config.prior_scale)
 
     def __call__(self, distances: Tensor) -> Tensor:
@@ -111,7 +111,7 @@ class RadianceField:
 
 
 class _BoundedExp(torch.autograd.Function):
-    """exp with a bounded argument; the gradient keeps flowing at the bound, so that nothing gets stuck there."""
+    """exp with a bounded argument; the gradient is not cut at the bound, so values can leave it."""
 
     @staticmethod
     def forward(ctx, values: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
@@ -141,15 +141,15 @@ class Level(NamedTuple):
 def make_levels(count: int, base: int, finest: int, log2_table: int) -> tuple[Level, ...]:
     """Levels whose resolutions grow geometrically from ``base`` to ``finest``.
 
-    A level has one row per sample, rounded up to 8, as long as that is no more than ``2**log2_table``; beyond that
-    rows are shared by a hash. Sizes are those of the published program, which shifts positions by half a cell and so
-    reads the samples of the last half cell from the other side; here the first sample lies at 0.
+    A level has one row per sample, rounded up to 8, if that is at most ``2**log2_table``; otherwise rows are shared by
+    a hash. Sizes are those of the published program, which shifts positions by half a cell and so reads the samples of
+    the last half cell from the other side; here the first sample lies at 0.
     """
     growth = (math.log2(finest) - math.log2(base)) / (count - 1) if count > 1 else 0.0
     levels, first = [], 0
     for number in range(count):
         scale = base * 2 ** (number * growth) - 1
-        # The last level's scale is a whole number up to rounding, which must not add a sample.
+        # The last level's scale is an integer up to rounding, which must not add a sample.
         resolution = math.ceil(scale - 1e-6) + 1
         rows = min(-(-(resolution**3) // 8) * 8, 2**log2_table)
         levels.append(Level(scale, resolution, first, rows))
@@ -166,7 +166,7 @@ def table_rows(levels: Sequence[Level]) -> int:
 def encode(table: Tensor, positions: Tensor, levels: Sequence[Level]) -> Tensor:
     """(N, levels * features) values at (N, 3) positions in [0, 1]: trilinear sums of eight rows on every level.
 
-    Compiled, only the (rows, features) table receives a gradient, and the type of the table counts.
+    In the compiled form, only the (rows, features) table receives a gradient, and its dtype selects the precision.
     """
     corners = torch.tensor([[c >> axis & 1 for axis in range(3)] for c in range(8)], device=positions.device)
     parts = []
@@ -215,7 +215,7 @@ class _Encode(torch.autograd.Function):
         return None, by_table, None
 
 
-BLOCK = 2048  # rows; their activations fit a core's second-level cache
+BLOCK = 2048  # rows per block; their activations fit a core's second-level cache
 
 
 def layer_shapes(inputs: int, hidden: int, layers: int, outputs: int) -> list[tuple[int, int]]:

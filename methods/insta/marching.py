@@ -1,4 +1,4 @@
-"""The mesh as the field's guide: which samples of a ray lie near it, and where they are in canonical space."""
+"""Samples of rays near the mesh, and their positions in canonical space."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .warp import Blend, Found, Variant, blended, canonical_from_posed, first_hi
 Backend = Literal["auto", "kernel", "reference"]
 FREE_MAX = 255
 STRETCH_MAX = 2.0
-"""Factor on the search distance for density if a pose stretches the mesh."""
+"""Factor on the search distance for density, for poses that stretch the mesh."""
 
 
 class Rays(NamedTuple):
@@ -46,7 +46,7 @@ class Samples(NamedTuple):
     rays: np.ndarray  # (N,) int32
     indices: np.ndarray  # (N,) int32 numbers k of the samples
     triangles: np.ndarray  # (N,) int32
-    next: np.ndarray  # (R,) int32, k to go on at; -1 for a ray that has left the surface behind
+    next: np.ndarray  # (R,) int32, next k; -1 for a ray that has passed the surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +58,13 @@ class Space:
     cell: float  # size of its cubic cells, metres
     free: (
         np.ndarray
-    )  # (X, Y, Z) uint8, cells to the nearest occupied one along the axis where that is most; 0 in one
+    )  # (X, Y, Z) uint8, Chebyshev distance to the nearest occupied cell, in cells; 0 in occupied ones
 
     @classmethod
     def of(cls, reach: np.ndarray, low: np.ndarray, cell: float, occupied: np.ndarray) -> Space:
-        """The space of (X, Y, Z) bool of occupied cells."""
+        """The space for an (X, Y, Z) bool array of occupied cells."""
         away = distance_transform_cdt(np.logical_not(occupied), metric="chessboard")
-        # Where nothing is occupied at all there is no distance.
+        # Without occupied cells there is no distance.
         free = np.where(away < 0, FREE_MAX, away.clip(0, FREE_MAX)).astype(np.uint8)
         return cls(reach, low, cell, free)
 
@@ -75,9 +75,10 @@ class Space:
 
 
 class CanonicalSurface:
-    """The canonical mesh of a subject, (V, 3) metres, and what all its poses share.
+    """The canonical mesh of a subject, (V, 3) metres, and data shared by all its poses.
 
-    Backend "kernel" is compiled, "reference" tries every triangle in torch; "auto" takes what there is.
+    Backend "kernel" is compiled, "reference" tests every triangle in torch; "auto" selects the kernel if it is
+    installed.
     """
 
     def __init__(
@@ -115,7 +116,7 @@ class PosedSurface:
 
     @property
     def bytes(self) -> int:
-        """Memory, nearly: matrices, corners twice in the kernel, boxes."""
+        """Approximate memory: matrices, corners (twice in the kernel), boxes."""
         return 4 * (self.matrices.numel() + 4 * self.corners.numel())
 
     def nearest(self, points: np.ndarray) -> Found:
@@ -148,19 +149,19 @@ class PosedSurface:
         return Samples(*self.surface.module.march(self.guide(space), *how))
 
     def reach(self, space: Space) -> np.ndarray:
-        """(F,) float32 metres from each triangle of this pose within which the space has density; negative for none."""
+        """(F,) float32 maximum distance of density from each triangle of this pose, metres; negative for none."""
         return np.asarray(space.reach / self._shrinking, dtype=np.float32)
 
     @cached_property
     def _shrinking(self) -> np.ndarray:
-        """(F,) canonical metres for each of this pose around a triangle: the smallest scale blended there, up to 1."""
+        """(F,) canonical metres per metre of this pose around a triangle: the smallest scale blended there, at most 1."""
         scale = (torch.linalg.vector_norm(self.matrices[:, :, :3], dim=(1, 2)) / math.sqrt(3)).numpy()
         neighbours = self.surface.blend.neighbours
         across = np.where(neighbours >= 0, neighbours, np.arange(len(scale))[:, None])
         return np.asarray(np.minimum(scale, scale[across].min(1)).clip(1 / STRETCH_MAX, 1))
 
     def guide(self, space: Space) -> Any:
-        """The kernel's view of this pose and a space; the last one is kept. Needs the kernel."""
+        """The kernel's data of this pose and a space; the last one is cached. Needs the kernel."""
         if self._guide is None or self._guide[0] is not space:
             blend = self.surface.blend
             posed = (self.reach(space), _array(self.matrices.float()), _array(self.centroids.float()))
@@ -173,7 +174,7 @@ class PosedSurface:
     def _march_reference(
         self, rays: Rays, first: np.ndarray, step: float, samples_max: int, space: Space
     ) -> Samples:
-        """Reference implementation of the kernel: every sample that is not behind the mesh, its nearest triangle of all."""
+        """Reference implementation of the kernel: tests every triangle for every sample that is not behind the mesh."""
         low, high = self.vertices.min(0).values.numpy(), self.vertices.max(0).values.numpy()
         reach = self.reach(space)
         padding = max(float(reach.max()), 0.0)
@@ -237,7 +238,7 @@ def _array(values: Tensor) -> np.ndarray:
 def canonical_surface(
     head: HeadAsset, mesh: SubjectMesh, config: InstaConfig, backend: Backend = "auto"
 ) -> CanonicalSurface:
-    """The canonical surface of a subject; ``mesh`` lies on the CPU."""
+    """The canonical surface of a subject; ``mesh`` is on the CPU."""
     still, jaw = np.zeros(3), np.array([config.jaw_opening, 0, 0])
     pose = HeadPose(mesh.version, np.zeros(mesh.model.expression_size), still, still, jaw, np.zeros(6), still)
     vertices = mesh.posed(mesh.arguments([pose]))

@@ -1,6 +1,6 @@
 """Occupied cells of canonical space, and their maximum distance from each triangle.
 
-Instant NGP's grid (Mueller et al. 2022, appendix E.2), kept to the cells near the canonical mesh.
+Instant NGP's grid (Mueller et al. 2022, appendix E.2), limited to the cells near the canonical mesh.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ CELLS_AT_ONCE = 1 << 16
 class Occupancy:
     """A grid over the box around the canonical mesh and its shell.
 
-    Only cells near the mesh (``candidates``) are ever occupied; at the start all of them are.
+    Only cells near the mesh (``candidates``) can be occupied; initially all of them are.
     """
 
     def __init__(self, surface: CanonicalSurface, config: InstaConfig):
@@ -41,7 +41,7 @@ class Occupancy:
         self._neighbours = surface.blend.neighbours
 
     def box(self, device: str) -> EncodedCube:
-        """The cube that the encoding covers."""
+        """The cube covered by the encoding."""
         return EncodedCube(torch.from_numpy(self.low).to(device), float(self.cell * self.size.max()))
 
     @property
@@ -66,7 +66,7 @@ class Occupancy:
         *,
         whole: bool,
     ) -> None:
-        """Replace values by the larger of their decayed selves and the density at a random point of the cell.
+        """Replace values by the maximum of the decayed value and the density at a random point of the cell.
 
         Parameters
         ----------
@@ -115,10 +115,10 @@ class Occupancy:
         return np.concatenate(parts) if parts else np.empty(0, np.float32)
 
     def reach(self, chosen: np.ndarray) -> np.ndarray:
-        """(F,) metres from each triangle within which there are cells of the (n,) ``chosen`` candidates.
+        """(F,) maximum distance of cells of the (n,) ``chosen`` candidates from each triangle, metres.
 
-        A cell counts for the triangles nearest to its centre and to its corners, and for those around them as far as
-        the cell's diagonal goes. Negative where there are none.
+        A cell counts for the triangles nearest to its centre and to its corners, and for those around them within the
+        cell's diagonal. Negative without such cells.
         """
         reach = np.full(len(self._neighbours), -1.0, np.float32)
         farthest = self._distances[chosen] + 0.5 * math.sqrt(3) * self.cell
@@ -134,12 +134,12 @@ class Occupancy:
         return {"values": torch.from_numpy(self.values.copy())}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` gave."""
+        """Restore what `state` returned."""
         self.values = state["values"].cpu().numpy().copy()
 
 
 def occupied_space(occupancy: Occupancy, cells: np.ndarray) -> Space:
-    """The space of (n,) flat numbers of occupied cells, of which candidates alone count."""
+    """The space for (n,) flat indices of occupied cells; only candidates count."""
     chosen = np.flatnonzero(np.isin(occupancy.candidates, cells))
     grid = np.zeros(int(np.prod(occupancy.size)), bool)
     grid[occupancy.candidates[chosen]] = True
@@ -149,7 +149,7 @@ def occupied_space(occupancy: Occupancy, cells: np.ndarray) -> Space:
 def _cells_near(
     surface: CanonicalSurface, low: np.ndarray, cell: float, size: np.ndarray, config: InstaConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Flat numbers, nearest triangles and distances of the cells within the shell, by their centres."""
+    """Flat indices, nearest triangles and distances of the cells with their centres in the shell."""
     numbers = np.arange(int(np.prod(size)))
     normals = np.cross(
         surface.rest.corners[:, 1] - surface.rest.corners[:, 0],
@@ -190,7 +190,7 @@ def _probes(
 
 
 def _dilation_rounds(surface: CanonicalSurface, cell: float) -> int:
-    """Steps across edges that cover a cell's diagonal, half an edge each."""
+    """Number of steps across edges, half an edge each, that cover a cell's diagonal."""
     corners = surface.rest.corners.numpy()
     edge = float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))
     return 1 + math.ceil(2 * math.sqrt(3) * cell / max(edge, 1e-6))

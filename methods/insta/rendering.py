@@ -1,4 +1,4 @@
-"""Rays through the field: marched in rounds, so that what is hidden is not evaluated."""
+"""Rays through the field, marched in rounds so that hidden samples are not evaluated."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .marching import PosedSurface, Rays, Space
 
 @dataclass(frozen=True, eq=False)
 class PosedRays:
-    """One pose of the head with rays into it."""
+    """One pose of the head and its rays."""
 
     surface: PosedSurface
     condition: Tensor  # (K,) leading expression coefficients
@@ -25,12 +25,12 @@ class PosedRays:
 
 
 class Rendered(NamedTuple):
-    """Rays of all scenes, in the order of the scenes."""
+    """Results of the rays of all scenes, in the order of the scenes."""
 
-    color: Tensor  # (R, 3) not yet composited on anything
+    color: Tensor  # (R, 3) not composited on a background
     transmittance: Tensor  # (R,)
     distance: Tensor  # (R,) metres, weighted by opacity
-    opacity_sum: Tensor  # scalar, opacities of all samples added up
+    opacity_sum: Tensor  # scalar, sum of the opacities of all samples
     samples: int
 
 
@@ -52,12 +52,12 @@ def render_rays(
 ) -> Rendered:
     """March the rays of several poses together; differentiable in the parameters.
 
-    Where the nearest triangle is one of the (F,) bool ``mouth`` the density depends on the expression.
+    The density depends on the expression if the nearest triangle is one of the (F,) bool ``mouth``.
     """
     device = parameters["table"].device
     counts = [len(scene.rays.origins) for scene in scenes]
     total = sum(counts)
-    # The last row is what the density network sees outside the mouth.
+    # The last row is the condition of the density network outside the mouth.
     width = field.architecture.conditions
     conditions = torch.ones(len(scenes) + 1, width, device=device, dtype=parameters["table"].dtype)
     for number, scene in enumerate(scenes):
@@ -113,16 +113,16 @@ class Composite(NamedTuple):
     """Result of compositing along rays."""
 
     color: Tensor  # (R, C) weighted sums of the samples' values
-    transmittance: Tensor  # (R,) what is left of the light behind
+    transmittance: Tensor  # (R,) transmittance behind the last sample
     distance: Tensor  # (R,) weighted sums of the samples' distances, metres
 
 
 def composite(
     thickness: Tensor, values: Tensor, distances: Tensor, rays: Tensor, entering: Tensor
 ) -> Composite:
-    """Sums over samples of ``T (1 - exp(-thickness)) value``, T the transmittance in front of a sample.
+    """Sums over samples of ``T (1 - exp(-thickness)) value`` with the transmittance T in front of a sample.
 
-    Optical depths are summed in float64, since a ray's are differences of a sum over all rays.
+    Optical depths are summed in float64, since those of a ray are differences of a sum over all rays.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def camera_rays(camera: Camera, columns: np.ndarray, rows: np.ndarray, jitter: n
 
 
 def pixels_of_hull(camera: Camera, points: FloatArray) -> Region:
-    """Pixels outside of which no ray meets the convex hull of (N, 3) points; the whole image if any is behind."""
+    """Box of the pixels whose rays may hit the convex hull of (N, 3) points; the whole image if a point is behind the camera."""
     transform = np.asarray(camera.world_to_camera, np.float64)
     seen = np.asarray(points, np.float64) @ transform[:3, :3].T + transform[:3, 3]
     if seen[:, 2].min() <= 1e-6:
@@ -179,13 +179,13 @@ def pixels_of_hull(camera: Camera, points: FloatArray) -> Region:
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
-BLOCK = 4  # pixels on a side: as many rays as the kernel marches together
+BLOCK = 4  # pixels on a side; a block has as many rays as the kernel marches together
 
 
 def pixels_by_blocks(region: Region, most: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Rows and columns of a region's pixels, square block by block, up to about ``most`` (or a row of blocks) at a time.
+    """Rows and columns of a region's pixels by square blocks, up to about ``most`` (or a row of blocks) at a time.
 
-    Blocks at the right and at the bottom are whole and may lie beyond the region.
+    Blocks at the right and at the bottom are whole and may extend beyond the region.
     """
     left, top, right, bottom = region
     columns = left + np.arange(-(-max(right - left, 0) // BLOCK) * BLOCK)

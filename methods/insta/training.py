@@ -1,4 +1,4 @@
-"""Training of the field: rays of several images, adapted in number to the samples they cost."""
+"""Training of the field on rays of several images; their number is adapted to the number of samples."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RAYS_MIN, RAYS_MAX = 64, 1 << 18
 
 
 class Batch(NamedTuple):
-    """Rays of one iteration and what they should see."""
+    """Rays of one iteration and their targets."""
 
     scenes: list[PosedRays]
     image: Tensor  # (R, 3) in [0, 1]
@@ -36,7 +36,7 @@ class Batch(NamedTuple):
 
 
 class InstaTraining:
-    """A `Trainable`. The loop's index names the first image of an iteration; the others are drawn beside it."""
+    """A `Trainable`. The loop's index is the first image of an iteration; the others are drawn at random."""
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class InstaTraining:
         return {name: mean / missing for name, mean in self._mean.items()}
 
     def begin(self, timeline: Timeline) -> None:
-        """Fit schedules to the length of the run."""
+        """Scale schedules to the length of the run."""
         self._timeline = timeline
 
     def loss(self, iteration: int, index: int) -> Tensor:
@@ -104,7 +104,7 @@ class InstaTraining:
         batch = self._batch(iteration, index)
         rendered = self.render(batch.scenes)
         drawn = numpy_generator(self._seed, "backgrounds", iteration).random((len(batch.image), 3))
-        # Without a mask the recorded background is part of the picture and has to be rendered as it is.
+        # Without a mask the recorded background is part of the image and has to be rendered.
         random = torch.from_numpy(drawn.astype(np.float32))
         background = random if self._masked else self._ground.expand_as(random)
         target = target_colors(batch.image, batch.coverage, self._ground, background, config)
@@ -113,7 +113,7 @@ class InstaTraining:
         weighted = iteration >= self._timeline.at(config.mouth_from)
         weights = torch.where(batch.mouth & weighted, config.mouth_weight, 1.0)
         loss = color_loss(color, target.to(device), weights.to(device), config.huber)
-        if not rendered.samples:  # all rays passed the head by: nothing to learn, but no error either
+        if not rendered.samples:  # no ray hits the head: nothing to learn, and no error
             loss = loss + 0.0 * self._optimiser[self._names[-1]].sum()
         if config.opacity_weight:
             loss = loss + config.opacity_weight * rendered.opacity_sum / len(batch.image)
@@ -123,12 +123,12 @@ class InstaTraining:
         return loss
 
     def render(self, scenes: Sequence[PosedRays]) -> Rendered:
-        """March rays through the field as it is."""
+        """March rays through the current field."""
         parameters = {name: self._optimiser[name] for name in self._names}
         return render_rays(self.field, parameters, scenes, self._space, self.mouth, self._marching)
 
     def after_backward(self, iteration: int) -> None:
-        """Weight decay, running mean, learning rate, number of rays, and the occupancy grid when it is due."""
+        """Update weight decay, running mean, learning rate, number of rays, and the occupancy grid when it is due."""
         config = self._config
         with torch.no_grad():
             for name in self._names:
@@ -141,7 +141,7 @@ class InstaTraining:
         for name in self._names:
             self._optimiser.set_learning_rate(name, decay * config.learning_rate)
         wanted = self._rays * config.samples_per_iteration / max(self._seen, 1)
-        # By no more than half at once: an iteration may have met little by chance.
+        # By at most half at once, since an iteration may have few samples by chance.
         self._rays = int(np.clip(wanted, max(self._rays / 2, RAYS_MIN), min(self._rays * 1.5, RAYS_MAX)))
         if iteration % config.occupancy_every == 0:
             self._refresh(iteration)
@@ -157,7 +157,7 @@ class InstaTraining:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` gave."""
+        """Restore what `state` returned."""
         self._optimiser.load_state(state["optimiser"])
         self._mean = {name: state["mean"][name].to(self._device) for name in self._names}
         self._steps, self._rays = state["steps"], state["rays"]
@@ -165,7 +165,7 @@ class InstaTraining:
         self._space = self.occupancy.space()
 
     def note(self) -> str:
-        """Rays, and how much of the grid is occupied."""
+        """Number of rays, and occupied fraction of the grid."""
         return f"{self._rays} rays; {self.occupancy.occupied.mean():.0%} of the shell"
 
     def _refresh(self, iteration: int) -> None:
@@ -194,7 +194,7 @@ class InstaTraining:
         key = self.keys[index]
         camera, pose = self._clip.cameras[key.camera], self._clip.poses[key.timestep]
         surface = self._poses(self._alike.setdefault(pose_key(pose), key.timestep))
-        # Beyond these pixels nothing can be rendered, and no gradient comes of them.
+        # Other pixels cannot show the head and have no gradient.
         corners = box_corners(surface.vertices.numpy(), max(float(surface.reach(self._space).max()), 0.0))
         left, top, right, bottom = pixels_of_hull(camera, corners)
         columns = generator.integers(left, max(right, left + 1), count).clip(0, camera.width - 1)
@@ -237,7 +237,7 @@ COLOR_PART = 0.2  # the published program divides the Huber loss by 5
 def color_loss(color: Tensor, target: Tensor, weights: Tensor, huber: float) -> Tensor:
     """Weighted mean over (R,) rays of the Huber loss of (R, 3) colours: square below ``huber``, linear above.
 
-    Channels are added up, as in the published program, which hands each its own gradient.
+    Channels are summed, as in the published program, which gives each its own gradient.
     """
     each = torch.nn.functional.huber_loss(color, target, delta=huber, reduction="none") / huber
     return COLOR_PART * (weights * each.sum(1)).mean()
@@ -252,7 +252,7 @@ def depth_loss(distance: Tensor, target: Tensor) -> Tensor:
 def target_colors(
     image: Tensor, coverage: Tensor, recorded_on: Tensor, background: Tensor, config: InstaConfig
 ) -> Tensor:
-    """Colours of (R, 3) pixels, (R, 1) covered, on another background than the one they were recorded on."""
+    """Colours of (R, 3) pixels with (R, 1) coverage on another background than the recorded one."""
     if config.target_variant == "official":
         own = (image - (1 - coverage) * recorded_on).clamp(0, 1) / coverage.clamp_min(1 / 255)
         mixed = coverage * to_linear(own.clamp(0, 1)) + (1 - coverage) * to_linear(background)

@@ -13,7 +13,7 @@ from ...bench.contracts import HeadAsset, IntArray
 
 FALLOFF = 4.0  # per metre
 OFFICIAL_OWN_FALLOFF = 1.0
-SCALE_LIMIT = 4.0  # a triangle that an extreme pose collapses must not throw its points out of the box
+SCALE_LIMIT = 4.0  # limits points at triangles that an extreme pose collapses
 ALONE = -1.0
 
 Variant = Literal["paper", "official"]
@@ -21,17 +21,17 @@ Variant = Literal["paper", "official"]
 
 @dataclass(frozen=True, eq=False)
 class Blend:
-    """Whose transforms carry a point, with weights exp(-falloff distance to the centroid)."""
+    """Triangles whose transforms are blended at a point, with weights exp(-falloff distance to the centroid)."""
 
     neighbours: IntArray  # (F, 3) int32 triangles across the edges, -1 at a border
     own_falloff: np.ndarray  # (F,) float32 per metre; negative: the nearest triangle's transform alone
     neighbour_falloff: np.ndarray  # (F,) float32 per metre
     scaled: np.ndarray  # (F,) bool, whether the ratio of areas scales the transform
-    root: bool  # whether it is the root of that ratio
+    root: bool  # whether the scale is the square root of that ratio
 
     @classmethod
     def of(cls, head: HeadAsset, variant: Variant) -> Blend:
-        """The blend of a head, as the paper or as the authors' code has it."""
+        """The blend of a head, according to the paper or to the authors' code."""
         faces = np.asarray(head.faces)
         count = len(faces)
         neighbours = edge_neighbours(faces)
@@ -46,7 +46,7 @@ class Blend:
 
 
 def touching(head: HeadAsset, region: str) -> np.ndarray:
-    """(F,) bool: triangles with a vertex in a region; none where the head does not know the region."""
+    """(F,) bool: triangles with a vertex in a region; none if the head lacks the region."""
     inside = np.zeros(len(head.template), bool)
     inside[np.asarray(head.regions.get(region, ()), dtype=np.int64)] = True
     return np.asarray(inside[np.asarray(head.faces)].any(1))
@@ -55,7 +55,7 @@ def touching(head: HeadAsset, region: str) -> np.ndarray:
 def edge_neighbours(faces: IntArray) -> IntArray:
     """(F, 3) int32: the triangle across each edge (corners 0-1, 1-2, 2-0), -1 at a border.
 
-    Where more than two triangles share an edge, each has the next of them in order as its neighbour.
+    If more than two triangles share an edge, the neighbour of each is the next one in order.
     """
     faces = np.asarray(faces, dtype=np.int64)
     edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
@@ -93,7 +93,7 @@ def areas(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def canonical_from_posed(canonical: Tensor, posed: Tensor, faces: Tensor, blend: Blend) -> Tensor:
-    """(F, 3, 4) transforms that carry each posed triangle's surroundings to its canonical place; (V, 3) metres."""
+    """(F, 3, 4) transforms from the surroundings of each posed triangle to canonical space; (V, 3) metres."""
     target, source = triangle_bases(canonical, faces), triangle_bases(posed, faces)
     ratio = areas(canonical, faces) / areas(posed, faces).clamp_min(1e-12)
     scale = (ratio.sqrt() if blend.root else ratio).clamp(1 / SCALE_LIMIT, SCALE_LIMIT)
@@ -104,7 +104,7 @@ def canonical_from_posed(canonical: Tensor, posed: Tensor, faces: Tensor, blend:
 
 
 def blended(points: Tensor, triangles: Tensor, matrices: Tensor, centroids: Tensor, blend: Blend) -> Tensor:
-    """(N, 3, 4) transform of each point by its (N,) nearest triangle and that one's neighbours."""
+    """(N, 3, 4) transform of each point, blended over its (N,) nearest triangle and the neighbours of that triangle."""
     neighbours = torch.as_tensor(blend.neighbours, device=points.device).long()[triangles]
     own_falloff = torch.as_tensor(blend.own_falloff, device=points.device)[triangles].to(points)
     falloff = torch.as_tensor(blend.neighbour_falloff, device=points.device)[triangles].to(points)
@@ -125,7 +125,7 @@ def _unit(vectors: Tensor) -> Tensor:
 
 
 PAIRS_AT_ONCE = 1 << 22
-TIE, TIE_FLOOR = 2e-6, 1e-16  # squared distances that differ by no more than this are equal
+TIE, TIE_FLOOR = 2e-6, 1e-16  # squared distances within this are equal
 
 
 class Found(NamedTuple):
@@ -138,8 +138,8 @@ class Found(NamedTuple):
 def nearest_triangles(points: Tensor, corners: Tensor) -> Found:
     """Nearest of (F, 3, 3) triangles to each of (N, 3) points, with its squared distance.
 
-    Of equally near ones (a shared edge or corner) that whose plane is farthest is taken, which parts the space
-    around a convex edge along its bisector.
+    Of equally near triangles (a shared edge or corner) the one whose plane is farthest is selected, which divides the
+    space around a convex edge along its bisector.
     """
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = torch.nn.functional.normalize(normals, dim=-1, eps=torch.finfo(normals.dtype).tiny)
@@ -172,7 +172,7 @@ def squared_distances(points: Tensor, corners: Tensor) -> Tensor:
 
 
 def first_hits(origins: Tensor, directions: Tensor, corners: Tensor) -> Found:
-    """First triangle that each ray hits at a distance above 0, from either side (Moeller and Trumbore, 1997)."""
+    """First triangle hit by each ray at a distance above 0, from either side (Moeller and Trumbore, 1997)."""
     ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     triangles = torch.full((len(origins),), -1, dtype=torch.int64, device=origins.device)
     values = torch.full((len(origins),), torch.inf, dtype=origins.dtype, device=origins.device)
@@ -207,11 +207,11 @@ HAIR = ("hair", "scalp", "boundary")
 
 
 def mouth_triangles(head: HeadAsset) -> Tensor:
-    """(F,) bool: lips and what the head has inside the mouth."""
+    """(F,) bool: lips and the inside of the mouth."""
     return torch.from_numpy(np.logical_or.reduce([touching(head, region) for region in MOUTH]))
 
 
 def bare_triangles(head: HeadAsset) -> Tensor:
-    """(F,) bool: where the mesh is the visible surface; hair stands off it, and the boundary is cut."""
+    """(F,) bool: triangles that are the visible surface, without hair, neck and boundary."""
     hair = np.logical_or.reduce([touching(head, region) for region in HAIR])
     return torch.from_numpy(~hair | touching(head, "face"))

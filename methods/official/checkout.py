@@ -1,4 +1,4 @@
-"""The authors' checkout and interpreter: looked at before any long work."""
+"""Validation of the authors' checkout and interpreter before any long work."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .process import environment
 
 SHORTEST_COMMIT = 7
 PROBE_S = 300.0
-"""Seconds that the interpreter has to import the modules that are asked of it; the first time they come from disk."""
+"""Time limit for the interpreter to import the required modules, seconds; the first import reads them from disk."""
 MOST_SOURCE = 2**22
 
 SHIM = "headbench.methods.official.shim.cpu"
@@ -30,7 +30,7 @@ SHIMMED = (
     *("diff_gaussian_rasterization", "simple_knn", "nvdiffrast"),
     *("pytorch3d", "point_cloud_utils", "torch.utils.tensorboard"),
 )
-"""Packages and modules that the shim stands in for."""
+"""Packages and modules that the shim replaces."""
 
 _PROBE = """
 import importlib, json, sys
@@ -73,7 +73,7 @@ class Repository:
     trial : str
         A statement that its interpreter must execute, or "", and the remedy if it fails.
     downloads : Mapping[str, str]
-        Files that the authors distribute separately and expect in it, with their sources.
+        Files that the authors distribute separately and expect in the checkout, with their sources.
     """
 
     url: str
@@ -87,7 +87,7 @@ class Repository:
 
 @dataclass(frozen=True)
 class Checkout:
-    """A checkout that was looked at.
+    """A validated checkout.
 
     Attributes
     ----------
@@ -107,11 +107,11 @@ class Checkout:
 
 
 def find_constant(folder: Path, file: str, pattern: str, what: str) -> str:
-    """A value that stands in a source file of a checkout; see `Checkout.constant`."""
+    """A value in a source file of a checkout; see `Checkout.constant`."""
     path = folder / file
     match = re.search(pattern, read_bytes(path, "a source file", MOST_SOURCE).decode(errors="replace"))
     if match is None:
-        remedy = "Check out the commit that this adapter was written for."
+        remedy = "Check out the commit that the adapter was written for."
         raise InputError(path, what, f"a line like {pattern}", "none", remedy)
     return match[1]
 
@@ -130,7 +130,7 @@ def inspect_interpreter(method: str, config: OfficialConfig, repository: Reposit
 
 
 def inspect_program(method: str, config: INSTAOfficialConfig, repository: Repository) -> Environment:
-    """Command and version of the program that a build leaves in the checkout, and a GPU; see `look`."""
+    """Command and version of the program built in the checkout; also checks for a GPU; see `look`."""
     source = f"settings.{method}.program"
     try:
         words = shlex.split(config.program)
@@ -152,9 +152,7 @@ def inspect_program(method: str, config: INSTAOfficialConfig, repository: Reposi
     match = re.search(r"neural graphics primitives version (\S{1,40})", said)
     if match is None:
         found = " ".join(said.split())[-200:] or "no answer"
-        raise InputError(
-            program, source, "an answer to --version, as the authors' program gives", found, built
-        )
+        raise InputError(program, source, "the answer of the authors' program to --version", found, built)
     devices = re.search(r"headbench-devices (\d+)", _answer([sys.executable, "-c", _DEVICES], source))
     if devices is None or devices[1] == "0":
         remedy = "Run it on a machine with an NVIDIA GPU."
@@ -189,10 +187,10 @@ def inspect_checkout(
     repository: Repository,
     environment: Callable[[], Environment] | None = None,
 ) -> Checkout:
-    """Check the settings of a method: folder, commit, what runs its code, what that can import, and a GPU.
+    """Check the settings of a method: folder, commit, interpreter or program, importable modules, and GPU.
 
-    ``environment`` looks at what runs the code; None takes `inspect_interpreter`. Raises `InputError` that names the
-    setting and the next step for the first that is not as it should be.
+    ``environment`` checks what runs the code; None uses `inspect_interpreter`. Raises `InputError` with the setting
+    and the next step for the first failed check.
     """
     folder, record = inspect_folder(method, config, repository)
     python, versions = environment() if environment else inspect_interpreter(method, config, repository)
@@ -202,7 +200,7 @@ def inspect_checkout(
 def inspect_folder(
     method: str, config: OfficialConfig, repository: Repository
 ) -> tuple[Path, dict[str, Any]]:
-    """The checkout, and its commit and changes; see `look`."""
+    """The checkout with its commit and changes; see `look`."""
     source, commit = f"settings.{method}", config.commit
     remedy = (
         f"git clone --recursive {repository.url} DIR && git -C DIR checkout {repository.commit[:12]}; then --set "
@@ -231,10 +229,10 @@ def inspect_folder(
         raise InputError(source, "commit", expected, repr(commit)[:60])
     found, changed = _commit(folder)
     if commit and not found.startswith(commit):
-        what = "a folder that git does not know" if not found else f"commit {found[:12]}"
+        what = "a folder that is not a git checkout" if not found else f"commit {found[:12]}"
         step = (
             f"git -C {folder} checkout {commit[:12]}, or --set settings.{method}.commit={found[:12] or chr(39) * 2} "
-            "to take what is there; results then name that."
+            "to use this commit, which results then name."
         )
         raise InputError(folder, f"{source}.commit", f"commit {commit[:12]}", what, step)
     return folder, {"repository": repository.url, "commit": found, **changed}
@@ -257,7 +255,7 @@ def _commit(folder: Path) -> tuple[str, dict[str, Any]]:
 
 
 def _git(folder: Path, *arguments: str) -> str:
-    """Output of git, "" where it fails. Hooks and programs that the checkout's configuration names are not run."""
+    """Output of git, "" if it fails. Hooks and programs named in the checkout's configuration are not run."""
     safe = ("-c", "core.fsmonitor=false", "-c", "core.hooksPath=/dev/null", "-c", f"safe.directory={folder}")
     try:
         done = subprocess.run(
@@ -287,18 +285,18 @@ def _interpreter(method: str, config: OfficialConfig) -> tuple[str, ...]:
         raise InputError(source, "python", "the interpreter that the checkout's code runs in", found, remedy)
     program = shutil.which(
         os.path.expanduser(words[0])
-    )  # a Path would lose the ./ that tells a file from a name
+    )  # a Path would lose the ./ that distinguishes a file from a name
     if program is None:
         raise InputError(
             words[0], f"{source}.python", "a program that can be run", "none of that name", remedy
         )
-    # Not resolved: the interpreter of a virtual environment is a link, and known by where the link is.
+    # Not resolved: the interpreter of a virtual environment is a link, whose location identifies the environment.
     absolute = Path(program) if Path(program).is_absolute() else Path.cwd() / program
     return (str(absolute), *words[1:])
 
 
 def _probed(method: str, python: Sequence[str], repository: Repository, *, cuda: bool) -> dict[str, Any]:
-    """Versions of the interpreter, once it has shown that it can import what the code needs."""
+    """Versions of the interpreter, if it can import what the code needs."""
     source = f"settings.{method}.python"
     program = _PROBE.replace("TRIAL", repository.trial or "pass")
     try:
@@ -332,7 +330,7 @@ def _probed(method: str, python: Sequence[str], repository: Repository, *, cuda:
         raise InputError(python[0], source, expected, found.failed, repository.trial_remedy)
     if cuda and found.cuda is False:
         remedy = "Run it on a machine with an NVIDIA GPU and a CUDA build of PyTorch"
-        remedy += f", or by our renderer: --set settings.{method}.device=cpu-shim."
+        remedy += f", or with headbench's renderer: --set settings.{method}.device=cpu-shim."
         raise InputError(python[0], source, "PyTorch that finds a CUDA device", "none", remedy)
     return {"python": found.python, "torch": found.torch}
 

@@ -1,4 +1,4 @@
-"""Settings that all official methods share. Light: nothing but the standard library is imported."""
+"""Settings shared by all official methods. Light: only the standard library is imported."""
 
 from __future__ import annotations
 
@@ -23,10 +23,9 @@ class OfficialConfig:
     arguments : tuple[str, ...]
         Appended to their training command.
     device : Literal['cuda', 'cpu-shim']
-        Where their code computes. It supports "cuda" only; "cpu-shim" replaces its rasteriser by the
-        CPU renderer of this package and other CUDA code by stand-ins (`shim.cpu`), with headbench's
-        interpreter unless ``python`` names another one that has it. Rows are then labelled
-        "(cpu-shim)" and are not the original's.
+        Device of their code. It supports only "cuda"; "cpu-shim" replaces its rasteriser by the CPU renderer of this
+        package and other CUDA code by stand-ins (`shim.cpu`), with headbench's interpreter unless ``python`` names
+        another one with headbench. Rows are then labelled "(cpu-shim)" and are not results of the original.
     order : Literal['published', 'native']
         Order of the training images: as their code draws them, or as the native method does with the
         same seed, so that both use the same image in each iteration.
@@ -49,30 +48,30 @@ class OfficialConfig:
 
 @dataclass(frozen=True)
 class GAOfficialConfig(OfficialConfig):
-    """GaussianAvatars by its authors' code; the commit is the one that the adapter was written for."""
+    """GaussianAvatars by its authors' code; the default commit is the one that the adapter was written for."""
 
     commit: str = "30cc4bde86b59968c2848934bdd962f410fb63f6"
 
 
 @dataclass(frozen=True)
 class TGAOfficialConfig(OfficialConfig):
-    """The method of `ours` by its authors' code; the commit is the one that the adapter was written for."""
+    """The method of `ours` by its authors' code; the default commit is the one that the adapter was written for."""
 
     commit: str = "828adf5575cfe493907de7cc04ad78aba70bcd10"
 
 
 @dataclass(frozen=True)
 class GBSOfficialConfig(OfficialConfig):
-    """GaussianBlendshapes by its authors' code; the commit is the one that the adapter was written for."""
+    """GaussianBlendshapes by its authors' code; the default commit is the one that the adapter was written for."""
 
     commit: str = "2952da7d246e5790140dbb477d1468214564f092"
 
 
 @dataclass(frozen=True)
 class GHAOfficialConfig(OfficialConfig):
-    """Gaussian Head Avatar by its authors' code; the commit is the one that the adapter was written for.
+    """Gaussian Head Avatar by its authors' code; the default commit is the one that the adapter was written for.
 
-    Their scripts have no options but a configuration file, which is written here, so that ``arguments`` has to be empty.
+    Their scripts take only a configuration file, which is written here, so ``arguments`` must be empty.
 
     Attributes
     ----------
@@ -92,9 +91,9 @@ class GHAOfficialConfig(OfficialConfig):
 
 @dataclass(frozen=True)
 class INSTAOfficialConfig(OfficialConfig):
-    """INSTA by its authors' code; the commit is the one that the adapter was written for.
+    """INSTA by its authors' code; the default commit is the one that the adapter was written for.
 
-    Their code is a program and no Python, so that ``python`` has to be empty.
+    Their code is a compiled program, so ``python`` must be empty.
 
     Attributes
     ----------

@@ -43,7 +43,7 @@ from ..shared.avatar_files import (
     write_record,
     write_subject,
 )
-from ..shared.loop import Fit, Outcome, check_budget, check_training_split
+from ..shared.loop import Fit, TrainingSummary, check_budget, check_training_split
 from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import threads
 from .checkout import Checkout, Environment, Repository, inspect_checkout, inspect_interpreter
@@ -51,13 +51,13 @@ from .config import OfficialConfig
 from .process import ProgramEnd, described, run_program
 
 TRAINING, RENDERING = "training", "rendering"
-"""Folders inside the avatar's: of a training under way, and of frames being rendered. Neither outlives its work."""
+"""Temporary folders inside the avatar's, for training and for rendering."""
 TRAINING_LOG, RENDERING_LOG = "training.log", "rendering.log"
 EXPORTED = "exported.json"
 PLAN, LAUNCHER = "plan.json", Path(__file__).parent / "shim" / "launch.py"
 
 Patch = tuple[str, str, str]
-"""A source file of theirs, a text in it, and what stands there instead when it is run."""
+"""A source file of theirs, a text in it, and its replacement when the file is run."""
 
 INDEX = "index.json"
 
@@ -80,7 +80,7 @@ class Workplace:
 
     @classmethod
     def at(cls, root: Path) -> Workplace:
-        """Input with absolute paths, since the program has another working directory."""
+        """The input folder as an absolute path, since the program has another working directory."""
         return cls(root.absolute())
 
     @property
@@ -114,8 +114,8 @@ class Listed:
 class OfficialMethod(ABC, Generic[Config]):
     """A `CheckedMethod` around an official repository.
 
-    A derived class names its spec and repository, and says how a clip is exported, which commands are run, what of the
-    program's output has to be kept, and where its renders are.
+    A derived class defines spec and repository, export of clips, commands to run, output to keep, and location of
+    renders.
     """
 
     name: ClassVar[str]
@@ -123,9 +123,9 @@ class OfficialMethod(ABC, Generic[Config]):
     config_class: ClassVar[Any]
     repository: ClassVar[Repository]
     shimmed: ClassVar[Literal["", "bound splats", "blendshapes"]] = ""
-    """Which code `shim` has to stand in for things of; "" where it is not made for the repository."""
+    """Kind of code for `shim`; "" if it does not support the repository."""
     variables: ClassVar[Mapping[str, str]] = {}
-    """Variables of the environment that the authors' programs need besides `process.environment`."""
+    """Environment variables of the authors' programs besides `process.environment`."""
 
     def __init__(self, config: Config | None = None):
         self.config: Config = config or self.config_class()
@@ -134,34 +134,34 @@ class OfficialMethod(ABC, Generic[Config]):
 
     @abstractmethod
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
-        """Raise `InputError` for a clip that the repository's code cannot take."""
+        """Raise `InputError` for a clip that the repository's code does not support."""
 
     def check_length(self, iterations: int, checkout: Checkout) -> None:
-        """Raise `InputError` for a run of a length that the repository's code cannot make sense of."""
+        """Raise `InputError` for a length of the run that the repository's code does not support."""
 
     @abstractmethod
     def export(
         self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
     ) -> dict[str, FrameKey]:
-        """Write the training frames in the repository's form; return the key of every image, by place in the input."""
+        """Write the training frames in the repository's format; return the key of every image, by path in the input."""
 
     @abstractmethod
     def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
         """The training command."""
 
     def shrink_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str] | None:
-        """A command, run when training has ended, that leaves out of its output what rendering never reads."""
+        """A command, run after training, that removes data from its output that rendering never reads."""
         return None
 
     @abstractmethod
     def done(self, line: str) -> tuple[int, str] | None:
-        """Iterations done and a few words, where a line of the training's output tells."""
+        """Iterations done and a short status, if a line of the training's output has them."""
 
     @abstractmethod
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
-        """Put what rendering needs of the program's output into the avatar's folder; return more for the record.
+        """Move the output needed for rendering into the avatar's folder; return entries for the record.
 
-        Subject and head model are put beside it.
+        Subject and head model are written beside it.
         """
 
     @abstractmethod
@@ -181,7 +181,7 @@ class OfficialMethod(ABC, Generic[Config]):
         checkout: Checkout,
         work: Workplace,
     ) -> None:
-        """Write the frames to render, in order, in the repository's form."""
+        """Write the frames to render, in order, in the repository's format."""
 
     @abstractmethod
     def render_command(self, folder: Path, checkout: Checkout, work: Workplace) -> list[str]:
@@ -189,7 +189,7 @@ class OfficialMethod(ABC, Generic[Config]):
 
     @abstractmethod
     def drawn(self, line: str) -> int | None:
-        """Frames drawn, where a line of the renderer's output tells."""
+        """Frames drawn, if a line of the renderer's output has their number."""
 
     @abstractmethod
     def render_folder(self, folder: Path, work: Workplace) -> Path:
@@ -197,18 +197,18 @@ class OfficialMethod(ABC, Generic[Config]):
 
     @abstractmethod
     def render_name(self, number: int) -> str:
-        """File name of a render, by its number in the list: the repository's rule."""
+        """File name of a render by its number in the list, according to the repository."""
 
     def is_render(self, name: str) -> bool:
-        """Whether a file beside the renders is one of them: the program may write more into that folder."""
+        """Whether a file in the folder of the renders is one of them, since the program may write other files there."""
         return True
 
     @abstractmethod
     def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
-        """A render as the camera asked for it. Raises `InputError` for one of another size or of another frame."""
+        """A render for its camera. Raises `InputError` for a render of another size or frame."""
 
     def excused(self, ended: ProgramEnd) -> bool:
-        """Whether a renderer that failed has failed after its work was done."""
+        """Whether a failed renderer failed after all frames were rendered."""
         return False
 
     def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
@@ -216,8 +216,7 @@ class OfficialMethod(ABC, Generic[Config]):
         return {"leaks": [], "differences": []}
 
     def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
-        """Texts of their sources that the CPU shim replaces in memory for a training with this number of
-        iterations."""
+        """Texts in their sources that the CPU shim replaces in memory for a training with this number of iterations."""
         return []
 
     def patches_to_render(self, folder: Path, checkout: Checkout) -> list[Patch]:
@@ -225,7 +224,7 @@ class OfficialMethod(ABC, Generic[Config]):
         return []
 
     def patches_for_order(self) -> list[Patch]:
-        """Texts that are replaced where the order of the images is given, in code that draws them without a loader."""
+        """Texts replaced for a given order of the images, in code that draws images without a loader."""
         return []
 
     def image_name(self, path: str) -> str:
@@ -235,11 +234,11 @@ class OfficialMethod(ABC, Generic[Config]):
     # ------------------------------------------------------------------ the method
 
     def check_launch(self) -> None:
-        """Raise `InputError` where the shim, or an order of the images, is asked of code that neither is made for."""
+        """Raise `InputError` if the shim or an order of the images is requested for code that does not support it."""
         asked = {"device": (self.config.device, "cuda"), "order": (self.config.order, "published")}
         for name, (value, only) in asked.items():
             if value != only and not self.shimmed:
-                expected = f"{only}; the shim does not know what this code needs"
+                expected = f"{only}; the shim does not support this code"
                 raise InputError(f"settings.{self.name}", name, expected, value)
 
     def _launched(
@@ -251,7 +250,7 @@ class OfficialMethod(ABC, Generic[Config]):
         patches: Sequence[Patch],
         order: Sequence[str] = (),
     ) -> list[str]:
-        """A command of theirs, by way of our launcher where there is something to do before."""
+        """A command of theirs, run by the launcher if its sources have to be changed."""
         shim = self.config.device != "cuda"
         if not (shim or patches or order):
             return list(command)
@@ -267,7 +266,7 @@ class OfficialMethod(ABC, Generic[Config]):
         return [*python, str(work.root / LAUNCHER.name), str(work.root / PLAN), *script]
 
     def _order(self, fit: Fit, work: Workplace) -> list[str]:
-        """Names of the images that the native method takes with this seed, one for each iteration; empty for theirs."""
+        """Names of the images in the order of the native method with this seed, one for each iteration; empty for their order."""
         if self.config.order == "published":
             return []
         images = read_json(work.root / EXPORTED)["images"]
@@ -281,7 +280,7 @@ class OfficialMethod(ABC, Generic[Config]):
         differences = []
         if self.config.device != "cuda":
             differences.append(
-                "run on a CPU by our renderer in place of their CUDA rasteriser (cpu-shim): not the original"
+                "run on a CPU with headbench's renderer instead of their CUDA rasteriser (cpu-shim): not the original"
             )
         if self.config.order == "native":
             differences.append("images in the order in which the native method draws them with this seed")
@@ -292,11 +291,11 @@ class OfficialMethod(ABC, Generic[Config]):
         return inspect_checkout(self.name, self.config, self.repository, self.inspect_environment)
 
     def inspect_environment(self) -> Environment:
-        """Check what runs their code: an interpreter, by default."""
+        """Check the interpreter or program that runs their code."""
         return inspect_interpreter(self.name, self.config, self.repository)
 
     def check(self, clip: Clip | None, budget: Budget) -> None:
-        """Raise `InputError` for a checkout or an interpreter that is not there, and work that the code cannot do."""
+        """Raise `InputError` for a missing checkout or interpreter, and for a clip or budget that the code does not support."""
         self._checked(clip, budget)
 
     def _checked(self, clip: Clip | None, budget: Budget) -> Checkout:
@@ -304,7 +303,7 @@ class OfficialMethod(ABC, Generic[Config]):
         if budget.iterations is None or budget.seconds is not None:
             remedy = f"--set settings.{self.name}.budget.iterations=N, and no seconds."
             raise InputError(
-                "budget", "seconds", "iterations alone; their code knows no clock", "seconds", remedy
+                "budget", "seconds", "only iterations, since their code has no time limit", "seconds", remedy
             )
         self.check_launch()
         checkout = self.inspect()
@@ -319,9 +318,9 @@ class OfficialMethod(ABC, Generic[Config]):
     ) -> OfficialAvatar:
         """Export the training frames, run the authors' training on them, and keep what rendering needs.
 
-        After a kill the training begins anew, on the export that is there: the repositories' checkpoints lack what it would
-        need to go on as it was. Raises `InputError` before any work for what `check` refuses and a budget in seconds, `ProgramError`
-        where the program fails.
+        After a kill the training restarts on the existing export, since the repositories' checkpoints do not allow an
+        exact continuation. Raises `InputError` before any work for what `check` refuses and for a budget in seconds,
+        and `ProgramError` if the program fails.
         """
         run = run_digest(self.name, self.version, self.config, clip, budget, seed)
         if not is_finished(out, run):
@@ -332,7 +331,7 @@ class OfficialMethod(ABC, Generic[Config]):
         return self.load(out, device=device)
 
     def load(self, path: Path, *, device: str) -> OfficialAvatar:
-        """Read an avatar that `fit` wrote; the checkout is looked at when frames are asked for."""
+        """Read an avatar that `fit` wrote; the checkout is validated when frames are requested."""
         avatar = OfficialAvatar(self, path)
         for file in avatar.files():
             if not file.is_file():
@@ -391,10 +390,10 @@ class OfficialMethod(ABC, Generic[Config]):
         remarks = self.remarks(fit.clip, fit.seed)
         remarks["differences"] += self._of_launch(patches)
         recorded = {**remarks, "official": official, **kept}
-        write_record(fit, Outcome(iterations, iterations, time.monotonic() - start), **recorded)
+        write_record(fit, TrainingSummary(iterations, iterations, time.monotonic() - start), **recorded)
 
     def _export(self, fit: Fit, checkout: Checkout, work: Workplace) -> None:
-        """Write the program's input, or keep the complete one of an earlier call; then compare it with the
+        """Write the program's input, or reuse that of an earlier call if it is complete; then compare it with the
         training split."""
         record = work.root / EXPORTED
         steps = len(fit.clip.splits["train"]) + (fit.budget.iterations or 0)
@@ -421,18 +420,18 @@ class OfficialAvatar:
         self._method, self._folder = method, folder
 
     def files(self) -> Sequence[Path]:
-        """Files of the subject that the authors' program needs to render; the driving signal does not count."""
+        """Files of the subject that the authors' program needs for rendering, without the driving signal."""
         return self._method.files(self._folder)
 
     def shared_files(self) -> Sequence[Path]:
-        """Files that it needs besides, the same for every subject; not their checkout."""
+        """Further files, the same for every subject, without the checkout."""
         return self._method.shared_files(self._folder)
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """Never a single frame: raises `UnavailableError`, see `ListedFrames`."""
+        """Single frames are not supported: raises `UnavailableError`, see `ListedFrames`."""
         raise UnavailableError(
-            f"{self._method.name} renders lists of frames by the authors' program, never one frame on its own.",
-            "The native method of the same paper can be measured so.",
+            f"{self._method.name} renders lists of frames by the authors' program, not single frames.",
+            "Use the native method of the same paper.",
         )
 
     def render_listed(
@@ -441,7 +440,7 @@ class OfficialAvatar:
         background: Sequence[float],
         progress: Progress,
     ) -> Iterator[tuple[FrameKey, Frame]]:
-        """Render frames by the authors' program; give each with its key. See `ListedFrames`."""
+        """Render frames by the authors' program; yield each with its key. See `ListedFrames`."""
         method, folder = self._method, self._folder
         checkout = method.inspect()
         frames = [Listed(number, key, *view) for number, (key, view) in enumerate(views.items())]
@@ -475,7 +474,7 @@ class OfficialAvatar:
 def _read_back(
     method: OfficialMethod[Any], folder: Path, frames: Sequence[Listed], work: Workplace, ended: ProgramEnd
 ) -> Iterator[tuple[FrameKey, Frame]]:
-    """Renders by the names of the index that was written before; all are there and none besides."""
+    """Renders by the names of the index. Raises `InputError` unless these and no others exist."""
     renders = method.render_folder(folder, work)
     index = {name: FrameKey(*key) for name, key in read_json(work.root / INDEX).items()}
     found = {path.name for path in renders.iterdir()} if renders.is_dir() else set()
@@ -495,20 +494,20 @@ def _read_back(
 
 
 def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) -> None:
-    """Prove that the program is given training frames alone.
+    """Verify that the program gets only training frames.
 
-    Every image under the program's folders is one that was exported for a training key, each as often, or a placeholder,
-    which has a single pixel and so shows no frame. `clip` gives no pixels of other frames
-    (`headbench.bench.engine.guard.TrainingView`), so that none can stand under such a name.
+    Every image in the program's folders is one that was exported for a training key, each equally often, or a
+    placeholder, which has a single pixel and shows no frame. `clip` gives no pixels of other frames
+    (`headbench.bench.engine.guard.TrainingView`), so that none can have such a name.
 
-    Raises `InputError` for an image of another frame, one that nobody exported, and one that is gone.
+    Raises `InputError` for an image of another frame, one that was not exported, and a missing one.
     """
     allowed = frozenset(clip.splits["train"])
     for path, key in images.items():
         if key not in allowed:
             raise InputError(work.root / path, str(key), "a training frame", "a held-out one")
     if len(set(Counter(images.values()).values())) > 1:
-        expected, found = "as many images of each training frame", "more of one than of another"
+        expected, found = "as many images of each training frame", "different numbers"
         raise InputError(work.root, "images", expected, found)
     there = {path for path in _files(work) if Path(path).suffix.lower() in _IMAGES}
     there -= {path for path in there - images.keys() if _is_placeholder(work.root / path)}
@@ -523,7 +522,7 @@ def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) ->
 
 
 def write_placeholder(path: Path) -> None:
-    """Write what stands for an image that a loader insists on: one pixel, black and transparent."""
+    """Write a placeholder for an image that a loader requires: one pixel, black and transparent."""
     write_image(path, np.zeros((1, 1, 4), np.uint8))
 
 
@@ -539,14 +538,14 @@ _LOCK = "program.lock"
 
 
 def _files(work: Workplace) -> list[str]:
-    """Files of the program's input and working directory, by their place."""
+    """Files of the program's input and working directory, by path."""
     folders = (work.input, work.program)
     found = (path for folder in folders for path in folder.rglob("*") if path.is_file() or path.is_symlink())
     return sorted(path.relative_to(work.root).as_posix() for path in found)
 
 
 def _as_recorded(record: Path, work: Workplace) -> bool:
-    """Whether everything that was exported is there as it was written."""
+    """Whether all exported files exist unchanged."""
     files = read_json(record).get("files", {})
     return files.keys() <= set(_files(work)) and all(
         digest_file(work.root / path) == known for path, known in files.items()
@@ -555,9 +554,9 @@ def _as_recorded(record: Path, work: Workplace) -> bool:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[IO[str]]:
-    """Make a folder and hold its lock; a program that inherits it holds it on, should we be killed before it ends.
+    """Make a folder and hold its lock; a program that inherits the lock keeps it if this process is killed.
 
-    Raises `InputError` where a program of an earlier call still runs.
+    Raises `InputError` if a program of an earlier call still runs.
     """
     check_output_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -567,9 +566,9 @@ def _alone(folder: Path) -> Iterator[IO[str]]:
         except BlockingIOError:
             stream.seek(0)
             started = stream.read(200).strip()
-            remedy = "Wait until it ends, or end it."
+            remedy = "Wait until it ends, or terminate it."
             found = f"one of an earlier call ({started})"
-            raise InputError(folder, "", "no program at work there", found, remedy) from None
+            raise InputError(folder, "", "no running program", found, remedy) from None
         stream.truncate(0)
         stream.write(f"started by process {os.getpid()}")
         stream.flush()
@@ -577,7 +576,7 @@ def _alone(folder: Path) -> Iterator[IO[str]]:
 
 
 def _remove(folder: Path, but: str = "") -> None:
-    """Remove a folder, or all in it but one name."""
+    """Remove a folder, or everything in it except one name."""
     if not but:
         shutil.rmtree(folder, ignore_errors=True)
         return

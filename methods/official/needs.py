@@ -38,7 +38,7 @@ def gha(config: OfficialConfig, device: str) -> Iterator[Need]:
 
 
 def insta(config: OfficialConfig, device: str) -> Iterator[Need]:
-    """Checkout of INSTA, the program that was built in it, and a GPU."""
+    """Checkout of INSTA, the program built in it, and a GPU."""
     return _needs(INSTAOfficial, config)
 
 

@@ -1,4 +1,4 @@
-"""Runs a program of others: its output into a log, its progress read, its whole group ended with us."""
+"""Runs an external program: logs its output, reads its progress, and terminates its process group on exit."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ KEPT = (
     *("LD_LIBRARY_PATH", "CUDA_HOME", "CUDA_PATH", "CUDA_VISIBLE_DEVICES", "CUDA_DEVICE_ORDER"),
     *("NVIDIA_VISIBLE_DEVICES", "NVIDIA_DRIVER_CAPABILITIES", "TORCH_EXTENSIONS_DIR", "TORCH_HOME"),
 )
-"""Variables of the environment that a program is given; nothing of our interpreter's is among them."""
+"""Environment variables passed to a program, without those of the current interpreter."""
 
 GIVEN = {"PYTHONUNBUFFERED": "1", "PYTHONDONTWRITEBYTECODE": "1", "TQDM_MININTERVAL": "1"}
-"""Variables it is given besides: lines come when they are written, and no caches are left in its folder."""
+"""Additional variables: output is not buffered, and no caches are written to its folder."""
 
 LAST_LINES, LONGEST_LINE = 12, 2_000
 LONGEST_LOG = 64 * 2**20
 REDRAWN_EVERY_S = 30.0
-"""Seconds between lines kept of a progress bar that draws itself anew on the same line."""
+"""Seconds between logged lines of a progress bar that redraws its line."""
 PATIENCE_S = 10.0
-"""Seconds that a program has to end when it is asked to."""
+"""Seconds between the request to terminate and the kill of a program."""
 
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 class ProgramError(HeadbenchError):
-    """A program of others failed, or did not leave what it should have."""
+    """An external program failed or did not write the expected output."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def described(code: int) -> str:
     if code >= 0:
         return f"ended with exit code {code}"
     name = signal.Signals(-code).name if -code in {*signal.Signals} else f"signal {-code}"
-    why = "; the system ends programs so when memory is short" if -code == signal.SIGKILL else ""
+    why = "; the system may have killed it for lack of memory" if -code == signal.SIGKILL else ""
     return f"was ended by {name}{why}"
 
 
@@ -79,8 +79,8 @@ def run_program(
 ) -> ProgramEnd:
     """Run a command in ``folder`` until it ends; its output, both streams, is appended to ``log``.
 
-    The program and all that it starts are one process group, which is ended when this call is interrupted, and what the
-    program left running is ended with it. What was written for it is on disk before, whatever group of writes is open.
+    The program and its children are one process group, which is terminated when the program ends or this call is
+    interrupted. Files written for it are flushed to disk before, even inside a group of writes.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def _follow(output: IO[bytes], log: IO[bytes], last: deque[str], on_line: Callab
 
 
 def _lines(output: IO[bytes]) -> Iterator[tuple[str, bool]]:
-    """Lines, and whether each is one that the next overwrites; memory is bounded whatever comes."""
+    """Lines, and whether each is overwritten by the next; memory is bounded."""
     rest = b""
     while chunk := os.read(output.fileno(), 1 << 16):
         *whole, rest = re.split(rb"(\r\n|\n|\r)", rest + chunk)
@@ -157,13 +157,13 @@ def _readable(text: bytes) -> str:
 
 
 def _end_group(process: subprocess.Popen[bytes]) -> None:
-    """End a program and whatever it started, gently first."""
+    """Terminate a program and its children, and kill them if necessary."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         if not _signal_group(process.pid, number):
             break
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until and _signal_group(process.pid, 0):
-            process.poll()  # a dead leader stays in its group until somebody asks for its exit code
+            process.poll()  # a dead leader stays in its group until its exit code is read
             time.sleep(0.02)
     process.wait()
     if process.stdout is not None:

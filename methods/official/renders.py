@@ -14,20 +14,20 @@ from ...bench.errors import InputError
 
 
 def _numbered(folder: Path, prefix: str, count: Sequence[int], of: str) -> list[Path]:
-    """Images ``<prefix>00000.png`` and on in a folder; their number has to be one of ``count``."""
+    """Images ``<prefix>00000.png`` and following in a folder; their number must be one of ``count``."""
     pattern = re.compile(re.escape(prefix) + r"(\d{5,})\.png")
     numbers = sorted(int(match[1]) for path in folder.iterdir() if (match := pattern.fullmatch(path.name)))
     if len(numbers) not in count or numbers != [*range(len(numbers))]:
         wanted = " or ".join(map(str, sorted(set(count))))
         last = f", {prefix}{numbers[0]:05d}.png to {prefix}{numbers[-1]:05d}.png" if numbers else ""
         expected = f"{wanted} images, {prefix}00000.png and on, one for each frame of {of}"
-        remedy = f"Render the split again, whole and with all cameras. {MAP_REMEDY}"
+        remedy = f"Render the whole split again with all cameras. {MAP_REMEDY}"
         raise InputError(folder, "", expected, f"{len(numbers)}{last}", remedy)
     return [folder / f"{prefix}{number:05d}.png" for number in numbers]
 
 
 def _latest(folder: Path, stem: str) -> Path | None:
-    """The folder ``<stem>_<iterations>`` of most iterations, which the repositories load by default, too."""
+    """The folder ``<stem>_<iterations>`` with the most iterations, the default of the repositories."""
     made = {
         int(match[1]): path
         for path in (folder.iterdir() if folder.is_dir() else ())
@@ -37,7 +37,7 @@ def _latest(folder: Path, stem: str) -> Path | None:
 
 
 def gaussian_avatars(folder: Path, clip: Clip, listing: Listing) -> Renders:
-    """``{train,val,test}/ours_<iterations>/renders/<index>.png``, by the order of ``transforms_<split>.json``."""
+    """``{train,val,test}/ours_<iterations>/renders/<index>.png``, in the order of ``transforms_<split>.json``."""
     if not listing:
         expected = "a capture in the GaussianAvatars/VHAP layout, whose files give the order"
         raise InputError("command line", "--names", expected, f"another for {clip.subject}", MAP_REMEDY)
@@ -79,7 +79,7 @@ def gaussian_blendshapes(folder: Path, clip: Clip, listing: Listing) -> Renders:
 
 
 def insta(folder: Path, clip: Clip, listing: Listing) -> Renders:
-    """``overlay/<index>.png`` in the folder of its output: the test split, in the order of meshes' names. On black."""
+    """``overlay/<index>.png`` in its output folder: the test split, in the order of mesh names, on black."""
     held_out = {key.sequence for key in clip.splits["self_reenactment"]}
     frames = _of_one_camera(clip, [key for key in every_frame(clip) if key.sequence in held_out])
     made = folder / "overlay"
@@ -91,7 +91,7 @@ def insta(folder: Path, clip: Clip, listing: Listing) -> Renders:
 
 
 def _of_one_camera(clip: Clip, keys: Iterable[FrameKey]) -> list[FrameKey]:
-    """Frames in order. Raises `InputError` where the order is not given by their timesteps."""
+    """Frames in order. Raises `InputError` if their timesteps do not determine the order."""
     frames = sorted(keys, key=lambda key: (key.timestep, key.camera))
     repeated = [t for t, n in Counter(key.timestep for key in frames).items() if n > 1]
     if repeated:

@@ -16,7 +16,7 @@ from ..shared.config import PAPER_ITERATIONS, SHORT_SPLATS
 
 
 def _short_run() -> tuple[str, ...]:
-    """Learning rates of the native methods' short presets, as options of their training script."""
+    """Learning rates of the native methods' short presets, as options of the authors' training script."""
     rates: Mapping[str, Any] = {
         "--position_lr_init": SHORT_SPLATS["position_lr"],
         "--position_lr_final": SHORT_SPLATS["position_lr_final"],
@@ -29,7 +29,7 @@ def _short_run() -> tuple[str, ...]:
 
 GA_OFFICIAL = MethodSpec(
     name="ga-official",
-    summary="GaussianAvatars by its authors' code, in a checkout and an environment of yours; needs CUDA.",
+    summary="GaussianAvatars by its authors' code, in your checkout and environment; needs CUDA.",
     implementation="headbench.methods.official.ga.method:GAOfficial",
     config="headbench.methods.official.config:GAOfficialConfig",
     needs="headbench.methods.official.needs:ga",
@@ -46,12 +46,12 @@ GA_OFFICIAL = MethodSpec(
 
 TGA_OFFICIAL = MethodSpec(
     name="tga-official",
-    summary="The method of ours by its authors' code, in a checkout and an environment of yours; needs CUDA.",
+    summary="The method ours by its authors' code, in your checkout and environment; needs CUDA.",
     implementation="headbench.methods.official.tga.method:TGAOfficial",
     config="headbench.methods.official.config:TGAOfficialConfig",
     needs="headbench.methods.official.needs:tga",
     renders="headbench.methods.official.renders:gaussian_avatars",
-    # Their feature lines begin at an iteration that their code fixes: no shorter run trains the method.
+    # Their feature lines start at a fixed iteration, so shorter runs do not train the method.
     presets={"paper": {"budget": {"iterations": PAPER_ITERATIONS}}},
     native=False,
     source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
@@ -60,7 +60,7 @@ TGA_OFFICIAL = MethodSpec(
 
 
 def _short_blendshapes(samples: int) -> tuple[str, ...]:
-    """The same for GaussianBlendshapes, of which their script offers fewer, and splats to begin with."""
+    """The same for GaussianBlendshapes, whose script has fewer options, and the initial number of splats."""
     options: Mapping[str, Any] = {
         "--position_lr_init": GBS_SHORT_SPLATS["position_lr"],
         "--position_lr_final": GBS_SHORT_SPLATS["position_lr_final"],
@@ -74,7 +74,7 @@ def _short_blendshapes(samples: int) -> tuple[str, ...]:
 
 GBS_OFFICIAL = MethodSpec(
     name="gbs-official",
-    summary="GaussianBlendshapes by its authors' code, in a checkout and an environment of yours; needs CUDA.",
+    summary="GaussianBlendshapes by its authors' code, in your checkout and environment; needs CUDA.",
     implementation="headbench.methods.official.gbs.method:GBSOfficial",
     config="headbench.methods.official.config:GBSOfficialConfig",
     needs="headbench.methods.official.needs:gbs",
@@ -95,7 +95,7 @@ GBS_OFFICIAL = MethodSpec(
 
 GHA_OFFICIAL = MethodSpec(
     name="gha-official",
-    summary="Gaussian Head Avatar by its authors' code, in a checkout and an environment of yours; needs CUDA.",
+    summary="Gaussian Head Avatar by its authors' code, in your checkout and environment; needs CUDA.",
     implementation="headbench.methods.official.gha.method:GHAOfficial",
     config="headbench.methods.official.config:GHAOfficialConfig",
     needs="headbench.methods.official.needs:gha",
@@ -110,7 +110,7 @@ GHA_OFFICIAL = MethodSpec(
 
 INSTA_OFFICIAL = MethodSpec(
     name="insta-official",
-    summary="INSTA by its authors' code, a program that you have built in a checkout; needs CUDA.",
+    summary="INSTA by its authors' code, built in your checkout; needs CUDA.",
     implementation="headbench.methods.official.insta.method:INSTAOfficial",
     config="headbench.methods.official.config:INSTAOfficialConfig",
     needs="headbench.methods.official.needs:insta",

@@ -1,5 +1,4 @@
-"""Common code for repositories that train on a tracked video: straight colours, 6D rotations, the head's
-frame."""
+"""Common code for repositories that train on a tracked video: straight alpha, 6D rotations, the head's frame."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ from ...datasets.steps.masks import recomposite
 
 
 def check_masks(clip: Clip) -> None:
-    """Raise `InputError` for a clip without masks, by its first training frame; `straight_rgba` does for any other."""
+    """Raise `InputError` for a clip without masks, judged by its first training frame; `straight_rgba` checks the others."""
     coverage_of(clip, clip.splits["train"][0])
 
 
@@ -23,16 +22,16 @@ def coverage_of(clip: Clip, key: FrameKey) -> ByteArray:
     """(H, W) mask of a frame. Raises `InputError` if it is missing."""
     mask = clip.mask(key)
     if mask is None:
-        expected = "a mask; the code trains on the head alone, by a fourth channel of its images"
-        remedy = "Matte the capture (INSTA's generate.sh does), or compare with the native method, which goes without."
+        expected = "a mask; the code trains only on the head, selected by the fourth channel of its images"
+        remedy = "Matte the capture (INSTA's generate.sh does), or use the native method, which needs none."
         raise InputError(f"clip {clip.subject}", str(key), expected, "none", remedy)
     return mask
 
 
 def straight_rgba(clip: Clip, key: FrameKey) -> ByteArray:
-    """(H, W, 4) straight alpha: what the head contributes to a pixel over its coverage, without the background.
+    """(H, W, 4) straight alpha: contribution of the head to a pixel divided by its coverage, without the background.
 
-    Colours times coverage are the frame on black, to half a level. Raises `InputError` for a frame without a mask.
+    Colours times coverage equal the frame on black within half a level. Raises `InputError` for a frame without a mask.
     """
     mask = coverage_of(clip, key)
     coverage = mask.astype(np.float32) / 255
@@ -52,7 +51,7 @@ def six_numbers(turns: FloatArray) -> FloatArray:
 def cameras_at_rest(
     subject: PosedSubject, views: Sequence[tuple[Camera, HeadPose]], size: int = 64
 ) -> list[Camera]:
-    """The camera of each view relative to a head that does not move; a video's poses have no motion left to move."""
+    """The camera of each view relative to a head that does not move, and poses without rigid motion."""
     cameras = []
     for start in range(0, len(views), size):
         part = views[start : start + size]

@@ -31,7 +31,7 @@ def sh_degree(rest: Tensor) -> int:
 
 
 def occupied_degree(rest: Tensor) -> int:
-    """Highest degree of which (N, 3, K - 1) coefficients above degree 0 have any other than zero."""
+    """Highest degree with non-zero coefficients among (N, 3, K - 1) above degree 0."""
     degree = sh_degree(rest)
     while degree and not rest[:, :, coefficient_count(degree - 1) - 1 :].any():
         degree -= 1
@@ -113,14 +113,14 @@ class _HarmonicColors(torch.autograd.Function):
 
 
 class HarmonicShader(Protocol):
-    """Colours by spherical harmonics that stay, for any number of views, without gradients."""
+    """Colours by constant spherical harmonics for any number of views, without gradients."""
 
     def __call__(
         self, means: Tensor, center: Tensor, turns: Tensor | None = None, binding: Tensor | None = None
     ) -> Tensor:
-        """Colours (N, 3) >= 0 of splats at (N, 3) means as a camera at ``center`` sees them.
+        """Colours (N, 3) >= 0 of splats at (N, 3) means for a camera at ``center``.
 
-        ``turns`` (F, 3, 3) are applied to the directions of the splats that ``binding`` (N,) gives to each triangle.
+        ``turns`` (F, 3, 3) rotate the directions of the splats on each triangle, given by ``binding`` (N,).
         """
 
 
@@ -140,7 +140,7 @@ def harmonic_shader(dc: Tensor, rest: Tensor) -> HarmonicShader:
 
 
 HARMONICS_BLOCK = 16
-"""Splats whose coefficients lie side by side."""
+"""Number of splats whose coefficients are stored side by side."""
 
 
 @harmonic_shader.compiled(KERNEL)

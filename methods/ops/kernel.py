@@ -1,4 +1,4 @@
-"""Calls from compiled forms of operations into the splat renderer's kernel, which contains them."""
+"""Calls of compiled operations in the splat renderer's kernel."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from ..shared.threads import threads
 from ..splats.cpu import KERNEL, instruction_sets
 
 UNITS_STEP = 16
-"""Layers of networks are padded with units that are 0 to a multiple of it."""
+"""Layers of networks are padded with zero units to a multiple of this."""
 
 _backend: ContextVar[str] = ContextVar("backend of compiled operations", default="cpu")
 
 
 @contextmanager
 def backend(name: str) -> Iterator[None]:
-    """Use the variant of the kernel that a name in `instruction_sets` stands for; by default the fastest."""
+    """Use the variant of the kernel with a name in `instruction_sets`; by default the fastest."""
     token = _backend.set(name)
     try:
         yield
@@ -33,7 +33,7 @@ def backend(name: str) -> Iterator[None]:
 def call(name: str, *arguments: Any) -> Any:
     """Call a function of the kernel with `arrays`. Results do not depend on the number of threads.
 
-    What the kernel writes to has to be contiguous, as `empty_like` makes it.
+    Output arrays must be contiguous, as those of `empty_like`.
 
     Raises
     ------
@@ -45,14 +45,14 @@ def call(name: str, *arguments: Any) -> Any:
 
 
 def arrays(*arguments: Any) -> tuple[Any, ...]:
-    """Tensors as arrays, which reach the kernel faster than tensors do, and other arguments as they are."""
+    """Tensors as arrays, which are passed to the kernel faster, and other arguments unchanged."""
     return tuple(
         value.detach().contiguous().numpy() if isinstance(value, Tensor) else value for value in arguments
     )
 
 
 def empty_like(values: Tensor) -> Tensor:
-    """Memory for a result of this shape, contiguous whatever ``values`` are, as kernels need it."""
+    """Contiguous memory for a result of the shape of ``values``."""
     return torch.empty_like(values, memory_format=torch.contiguous_format)
 
 

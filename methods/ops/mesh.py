@@ -20,7 +20,7 @@ NORMAL = 1
 """Column of a frame's rotation that is the triangle's normal."""
 
 
-class Frames(NamedTuple):
+class TriangleFrames(NamedTuple):
     """Frame of each triangle.
 
     Attributes
@@ -42,11 +42,11 @@ class Frames(NamedTuple):
 
 
 @Operation
-def triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
+def triangle_frames(vertices: Tensor, faces: Tensor) -> TriangleFrames:
     """Frames of the triangles (v0, v1, v2) of a mesh.
 
     a0 = unit(v1 - v0), a1 = unit(a0 x (v2 - v0)), a2 = -unit(a1 x a0), R = [a0 a1 a2];
-    size = (|v1 - v0| + |a2 . (v2 - v0)|) / 2. A rotation of the mesh rotates R, and nothing else changes.
+    size = (|v1 - v0| + |a2 . (v2 - v0)|) / 2. A rotation of the mesh rotates only R.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
     faces : Tensor
         (F, 3) int64.
     """
-    # Coordinates apart, (3, F) each: several times faster on the CPU than rows of three.
+    # Separate coordinates of (3, F) are several times faster on the CPU than rows of three.
     corners = vertices.t().contiguous().index_select(1, faces.t().reshape(-1)).view(3, 3, -1)
     origin = corners[:, 0]
     base = corners[:, 1] - origin
@@ -67,15 +67,15 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
     height = (across * side).sum(0).abs()
     rotation = torch.stack([along, normal, across], dim=1).permute(2, 0, 1).contiguous()
     size = 0.5 * (base_length + height)
-    return Frames(rotation, corners.mean(1).t().contiguous(), size, matrix_to_quaternion(rotation))
+    return TriangleFrames(rotation, corners.mean(1).t().contiguous(), size, matrix_to_quaternion(rotation))
 
 
 @triangle_frames.compiled(KERNEL)
-def _triangle_frames(vertices: Tensor, faces: Tensor) -> Frames:
-    return Frames(*_TriangleFrames.apply(vertices, faces))  # type: ignore[no-untyped-call]
+def _triangle_frames(vertices: Tensor, faces: Tensor) -> TriangleFrames:
+    return TriangleFrames(*_TriangleFramesOperation.apply(vertices, faces))  # type: ignore[no-untyped-call]
 
 
-class _TriangleFrames(torch.autograd.Function):
+class _TriangleFramesOperation(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, vertices: Tensor, faces: Tensor) -> tuple[Tensor, ...]:
         ctx.save_for_backward(vertices, faces)
@@ -95,7 +95,7 @@ class _TriangleFrames(torch.autograd.Function):
 
 @Operation
 def turns_between(to: Tensor, origin: Tensor) -> Tensor:
-    """(F, 3, 3) rotations ``to`` times the transposes of ``origin``: they take directions on one mesh to the other's."""
+    """(F, 3, 3) rotations ``to`` times the transpose of ``origin``, which map directions on one mesh to the other."""
     return to @ origin.mT
 
 
@@ -126,7 +126,7 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _length(vectors: Tensor) -> Tensor:
-    """(F,) lengths of (3, F) vectors, `NORM_FLOOR` at least, where the gradient is 0."""
+    """(F,) lengths of (3, F) vectors, at least `NORM_FLOOR`, where the gradient is 0."""
     return vectors.square().sum(0).clamp_min(NORM_FLOOR**2).sqrt()
 
 

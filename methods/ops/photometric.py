@@ -39,9 +39,10 @@ def blur(planes: Tensor) -> Tensor:
 
 
 def mean_ssim(image: Tensor, truth: Tensor) -> Tensor:
-    """SSIM as 3DGS trains with: 11 x 11 Gaussian window of sigma 1.5, zero padding, mean over all pixels.
+    """SSIM as in the training of 3DGS: 11 x 11 Gaussian window of sigma 1.5, zero padding, mean over all pixels.
 
-    Wang et al. 2004, eq. 13 with population moments. Not an evaluation metric: the zero padding lowers borders.
+    Wang et al. 2004, eq. 13 with population moments. This is not an evaluation metric: the zero padding lowers values
+    at borders.
 
     Parameters
     ----------
@@ -60,7 +61,7 @@ def mean_ssim(image: Tensor, truth: Tensor) -> Tensor:
 def photometric_loss(image: Tensor, truth: Tensor, ssim_weight: float) -> Tensor:
     """``(1 - w) mean|image - truth| + w (1 - SSIM)`` of two (H, W, 3) images in [0, 1]; 3DGS, eq. 7.
 
-    Compiled, only ``image`` receives a gradient.
+    In the compiled form, only ``image`` receives a gradient.
     """
     loss = (1 - ssim_weight) * (image - truth).abs().mean()
     if ssim_weight:
@@ -74,7 +75,7 @@ def _photometric_loss(image: Tensor, truth: Tensor, ssim_weight: float) -> Tenso
 
 
 class _Photometric(torch.autograd.Function):
-    """Loss and gradient come of one sweep over the image."""
+    """Loss and gradient are computed in one pass over the image."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, truth: Tensor, ssim_weight: float) -> Tensor:

@@ -65,16 +65,17 @@ def encode(values: Tensor) -> Tensor:
 
 @functools.cache
 def _frequencies(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`FREQUENCIES` where they are used: made at each call, the host would wait for the device."""
+    """`FREQUENCIES` on a device, cached because creating them at each call would make the host wait for the device."""
     on_device: Tensor = to_device(torch.tensor(FREQUENCIES, dtype=dtype), device)
     return on_device
 
 
 def smoothing(spread: float) -> Tensor:
-    """(9 D,) factors on `encode` of D = 3 values known to the standard deviation ``spread``, which make it its mean.
+    """(9 D,) factors that turn `encode` of D = 3 values into its mean for a standard deviation ``spread`` of the
+    values.
 
-    Of x + n, n normal: a wave of frequency f keeps exp(-(f spread)^2 / 2) (integrated positional encoding; Barron et al.
-    2021, arXiv 2103.13415, eq. 13).
+    A wave of frequency f is scaled by exp(-(f spread)^2 / 2) (integrated positional encoding; Barron et al. 2021,
+    arXiv 2103.13415, eq. 13).
     """
     frequencies = torch.tensor(FREQUENCIES).repeat_interleave(2 * 3)
     return torch.cat([torch.ones(3), torch.exp(-0.5 * (frequencies * spread) ** 2)])
@@ -91,7 +92,7 @@ class Bounds(NamedTuple):
         return (points - self.low) / (self.high - self.low)
 
     def contains(self, points: Tensor) -> Tensor:
-        """(N,) whether points lie in the box, its faces included."""
+        """(N,) whether points are in the box, including its faces."""
         return ((points >= self.low) & (points <= self.high)).all(1)
 
 
@@ -114,10 +115,10 @@ class ColorNetwork(NamedTuple):
 
 
 def triplane_features(planes: Sequence[Tensor], box: Bounds, positions: Tensor) -> tuple[Tensor, ...]:
-    """Features (N, C_k) of three planes, in the order of `PAIRS`, at positions in the box that they span; clamped outside."""
+    """Features (N, C_k) of three planes, in the order of `PAIRS`, at positions in their box; clamped outside."""
     points, resolution = 2 * box.unit(positions) - 1, round(len(planes[0]) ** 0.5)
     return tuple(
-        # The two coordinates by steps: a list of numbers would be copied to the device.
+        # The two coordinates as a slice, since a list of indices would be copied to the device.
         sample_plane(plane, points[:, width : height + 1 : height - width], resolution)
         for plane, (_, width, height) in zip(planes, PAIRS)
     )
@@ -167,7 +168,7 @@ AXES = 3
 
 
 class LinePosition(NamedTuple):
-    """Position of points on the three lines: rows of the (3 L)-row table and linear weights, (N, 6) each."""
+    """Positions of points on the three lines: rows of the (3 L)-row table and linear weights, (N, 6) each."""
 
     rows: Tensor
     weights: Tensor
@@ -202,14 +203,14 @@ class OffsetLayers(NamedTuple):
 
 @Operation
 def line_offsets(positions: Tensor, box: Bounds, table: Tensor, layers: OffsetLayers) -> Tensor:
-    """(N, D) offsets at (N, 3) positions, 0 outside the box; without gradient by positions and box.
+    """(N, D) offsets at (N, 3) positions, 0 outside the box; no gradient for positions and box.
 
     Parameters
     ----------
     table : Tensor
         (3 L, H) contribution of each sample of the lines to the first layer.
     """
-    # Computed outside, too: on a GPU the host would wait for the number of those inside.
+    # Computed outside as well, since selecting the points inside would make the host wait for a GPU.
     position = line_position(box.unit(positions.detach()), len(table) // AXES)
     offsets = layers(sum_rows(table, *position))
     return torch.where(box.contains(positions)[:, None], offsets, 0)
@@ -238,17 +239,17 @@ class _LineOffsets(torch.autograd.Function):
 
 
 Shader = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
-"""Colours (N, 3) >= 0 by the arguments of `splats.directions_to`, without gradients."""
+"""Colours (N, 3) >= 0 for the arguments of `splats.directions_to`, without gradients."""
 
 
 @Operation
 def shader(from_position: Tensor, of_direction: Tensor, last: Tensor) -> Shader:
-    """`plane_colors` of positions that stay, for any number of views.
+    """`plane_colors` of constant positions for any number of views.
 
     Parameters
     ----------
     from_position : Tensor
-        (N, H), contribution of the planes to the hidden layer.
+        (N, H) contribution of the planes to the hidden layer.
     of_direction, last : Tensor
         (27, H) and (3, H) weights of the encoded direction and of the hidden layer.
     """
@@ -267,11 +268,11 @@ SAMPLES = 512
 
 @shader.compiled(KERNEL)
 def _shader(from_position: Tensor, of_direction: Tensor, last: Tensor, samples: int = SAMPLES) -> Shader:
-    """The part of the position in 16 bits (`in_steps`), that of the direction from a table.
+    """The contribution of the position is stored in 16 bits (`in_steps`), that of the direction is read from a table.
 
-    Each coordinate of a direction adds to the hidden layer what its own waves make of it. The table is linear between
-    samples: a wave of the highest frequency, 8, is off by 8^2 / (2 SAMPLES^2) = 1e-4 of its amplitude at most, and more
-    samples would not stay in the first caches. The README of "ours" says what both change of an image.
+    Each coordinate of a direction contributes to the hidden layer through its own waves. The table is interpolated
+    linearly: the error of a wave of the highest frequency, 8, is at most 8^2 / (2 SAMPLES^2) = 1e-4 of its amplitude,
+    and more samples would not fit into the first cache level. The README of "ours" has the effect of both on images.
     """
     of_direction, last = pad_units(of_direction, 1), pad_units(last, 1)
     network = *in_steps(pad_units(from_position, 1)), direction_table(of_direction, samples), last
@@ -285,16 +286,16 @@ def _shader(from_position: Tensor, of_direction: Tensor, last: Tensor, samples: 
 
 
 def in_steps(values: Tensor) -> tuple[Tensor, Tensor]:
-    """(N, H) int16 and the steps (H,) float32 they count: what is left of a column is half a step, 1.5e-5 of its largest."""
+    """(N, H) int16 and (H,) float32 steps; the error is at most half a step, 1.5e-5 of the largest value of a column."""
     largest = values.abs().amax(0) if len(values) else values.new_zeros(values.shape[1])
     steps = (largest / torch.iinfo(torch.int16).max).clamp_min(torch.finfo(values.dtype).tiny)
     return (values / steps).round_().to(torch.int16), steps
 
 
 def direction_table(of_direction: Tensor, samples: int) -> Tensor:
-    """(3 L, H): what each coordinate adds to the hidden layer at L samples from -1 to 1, by (27, H) weights of `encode`."""
+    """(3 L, H): contribution of each coordinate to the hidden layer at L samples from -1 to 1, by (27, H) weights of `encode`."""
     along = torch.linspace(-1, 1, samples, dtype=torch.float64)
-    # The coordinates' turn in each wave.
+    # Selects one coordinate in each wave.
     waves = encode(along[:, None].expand(-1, AXES)).unflatten(1, (-1, AXES))
     weights = of_direction.double().unflatten(0, (-1, AXES))
     return torch.einsum("lwa,wah->alh", waves, weights).flatten(0, 1).to(of_direction.dtype)
@@ -306,7 +307,7 @@ OffsetWriter = Callable[[Tensor, Tensor, Tensor], None]
 
 @Operation
 def offset_writer(layers: OffsetLayers, position: LinePosition) -> OffsetWriter:
-    """The offset network at places on the lines that stay, for any number of tables."""
+    """The offset network at constant positions on the lines, for any number of tables."""
 
     def write(out: Tensor, splats: Tensor, table: Tensor) -> None:
         out.index_copy_(0, splats, layers(sum_rows(table, *position)))
@@ -316,7 +317,7 @@ def offset_writer(layers: OffsetLayers, position: LinePosition) -> OffsetWriter:
 
 @offset_writer.compiled(KERNEL)
 def _offset_writer(layers: OffsetLayers, position: LinePosition) -> OffsetWriter:
-    """Units of the first layer that none of a few neighbours turns on are left out of their second layer."""
+    """Units of the first layer that are inactive for a group of neighbours are skipped in the second layer."""
     rows, fractions = position.rows[:, :AXES].to(torch.int32), position.weights[:, AXES:]
     first_bias, second_bias = (pad_units(bias, 0) for bias in (layers.bias_0, layers.bias_1))
     second, last = pad_units(layers.weight_1.t(), 0, 1), pad_units(layers.weight_2, 1)

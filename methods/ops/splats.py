@@ -1,4 +1,4 @@
-"""Splats bound to the triangles of a mesh: their way to the world, to the canonical mesh, and directions to the camera.
+"""Splats bound to the triangles of a mesh: transforms to world and canonical space, and directions to the camera.
 
 Qian et al., "GaussianAvatars: Rigged 3D Gaussian Splatting", CVPR 2024, section 3.2.
 """
@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 
 from ...bench.native.dispatch import Operation
 from .kernel import KERNEL, call, empty_like
-from .mesh import Frames
+from .mesh import TriangleFrames
 
 
 class WorldSplats(NamedTuple):
@@ -34,7 +34,7 @@ class Activated(NamedTuple):
 
 @Operation
 def activate(log_scales: Tensor, quats: Tensor) -> Activated:
-    """Scales of (N, 3) logarithms and unit quaternions of (N, 4) of any length. Compiled, without gradients."""
+    """Scales of (N, 3) logarithms and unit quaternions of (N, 4) of any length. The compiled form has no gradients."""
     return Activated(
         log_scales.exp(), quats / torch.linalg.vector_norm(quats, dim=1, keepdim=True).clamp_min(1e-12)
     )
@@ -49,7 +49,7 @@ def _activate(log_scales: Tensor, quats: Tensor) -> Activated:
 
 @Operation
 def to_world(
-    frames: Frames,
+    frames: TriangleFrames,
     binding: Tensor,
     means: Tensor,
     log_scales: Tensor,
@@ -69,12 +69,11 @@ def to_world(
     quats : Tensor
         (N, 4), real part first, of any length.
     activated : Activated | None
-        Activations of ``log_scales`` and ``quats``, if these stay the same for many frames and no
-        gradient is needed.
+        Activations of ``log_scales`` and ``quats``, if these are constant over frames and no gradient is needed.
     """
     linear = (frames.size[:, None, None] * frames.rotation).flatten(1)
-    # One gather instead of four, and one scatter for its gradient. The quaternion goes along as the matrix that
-    # multiplies by it: products of small matrices are several times faster than sums over columns.
+    # One gather instead of four, and one scatter for its gradient. The quaternion is passed as the matrix of
+    # multiplication by it: products of small matrices are several times faster than sums over columns.
     turn = left_products(frames.quaternion).flatten(1)
     packed = torch.cat([linear, frames.center, frames.size[:, None], turn], dim=1)
     linear, center, size, turn = packed.index_select(0, binding).split([9, 3, 1, 16], dim=1)
@@ -85,7 +84,7 @@ def to_world(
 
 @to_world.compiled(KERNEL)
 def _to_world(
-    frames: Frames,
+    frames: TriangleFrames,
     binding: Tensor,
     means: Tensor,
     log_scales: Tensor,
@@ -119,7 +118,7 @@ class _ToWorld(torch.autograd.Function):
 
 @Operation
 def points_on(means: Tensor, binding: Tensor, linear: Tensor, center: Tensor) -> Tensor:
-    """Positions (N, 3) on a mesh of local means: A mean + c. Compiled, only ``means`` receive a gradient.
+    """Positions (N, 3) on a mesh of local means: A mean + c. In the compiled form only ``means`` receive a gradient.
 
     Parameters
     ----------
@@ -156,7 +155,8 @@ class _PointsOn(torch.autograd.Function):
 def directions_to(
     means: Tensor, center: Tensor, turns: Tensor, binding: Tensor, last: Tensor | None = None
 ) -> Tensor:
-    """Unit vectors (N, 3) from world means to the camera, turned by triangle. Compiled, only ``means`` receive a gradient.
+    """Unit vectors (N, 3) from world means to the camera, rotated by triangle. In the compiled form only ``means``
+    receive a gradient.
 
     Parameters
     ----------
@@ -205,6 +205,6 @@ def left_products(quaternions: Tensor) -> Tensor:
 
 
 def apply_matrices(rows: Tensor, vectors: Tensor) -> Tensor:
-    """Product of each (D, D) matrix, given as a row of (N, D D), with its vector of (N, D)."""
+    """Products of (D, D) matrices, given as rows of (N, D D), with the vectors of (N, D)."""
     size = vectors.shape[1]
     return torch.bmm(rows.view(-1, size, size), vectors[:, :, None])[:, :, 0]

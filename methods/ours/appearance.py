@@ -1,4 +1,4 @@
-"""Training side of "ours": known timesteps prepared once, colour from planes, opacity from lines, the penalty."""
+"""Training of "ours": cached timesteps, colour from planes, opacity from lines, and the opacity penalty."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...datasets.head.arrays import faces_in_region
 from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
 from ..ops.harmonics import harmonic_colors, initial_coefficients
-from ..ops.mesh import NORMAL, Frames
+from ..ops.mesh import NORMAL, TriangleFrames
 from ..ops.planes import Bounds, line_offsets, plane_colors, smoothing
 from ..ops.splats import directions_to, to_world
 from ..shared.optimisation import Optimiser
@@ -45,9 +45,9 @@ FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weigh
 
 @dataclass(frozen=True, eq=False)
 class PreparedTimestep:
-    """Constants of training: frames, directions, driving coefficients, penalty weights."""
+    """Constants of a training timestep: frames, directions, driving coefficients, penalty weights."""
 
-    frames: Frames
+    frames: TriangleFrames
     turns: Tensor  # (F, 3, 3) world directions to canonical ones
     expression: Tensor  # (E,)
     jaw: Tensor  # (J,)
@@ -55,9 +55,9 @@ class PreparedTimestep:
 
 
 class OursAppearance:
-    """Tri-plane colour and feature-line opacity; tracking is left as it is.
+    """Tri-plane colour and feature-line opacity; tracking is not refined.
 
-    ``lines_within`` bounds the lines in place of the box that ``config.lines.bounds`` names.
+    ``lines_within`` replaces the box of ``config.lines.bounds``.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class OursAppearance:
             self._smoothing = factors.to(device)
 
     def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
-        """A colour beside that of the planes, if any; spherical harmonics where they replace the planes."""
+        """A colour added to that of the planes, if any; spherical harmonics if they replace the planes."""
         if self._config.color == "planes":
             rate = self._config.planes.residual_lr
             return {RESIDUAL: (torch.zeros(count, 3, device=self._device), rate)} if rate else {}
@@ -107,23 +107,28 @@ class OursAppearance:
         return {name: (value.to(self._device), rate) for name, (value, rate) in initial.items()}
 
     def stored(self, optimiser: Optimiser) -> dict[str, Tensor]:
-        """Trained `parameters` in the form of an avatar: the factors on directions are part of the
-        weights."""
+        """Trained `parameters` in the form of an avatar: the factors on directions are part of the weights."""
         return {name: optimiser[name] for name in self.parameters()} | self._network(optimiser)
 
     def begin(self, timeline: Timeline) -> None:
-        """Fit the start of the lines, and the steps of the harmonics' degree, to the run."""
+        """Scale the start of the lines and the schedule of the harmonics' degree to the run."""
         self._lines_from = timeline.at(self._config.lines.start)
         self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
 
-    def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
+    def frames(self, timestep: int, optimiser: Optimiser) -> TriangleFrames:
         """Triangle frames, without gradient."""
         return self._prepared(timestep).frames
 
     def place(
-        self, frames: Frames, binding: Tensor, view: View, timestep: int, optimiser: Optimiser, iteration: int
+        self,
+        frames: TriangleFrames,
+        binding: Tensor,
+        view: View,
+        timestep: int,
+        optimiser: Optimiser,
+        iteration: int,
     ) -> ShadedSplats:
-        """Colour by canonical position and direction; what the lines change, once they are on."""
+        """Colours by canonical position and direction, and changes by the lines once they have started."""
         prepared = self._prepared(timestep)
         planes = self._config.planes
         means = optimiser["means"] if planes.move_splats else optimiser["means"].detach()
@@ -158,7 +163,7 @@ class OursAppearance:
         angles = self._config.direction_jitter * torch.randn(3, generator=generator)
         turn = Rotation.from_rotvec(
             angles.numpy()
-        ).as_matrix()  # a tenth of the time of torch's small operations
+        ).as_matrix()  # ten times faster than small torch operations
         return torch.as_tensor(turn, dtype=torch.float32, device=self._device)
 
     def _colors(self, optimiser: Optimiser, positions: Tensor, directions: Tensor, iteration: int) -> Tensor:
@@ -196,13 +201,13 @@ class OursAppearance:
 def driving_coefficients(
     pose: HeadPose, expressions: int, bases: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Blend coefficients of the lines, float32: the first expression coefficients, and the jaw's weights on its bases."""
+    """Blend coefficients of the lines, float32: leading expression coefficients, and weights of the jaw bases."""
     jaw = jaw_weights(jaw_quaternions([pose]), bases)[0] if len(bases) else np.zeros(0)
     return np.array(pose.expression[:expressions], np.float32), np.asarray(jaw, np.float32)
 
 
 def softened(offsets: Tensor, softness: float) -> Tensor:
-    """|offset|, below ``softness`` a parabola that meets it with the same slope (Huber 1964): offset^2 / (2 softness)."""
+    """|offset|, replaced below ``softness`` by a parabola with continuous slope (Huber 1964): offset^2 / (2 softness)."""
     if softness == 0:
         return offsets.abs()
     zero = torch.zeros_like(offsets)
@@ -214,8 +219,8 @@ def penalty_weights(
 ) -> Tensor:
     """(F,) weights of the adaptive truncated opacity penalty.
 
-    Where the expression moves a triangle's centroid by less than a threshold, its splats may not change their
-    opacity; where it moves it more, they may. The face region and the rest differ in threshold and weight.
+    Opacities of splats may change only if the expression moves the centroid of their triangle by more than a
+    threshold. The face region and the rest have different thresholds and weights.
 
     Parameters
     ----------
@@ -238,9 +243,9 @@ def _line_box(mesh: SubjectMesh, clip: Clip, config: OursConfig) -> Bounds:
 
 
 def outer_layers_start(mesh: SubjectMesh, clip: Clip, config: OursConfig, device: str) -> Start:
-    """One splat per triangle, and ``config.outer_layers.count`` more outwards over each of `expressive_triangles`.
+    """One splat per triangle, and ``config.outer_layers.count`` more outside each of `expressive_triangles`.
 
-    Without lines there is no opacity to change, hence no outer layers.
+    Without lines opacities are constant, so there are no outer layers.
     """
     start = one_per_triangle(len(mesh.faces), config.splats.initial_opacity, device)
     if not config.lines.enabled or not config.outer_layers.count:
@@ -260,7 +265,7 @@ def outer_layers_start(mesh: SubjectMesh, clip: Clip, config: OursConfig, device
 def expressive_triangles(mesh: SubjectMesh, clip: Clip, millimetres: float, device: str) -> Tensor:
     """Indices of face triangles whose centroid a training expression moves by ``millimetres`` or more, ascending.
 
-    There, at some time, the penalty lets opacity change (`penalty_weights`).
+    On these triangles the penalty allows changes of opacity at some timestep (`penalty_weights`).
     """
     face = torch.from_numpy(faces_in_region(clip.head, "face")).to(device)
     moved = torch.zeros(len(face), dtype=torch.bool, device=device)

@@ -30,19 +30,18 @@ from .field import (
     position_part,
 )
 from .inference import DrivenPose, LineOffsets
-from .storage import FIELD_FILE, RESIDUAL, Field, read_field, splat_columns
+from .storage import FIELD_FILE, RESIDUAL, StoredField, read_field, splat_columns
 
 
 class OursAvatar(StoredSplatAvatar):
     """A trained head: splats without colour, planes, lines and two small networks.
 
-    What depends on canonical position alone (plane features, places on the lines) is computed once when loaded.
-    A folder holds the exact file, the compact one or both, in which case the compact one is read unless the other is
-    asked for.
+    Values that depend only on the canonical position (plane features, positions on the lines) are computed once when
+    the avatar is loaded. A folder has the exact file, the compact one or both; the compact one is read by default.
 
     Attributes
     ----------
-    subject, field : Subject, Field
+    subject, field : Subject, StoredField
         The subject, and the content of its file.
     neutral : LocalSplats
         The splats before an expression changes them.
@@ -57,7 +56,7 @@ class OursAvatar(StoredSplatAvatar):
         stored: Sequence[Path],
         mesh: SubjectMesh,
         subject: Subject,
-        field: Field,
+        field: StoredField,
         device: str,
         cutoffs: Cutoffs = USUAL,
     ):
@@ -88,7 +87,7 @@ class OursAvatar(StoredSplatAvatar):
 
     @classmethod
     def read(cls, folder: Path, device: str, *, exact: bool = False) -> OursAvatar:
-        """Read an avatar from its folder; ``exact`` reads the exact file where there is a compact one as well.
+        """Read an avatar from its folder; ``exact`` reads the exact file even if there is a compact one.
 
         Raises `InputError` for damaged or foreign files.
         """
@@ -104,10 +103,10 @@ class OursAvatar(StoredSplatAvatar):
         return cls([folder / FIELD_FILE, folder / SUBJECT_FILE], mesh, subject, field, device)
 
     def prepare(self, poses: Iterable[HeadPose], megabytes: float = 512.0) -> int:
-        """Compute meshes, triangle frames, jaw weights and offsets of known poses beforehand, within a bound of memory.
+        """Compute meshes, triangle frames, jaw weights and offsets of known poses beforehand, within a memory limit.
 
-        Frames of these poses are then drawn faster, and equal bit for bit. Nothing is prepared unless asked for, so a
-        measured frame time includes them. Returns how many poses fitted; what was prepared before is forgotten.
+        Frames of these poses are then rendered faster and bit-identical. This must be requested, so measured frame
+        times include these computations. Returns the number of poses within the limit; earlier results are discarded.
         """
         self._known = KnownPoses(self._posed, int(megabytes * 2**20))
         return self._known.prepare(poses)

@@ -1,8 +1,7 @@
-"""A plan of how large an avatar of "ours" has to be, each size with the evidence for it.
+"""A plan of the sizes of an avatar of "ours", each with its evidence.
 
-The configured sizes are upper limits; the plan says how much of them the training data require. What a capture does
-not show costs nothing: no lines without changes of expression, no jaw bases without jaw motion, no planes finer than
-the images. README.md has measurements.
+The configured sizes are upper limits; the plan reduces them to what the training data require: no lines without
+changes of expression, no jaw bases without jaw motion, no planes finer than the images. README.md has measurements.
 """
 
 from __future__ import annotations
@@ -27,15 +26,14 @@ from .field import PLANE_MARGIN, line_box, plane_box
 
 LINE_SAMPLES_PER_PIXEL = 0.5
 SPLATS_PER_PIXEL = 1.0
-"""Samples for the whole surface, unrolled at the median footprint of a pixel; half as many lose 0.2 to 0.5 dB
-(README.md)."""
+"""Splats per pixel of the unrolled surface at the median pixel size; half as many lose 0.2 to 0.5 dB (README.md)."""
 MINIMUM_PLANE, MINIMUM_LINE = 8, 4
-"""Samples that are left in any case."""
+"""Minimum number of samples."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """One size: what was configured, what the plan takes, why, and the numbers behind it (SI units and pixels)."""
+    """One size: configured and chosen value, reason, and supporting numbers (SI units and pixels)."""
 
     name: Planned
     configured: int | str | None
@@ -77,7 +75,7 @@ class CapacityPlan:
         return replace(config, **groups)
 
     def box(self, device: str) -> Bounds | None:
-        """Bounds of the lines as tensors, or None where the configured one holds."""
+        """Bounds of the lines as tensors, or None for the configured ones."""
         if self.lines_within is None:
             return None
         low, high = (torch.tensor(corner, device=device) for corner in self.lines_within)
@@ -88,7 +86,7 @@ class CapacityPlan:
         return asdict(self)
 
     def summary(self) -> str:
-        """One line: every size, and the configured one where it was changed; the reasons are in `record`."""
+        """One line with every size, and the configured value if it was changed; the reasons are in `record`."""
         sizes = (
             f"{d.name} {d.chosen}" + f" of {d.configured}" * (d.chosen != d.configured)
             for d in self.decisions
@@ -168,14 +166,14 @@ class _Planner:
     def _jaw_bases(self) -> int:
         """Number of jaw bases with lines."""
         configured = self._config.lines.jaw_bases
-        # The official choice looks at held-out poses; it is reproduced as it is or not at all.
+        # The official choice uses held-out poses; it is reproduced without changes.
         official = self._config.lines.jaw_bases_variant == "official"
         if self._kept("lines.jaw_bases") or official or not configured:
             return configured
         lever = jaw_lever(self._mesh)
         chosen, metres = spanning_jaw_bases(self._poses, configured, lever, self._metres)
         rest = metres / self.pixel
-        reason = f"without more the jaw moves the surface by {rest:.2f} px at most"
+        reason = f"without further bases the jaw moves the surface by {rest:.2f} px at most"
         self._decide("lines.jaw_bases", configured, chosen, reason, lever_m=lever, left_out_px=rest)
         return chosen
 
@@ -185,7 +183,7 @@ class _Planner:
         configured, moves = self._config.lines.bounds, self._moving()
         if not moves.any():
             self.dynamic = False
-            reason = "no triangle moves enough in training that the penalty lets it change"
+            reason = "no triangle moves enough in training for the penalty to allow changes"
             self._decide("lines.bounds", configured, None, reason, triangles=0)
             return
         corners = self._canonical[self._faces[moves].ravel()]
@@ -194,12 +192,12 @@ class _Planner:
         high = np.minimum(corners.max(0) + PLANE_MARGIN, whole.high.numpy())
         share = float(np.prod((high - low) / (whole.high - whole.low).numpy()))
         self.within = tuple(map(float, low)), tuple(map(float, high))
-        reason = f"{moves.mean():.0%} of the triangles move, {share:.0%} of the volume holds them"
+        reason = f"{moves.mean():.0%} of the triangles move, {share:.0%} of the volume contains them"
         count = float(moves.sum())
         self._decide("lines.bounds", configured, "moving", reason, triangles=count, volume_share=share)
 
     def _moving(self) -> np.ndarray:
-        """(F,) whether the penalty lets a triangle's splats change in some training timestep, visibly."""
+        """(F,) whether the penalty allows visible changes of a triangle's splats in some training timestep."""
         penalty = self._config.penalty
         least = np.full(len(self._faces), self._metres)
         if penalty.weight:
@@ -223,11 +221,11 @@ class _Planner:
         size = (whole.high - whole.low).numpy()
         inside = size if self.within is None else np.subtract(self.within[1], self.within[0])
         configured, longest = self._config.lines.resolution, float(inside.max())
-        # On no axis finer than configured, and not finer than the images.
+        # Not finer than configured on any axis, and not finer than the images.
         spacing = np.maximum(size / (configured - 1), self.pixel / LINE_SAMPLES_PER_PIXEL)
         needed = 1 + ceil(float((inside / spacing).max()) - 1e-6)
         chosen = min(configured, max(needed, MINIMUM_LINE))
-        reason = f"a sample each {1000 * longest / (chosen - 1):.1f} mm of {1000 * longest:.0f} mm"
+        reason = f"a sample every {1000 * longest / (chosen - 1):.1f} mm of {1000 * longest:.0f} mm"
         self._decide("lines.resolution", configured, chosen, reason, longest_m=longest)
 
     def planes(self) -> None:
@@ -255,11 +253,11 @@ class _Planner:
         self._decide("splats.max_splats", configured, chosen, reason, **numbers)
 
 
-_BLOCK = 64  # timesteps whose displacement fields are held at once
+_BLOCK = 64  # timesteps whose displacement fields are in memory at once
 
 
 def pixel_footprint(clip: Clip, center: FloatArray) -> float:
-    """Metres that a pixel covers on the head: the median over training frames of depth over focal length.
+    """Size of a pixel on the head, metres: median over training frames of depth divided by focal length.
 
     Parameters
     ----------
@@ -276,7 +274,7 @@ def pixel_footprint(clip: Clip, center: FloatArray) -> float:
 
 
 def largest_displacements(mesh: SubjectMesh, poses: list[HeadPose]) -> FloatArray:
-    """(F,) metres: how far expression, jaw and eyes take a triangle's centroid from the canonical mesh, at most."""
+    """(F,) maximum displacement of a triangle's centroid from the canonical mesh by expression, jaw and eyes, metres."""
     largest = torch.zeros(len(mesh.faces), device=mesh.faces.device)
     with torch.no_grad():
         for pose in poses:
@@ -289,8 +287,7 @@ def largest_displacements(mesh: SubjectMesh, poses: list[HeadPose]) -> FloatArra
 def leading_directions(coefficients: FloatArray, basis: FloatArray, tolerance: float) -> int:
     """Sufficient number of leading expression directions.
 
-    A constant expression needs no direction, as what does not change is not dynamic: deviations from the mean over
-    the timesteps count.
+    Deviations from the mean over the timesteps count, since a constant expression needs no direction.
 
     Parameters
     ----------
@@ -321,7 +318,7 @@ def leading_directions(coefficients: FloatArray, basis: FloatArray, tolerance: f
 
 
 def displacement_without(coefficients: FloatArray, basis: FloatArray, kept: int) -> float:
-    """Metres that leaving out the directions from ``kept`` on displaces a vertex, at most; as above."""
+    """Maximum displacement of a vertex by omitting the directions from ``kept`` on, metres; as above."""
     deviation, columns = _deviation(coefficients)[:, kept:], _columns(basis)[:, kept:]
     blocks = range(0, len(deviation), _BLOCK)
     return max(_longest(deviation[start : start + _BLOCK] @ columns.T) for start in blocks)
@@ -342,7 +339,7 @@ def _longest(field: FloatArray) -> float:
 
 
 def jaw_lever(mesh: SubjectMesh) -> float:
-    """Metres from the jaw joint to the vertex it moves most: skinning weight times distance, at most."""
+    """Lever of the jaw joint, metres: maximum of skinning weight times distance over vertices."""
     joint = JOINT_NAMES.index("jaw")
     center = mesh.model.joint_regressor[joint] @ mesh.canonical
     distance = torch.linalg.vector_norm(mesh.canonical - center, dim=1)
@@ -352,11 +349,11 @@ def jaw_lever(mesh: SubjectMesh) -> float:
 def spanning_jaw_bases(
     poses: list[HeadPose], limit: int, lever: float, tolerance: float
 ) -> tuple[int, float]:
-    """Sufficient number of jaw bases, and the motion by rotations that they do not reach.
+    """Sufficient number of jaw bases, and the motion by rotations outside their span.
 
-    The weights |<q, q_i>| on the bases are linear in the quaternion q but for their common scale, so that lines
-    for bases with the same span can say the same: four at most are ever needed, two for a jaw that only opens. A
-    residual r of a unit quaternion is a rotation by 2 asin(r), which moves a vertex by 2 r times its lever.
+    The weights |<q, q_i>| on the bases are linear in the quaternion q up to a common scale, so lines for bases with
+    the same span are equivalent: at most four are needed, and two for a jaw that only opens. A residual r of a unit
+    quaternion is a rotation by 2 asin(r), which moves a vertex by 2 r times its lever.
 
     Returns
     -------

@@ -106,7 +106,7 @@ class Lines:
         if self.expressions < 0 or self.jaw_bases < 0:
             raise ValueError("expressions and jaw_bases must not be negative")
         if not self.dynamic or len(set(self.dynamic)) != len(self.dynamic):
-            raise ValueError(f"dynamic must name each thing once, and one at least, found {self.dynamic}")
+            raise ValueError(f"dynamic must name at least one attribute, each once, found {self.dynamic}")
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class Penalty:
 
 @dataclass(frozen=True)
 class OuterLayers:
-    """Further splats at the start, outwards over each face triangle that training expressions move.
+    """Additional initial splats outside each face triangle that training expressions move.
 
     Attributes
     ----------
@@ -155,7 +155,9 @@ class OuterLayers:
 
     def __post_init__(self) -> None:
         if self.count < 0 or not 0 < self.opacity < 1 or not self.gap > 0:
-            raise ValueError("count must not be negative, opacity lie between 0 and 1, gap be above 0 metres")
+            raise ValueError(
+                "count must not be negative, opacity must lie between 0 and 1, and gap must be above 0 metres"
+            )
 
 
 @dataclass(frozen=True)
@@ -167,7 +169,7 @@ class Sampling:
     balanced, expression_clusters : bool, int
         Whether clusters of expressions have equal shares, and their number.
     clusters_variant : Literal['paper', 'official']
-        "paper" finds the same clusters every time without a comparison of all pairs of timesteps;
+        "paper" is deterministic and does not compare all pairs of timesteps;
         "official" finds them as the authors' program does. Both use training timesteps only.
     """
 

@@ -1,9 +1,8 @@
-"""Attributes of a splat that an expression changes: opacity as published, or, for the ablation, everything
-else.
+"""Attributes of a splat that an expression changes: opacity as published, or others for the ablation.
 
 "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations" (CVPR 2025,
-arXiv 2504.14967), section 3.3 and Table 4: offsets on position, rotation and scale win novel views and lose novel
-expressions.
+arXiv 2504.14967), section 3.3 and Table 4: offsets on position, rotation and scale improve novel views and degrade
+novel expressions.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ..ops.mesh import Frames, turns_between
+from ..ops.mesh import TriangleFrames, turns_between
 from ..ops.planes import (
     AXES,
     ENCODING_SIZE,
@@ -30,7 +29,7 @@ from ..ops.splats import points_on
 from .config import Dynamic, OursConfig
 
 WIDTHS: Mapping[Dynamic, int] = {"opacity": 1, "position": 3, "rotation": 4, "scale": 3, "color": 3}
-"""Numbers per splat of each thing that may change."""
+"""Number of values per splat of each attribute that may change."""
 
 PLANES = tuple(f"plane_{pair}" for pair, _, _ in PAIRS)
 FIRST_LAYER = "color_weight_0"
@@ -43,7 +42,7 @@ FIELDS = {"opacity": "logits", "position": "means", "rotation": "quats", "scale"
 
 
 class LocalSplats(NamedTuple):
-    """Splats in their triangles' frames, before an expression changes them or after.
+    """Splats in their triangles' frames, before or after changes by an expression.
 
     Attributes
     ----------
@@ -72,7 +71,7 @@ def offset_width(dynamic: Sequence[Dynamic]) -> int:
 
 
 def apply_offsets(splats: LocalSplats, offsets: Tensor, dynamic: Sequence[Dynamic]) -> LocalSplats:
-    """Add (N, `offset_width`) offsets, in the order of ``dynamic``: to logits, local means, quaternions, log-scales."""
+    """Add (N, `offset_width`) offsets, in the order of ``dynamic``, to logits, local means, quaternions and log-scales."""
     parts = dict(zip(dynamic, offsets.split([WIDTHS[name] for name in dynamic], dim=1)))
     if "opacity" in parts:
         parts["opacity"] = parts["opacity"][:, 0]
@@ -112,7 +111,7 @@ def blend_lines(lines: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
 
 
 def offset_layers(parameters: NamedTensors) -> OffsetLayers:
-    """The offset network behind its first weights, which are part of `line_table`; weight-normalised."""
+    """The offset network after its first weights, which are part of `line_table`; weight-normalised."""
     return OffsetLayers(
         parameters["line_bias_0"],
         *(normalised_weight(parameters, 1), parameters["line_bias_1"]),
@@ -121,7 +120,7 @@ def offset_layers(parameters: NamedTensors) -> OffsetLayers:
 
 
 def line_table(blended: Tensor, first: Tensor) -> Tensor:
-    """(3 L, H): what each sample of the (2, 3, L, C) blended lines adds to the first layer of (H, 6 C) weights.
+    """(3 L, H): contribution of each sample of the (2, 3, L, C) blended lines to the first layer of (H, 6 C) weights.
 
     The layer's inputs are [e_x e_y e_z j_x j_y j_z], C features of each line.
     """
@@ -156,7 +155,7 @@ def uniform(shape: tuple[int, ...], bound: float, generator: torch.Generator) ->
 
 
 PLANE_MARGIN = 0.005  # metres around the canonical mesh
-PLANE_MARGIN_BELOW = 0.025  # metres more at the bottom: splats of the neck hang below the mesh
+PLANE_MARGIN_BELOW = 0.025  # additional metres at the bottom, for splats of the neck below the mesh
 PAPER_HALF_WIDTH = 0.25  # metres
 
 
@@ -171,13 +170,13 @@ def plane_box(canonical: Tensor, variant: str) -> Bounds:
 
 
 def line_box(vertices: Tensor) -> Bounds:
-    """Bounds of the lines: exactly the vertices given."""
+    """Bounds of the lines: the box of the given vertices."""
     return Bounds(vertices.amin(0), vertices.amax(0))
 
 
 @dataclass(frozen=True, eq=False)
 class CanonicalFrames:
-    """Triangle frames of the canonical mesh, and the way of splats and directions into it.
+    """Triangle frames of the canonical mesh, which map splats and directions to canonical space.
 
     Attributes
     ----------
@@ -194,8 +193,8 @@ class CanonicalFrames:
     rotation: Tensor
 
     @classmethod
-    def of(cls, frames: Frames) -> CanonicalFrames:
-        """Take what is needed from triangle frames."""
+    def of(cls, frames: TriangleFrames) -> CanonicalFrames:
+        """Select what is needed from triangle frames."""
         linear = (frames.size[:, None, None] * frames.rotation).flatten(1)
         return cls(linear, frames.center, frames.rotation)
 
@@ -203,13 +202,13 @@ class CanonicalFrames:
         """Canonical positions (N, 3) of local means: k_c R_c mean + T_c."""
         return points_on(means, binding, self.linear, self.center)
 
-    def turns(self, frames: Frames) -> Tensor:
-        """(F, 3, 3) rotations that take world directions of a posed mesh to canonical ones: R_c R_t^T."""
+    def turns(self, frames: TriangleFrames) -> Tensor:
+        """(F, 3, 3) rotations from world directions of a posed mesh to canonical ones: R_c R_t^T."""
         return turns_between(self.rotation, frames.rotation)
 
 
 def color_network(parameters: NamedTensors) -> ColorNetwork:
-    """The tensors that give colours by place and direction."""
+    """The tensors that give colours by position and direction."""
     return ColorNetwork(*(parameters[name] for name in COLOR_NETWORK))
 
 
@@ -219,7 +218,7 @@ def plane_features(parameters: NamedTensors, box: Bounds, positions: Tensor) -> 
 
 
 def position_part(parameters: NamedTensors, features: tuple[Tensor, ...]) -> Tensor:
-    """(N, H) what plane features, (N, C_k) each, add to the hidden layer; for an avatar it never changes."""
+    """(N, H) contribution of plane features, (N, C_k) each, to the hidden layer; constant for an avatar."""
     joined = torch.cat(features, dim=1)
     return joined @ parameters[FIRST_LAYER][:, : joined.shape[1]].t()
 

@@ -1,8 +1,7 @@
-"""Per-frame computation of a stored avatar of "ours", with everything precomputed that does not depend on the
-frame.
+"""Per-frame computation of a stored avatar of "ours", with precomputed values that do not depend on the frame.
 
-`tests/methods/ours/test_formula.py` compares it with the definition in float64. README.md lists what was measured and left
-out.
+`tests/methods/ours/test_formula.py` compares it with the definition in float64. README.md lists optimisations that
+were measured and not adopted.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..ops.mesh import Frames
+from ..ops.mesh import TriangleFrames
 from ..ops.planes import AXES, Bounds, LinePosition, line_position, offset_writer
 from .field import blend_lines, line_table, normalised_weight, offset_layers
 
@@ -21,7 +20,7 @@ from .field import blend_lines, line_table, normalised_weight, offset_layers
 class DrivenPose(NamedTuple):
     """Results for a pose that are cached for known poses."""
 
-    frames: Frames
+    frames: TriangleFrames
     turns: Tensor
     """(F, 3, 3) world directions to canonical ones."""
     offsets: Tensor | None
@@ -35,7 +34,7 @@ class DrivenPose(NamedTuple):
 
 
 class LineOffsets:
-    """Offsets of the splats inside the lines' box; the others have none.
+    """Offsets of the splats inside the lines' box; others have none.
 
     Parameters
     ----------
@@ -50,7 +49,7 @@ class LineOffsets:
         inside = box.contains(positions).nonzero().squeeze(1)
         unit = box.unit(positions.index_select(0, inside))
         position = line_position(unit, self._lines.shape[2])
-        # Neighbours on the lines beside each other: they read the same rows, and turn the same units on.
+        # Neighbours on the lines are stored together because they read the same rows and activate the same units.
         order = _lexicographic(position.rows[:, :AXES], self._lines.shape[2])
         self.inside = inside[order]
         self._first, layers = normalised_weight(tensors, 0), offset_layers(tensors)
@@ -58,7 +57,7 @@ class LineOffsets:
         self._write = offset_writer(layers, LinePosition(*(part[order] for part in position)))
 
     def __call__(self, coefficients: Tensor) -> Tensor:
-        """(N, D) offsets of all splats for the (E + J,) coefficients of a frame, the jaw's last."""
+        """(N, D) offsets of all splats for the (E + J,) coefficients of a frame, jaw weights last."""
         table = self.table(coefficients)
         out = table.new_empty if len(self.inside) == self._count else table.new_zeros
         offsets = out(self._count, self._outputs)
@@ -72,6 +71,6 @@ class LineOffsets:
 
 
 def _lexicographic(rows: Tensor, resolution: int) -> Tensor:
-    """(N,) order of (N, 3) rows by their last number, then the middle one, then the first."""
+    """(N,) order of (N, 3) rows by the last column, then the middle one, then the first."""
     x, y, z = rows.unbind(1)
     return torch.argsort((z * AXES * resolution + y) * AXES * resolution + x, stable=True)

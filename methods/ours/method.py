@@ -1,7 +1,7 @@
 """Compact tensorial Gaussian avatars: static colour from planes, dynamic opacity from feature lines.
 
 "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations", CVPR 2025,
-arXiv 2504.14967. What the paper does not change is as in GaussianAvatars (`shared.splat_training`).
+arXiv 2504.14967. Everything else is as in GaussianAvatars (`shared.splat_training`).
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class Ours(TrainedMethod[OursConfig, OursAvatar]):
     _plan: CapacityPlan | None = None
 
     def _resolved(self, clip: Clip, device: str) -> tuple[OursConfig, Any]:
-        """With sizes as planned, where they are. The digest takes these, and not the measurements behind them, whose
-        last digits depend on the number of threads."""
+        """The configuration with planned sizes, if any. The digest covers the sizes and not the measurements for them,
+        whose last digits depend on the number of threads."""
         config, lines = self.config, self.config.lines
         if config.sampling.balanced or (lines.enabled and (config.penalty.weight or lines.bounds == "face")):
             faces_in_region(clip.head, "face")  # raises before long work if the region is missing

@@ -24,10 +24,10 @@ from .field import COLOR_NETWORK, FIRST_LAYER, LAST_LAYER, PLANES, WIDTHS, offse
 
 FIELD_FILE = "avatar.safetensors"
 DYNAMIC = "dynamic"
-"""Key of the file's metadata: what the lines change, in the order of the offset network's outputs."""
+"""Key of the file's metadata: attributes that the lines change, in the order of the offset network's outputs."""
 
 RESIDUAL = "color_residual"
-"""The (N, 3) colours of their own, where splats have one beside that of the planes."""
+"""The (N, 3) separate colours of splats, added to those of the planes."""
 
 PER_SPLAT = ("splats", "sh_dc", "sh_rest", RESIDUAL)
 """Tensors with a row for each splat."""
@@ -62,33 +62,33 @@ def write_field(
         "line_box": torch.stack(list(line_box)),
         "jaw_bases": torch.from_numpy(np.asarray(jaw_bases, dtype=np.float32)),
     }
-    save_field(path, Field(tensors, tuple(dynamic)))
+    save_field(path, StoredField(tensors, tuple(dynamic)))
 
 
-class Field(NamedTuple):
+class StoredField(NamedTuple):
     """Content of an avatar's file: its tensors by name, and the attributes that the lines change."""
 
     tensors: dict[str, Tensor]
     dynamic: tuple[Dynamic, ...]
 
 
-def save_field(path: Path, field: Field) -> None:
+def save_field(path: Path, field: StoredField) -> None:
     """Write the exact file of a field, whole or not at all."""
     tensors = {name: value.cpu().contiguous() for name, value in field.tensors.items()}
     write_bytes(path, save(tensors, {DYNAMIC: ",".join(field.dynamic)}))
 
 
-def read_field(path: Path, head: HeadAsset, device: str) -> Field:
-    """Read and check what `write_field` wrote. Raises `InputError` where a tensor is missing or does not fit."""
+def read_field(path: Path, head: HeadAsset, device: str) -> StoredField:
+    """Read and check what `save_field` wrote. Raises `InputError` if a tensor is missing or does not fit."""
     tensors, metadata = read_safetensors(path)
     field = checked_field(path, tensors, metadata.get(DYNAMIC, "opacity"), head)
     return field._replace(tensors={name: value.to(device) for name, value in field.tensors.items()})
 
 
-def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: HeadAsset) -> Field:
-    """Make a field of tensors that came from outside, and of what they say the lines change, by comma.
+def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: HeadAsset) -> StoredField:
+    """Make a field of untrusted tensors and the comma-separated attributes that the lines change.
 
-    Raises `InputError` where a tensor is missing, is not finite float32 or does not fit the others.
+    Raises `InputError` if a tensor is missing, is not finite float32 or does not fit the others.
     """
     given = names.split(",")
     if len(set(given)) != len(given) or not set(given) <= set(WIDTHS):
@@ -104,11 +104,11 @@ def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: Head
     number = Member("f", None, MAX_MAGNITUDE, "f4")
     check_tensors(path, tensors, dict.fromkeys([*needed, *tensors], number))
     _check_shapes(path, tensors, head, offset_width(dynamic))
-    return Field(tensors, dynamic)
+    return StoredField(tensors, dynamic)
 
 
 def _check_shapes(path: Path, tensors: Mapping[str, Tensor], head: HeadAsset, outputs: int) -> None:
-    """Raise `InputError` at the first tensor that does not fit the others, so that no rendering can."""
+    """Raise `InputError` for the first tensor that does not fit the others, so that rendering cannot fail."""
 
     def require(name: str, fits: bool, expected: str) -> None:
         if not fits:
@@ -129,7 +129,7 @@ def _check_shapes(path: Path, tensors: Mapping[str, Tensor], head: HeadAsset, ou
     for name in ("plane_box", "line_box"):
         exactly(name, 2, 3)
         if not (tensors[name][0] < tensors[name][1]).all():
-            raise InputError(path, name, "a low corner below the high one", str(tensors[name].tolist()))
+            raise InputError(path, name, "a low corner below the high corner", str(tensors[name].tolist()))
 
     if "sh_dc" in tensors:
         exactly("sh_dc", len(splats), 3)

@@ -1,4 +1,4 @@
-"""Files that mesh-bound avatars share: the head model, the subject, refined tracking, the record of the run."""
+"""Common files of mesh-bound avatars: head model, subject, refined tracking, and record of the run."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.documents import read_json
 from ...bench.io.files import atomic_path, digest, write_json
 from ...datasets.head.arrays import STORED, HeadArrays, read_head, save_head
-from .loop import Fit, Outcome
+from .loop import Fit, TrainingSummary
 
-RECORDED_LOSSES = 200  # losses of an avatar's record at most
+RECORDED_LOSSES = 200  # maximum number of losses in an avatar's record
 _SIZES = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
 TRACKED = ("expression", "rotation", "neck", "jaw", "eyes", "translation")
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """Who an avatar shows: name, head model version, (S,) identity, (V, 3) static offset in metres."""
+    """Subject of an avatar: name, head model version, (S,) identity, (V, 3) static offset in metres."""
 
     name: str
     head_model: str
@@ -35,13 +35,13 @@ class Subject:
 
     @classmethod
     def of(cls, clip: Clip) -> Subject:
-        """The subject of a clip, in float32 as it is stored."""
+        """The subject of a clip in float32, as stored."""
         shape, offset = np.asarray(clip.shape, np.float32), np.asarray(clip.static_offset, np.float32)
         return cls(clip.subject, clip.head.version, shape, offset)
 
 
 def head_arrays(head: HeadAsset) -> HeadArrays:
-    """A head model as arrays that can be stored and changed."""
+    """A head model as writable arrays for storage."""
     if isinstance(head, HeadArrays):
         return head
     names = ("version", *STORED, "eyelid_basis", "regions")
@@ -49,7 +49,7 @@ def head_arrays(head: HeadAsset) -> HeadArrays:
 
 
 def save_shared_head(folder: Path, head: HeadAsset) -> None:
-    """Put the head model beside the avatar, so that the folder alone can be rendered. A shared asset."""
+    """Write the head model beside the avatar, so that the folder can be rendered by itself. It is a shared asset."""
     save_head(folder / HEAD_FILE, head_arrays(head))
 
 
@@ -72,7 +72,7 @@ def write_subject(path: Path, subject: Subject) -> None:
 
 
 def read_subject(path: Path, head: HeadAsset) -> Subject:
-    """Read what `write_subject` wrote. Raises `InputError` where it does not fit the head model."""
+    """Read what `write_subject` wrote. Raises `InputError` if it does not fit the head model."""
     members = {
         "name": TEXT,
         "head_model": TEXT,
@@ -89,8 +89,8 @@ def read_subject(path: Path, head: HeadAsset) -> Subject:
 class RefinedTracking:
     """Tracking refined in training, which replaces the tracked pose of a training timestep.
 
-    It answers to the very signal it was refined from and to nothing else: subject, timestep and all tracked
-    values must be equal, so a held-out or foreign signal is never touched.
+    It applies only to the signal from which it was refined: subject, timestep and all tracked values must be equal, so
+    held-out and foreign signals are never changed.
 
     Parameters
     ----------
@@ -144,14 +144,14 @@ class RefinedTracking:
 
 
 def run_digest(method: str, version: str, config: Any, clip: Clip, budget: Budget, seed: int) -> str:
-    """Digest of everything that decides how training goes."""
+    """Digest of everything that affects training."""
     return digest(method, version, deciding_settings(config), clip.fingerprint, budget, seed)
 
 
 def is_finished(folder: Path, run: str) -> bool:
-    """Whether this folder holds the finished avatar of this run.
+    """Whether this folder has the finished avatar of this run.
 
-    Raises `InputError` where it holds that of another.
+    Raises `InputError` if it has that of another run.
     """
     path = folder / TRAINING_FILE
     if not path.exists():
@@ -164,15 +164,15 @@ def is_finished(folder: Path, run: str) -> bool:
     return True
 
 
-def write_record(fit: Fit, outcome: Outcome, **more: Any) -> None:
-    """Write how the run went. The last file of a fit: its presence says that the avatar is whole."""
-    done: dict[str, Any] = {"iterations": outcome.iterations, "planned_iterations": outcome.planned}
+def write_record(fit: Fit, summary: TrainingSummary, **more: Any) -> None:
+    """Write the record of a run. It is the last file of a fit: its presence marks a complete avatar."""
+    done: dict[str, Any] = {"iterations": summary.iterations, "planned_iterations": summary.planned}
     if fit.trials:
         done["trials"] = [asdict(trial) for trial in fit.trials]
-    if outcome.losses:
-        done["losses"] = [[at, float(f"{value:.4g}")] for at, value in thinned(outcome.losses)]
+    if summary.losses:
+        done["losses"] = [[at, float(f"{value:.4g}")] for at, value in thinned(summary.losses)]
     write_json(
-        fit.out / TRAINING_FILE, {"run": fit.run, **done, "seconds": round(outcome.seconds, 3), **more}
+        fit.out / TRAINING_FILE, {"run": fit.run, **done, "seconds": round(summary.seconds, 3), **more}
     )
 
 
@@ -183,8 +183,8 @@ def thinned(losses: Sequence[tuple[int, float]], count: int = RECORDED_LOSSES) -
     return [(group[-1][0], sum(value for _, value in group) / len(group)) for group in groups]
 
 
-def finish_fit(fit: Fit, outcome: Outcome, subject: Subject, head: HeadAsset, **more: Any) -> None:
-    """Write what every trained avatar has beside its own files, the record last."""
+def finish_fit(fit: Fit, summary: TrainingSummary, subject: Subject, head: HeadAsset, **more: Any) -> None:
+    """Write the common files of trained avatars, the record last."""
     write_subject(fit.out / SUBJECT_FILE, subject)
     save_shared_head(fit.out, head)
-    write_record(fit, outcome, **more)
+    write_record(fit, summary, **more)

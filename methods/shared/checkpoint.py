@@ -1,7 +1,7 @@
 """Checkpoints: tensors and plain containers, written whole or not at all, read as data only.
 
 A checkpoint is a safetensors file. Its metadata has one key, ``checkpoint``: JSON with ``layout``, ``run``, ``state``
-and ``digest``. In the state, tensors are named by number, and containers say what they are.
+and ``digest``. In the state, tensors are referenced by number, and containers have their type.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def load_checkpoint(path: Path, run: str, device: str) -> dict[str, Any] | None:
         )
     if content.get("digest") != _digest(content.get("state"), tensors):
         raise InputError(path, "digest", "what was written", "damaged data", REMEDY)
-    # Copies, since the alignment of numbers in memory, too, decides how sums are rounded.
+    # Copies, since the rounding of sums also depends on memory alignment.
     copies = {name: value.to(device, copy=True) for name, value in tensors.items()}
     with reading(path, "containers and tensors of the file", "state", REMEDY):
         state = _unpacked(content["state"], copies)
@@ -78,12 +78,12 @@ def load_checkpoint(path: Path, run: str, device: str) -> dict[str, Any] | None:
 
 
 def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
-    """The value as JSON, its tensors by number."""
+    """The value as JSON, with tensors by number."""
     if isinstance(value, Tensor):
         name, strides = str(len(tensors)), value.stride()
-        # The order of axes in memory decides how sums are rounded, and with it how the run goes on.
+        # The order of axes in memory affects the rounding of sums and thus the continued run.
         axes = sorted(range(value.ndim), key=lambda axis: strides[axis], reverse=True)
-        # A copy, as a file cannot have two tensors that share their numbers.
+        # A copy, since a file cannot have two tensors with shared memory.
         ordered = value.detach().permute(axes)
         tensors[name] = ordered.to("cpu", copy=True, memory_format=torch.contiguous_format)
         return {"tensor": [name, axes]}
@@ -96,7 +96,7 @@ def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
         return {"float": str(value)}
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    raise TypeError(f"{type(value).__name__} is nothing that a checkpoint can hold")
+    raise TypeError(f"{type(value).__name__} is not supported in a checkpoint")
 
 
 def _unpacked(tree: Any, tensors: Mapping[str, Tensor]) -> Any:

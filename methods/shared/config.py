@@ -1,10 +1,10 @@
-"""Settings and presets that methods trained with splats share. Light: neither torch nor numpy is imported here.
+"""Settings and presets shared by methods trained with splats. Light: neither torch nor numpy is imported here.
 
-The defaults are the published values (600,000 iterations). Where the authors' program departs from the paper, a setting
-``<what>_variant`` chooses between "paper" and "official".
+The defaults are the published values (600,000 iterations). If the authors' program differs from the paper, a setting
+``<name>_variant`` selects "paper" or "official".
 
-Moments in training are written on the published scale and mapped to the budget at hand as fractions
-(`schedule.Timeline`); the ``min_...`` fields are the iterations that a thing needs in any run to do more good than harm.
+Iterations are given on the published scale and mapped to the budget as fractions (`schedule.Timeline`); the
+``min_...`` fields are lower limits in iterations of the actual run, below which a step would do harm.
 """
 
 from __future__ import annotations
@@ -166,12 +166,12 @@ SHORT_SPLATS: Mapping[str, Any] = {
     "scale_lr": 0.05,
     "rotation_lr": 0.01,
 }
-"""Of runs much shorter than published: splats start half opaque, and move, grow and turn far before rates fall
-(`ga/README.md`)."""
+"""Settings of runs much shorter than published: splats start half opaque, with high learning rates of position, size
+and rotation (`ga/README.md`)."""
 
 
 def splat_presets(short: Mapping[str, Any], paper: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Presets of a mesh-bound method: its own settings for short runs and for the published one, budgets, splats."""
+    """Presets of a mesh-bound method from its own settings for short and published runs, with budgets and splat settings."""
     return {
         "smoke": {"budget": {"iterations": 60}, **short, "splats": SHORT_SPLATS},
         "demo": {"budget": {"iterations": 2_000}, **short, "splats": {**SHORT_SPLATS, "max_splats": 20_000}},

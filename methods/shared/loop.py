@@ -1,4 +1,4 @@
-"""The training loop, once for all methods: budget, sampling, steps, progress, checkpoints."""
+"""The training loop of all methods: budget, sampling, steps, progress, checkpoints."""
 
 from __future__ import annotations
 
@@ -27,25 +27,24 @@ from .threads import torch_on_one_thread
 
 CHECKPOINT = "checkpoint.safetensors"
 TIMED_STEPS = 5  # steps timed to turn seconds into iterations
-COST_GROWTH = 1.6  # a step late in training costs about so much more than one at its start: more splats
-REPORT_EVERY = 10  # iterations between looks at the loss, each of which waits for the device
+COST_GROWTH = 1.6  # estimated cost of a late step relative to an early one, because there are more splats
+REPORT_EVERY = 10  # iterations between reads of the loss, each of which waits for the device
 
 
 class Trainable(Protocol):
-    """Trainable part of a method. Random numbers are drawn by iteration (`schedule`), never from a global
-    state."""
+    """Trainable part of a method. Random numbers are drawn by iteration (`schedule`), never from a global state."""
 
     @property
     def optimiser(self) -> Optimiser: ...
 
     def begin(self, timeline: Timeline) -> None:
-        """Fit schedules to the length of the run. Called before anything else, perhaps more than once."""
+        """Scale schedules to the length of the run. Called first, possibly more than once."""
 
     def loss(self, iteration: int, index: int) -> Tensor:
-        """Loss for training image ``index``. Must not change what training depends on."""
+        """Loss for training image ``index``. Must not change the state of training."""
 
     def after_backward(self, iteration: int) -> None:
-        """Use the gradients before the step: densification, resets, learning rates."""
+        """Hook between gradients and step: densification, resets, learning rates."""
 
     def state(self) -> dict[str, Any]:
         """Everything that training changes, as tensors and plain containers."""
@@ -53,7 +52,7 @@ class Trainable(Protocol):
     def load_state(self, state: dict[str, Any]) -> None: ...
 
     def note(self) -> str:
-        """A few words on the state of training, for progress."""
+        """Short description of the state of training, for progress."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,7 @@ class Fit:
     clock : Callable
         Clock in seconds with any origin, for budgets in seconds.
     trials : Sequence[Any]
-        The sizes that were tried before, for the record.
+        The sizes tried before, for the record.
     """
 
     clip: Clip
@@ -84,8 +83,8 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """Summary of a run: iterations done and planned, and seconds over all its parts.
+class TrainingSummary:
+    """Summary of a training: iterations done and planned, and seconds including interrupted parts.
 
     ``losses`` are pairs of an iteration and the loss of its image, from every `REPORT_EVERY`-th iteration, the first and the last planned one.
     """
@@ -104,12 +103,13 @@ def train(
     published_length: int,
     checkpoint_every_s: float,
     began: float | None = None,
-) -> Outcome:
+) -> TrainingSummary:
     """Train until the budget is spent; continue from the checkpoint in ``fit.out`` if it is of the same run.
 
     One iteration is: loss of one image, gradients, `after_backward` (densification), Adam step; the last
-    iteration has no Adam step, as published. A run that was killed and continued ends bit for bit like an
-    unbroken one on the same machine, unless seconds rule: then the clock decides how many iterations fit.
+    iteration has no Adam step, as published. A killed and continued run gives bit-identical results to an
+    uninterrupted one on the same machine, unless the budget is in seconds, where the number of iterations depends on
+    the clock.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def train(
                 last_save = clock()
             fit.progress(iteration, total, note + trainable.note() if note else "")
     wait()
-    return Outcome(iteration, total, seconds(), losses)
+    return TrainingSummary(iteration, total, seconds(), losses)
 
 
 def synchroniser(device: str) -> Callable[[], None]:
@@ -185,7 +185,7 @@ def synchroniser(device: str) -> Callable[[], None]:
 
 
 def check_budget(budget: Budget) -> None:
-    """Raise `InputError` unless the budget bounds something."""
+    """Raise `InputError` for a budget without a limit."""
     if budget.iterations is None and budget.seconds is None:
         raise InputError("budget", "", "iterations, seconds or both", "neither")
     for name in ("iterations", "seconds"):
@@ -202,8 +202,7 @@ def _estimate(
     clock: Callable[[], float],
     wait: Callable[[], None],
 ) -> int:
-    """Number of iterations in a number of seconds, at least one, estimated from a few steps without
-    effect."""
+    """Number of iterations in a number of seconds, at least one, estimated from a few steps without effect."""
     trainable.begin(Timeline(published_length, published_length))
     durations = []
     for step in range(1, TIMED_STEPS + 2):
@@ -219,14 +218,14 @@ def _estimate(
 
 
 class TrainingImages:
-    """Images of a clip by index. What they cost in memory is the clip's affair; this holds two at most.
+    """Images of a clip by index. Keeps at most two images; the clip may cache others.
 
     ``clip.image`` and ``clip.mask`` are called from a thread, one call at a time.
 
     Parameters
     ----------
     masks : bool
-        Whether images have a fourth channel, the foreground's coverage.
+        Whether images have a fourth channel, the foreground coverage.
     """
 
     def __init__(
@@ -257,7 +256,7 @@ class TrainingImages:
         image = _checked(key, "image", image, (camera.height, camera.width, 3))
         if self._masks:
             image = np.dstack([image, _checked(key, "mask", self._clip.mask(key), image.shape[:2])])
-        # A clip's images may be read-only and shared; torch wants an array it may write to.
+        # A clip's images may be read-only and shared; torch requires writable arrays.
         return pinned(torch.from_numpy(np.array(image, copy=True)), self._device)
 
 
@@ -269,12 +268,12 @@ def _checked(key: FrameKey, name: str, pixels: ByteArray | None, shape: tuple[in
 
 
 def recomposited(image: Tensor, coverage: Tensor, recorded_on: Tensor, background: Tensor) -> Tensor:
-    """Colours (..., 3) on another background than the one they were recorded on; ``coverage`` is (..., 1) in [0, 1]."""
+    """Colours (..., 3) on another background than the recorded one; ``coverage`` is (..., 1) in [0, 1]."""
     return image + (1 - coverage) * (background - recorded_on)
 
 
 def check_training_split(clip: Clip) -> None:
-    """Raise `InputError` unless the clip has training frames, all with a pose of its head model and a camera."""
+    """Raise `InputError` unless the clip has training frames, and all have a pose of its head model and a camera."""
     where, version = f"clip of {clip.subject}", clip.head.version
     if not clip.splits.get("train"):
         raise InputError(where, "splits[train]", "at least one frame", "none")

@@ -1,4 +1,4 @@
-"""Common parts of trained methods around their training: checks, resuming, reading back."""
+"""Common code of trained methods around their training: checks, resuming, loading."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ Avatar = TypeVar("Avatar")
 class TrainedMethod(Generic[Config, Avatar]):
     """A `Method` except for its training, `_train`, which writes the avatar under ``fit.out``.
 
-    A derived class names its settings' class, its avatar's (with ``read(folder, device)``), and the name and version
-    of its spec; one that draws no splats says so.
+    A derived class defines the classes of its settings and its avatar (with ``read(folder, device)``), name and
+    version of its spec, and whether it draws splats.
     """
 
     name: ClassVar[str]
@@ -42,8 +42,8 @@ class TrainedMethod(Generic[Config, Avatar]):
     ) -> Avatar:
         """Train on the training split and write the avatar under ``out``; continues a killed run.
 
-        Raises `InputError` for a budget without bound, a clip without training frames, and an output folder that holds
-        the avatar of another run.
+        Raises `InputError` for a budget without bound, a clip without training frames, and an output folder with the
+        avatar of another run.
         """
         check_budget(budget)
         check_training_split(clip)
@@ -57,7 +57,7 @@ class TrainedMethod(Generic[Config, Avatar]):
         return self.load(out, device=device)
 
     def prepare(self, device: str) -> None:
-        """Make ready what draws on ``device``; see `cuda.prepare`."""
+        """Prepare the renderer for ``device``; see `cuda.prepare`."""
         if self.draws_splats:
             cuda.prepare(device)
         else:
@@ -70,15 +70,15 @@ class TrainedMethod(Generic[Config, Avatar]):
         return avatar
 
     def _resolved(self, clip: Clip, device: str) -> tuple[Any, Any]:
-        """The configuration to train with, and what of it tells one run from another."""
+        """The configuration to train with, and the part of it that identifies the run."""
         return self.config, self.config
 
     def _sizes(self, clip: Clip, config: Any) -> Sequence[Size]:
-        """The sizes that are tried where ``config.capacity`` says so."""
+        """The sizes to try if ``config.capacity`` is "auto"."""
         return ()
 
     def _sized(self, fit: Fit, config: Any) -> tuple[Fit, Any]:
-        """The fit and its configuration with sizes as tried, where they are."""
+        """The fit and its configuration with the sizes chosen by trials, if any."""
         sizes = [size for size in self._sizes(fit.clip, config) if size.values]
         if not sizes or config.capacity.mode == "fixed":
             return fit, config
@@ -92,7 +92,7 @@ class TrainedMethod(Generic[Config, Avatar]):
         return replace(fit, trials=trials), config
 
     def _remove_training_files(self, out: Path) -> None:
-        """Remove what a finished avatar no longer needs, that of a run killed just before it did so included."""
+        """Remove files that a finished avatar no longer needs, also after a kill before this step."""
         (out / CHECKPOINT).unlink(missing_ok=True)
         shutil.rmtree(out / FOLDER, ignore_errors=True)
 

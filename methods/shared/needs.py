@@ -19,7 +19,7 @@ def splats(config: Any, device: str) -> Iterator[Need]:
         return
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else ""
     there = importlib.util.find_spec("gsplat") is not None
-    slow = f"{cuda.REMEDY} The slow reference backend draws meanwhile."
+    slow = f"{cuda.REMEDY} The slow reference backend is used instead."
     yield Need("GPU", gpu, "PyTorch with CUDA, and an NVIDIA driver: https://pytorch.org/get-started.")
     yield Need("gsplat", "installed" if there else "", slow, required=False)
     if there and not cuda.compiled():
@@ -27,7 +27,7 @@ def splats(config: Any, device: str) -> Iterator[Need]:
 
 
 def insta(config: Any, device: str) -> Iterator[Need]:
-    """INSTA's kernel, and the device that it is for."""
+    """INSTA's kernel and its device."""
     from ..insta.kernel import KERNEL
 
     if not device.startswith("cpu"):

@@ -21,8 +21,8 @@ class Optimiser:
     """One Adam (eps 1e-15, dense) over named parameters.
 
     Densification replaces per-splat parameters by longer or shorter ones; `select` and `append` keep the moments, with
-    zeros for new rows. A replaced parameter has no gradient, so it sits out the step that follows, as in the published
-    code.
+    zeros for new rows. A replaced parameter has no gradient, so it is not changed by the following step, as in the
+    published code.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class Optimiser:
             )
 
     def set_values(self, name: str, values: Tensor) -> None:
-        """Put new values into a parameter and forget its moments (opacity reset)."""
+        """Set the values of a parameter and reset its moments (opacity reset)."""
         self._replace(name, lambda _: values, torch.zeros_like)
 
     def _replace(self, name: str, change: Any, change_moment: Any = None) -> None:
@@ -103,7 +103,7 @@ class Optimiser:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Take over what `state` gave, whatever the number of rows then was."""
+        """Restore what `state` returned, with any number of rows."""
         for name, group in self._groups.items():
             entry = state[name]
             old = group["params"][0]
@@ -116,11 +116,11 @@ class Optimiser:
 
 
 CHILDREN = 2
-SHRINK = 0.8 * CHILDREN  # a child's scale is its parent's over this
+SHRINK = 0.8 * CHILDREN  # ratio of a parent's scale to its children's
 
 
 class Densifier:
-    """Gathers projected gradients, and grows and thins the splats from them.
+    """Accumulates projected gradients, and clones, splits and prunes splats.
 
     Per-splat parameters are the optimiser's groups ``names``; "means", "log_scales", "quats" and "opacities"
     (logits) must be among them.
@@ -137,8 +137,8 @@ class Densifier:
     keep_last : bool
         Whether the last splat of a triangle is never removed.
     tables : tuple[str, ...]
-        Groups with any number of rows for each splat, all rows of the first splat first; splats on
-        one triangle have equally many. Children inherit them.
+        Groups with any number of rows per splat, ordered by splat; splats on one triangle have the same number.
+        Children inherit them.
     table_rows : Tensor | None
         (F,) int64, number of rows in the tables for a splat on each triangle.
     """
@@ -166,9 +166,10 @@ class Densifier:
         self._restart()
 
     def observe(self, gradient: Tensor, visible: Tensor, width: int, height: int) -> None:
-        """Add one view: (N, 2) gradient by the projected means in pixels, and (N,) which splats were seen.
+        """Add one view: (N, 2) gradient with respect to the projected means in pixels, and (N,) whether a splat was
+        visible.
 
-        Pixels become normalised device units by half the image size, as the published thresholds have it.
+        Gradients are converted to normalised device units by half the image size, the unit of the published thresholds.
         """
         half = to_device(torch.tensor([0.5 * width, 0.5 * height], dtype=gradient.dtype), gradient.device)
         seen = visible.to(gradient.dtype)
@@ -176,7 +177,7 @@ class Densifier:
         self._views += seen
 
     def run(self, iteration: int, schedule: DensifySchedule, face_sizes: Tensor) -> None:
-        """Clone, then split, then prune; then gather afresh.
+        """Clone, split and prune, then reset the accumulated gradients.
 
         Parameters
         ----------
@@ -198,7 +199,7 @@ class Densifier:
         self._restart()
 
     def reset_opacity(self) -> None:
-        """Cut opacities to the reset value and forget their moments."""
+        """Clamp opacities to the reset value and reset their moments."""
         ceiling = logit(self._settings.reset_opacity)
         logits = self._optimiser["opacities"].detach()
         self._optimiser.set_values("opacities", logits.clamp_max(ceiling))
@@ -208,7 +209,7 @@ class Densifier:
         return {"binding": self.binding, "gradient_sum": self._gradient_sum, "views": self._views}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` gave."""
+        """Restore what `state` returned."""
         self.binding = state["binding"]
         self._gradient_sum, self._views = state["gradient_sum"], state["views"]
 
@@ -222,13 +223,13 @@ class Densifier:
         return largest * face_sizes.index_select(0, self.binding)
 
     def _within_bound(self, asks: Tensor, gradient: Tensor) -> Tensor:
-        """If a limit leaves room for some splats only, select those with the largest gradients."""
+        """If the maximum number allows only some splats, select those with the largest gradients."""
         if self._settings.max_splats is None:
             return asks
         room = max(self._settings.max_splats - len(self.binding), 0)
         if int(asks.sum()) <= room:
             return asks
-        # Stable: equal gradients are taken in order, so that a resumed run takes the same ones.
+        # A stable sort takes equal gradients in order, so that a resumed run selects the same splats.
         order = torch.argsort(
             torch.where(asks, gradient, gradient.new_full((), -1.0)), descending=True, stable=True
         )
@@ -252,7 +253,7 @@ class Densifier:
         self._append(self._rows(rows), self.binding.index_select(0, rows))
 
     def _split(self, parents: Tensor, face_sizes: Tensor, iteration: int) -> None:
-        """Add the children of the parents; `_prune` then takes the parents away."""
+        """Add the children of the parents; `_prune` then removes the parents."""
         rows = parents.nonzero().squeeze(1).repeat(CHILDREN)
         binding = self.binding.index_select(0, rows)
         children = self._rows(rows)
@@ -274,7 +275,7 @@ class Densifier:
         if large_too:
             unfit |= self._world_scale(face_sizes) > self._settings.prune_extent * self._extent
         if self._keep_last:
-            # A parent goes in any case: its children hold the face, fit or not.
+            # A parent is always removed: its children keep the triangle occupied.
             kept = torch.bincount(self.binding[~(replaced | unfit)], minlength=self._face_count)
             unfit &= kept.index_select(0, self.binding) > 0
         keep = ~(replaced | unfit)
@@ -286,7 +287,7 @@ class Densifier:
 
 
 def rows_of_tables(counts: Tensor, splats: Tensor) -> Tensor:
-    """Rows of some splats in a table that has ``counts`` (N,) rows for each splat, in their order."""
+    """Rows of some splats, in order, in a table with ``counts`` (N,) rows per splat."""
     starts = counts.cumsum(0) - counts
     chosen = counts.index_select(0, splats)
     within = torch.arange(int(chosen.sum()), device=counts.device)

@@ -1,4 +1,4 @@
-"""PLY files of one float32 vertex table: what splat viewers open."""
+"""PLY files of one float32 vertex table, as read by splat viewers."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ SCALARS = {
     **dict.fromkeys(("float", "float32"), "<f4"),
     **dict.fromkeys(("double", "float64"), "<f8"),
 }
-"""Types of a property, by both of their names."""
+"""Types of a property, by both their names."""
 BEGIN, END = re.compile(rb"ply\r?\n"), re.compile(rb"\nend_header\r?\n")
-OPACITY, LARGEST_LOGIT = "opacity", 20.0  # the sigmoid of which is 1 in float32
+OPACITY, LARGEST_LOGIT = "opacity", 20.0  # its sigmoid is 1 in float32
 _COUNT = re.compile(r"[0-9]{1,18}")
 EXPECTED, MAX_BYTES = "a PLY file", 2**30
-HEADER_LIMIT = 65536  # bytes; a file with a longer header was not written here
+HEADER_LIMIT = 65536  # bytes; files with a longer header are refused
 
 
 def write_ply(path: Path, names: tuple[str, ...], table: FloatArray, comment: str = "") -> None:
     """Write an (N, len(names)) table as binary little-endian float32 vertices, whole or not at all.
 
-    A comment stands at the end of the header: some viewers count the lines before the properties.
+    Comments are at the end of the header because some viewers count the lines before the properties.
     """
     if table.ndim != 2 or table.shape[1] != len(names):
         raise ValueError(f"table: expected (N, {len(names)}), found {table.shape}")
@@ -48,8 +48,8 @@ def write_ply(path: Path, names: tuple[str, ...], table: FloatArray, comment: st
 def read_ply(path: Path, names: tuple[str, ...]) -> FloatArray:
     """Read columns of a binary little-endian vertex table by name, as (N, len(names)) float32.
 
-    Other columns may be there, of any scalar type. Raises `InputError` where the file is no such PLY, lacks a column,
-    is cut short, or holds numbers that are not finite in float32. Infinite logits of opacities are cut to `LARGEST_LOGIT`.
+    Other columns of any scalar type are ignored. Raises `InputError` if the file is no such PLY, lacks a column, is
+    truncated, or has numbers that are not finite in float32. Infinite opacity logits are clamped to `LARGEST_LOGIT`.
     """
     content = read_bytes(path, EXPECTED, MAX_BYTES)
     count, columns, start = _header(path, content)
@@ -65,7 +65,7 @@ def read_ply(path: Path, names: tuple[str, ...]) -> FloatArray:
     with np.errstate(over="ignore"):
         for column, name in enumerate(names):
             chosen[:, column] = table[name]
-    if OPACITY in names:  # opaque and invisible splats have infinite logits where a program clamps none
+    if OPACITY in names:  # programs that do not clamp write infinite logits for opaque and invisible splats
         logits = chosen[:, names.index(OPACITY)]
         logits[np.isinf(logits)] = np.sign(logits[np.isinf(logits)]) * LARGEST_LOGIT
     if not np.isfinite(chosen).all():
@@ -76,13 +76,13 @@ def read_ply(path: Path, names: tuple[str, ...]) -> FloatArray:
 
 
 def read_names(path: Path) -> tuple[str, ...]:
-    """The columns a PLY file has, by its header alone. Raises `InputError` as `read_ply` does."""
+    """The columns of a PLY file from its header. Raises `InputError` as `read_ply` does."""
     with open_regular(path, EXPECTED) as stream:
         return tuple(_header(path, stream.read(HEADER_LIMIT))[1])
 
 
 def _header(path: Path, content: bytes) -> tuple[int, dict[str, str], int]:
-    """Number of vertices, types of their properties by name, and where the data starts."""
+    """Number of vertices, types of their properties by name, and offset of the data."""
     end = END.search(content, 0, HEADER_LIMIT)
     if not BEGIN.match(content) or end is None:
         raise InputError(path, "header", "a PLY header", "none")

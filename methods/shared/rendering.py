@@ -1,4 +1,4 @@
-"""Rendering of splats bound to a mesh, shared by the avatars that differ in colour and opacity."""
+"""Rendering of splats bound to a mesh, shared by avatars with different colour and opacity models."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class PosedSplats:
 
 
 class Cutoffs(NamedTuple):
-    """Below what the renderer leaves work out; see `rasterize`. More is faster and less exact."""
+    """Thresholds below which the renderer skips work; see `rasterize`. Larger values are faster and less exact."""
 
     alpha_min: float = ALPHA_MIN
     transmittance_min: float = TRANSMITTANCE_MIN
@@ -55,14 +55,14 @@ USUAL = Cutoffs()
 
 
 class Copy(NamedTuple):
-    """A frame on its way into pinned host memory, colours before alpha, and the event after which it is there."""
+    """A frame being copied to pinned host memory, colours before alpha, and the event of its completion."""
 
     host: Tensor
     ready: torch.cuda.Event
 
 
 class Drawn(NamedTuple):
-    """A drawn frame, still where it was computed; from a CUDA device its copy has begun."""
+    """A drawn frame on its device; the copy from a CUDA device has started."""
 
     image: Tensor
     """(H, W, 3) in [0, 1]."""
@@ -95,7 +95,7 @@ def draw_splats(
 
 
 def _copied_ahead(drawn: Drawn) -> Drawn:
-    """Begin to copy a frame: whoever reads it back waits for it alone, not for frames that were drawn after it."""
+    """Start copying a frame, so that reading it back does not wait for frames drawn later."""
     joined = _joined(drawn)
     host = torch.empty(joined.shape, dtype=joined.dtype, pin_memory=is_cuda(joined.device))
     host.copy_(joined, non_blocking=True)
@@ -109,7 +109,7 @@ def _joined(drawn: Drawn) -> Tensor:
 
 
 def read_back(drawn: Drawn) -> Frame:
-    """Bring a drawn frame into host memory, as numpy; from a GPU by one copy."""
+    """Copy a drawn frame to host memory, as numpy; from a GPU by one copy."""
     image, alpha = drawn.image, drawn.alpha
     if drawn.copy is not None:
         drawn.copy.ready.synchronize()
@@ -120,7 +120,7 @@ def read_back(drawn: Drawn) -> Frame:
 
 
 def posed_splats(world: WorldSplats, opacities: Tensor, colors: Tensor | None) -> PosedSplats:
-    """Copy to numpy: avatars keep tensors for the next frame."""
+    """Copy to numpy, since avatars reuse tensors for the next frame."""
     means, quats, scales, of_splats = (_numpy(values).copy() for values in (*world, opacities))
     return PosedSplats(means, quats, scales, of_splats, None if colors is None else _numpy(colors).copy())
 
@@ -131,7 +131,7 @@ def _numpy(values: Tensor) -> np.ndarray:
 
 @dataclass(frozen=True)
 class View:
-    """A camera as tensors, and what is behind the head: (C,), none unless asked for."""
+    """A camera as tensors, and an optional (C,) background."""
 
     camera: Camera
     world_to_camera: Tensor
@@ -141,7 +141,7 @@ class View:
 
 
 def view_of(camera: Camera, device: str, background: Sequence[float] = ()) -> View:
-    """Put a camera and a background on a device, all at once."""
+    """Copy a camera and a background to a device in one transfer."""
     parts = camera.world_to_camera, camera.K, camera.center, [float(channel) for channel in background]
     numbers = np.concatenate([np.ravel(part) for part in parts]).astype(np.float32)
     joined = to_device(torch.from_numpy(numbers), device)
@@ -150,9 +150,10 @@ def view_of(camera: Camera, device: str, background: Sequence[float] = ()) -> Vi
 
 
 def scene_center(poses: Iterable[HeadPose]) -> FloatArray:
-    """(3,) metres near a head in these poses, from which places are measured where a world may have its origin far away.
+    """(3,) reference point near the head in these poses, metres, for worlds with a distant origin.
 
-    Whole metres: a capture around the origin, as all published ones, keeps its numbers, and differences are exact.
+    Rounded to whole metres: captures around the origin, as all published ones, are not changed, and differences are
+    exact.
     """
     places = np.array([pose.translation for pose in poses], np.float64)
     return np.asarray(places.mean(axis=0).round())
@@ -172,7 +173,7 @@ def scene_extent(cameras: Mapping[str, Camera], center: FloatArray | None = None
 
 
 class PlacedSplats(NamedTuple):
-    """Splats of a pose in the world: geometry, (N,) opacities, and colours (N, 3) >= 0 as a camera's centre sees them."""
+    """Splats of a pose in the world: geometry, (N,) opacities, and colours (N, 3) >= 0 seen from a camera's centre."""
 
     world: WorldSplats
     opacities: Tensor
@@ -180,7 +181,7 @@ class PlacedSplats(NamedTuple):
 
 
 class LastPose(Generic[Value]):
-    """Cached result of ``compute`` for the last pose, since several cameras often render one."""
+    """Cached result of ``compute`` for the last pose, since several cameras often render one pose."""
 
     def __init__(self, compute: Callable[[HeadPose, Callable[[str], None]], Value]):
         self._compute = compute
@@ -238,20 +239,20 @@ class StoredSplatAvatar:
 
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:
-        """Splats of a pose in the world; with colours where a camera says from where they are seen."""
+        """Splats of a pose in the world; with colours if a camera is given."""
         placed = self._place(pose, no_stage)
         colors = None if camera is None else self._colors(placed, view_of(camera, self._device))
         return posed_splats(placed.world, placed.opacities, colors)
 
     def _colors(self, placed: PlacedSplats, view: View) -> Tensor:
-        """Colours of placed splats; those of the last call again for the same splats seen from the same place."""
+        """Colours of placed splats, cached for the same splats and the same camera position."""
         place = view.camera.center.tobytes()
         if self._seen is None or self._seen[0] is not placed or self._seen[1] != place:
             self._seen = placed, place, placed.colors(view.center)
         return self._seen[2]
 
     def files(self) -> Sequence[Path]:
-        """The files that hold the avatar."""
+        """The files of the avatar."""
         return self._stored
 
     def shared_files(self) -> Sequence[Path]:

@@ -1,4 +1,4 @@
-"""Training schedules: moments of the published run as fractions of the budget."""
+"""Training schedules: iterations of the published run as fractions of the budget."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ Item = TypeVar("Item")
 
 
 def evenly(items: Sequence[Item], most: int) -> list[Item]:
-    """Evenly spread items, up to a maximum number, including the first and the last if there are two or
-    more."""
+    """Evenly spread items, up to a maximum number, including the first and the last if there are two or more."""
     rows = np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int))
     return [items[row] for row in rows]
 
@@ -76,7 +75,7 @@ class DensifySchedule:
 
     @classmethod
     def of(cls, settings: DensifiedTraining, timeline: Timeline, *, white: bool) -> DensifySchedule:
-        """Fit the published schedule to a run; ``white`` says whether splats are trained on a white background."""
+        """Scale the published schedule to a run; ``white`` is whether splats are trained on a white background."""
         long_enough = timeline.total > settings.min_reset_every
         settle = 1 if timeline.total >= settings.schedule_length else settings.min_settle
         start = timeline.at(settings.densify_from)
@@ -91,7 +90,7 @@ class DensifySchedule:
         )
 
     def gathers(self, iteration: int) -> bool:
-        """Whether gradients of this iteration still serve a later round."""
+        """Whether gradients of this iteration are used by a later round."""
         return iteration < self.stop
 
     def is_round(self, iteration: int) -> bool:
@@ -99,7 +98,7 @@ class DensifySchedule:
         return self.start < iteration < self.stop and iteration % self.every == 0
 
     def is_reset(self, iteration: int) -> bool:
-        """Whether this iteration cuts the opacities."""
+        """Whether this iteration resets opacities."""
         if iteration >= self.stop:
             return False
         regular = self.reset_every is not None and iteration % self.reset_every == 0
@@ -120,7 +119,7 @@ class Sampler(Protocol):
 
 
 class ShuffledEpochs:
-    """Every image once per epoch, in an order of its own each epoch. Iterations count from 1."""
+    """Every image once per epoch, in a new random order each epoch. Iterations are numbered from 1."""
 
     def __init__(self, count: int, seed: int):
         self._count = count
@@ -134,7 +133,7 @@ class ShuffledEpochs:
 
 
 class Weighted:
-    """Draws with replacement by probability. Iterations count from 1.
+    """Draws with replacement by probability. Iterations are numbered from 1.
 
     Parameters
     ----------
@@ -159,8 +158,8 @@ class Weighted:
 def balanced_weights(timestep_of_image: IntArray, class_of_timestep: dict[int, int]) -> np.ndarray:
     """Weight of each image: 1 / (number of timesteps in its class).
 
-    So a class of expressions has the same share however often it was recorded; "3D Gaussian Head Avatars with
-    Expressive Dynamic Appearances", section 3.4.
+    All classes of expressions thus have the same share, regardless of their number of timesteps; "3D Gaussian Head
+    Avatars with Expressive Dynamic Appearances", section 3.4.
     """
     sizes = Counter(class_of_timestep.values())
     return np.array([1.0 / sizes[class_of_timestep[int(t)]] for t in timestep_of_image])

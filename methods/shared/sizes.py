@@ -1,7 +1,7 @@
-"""Size of an avatar, chosen by short trainings that are evaluated on unseen training timesteps.
+"""Choice of the size of an avatar by short trainings that are evaluated on held-out training timesteps.
 
-A method names its sizes and what smaller values to try; a smaller one is taken where the held-out frames lose no more than
-a tolerance against the configured sizes. No test frame is looked at.
+A method defines its sizes and smaller values to try; a smaller one is chosen if the held-out frames lose at most a
+tolerance against the configured sizes. Test frames are not used.
 """
 
 from __future__ import annotations
@@ -25,21 +25,22 @@ from .schedule import evenly
 log = logging.getLogger(__name__)
 Config = TypeVar("Config")
 FRAMES = 48
-"""Held-out frames that a trial is judged by, at most, evenly spaced."""
+"""Maximum number of held-out frames that evaluate a trial, evenly spaced."""
 HELD_OUT_SHARE = 8
-"""The last of so many parts of each training sequence is held out. One whole sequence says too little of the others:
-without it half the expressions seemed enough for `gbs`, and lost 0.7 dB in self-reenactment (`gbs/README.md`)."""
+"""Number of parts of each training sequence, of which the last is held out. A whole sequence does not represent the
+others: with one held out, half the expressions seemed enough for `gbs`, and lost 0.7 dB in self-reenactment
+(`gbs/README.md`)."""
 LEAST_ITERATIONS = 500
-"""Of a trial, if the training itself has as many: what is learnt later says nothing in shorter ones."""
+"""Minimum iterations of a trial, if the training has as many, since shorter ones do not show what is learned later."""
 FOLDER = "trials"
 
 
 @dataclass(frozen=True)
 class Size:
-    """A size of an avatar: dotted name of the setting, and smaller values to try, falling.
+    """A size of an avatar: dotted name of the setting, and smaller values to try, descending.
 
-    ``used`` gives how much of it an avatar has: values that the avatar of the configured sizes does not exceed are not
-    tried, as its training was too short to say anything of them. None: all that is configured.
+    ``used`` returns the size that an avatar actually has. Values that the avatar with the configured sizes does not
+    exceed are not tried, since its training was too short to test them. None stands for the configured size.
     """
 
     name: str
@@ -49,7 +50,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Trial:
-    """A setting and value that was tried, what the held-out frames came to, and whether it was taken."""
+    """A setting and value that was tried, the result on the held-out frames, and whether it was chosen."""
 
     name: str
     value: int | None
@@ -59,7 +60,7 @@ class Trial:
 
 
 class HeldOut:
-    """A `Clip` without the ends of its training sequences; everything else is the clip's own."""
+    """A `Clip` without the ends of its training sequences."""
 
     def __init__(self, clip: Clip):
         self._clip = clip
@@ -74,7 +75,7 @@ class HeldOut:
 
 
 def held_out_frames(clip: Clip) -> tuple[FrameKey, ...]:
-    """The training frames of the last timesteps of each sequence that has two or more; () where none has."""
+    """The training frames of the last timesteps of each sequence with two or more; () without such sequences."""
     train = clip.splits["train"]
     sequences: dict[str, set[int]] = {}
     for key in train:
@@ -93,18 +94,18 @@ def choose_sizes(
     sizes: Sequence[Size],
     train: Callable[[Config, Clip, Path, Budget, Progress], Avatar],
 ) -> tuple[Config, tuple[Trial, ...]]:
-    """The configuration with the smallest sizes that hold, one size after the other, and what was tried.
+    """The configuration with the smallest sufficient sizes, chosen one after the other, and the trials.
 
     Parameters
     ----------
     sizes : Sequence[Size]
-        Chosen one after another; for each, values are tried until one loses too much.
+        Sizes to choose one after another; for each, values are tried until the loss is too large.
     train : Callable
         Trains an avatar with a configuration on a clip into a folder, and resumes it after a kill.
     """
     clip = HeldOut(fit.clip)
     if not clip.held_out or not clip.splits["train"]:
-        log.warning("one timestep of training: nothing can be held out; sizes stay as they are configured")
+        log.warning("only one timestep of training, so none can be held out; the configured sizes are used")
         return config, ()
     frames = evenly(clip.held_out, FRAMES)
     budget = Budget(
@@ -133,7 +134,7 @@ def choose_sizes(
             holds = most_psnr - psnr <= capacity.tolerance_db and most_ssim - ssim <= capacity.tolerance_ssim
             trials.append(Trial(size.name, value, psnr, ssim, holds))
             log.info(
-                "%s %d: %s", size.name, value, f"{psnr:.2f} dB" + ("" if holds else ", too much is lost")
+                "%s %d: %s", size.name, value, f"{psnr:.2f} dB" + ("" if holds else ", the loss is too large")
             )
             if not holds:
                 break
@@ -146,14 +147,14 @@ def _trial_iterations(iterations: int | None, share: float) -> int | None:
 
 
 def with_size(config: Config, name: str, value: int) -> Config:
-    """A configuration with another value of a setting, which may lie in a group of its own."""
+    """A configuration with another value of a setting, which may be in a group."""
     group, _, last = name.rpartition(".")
     changed = {last: value} if not group else {group: replace(getattr(config, group), **{last: value})}
     return replace(config, **changed)  # type: ignore[type-var]
 
 
 def halves(configured: int | None, least: int, count: int = 2) -> tuple[int, ...]:
-    """A half, a quarter and so on of a number, as far as they are not below ``least``; none of no number."""
+    """A half, a quarter and so on of a number, down to ``least``; none for None."""
     values = () if configured is None else tuple(configured >> power for power in range(1, count + 1))
     return tuple(value for value in values if value >= least)
 

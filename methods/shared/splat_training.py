@@ -1,4 +1,4 @@
-"""Training of splats on the images of a clip, common to all ways of placing and colouring them."""
+"""Training of splats on the images of a clip, independent of their placement and colour model."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from ...bench.contracts import Camera, Clip, FrameKey
-from ..ops.mesh import Frames
+from ..ops.mesh import TriangleFrames
 from ..ops.photometric import photometric_loss
 from ..ops.splats import WorldSplats
 from ..splats import rasterize
 from ..splats.request import Rendering
 from .config import DensifiedTraining, SplatTraining
-from .loop import Fit, Outcome, TrainingImages, train
+from .loop import Fit, TrainingImages, TrainingSummary, train
 from .losses import position_penalty, scale_penalty
 from .optimisation import Densifier, Optimiser
 from .rendering import View, scene_center, scene_extent, view_of
@@ -52,7 +52,7 @@ class SplatTrainer:
         seed: int,
         **density: Any,
     ) -> None:
-        """Take over initial tensors.
+        """Set the initial tensors.
 
         Parameters
         ----------
@@ -74,7 +74,7 @@ class SplatTrainer:
 
     @property
     def binding(self) -> Tensor:
-        """(N,) int64, what each splat is bound to."""
+        """(N,) int64 index to which each splat is bound."""
         return self._densifier.binding
 
     def begin(self, timeline: Timeline) -> None:
@@ -88,7 +88,7 @@ class SplatTrainer:
         raise NotImplementedError
 
     def after_backward(self, iteration: int) -> None:
-        """Densification and resets of this iteration, and the learning rates."""
+        """Apply densification and resets of this iteration, and the learning rates."""
         settings, schedule = self._settings, self._schedule
         offset, visible, camera, face_sizes = self._seen
         if schedule.gathers(iteration) and offset.grad is not None:
@@ -110,7 +110,7 @@ class SplatTrainer:
         return {"optimiser": self.optimiser.state(), "densifier": self._densifier.state()}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` gave."""
+        """Restore what `state` returned."""
         self.optimiser.load_state(state["optimiser"])
         self._densifier.load_state(state["densifier"])
 
@@ -118,7 +118,7 @@ class SplatTrainer:
         """Number of splats."""
         return f"{len(self.binding)} splats"
 
-    def run(self, fit: Fit) -> Outcome:
+    def run(self, fit: Fit) -> TrainingSummary:
         """Train to the end of the budget; see `train`."""
         length, seconds = self._settings.schedule_length, self._settings.checkpoint_every_s
         try:
@@ -131,13 +131,13 @@ class SplatTrainer:
         self._images.close()
 
     def _position_progress(self, iteration: int) -> float:
-        """Progress of the positions' learning rate towards the final one; it stays there above 1."""
+        """Progress of the positions' learning rate towards the final one, which it keeps above 1."""
         return self._timeline.fraction(iteration)
 
     def _render(
         self, world: WorldSplats, opacities: Tensor, colors: Tensor, view: View, face_sizes: Tensor
     ) -> tuple[Rendering, Tensor]:
-        """Rasterize and remember what densification needs; also (N,) which splats are seen.
+        """Rasterize and store data for densification; also returns (N,) whether a splat is visible.
 
         Parameters
         ----------
@@ -152,13 +152,13 @@ class SplatTrainer:
             means2d_offset=offset,
             check_values=False,
         )
-        visible = rendering.radii > 0  # whatever their opacity, as published
+        visible = rendering.radii > 0  # of any opacity, as published
         self._seen: tuple[Tensor, Tensor, Camera, Tensor] = (offset, visible, view.camera, face_sizes)
         return rendering, visible
 
 
 class ShadedSplats(NamedTuple):
-    """Splats as one camera sees them at one timestep."""
+    """Splats at one timestep seen from one camera."""
 
     world: WorldSplats
     colors: Tensor  # (N, 3) >= 0
@@ -167,9 +167,9 @@ class ShadedSplats(NamedTuple):
 
 
 class Appearance(Protocol):
-    """The part of a mesh-bound method that is its own: tracking, colour and opacity.
+    """The specific part of a mesh-bound method: tracking, colour and opacity.
 
-    Per-splat tensors live in the optimiser (`splat_parameters`), everything else too (`parameters`).
+    All tensors are in the optimiser: per-splat tensors (`splat_parameters`) and others (`parameters`).
     """
 
     def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
@@ -181,17 +181,23 @@ class Appearance(Protocol):
     def begin(self, timeline: Timeline) -> None:
         """Fit schedules to the length of the run."""
 
-    def frames(self, timestep: int, optimiser: Optimiser) -> Frames:
+    def frames(self, timestep: int, optimiser: Optimiser) -> TriangleFrames:
         """Triangle frames of a training timestep."""
 
     def place(
-        self, frames: Frames, binding: Tensor, view: View, timestep: int, optimiser: Optimiser, iteration: int
+        self,
+        frames: TriangleFrames,
+        binding: Tensor,
+        view: View,
+        timestep: int,
+        optimiser: Optimiser,
+        iteration: int,
     ) -> ShadedSplats:
-        """Splats in the world with their colours and opacities as this camera sees them."""
+        """Splats in the world with their colours and opacities for this camera."""
 
 
 class Start(NamedTuple):
-    """Initial splats of their triangle's size.
+    """Initial splats with the size of their triangle.
 
     Attributes
     ----------
@@ -216,9 +222,9 @@ def one_per_triangle(face_count: int, opacity: float, device: str) -> Start:
 
 
 class BoundTraining(SplatTrainer):
-    """A `Trainable`: splats on the triangles of a mesh, seen in the training images of a clip.
+    """A `Trainable`: splats on the triangles of a mesh, trained on the images of a clip.
 
-    ``start`` holds each of the ``face_count`` triangles at least once; None: `one_per_triangle`.
+    ``start`` has each of the ``face_count`` triangles at least once; None uses `one_per_triangle`.
     """
 
     _settings: SplatTraining

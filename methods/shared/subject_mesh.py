@@ -13,13 +13,13 @@ from torch import Tensor
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose
 from ...datasets.head.arrays import check_size
 from ...datasets.head.model import HeadModel
-from ..ops.mesh import Frames, triangle_frames
+from ..ops.mesh import TriangleFrames, triangle_frames
 
 Value = TypeVar("Value")
 
 
 class SubjectMesh:
-    """A head model with one identity. Only expression, pose and translation are left to drive it.
+    """A head model with fixed identity, driven by expression, pose and translation.
 
     Parameters
     ----------
@@ -64,16 +64,16 @@ class SubjectMesh:
         return self.model(canonical=self._canonical, **arguments)[0]
 
     def unposed(self, arguments: Mapping[str, Tensor]) -> Tensor:
-        """(V, 3) with expression, jaw and eyes (and eyelids) alone: no rotation, neck or translation."""
+        """(V, 3) with only expression, jaw and eyes (and eyelids), without rotation, neck and translation."""
         still = {name: torch.zeros_like(arguments[name]) for name in ("rotation", "neck", "translation")}
         return self.posed({**arguments, **still})
 
-    def frames(self, vertices: Tensor) -> Frames:
+    def frames(self, vertices: Tensor) -> TriangleFrames:
         """Triangle frames of a mesh; differentiable in its vertices."""
         return triangle_frames(vertices, self.faces)
 
     @torch.no_grad()
-    def drive(self, pose: HeadPose) -> Frames:
+    def drive(self, pose: HeadPose) -> TriangleFrames:
         """Triangle frames of a pose in the world. Raises `InputError` for another head model's pose."""
         return self.frames(self.posed(self.arguments([pose])))
 
@@ -85,8 +85,7 @@ def centroid_displacements(one: Tensor, other: Tensor, faces: Tensor) -> Tensor:
 
 
 class BoundedCache(Generic[Value]):
-    """Values by key, computed on request; the least recently used ones are dropped beyond a number of
-    entries."""
+    """Values by key, computed on request; the least recently used ones are dropped beyond a number of entries."""
 
     def __init__(self, compute: Callable[[int], Value], entries: int):
         self._compute, self._entries = compute, max(entries, 1)
@@ -108,7 +107,7 @@ DRIVING = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyel
 
 
 class Sized(Protocol):
-    """A value that knows its memory."""
+    """A value with a known memory size."""
 
     @property
     def bytes(self) -> int: ...
@@ -118,7 +117,7 @@ SizedValue = TypeVar("SizedValue", bound=Sized)
 
 
 class KnownPoses(Generic[SizedValue]):
-    """Values by pose. A pose is known by all its numbers, so that it never answers to another one's timestep."""
+    """Values by pose. The key of a pose is all its values, so equal timesteps of other poses do not match."""
 
     def __init__(self, compute: Callable[[HeadPose], SizedValue], limit: int):
         self._compute, self._limit = compute, limit
@@ -126,7 +125,7 @@ class KnownPoses(Generic[SizedValue]):
 
     @torch.no_grad()
     def prepare(self, poses: Iterable[HeadPose]) -> int:
-        """Compute the values of poses in order for as long as they fit into ``limit`` bytes; returns how many do."""
+        """Compute the values of poses in order while they fit into ``limit`` bytes; returns their number."""
         taken, count = 0, 0
         for pose in poses:
             key = pose_key(pose)
@@ -140,13 +139,13 @@ class KnownPoses(Generic[SizedValue]):
         return count
 
     def __call__(self, pose: HeadPose) -> SizedValue:
-        """The value of a pose, computed if it is not known; then it is not kept."""
+        """The value of a pose, computed without caching if it is unknown."""
         value = self._values.get(pose_key(pose)) if self._values else None
         return self._compute(pose) if value is None else value
 
 
 def pose_key(pose: HeadPose) -> bytes:
-    """All the numbers of a pose; equal keys pose alike."""
+    """All values of a pose as a key."""
     parts = [pose.head_model.encode()]
     for name in DRIVING:
         values = getattr(pose, name)

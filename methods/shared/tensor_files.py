@@ -1,4 +1,4 @@
-"""Tensors from safetensors files: read in one place, and checked by the same descriptions as the arrays of an npz."""
+"""Reading of tensors from safetensors files, checked by the same descriptions as the arrays of an npz."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from ...bench.io.arrays import Member, check_arrays
 from ...bench.io.files import open_regular, reading
 
 MAX_HEADER = 2**24
-"""Maximum bytes of names, shapes and metadata; the largest, of a checkpoint, has some ten thousand."""
+"""Maximum bytes of names, shapes and metadata; those of checkpoints, the largest, have about ten thousand."""
 MAX_MAGNITUDE = 1e6
-"""Most that a number of an avatar may be: a network's weight, a feature, a position in the unit of its triangle."""
+"""Maximum magnitude of values of an avatar: network weights, features, positions in units of the triangle."""
 MAX_LOGARITHM = 30.0
-"""Most that the logarithm of a size may be; larger ones overflow once they are squared and multiplied."""
+"""Maximum logarithm of a size; larger ones overflow when they are squared and multiplied."""
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read all tensors of a file, on the CPU, and its metadata.
 
-    The file has to be as large as its header says, so that nothing is larger than the file. Raises `InputError` for a
-    file that is missing, damaged, or none.
+    The file size must match the header, so that tensors cannot be larger than the file. Raises `InputError` for a
+    missing, damaged or other file.
     """
     expected = "a safetensors file"
     with open_regular(path, expected) as stream:

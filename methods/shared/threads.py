@@ -12,16 +12,15 @@ _kernels: ContextVar[int | None] = ContextVar("threads of kernels", default=None
 
 
 def threads() -> int:
-    """Threads that kernels run on: as many as torch has, or had outside of `torch_on_one_thread`."""
+    """Number of threads of kernels: as many as torch has, or had outside of `torch_on_one_thread`."""
     return _kernels.get() or torch.get_num_threads()
 
 
 @contextmanager
 def torch_on_one_thread(compiled: bool) -> Iterator[None]:
-    """Leave torch's own functions to the calling thread, where the long work is done by ``compiled`` kernels, on `threads`.
+    """Run torch's own functions on the calling thread if ``compiled`` kernels do the long work on `threads`.
 
-    Torch's threads spin while they wait, on the cores that the kernels' threads need, and its results depend on their
-    number.
+    Torch's threads spin while they wait, on the cores of the kernels' threads, and its results depend on their number.
     """
     before = torch.get_num_threads()
     if before == 1 or not compiled:
@@ -38,7 +37,7 @@ def torch_on_one_thread(compiled: bool) -> Iterator[None]:
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Torch on ``count`` threads; with one, all that it does counts to the thread that is timed."""
+    """Run torch on ``count`` threads; with one, all its work is done by the timed thread."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

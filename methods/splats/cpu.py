@@ -17,13 +17,12 @@ from .request import Rendering, Request
 KERNEL = Kernel(
     "headbench.methods.splats._kernel",
     "The splat renderer's kernel",
-    "the reference backend works meanwhile, slowly",
+    "the slow reference backend is used instead",
 )
 
 
 def instruction_sets() -> dict[str, str]:
-    """Available instruction sets of the kernel, by backend name, the fastest first; empty if it is
-    missing."""
+    """Available instruction sets of the kernel, by backend name, the fastest first; empty if it is missing."""
     available = KERNEL.instruction_sets
     return {"cpu": available[0], **{f"cpu-{name}": name for name in available}} if available else {}
 
@@ -60,7 +59,7 @@ def rasterize_cpu(request: Request, backend: str, threads: int | None) -> Render
 
 
 class _Rasterize(torch.autograd.Function):
-    """The kernel's two passes. Arrays are handed over without copying where they are contiguous.
+    """The kernel's two passes. Contiguous arrays are passed without copying.
 
     Cameras are drawn one after the other, each with all threads; the kernel adds their gradients in that order.
     """
@@ -103,7 +102,7 @@ class _Rasterize(torch.autograd.Function):
         ]
         ctx.threads, ctx.absolute_like = threads, absolute.shape
         ctx.save_for_backward(*inputs)
-        # Taking the one image out of a stack here and not outside spares autograd a copy of its gradient.
+        # Removing the axis of a single camera here avoids a copy of the gradient in autograd.
         ctx.mark_non_differentiable(radii)
         return (images, alphas, radii) if batched else (images[0], alphas[0], radii)
 
@@ -112,7 +111,7 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, grad_images: Tensor, grad_alphas: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
         views = len(ctx.frames)
-        # The kernel adds to those of drawn splats; the others have zero.
+        # The kernel adds to the gradients of drawn splats; those of others are zero.
         gradients = [torch.zeros_like(value) for value in inputs]
         grad_viewmats, grad_Ks = inputs[0].new_zeros(views, 4, 4), inputs[0].new_zeros(views, 3, 3)
         absolute = inputs[0].new_zeros(ctx.absolute_like) if ctx.needs_input_grad[_ABSOLUTE] else None
@@ -142,12 +141,12 @@ def _of_view(tensors: Sequence[Tensor], view: int) -> tuple[Any, ...]:
 
 
 def peak_flops(backend: str) -> float:
-    """Measured multiply-add rate of one thread in a backend's instruction set, floating-point operations a second."""
+    """Measured multiply-add rate of one thread in a backend's instruction set, floating-point operations per second."""
     return KERNEL.load().peak_flops(instruction_sets()[backend])
 
 
 def work(node: Any) -> tuple[int, int]:
-    """Pairs of splat and pixel tested, and drawn, by the first camera of an autograd node of the kernel."""
+    """Number of splat-pixel pairs tested and drawn by the first camera of an autograd node of the kernel."""
     return node.frames[0].work(_of_view(node.saved_tensors, 0))
 
 
@@ -157,5 +156,5 @@ def stage_seconds(node: Any) -> dict[str, float]:
 
 
 def _arrays(*tensors: Tensor | None) -> tuple[Any, ...]:
-    """The tensors' memory as numpy arrays, which reach the kernel faster than tensors do."""
+    """The tensors' memory as numpy arrays, which are passed to the kernel faster."""
     return tuple(None if tensor is None else tensor.detach().numpy() for tensor in tensors)

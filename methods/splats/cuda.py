@@ -1,11 +1,11 @@
-"""The CUDA backend: gsplat's kernels behind the same function, imported when first used.
+"""The CUDA backend: gsplat's kernels with the same interface, imported when first used.
 
 gsplat (Apache-2.0, https://github.com/nerfstudio-project/gsplat) is the optional extra ``cuda``.
-It is driven through its functions for projection, tile lists and compositing instead of through its one big function, so
-that offsets of the 2D means and absolute gradients come out as here. Releases 1.5 and 1.6 are known. Their wheels hold
-sources: the extension is compiled when gsplat is first used on a machine, which takes minutes and needs the CUDA toolkit.
-`prepare` does it before anything is timed. With ``antialiased``, 1.6 lets no opacity fall below 0.5 % of its value, where
-the other backends let it go to 0.
+It is called through its functions for projection, tile lists and compositing instead of `rasterization`, so that
+offsets of the 2D means and absolute gradients are defined as here. Releases 1.5 and 1.6 are supported. Their wheels
+contain sources: the extension is compiled when gsplat is first used on a machine, which takes minutes and needs the
+CUDA toolkit. `prepare` does it before anything is timed. With ``antialiased``, 1.6 limits opacities to at least 0.5 %
+of their value, whereas other backends let them go to 0.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 REMEDY = f"{install_extra('cuda')} (needs an NVIDIA GPU and the CUDA toolkit)."
 
 CHANNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)
-"""Colour channels that kernels are compiled for, in 1.5 and 1.6 alike; other numbers are filled up with zeros."""
+"""Numbers of colour channels for which kernels are compiled in 1.5 and 1.6; other numbers are padded with zeros."""
 
 
 @functools.cache
@@ -49,21 +49,21 @@ def installed() -> bool:
 
 
 def draws_or_warns(request: Request) -> bool:
-    """Whether gsplat is there and draws this request; if a GPU is left without it, log why and what helps.
+    """Whether gsplat is available and supports this request; if a GPU cannot use it, log the reason and the remedy.
 
-    It is logged once per process and reason.
+    Each reason is logged once per process.
     """
     if not supports(request):
         if is_float32(request.means) and not on_host(request.means):
             kind = str(request.means.device).split(":")[0]
-            _warn_once(f"gsplat draws on NVIDIA GPUs alone, not on device {kind!r}", "Draw on the CPU.")
+            _warn_once(f"gsplat supports only NVIDIA GPUs, not device {kind!r}", "Draw on the CPU.")
         return False
     if not installed():
         _warn_once("gsplat is not installed", REMEDY)
         return False
     if not _exact(request):
-        reason = "gsplat has no other cut-offs than the defaults of alpha_min and transmittance_min"
-        _warn_once(reason, "Leave them at the defaults, or draw on the CPU.")
+        reason = "gsplat supports only the defaults of alpha_min and transmittance_min"
+        _warn_once(reason, "Use the defaults, or draw on the CPU.")
         return False
     return True
 
@@ -74,9 +74,9 @@ def _warn_once(reason: str, remedy: str) -> None:
 
 
 def prepare(device: str) -> None:
-    """Load gsplat if ``device`` is a CUDA device and it is installed; see `use_device`. Before anything is timed.
+    """Load gsplat if ``device`` is a CUDA device and it is installed; see `use_device`. Call it before timing.
 
-    Raises `UnavailableError` where gsplat's extension can neither be loaded nor compiled.
+    Raises `UnavailableError` if gsplat's extension can neither be loaded nor compiled.
     """
     use_device(device)
     if is_cuda(device) and installed():
@@ -85,12 +85,12 @@ def prepare(device: str) -> None:
 
 @functools.cache
 def load() -> ModuleType:
-    """Import gsplat and its extension, which is compiled where this machine has not done so before.
+    """Import gsplat and its extension, which is compiled when first used on a machine.
 
-    Raises `UnavailableError` where gsplat, a GPU or the CUDA toolkit is missing, and where compiling fails.
+    Raises `UnavailableError` if gsplat, a GPU or the CUDA toolkit is missing, or if compilation fails.
     """
     if not torch.cuda.is_available():
-        missing = "The renderer's backend 'cuda' needs a GPU that torch sees; there is none."
+        missing = "The renderer's backend 'cuda' needs a GPU, and torch finds none."
         raise UnavailableError(missing, REMEDY)
     if importlib.util.find_spec("gsplat") is None:
         raise UnavailableError("The renderer's backend 'cuda' needs gsplat; it is not installed.", REMEDY)
@@ -116,7 +116,7 @@ def load() -> ModuleType:
 
 @contextmanager
 def _one_process() -> Iterator[None]:
-    """Keep other processes of headbench from loading gsplat meanwhile, which removes what another one is compiling."""
+    """Prevent other headbench processes from loading gsplat meanwhile, which would delete files being compiled."""
     from torch.utils.cpp_extension import get_default_build_root
 
     root = Path(os.environ.get("TORCH_EXTENSIONS_DIR", get_default_build_root()))
@@ -134,7 +134,7 @@ def compiled() -> bool:
 
 
 def toolkit() -> str:
-    """Folder of the CUDA toolkit that torch compiles extensions with; "" where it has no nvcc."""
+    """Folder of the CUDA toolkit with which torch compiles extensions; "" without nvcc."""
     from torch.utils.cpp_extension import CUDA_HOME
 
     return str(CUDA_HOME) if CUDA_HOME and (Path(CUDA_HOME) / "bin" / "nvcc").is_file() else ""
@@ -157,7 +157,7 @@ def _exact(request: Request) -> bool:
 
 
 def rasterize_cuda(request: Request) -> Rendering:
-    """Render with gsplat; see `rasterize`. Gives no gradient of ``K``, as gsplat does not: refused, not dropped."""
+    """Render with gsplat; see `rasterize`. A required gradient of ``K`` is refused, since gsplat has none."""
     gsplat = load()
     if not _exact(request):
         expected = "alpha_min, transmittance_min: expected the defaults for backend 'cuda'"
@@ -172,7 +172,7 @@ def rasterize_cuda(request: Request) -> Rendering:
 
 
 def draw(gsplat: Any, request: Request) -> Rendering:
-    """Render ``request`` with a module that has gsplat's functions."""
+    """Render ``request`` with a module with gsplat's functions."""
     views, count = len(request.viewmats), len(request.means)
     columns, rows = -(-request.width // TILE), -(-request.height // TILE)
     radii, means2d, depths, conics, compensations = gsplat.fully_fused_projection(
@@ -201,7 +201,7 @@ def draw(gsplat: Any, request: Request) -> Rendering:
         means2d = _TakeAbsolute.apply(means2d, request.means2d_abs, holder)
         holder.append(means2d)
     with torch.no_grad():
-        # 1.6 leaves out tiles that a splat's box meets and its ellipse does not.
+        # 1.6 skips tiles that intersect a splat's box but not its ellipse.
         known = inspect.signature(gsplat.isect_tiles).parameters
         ellipses = {"conics": conics, "opacities": opacities.contiguous()} if "conics" in known else {}
         _, keys, splats = gsplat.isect_tiles(means2d, radii, depths, TILE, columns, rows, **ellipses)
@@ -224,7 +224,7 @@ def draw(gsplat: Any, request: Request) -> Rendering:
         backgrounds=backgrounds,
         absgrad=collects,
     )
-    # gsplat's own radii are 0 for splats too faint to be drawn, and are cut to their opacity.
+    # gsplat's own radii depend on opacity and are 0 for splats too faint to be drawn.
     return request.rendering(
         request.unstacked(images[..., :channels]),
         request.unstacked(alphas.squeeze(-1)),
@@ -233,7 +233,7 @@ def draw(gsplat: Any, request: Request) -> Rendering:
 
 
 class _TakeAbsolute(torch.autograd.Function):
-    """Pass the 2D means through; give a second input the absolute gradients gsplat leaves on them as an attribute."""
+    """Pass the 2D means through; the gradient of a second input is the absolute gradients that gsplat stores as an attribute."""
 
     @staticmethod
     def forward(ctx: Any, means2d: Tensor, absolute: Tensor, holder: list[Tensor]) -> Tensor:
@@ -242,22 +242,22 @@ class _TakeAbsolute(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
-        # Emptied, for the means hold this function and it would hold them.
+        # Cleared to break the reference cycle between the means and this function.
         return gradient, ctx.holder.pop().absgrad, None
 
 
 @functools.cache
 def warn_of_clamp(device: str) -> None:
-    """Warn once where this gsplat clamps alpha elsewhere than we do: 1.5 does at 0.999, a constant of its kernels.
+    """Warn once if this gsplat clamps alpha at another value: 1.5 does at 0.999, a constant of its kernels.
 
-    A splat that lets 1 % through here lets 0.1 % through there, and the next one of that kind is drawn, too. So a pixel
-    differs by at most 1 % of the range of colours, and by nothing where no splat's alpha is above 0.99.
+    A splat with a transmittance of 1 % here has 0.1 % there. A pixel differs by at most 1 % of the range of colours,
+    and does not differ if no splat's alpha is above 0.99.
     """
     highest = clamp_of(load(), device)
     if abs(highest - ALPHA_MAX) > 1e-4:
         log.warning(
             "This gsplat clamps alpha at %.4g, headbench's other backends at %.4g: pixels behind more opaque splats differ "
-            "by up to %.2g of the range of colours. gsplat 1.6 clamps where they do.",
+            "by up to %.2g of the range of colours. gsplat 1.6 clamps at the same value.",
             highest,
             ALPHA_MAX,
             1 - min(highest, ALPHA_MAX),
@@ -265,7 +265,7 @@ def warn_of_clamp(device: str) -> None:
 
 
 def clamp_of(gsplat: Any, device: str) -> float:
-    """Measure the highest alpha one splat of opacity 1 reaches."""
+    """Measure the maximum alpha of a splat of opacity 1."""
     one = torch.ones(1, device=device)
     request = Request(
         means=torch.tensor([[0.0, 0.0, 1.0]], device=device),

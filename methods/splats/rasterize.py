@@ -35,7 +35,7 @@ def rasterize(
     check_values: bool = True,
     mask_non_finite: bool = False,
 ) -> Rendering:
-    """Render 3D Gaussians into one camera or several; differentiable in every tensor.
+    """Render 3D Gaussians for one or several cameras; differentiable in every tensor.
 
     Names, meanings and constants are gsplat's. To render depth or features, pass them as colours.
 
@@ -68,7 +68,7 @@ def rasterize(
         Low-pass filter: variance added to both image axes, square pixels.
     antialiased : bool
         Multiply each opacity by the square root of the ratio of the 2D covariance's determinants
-        without and with ``eps2d``, so that the low-pass filter makes small splats faint, not bigger
+        without and with ``eps2d``, so that small splats become fainter instead of larger
         (gsplat's mode "antialiased"; Yu et al., "Mip-Splatting", CVPR 2024, eq. 9). The cut at
         ``alpha_min`` applies to the product.
     alpha_min : float
@@ -148,7 +148,8 @@ def rasterize(
 
 
 def available_backends(device: str = "cpu") -> tuple[str, ...]:
-    """Names `rasterize` accepts as ``backend`` here for tensors on ``device``, besides "auto"; the preferred one first."""
+    """Available values of ``backend`` in `rasterize` for tensors on ``device``, besides "auto"; the preferred one
+    first."""
     if device == "cpu":
         return (*cpu.instruction_sets(), "reference")
     return ("cuda", "reference") if cuda.installed() else ("reference",)

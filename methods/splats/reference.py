@@ -29,7 +29,7 @@ class Footprints(NamedTuple):
     covariances: Tensor  # (M, 3): xx, xy, yy, low-pass filter included
     determinants: Tensor  # (M,) of the covariances
     depths: Tensor  # (M,) camera z, metres
-    opacities: Tensor  # (M,) compensated for the low-pass filter where that is asked for
+    opacities: Tensor  # (M,) compensated for the low-pass filter if requested
 
 
 def rasterize_reference(request: Request) -> Rendering:
@@ -72,7 +72,7 @@ def _draw(request: Request, view: CameraInputs) -> tuple[Tensor, Tensor, Tensor]
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Turn quaternions (N, 4), wxyz of any length, into rotation matrices (N, 3, 3); zero gives the identity.
+    """Convert quaternions (N, 4), wxyz of any length, to rotation matrices (N, 3, 3); zero gives the identity.
 
     The largest component is divided out first, so that no square overflows or underflows.
     """
@@ -93,7 +93,7 @@ def project(request: Request, view: CameraInputs, subset: Tensor | slice) -> Foo
 
     The covariance is factored as ``Q Qᵀ + eps2d I`` with ``Q = J W R S`` (EWA Splatting, eq. 24-31: J the
     Jacobian of the perspective division, W the camera's rotation, R S the splat's axes). By the
-    Cauchy-Binet formula its determinant is a sum of squares, which needles do not cancel away:
+    Cauchy-Binet formula its determinant is a sum of squares without cancellation for needles:
     ``|q0 x q1|² + eps2d (|q0|² + |q1|²) + eps2d²``.
     """
     rotation, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
@@ -104,7 +104,7 @@ def project(request: Request, view: CameraInputs, subset: Tensor | slice) -> Foo
     if view.means2d_offset is not None:
         means = means + view.means2d_offset[subset]
 
-    # Far outside the image the linearisation degenerates; gsplat clamps the slopes it is taken at.
+    # Far outside the image the linearisation degenerates, so slopes are clamped as in gsplat.
     margin_x = FRUSTUM_MARGIN * 0.5 * request.width / fx
     margin_y = FRUSTUM_MARGIN * 0.5 * request.height / fy
     slope_x = torch.clamp(x / z, min=-cx / fx - margin_x, max=(request.width - cx) / fx + margin_x)
@@ -128,7 +128,7 @@ def project(request: Request, view: CameraInputs, subset: Tensor | slice) -> Foo
 def _find_drawn(request: Request, view: CameraInputs) -> tuple[Tensor, Tensor, Tensor]:
     """Indices (M,) of the splats to draw, half sizes (M, 2) of their bounding boxes, and radii (N,) of all splats.
 
-    Conditions are stated positively, so that a NaN anywhere culls.
+    Conditions are positive, so that a NaN culls the splat.
     """
     subset = _in_depth(request, view).nonzero().squeeze(-1)
     footprints = project(request, view, subset)
@@ -154,7 +154,7 @@ def published_radii(request: Request) -> Tensor:
     )
     for index, of_view in enumerate(radii):
         view = request.view(index)
-        # Of all splats, not of those in depth alone: on a GPU, training asks for it, and must not wait for their number.
+        # Computed for all splats, since selecting those in depth would make training wait for a GPU.
         radii_of_all = _published_radii(request, project(request, view, slice(None)))
         of_view.copy_(torch.where(_in_depth(request, view), radii_of_all, 0))
     return radii
@@ -167,10 +167,10 @@ def _in_depth(request: Request, view: CameraInputs) -> Tensor:
 
 
 def _published_radii(request: Request, footprints: Footprints) -> Tensor:
-    """(M,) int32: preprocessCUDA of diff-gaussian-rasterization (Kerbl et al. 2023), where opacity plays no part.
+    """(M,) int32 radii of preprocessCUDA in diff-gaussian-rasterization (Kerbl et al. 2023), independent of opacity.
 
-    Three standard deviations along the longest axis, and 0 where the square of that half side about the mean meets no
-    tile. Pixel centres are whole numbers there, and so half a pixel from ours.
+    Three standard deviations along the longest axis, or 0 if the square of that half side around the mean intersects
+    no tile. Pixel centres are integers there, half a pixel from those here.
     """
     xx, xy, yy = footprints.covariances.unbind(-1)
     spread = torch.sqrt((0.25 * (xx - yy) ** 2 + xy * xy).clamp(min=0.1))
@@ -187,7 +187,7 @@ def _resolved(footprints: Footprints) -> Tensor:
 
 
 def _touching(means: Tensor, extents: Tensor, left: int, top: int, right: int, bottom: int) -> Tensor:
-    """Indices of the splats whose bounding box, grown by a pixel against rounding, meets the tile."""
+    """Indices of the splats whose bounding box, extended by a pixel for rounding, intersects the tile."""
     low, high = means - extents - 1, means + extents + 1
     meets_x = (high[:, 0] > left) & (low[:, 0] < right)
     meets_y = (high[:, 1] > top) & (low[:, 1] < bottom)
@@ -208,14 +208,14 @@ def _composite_tile(
     pixels: Tensor,
     cut_offs: tuple[float, float],
 ) -> Tensor:
-    """Composite depth-sorted splats front to back onto ``pixels`` (P, 2); gives (P, C + 1), alpha last.
+    """Composite depth-sorted splats front to back onto ``pixels`` (P, 2); returns (P, C + 1), alpha last.
 
     ``absolute`` (M, 2) collects the absolute gradients of the means; ``cut_offs`` are the minimum alpha and transmittance.
     """
     image = pixels.new_zeros(len(pixels), colors.shape[1])
     transmittance = pixels.new_ones(len(pixels))
     running = torch.ones_like(transmittance, dtype=torch.bool)
-    # Once even without splats: what is drawn depends on the inputs all the same, with zero gradient.
+    # At least one chunk, so that the result depends on the inputs, with zero gradient.
     for start in range(0, max(len(colors), 1), CHUNK):
         part = slice(start, start + CHUNK)
         image, transmittance, running = checkpoint(
@@ -243,7 +243,7 @@ def _composite_chunk(
     colors: Tensor,
     cut_offs: tuple[float, float],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Blend one chunk over what is there (3D Gaussian Splatting, eq. 3).
+    """Blend one chunk behind the previous ones (3D Gaussian Splatting, eq. 3).
 
     The exponent ``dᵀ Σ⁻¹ d`` is written as the sum of squares ``Σ_yy/det (dx - Σ_xy/Σ_yy dy)² + dy²/Σ_yy``,
     which rounding cannot make negative.
@@ -265,7 +265,7 @@ def _composite_chunk(
 
 
 class _CollectAbsolute(torch.autograd.Function):
-    """Pass means (P, M, 2) through, and give a second input (M, 2) the sum of their absolute gradients over P."""
+    """Pass means (P, M, 2) through; the gradient of a second input (M, 2) is the sum of their absolute gradients over P."""
 
     @staticmethod
     def forward(ctx: Any, means: Tensor, absolute: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ ArrayLike = Tensor | np.ndarray | Sequence[Any]
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """A rendered image, or V of them along a leading dimension where V cameras were asked for."""
+    """A rendered image, or V images along a leading dimension for V cameras."""
 
     image: Tensor
     """(H, W, C), composited over the background."""
@@ -31,13 +31,13 @@ class Rendering:
     find_radii: Callable[[], Tensor]
     """Gives `radii`."""
     masked: int = 0
-    """Splats left out because some value of theirs is not finite; counted with ``mask_non_finite`` alone."""
+    """Number of splats skipped because a value is not finite; counted only with ``mask_non_finite``."""
 
     @functools.cached_property
     def radii(self) -> Tensor:
-        """(N,) int32, pixels: which splats are in view (above 0) and how large, whatever their opacity; see `rasterize`.
+        """(N,) int32 radii in pixels, above 0 for splats in view, regardless of opacity; see `rasterize`.
 
-        Found when first asked for, for gsplat computes something else.
+        Computed on first access, since gsplat's radii have another definition.
         """
         return self.find_radii()
 
@@ -74,7 +74,7 @@ class Request:
     eps2d: float = 0.3
     antialiased: bool = False
     batched: bool = False
-    masked: Tensor | None = None  # (N,) bool, splats to leave out; None for none
+    masked: Tensor | None = None  # (N,) bool, splats to skip; None for none
     alpha_min: float = ALPHA_MIN
     transmittance_min: float = TRANSMITTANCE_MIN
 
@@ -90,12 +90,11 @@ class Request:
         )
 
     def unstacked(self, values: Tensor) -> Tensor:
-        """Values of all cameras without their leading V where the caller gave one camera without it."""
+        """Values of all cameras, without the leading V if the caller gave one camera without it."""
         return values if self.batched else values[0]
 
     def rendering(self, image: Tensor, alpha: Tensor, find_radii: Callable[[], Tensor]) -> Rendering:
-        """The result of `rasterize` from an image and an alpha as the caller expects them and a function for
-        (V, N) radii."""
+        """The result of `rasterize` from image, alpha and a function that returns (V, N) radii."""
 
         def radii() -> Tensor:
             found = self.unstacked(find_radii())
@@ -215,7 +214,7 @@ def _count_views(cameras: dict[str, Tensor]) -> tuple[bool, int]:
 
 
 def _mask(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor | None]:
-    """Make splats with any value that is not finite invisible: zeros, and so no opacity and no gradient."""
+    """Make splats with non-finite values invisible by zeros, without opacity and gradient."""
     count = len(tensors["means"])
     bad = torch.zeros(count, dtype=torch.bool, device=tensors["means"].device)
     for value in tensors.values():
@@ -252,7 +251,7 @@ def _as_like(name: str, value: ArrayLike, shape: tuple[int, ...], means: Tensor)
 
 
 def _check_finite(name: str, value: Tensor) -> None:
-    """Refuse NaN and infinity. One sum tells in the usual case; the exact count is taken only on suspicion."""
+    """Refuse NaN and infinity. A sum detects them; the values are counted only if it is not finite."""
     if torch.isfinite(value.detach().sum()):
         return
     bad = ~torch.isfinite(value.detach())
@@ -263,7 +262,7 @@ def _check_finite(name: str, value: Tensor) -> None:
 
 
 def _check_range(name: str, value: Tensor, expected: str, low: float, high: float) -> None:
-    """Refuse values below ``low`` or above ``high``; two extremes are searched in the usual case."""
+    """Refuse values below ``low`` or above ``high``."""
     if not value.numel():
         return
     least, most = value.detach().aminmax()

@@ -1,6 +1,6 @@
-"""Avatars that learn nothing: the mean image, and the nearest training image.
+"""Baselines without learning: the mean image, and the nearest training image.
 
-They show what a number is worth: a method that does not clearly beat them has learned little.
+They put metrics into perspective: a method that does not clearly beat them has learned little.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.images import read_pixels
 from ...datasets.images import write_image
 from ..shared.avatar_files import TRACKED, write_arrays, write_record
-from ..shared.loop import Fit, Outcome
+from ..shared.loop import Fit, TrainingSummary
 from ..shared.method import TrainedMethod
 from .spec import MEAN_IMAGE, NEAREST_CAMERA, NearestCameraConfig
 
@@ -57,13 +57,13 @@ def recomposite(
 
 
 def _rgba(clip: Clip, key: FrameKey) -> ByteArray:
-    """(H, W, 4) image and coverage; a frame without mask is all foreground."""
+    """(H, W, 4) image and coverage, which is 1 without a mask."""
     rgb, mask = clip.image(key), clip.mask(key)
     return np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8) if mask is None else mask])
 
 
 class _ImageAvatar:
-    """An avatar that answers with an image of its own, at the camera's size.
+    """An avatar that renders one of its stored images at the camera's size.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class MeanImageAvatar(_ImageAvatar):
 
 
 class MeanImage(TrainedMethod[None, MeanImageAvatar]):
-    """Mean of all training images, at the size of the largest; the budget and the seed decide nothing."""
+    """Mean of all training images, at the size of the largest; budget and seed have no effect."""
 
     name, version = MEAN_IMAGE.name, MEAN_IMAGE.version
     config_class = type(None)
@@ -129,15 +129,15 @@ class MeanImage(TrainedMethod[None, MeanImageAvatar]):
             "head_model": np.array(clip.head.version),
         }
         write_arrays(fit.out / MEAN_FILE, arrays)
-        write_record(fit, Outcome(len(keys), len(keys), 0.0))
+        write_record(fit, TrainingSummary(len(keys), len(keys), 0.0))
 
 
 class NearestCameraAvatar(_ImageAvatar):
-    """Answers with a training image: nearest timestep by driving signal, then nearest camera by direction.
+    """Renders a training image: nearest timestep by driving signal, then nearest camera by direction.
 
-    The distance of two driving signals is the Euclidean one after every parameter was divided by its standard
-    deviation over the training timesteps, so that radians, metres and coefficients can be compared. The direction
-    is that from the head's translation to the camera.
+    The distance of two driving signals is Euclidean with every parameter divided by its standard deviation over the
+    training timesteps, so that radians, metres and coefficients are comparable. The direction is that from the head's
+    translation to the camera.
     """
 
     def __init__(self, folder: Path):
@@ -147,13 +147,13 @@ class NearestCameraAvatar(_ImageAvatar):
         self._check_index(folder / INDEX_FILE)
 
     def nearest(self, camera: Camera, pose: HeadPose) -> int:
-        """Number of the training image to show."""
+        """Index of the training image to show."""
         signals, scales = self._index["signals"], self._index["scales"]
         signal = driving_signal(pose)
         if signal.shape != scales.shape:
             raise InputError("pose", "expression", f"{len(scales)} driving values", f"{len(signal)}")
         distances = (((signals - signal) / scales) ** 2).sum(1)
-        # Among equally near timesteps the pose's own wins: a face may rest with its tracking unchanged.
+        # Among equally near timesteps the pose's own is preferred, since tracking may be constant.
         own = self._index["timesteps"] == (-1 if pose.timestep is None else pose.timestep)
         row = int(np.lexsort((~own, distances))[0])
         available = np.flatnonzero(self._index["images"][row] >= 0)
@@ -189,7 +189,7 @@ class NearestCameraAvatar(_ImageAvatar):
 
 
 class NearestCamera(TrainedMethod[NearestCameraConfig, NearestCameraAvatar]):
-    """Keeps the training images and an index of their driving signals and cameras; budget and seed decide nothing."""
+    """Stores the training images and an index of their driving signals and cameras; budget and seed have no effect."""
 
     name, version = NEAREST_CAMERA.name, NEAREST_CAMERA.version
     config_class = NearestCameraConfig
@@ -215,13 +215,13 @@ class NearestCamera(TrainedMethod[NearestCameraConfig, NearestCameraAvatar]):
             "background": np.asarray(clip.background, np.float32),
             "timesteps": np.array(timesteps),
             "signals": signals,
-            # A parameter that never moved in training must not outweigh all others when it does.
+            # A parameter that is constant in training must not outweigh all others when it changes.
             "scales": np.where(spread > 1e-8, spread, 1.0),
             "centers": np.stack([clip.cameras[name].center for name in column]),
             "images": images,
         }
         write_arrays(fit.out / INDEX_FILE, arrays)
-        write_record(fit, Outcome(len(keys), len(keys), 0.0))
+        write_record(fit, TrainingSummary(len(keys), len(keys), 0.0))
 
     def _timesteps(self, clip: Clip) -> list[int]:
         timesteps = sorted({key.timestep for key in clip.splits["train"]})

@@ -9,7 +9,7 @@ from ...bench.specs import MethodSpec
 
 @dataclass(frozen=True)
 class NearestCameraConfig:
-    """Nearest training image. ``max_timesteps`` keeps that many, evenly spaced, and bounds the storage."""
+    """Nearest training image. ``max_timesteps`` limits the number of timesteps, evenly spaced, and the storage."""
 
     max_timesteps: int | None = None
 
@@ -20,7 +20,7 @@ MEAN_IMAGE = MethodSpec(
     name="mean-image",
     default=True,
     demo=True,
-    summary="The mean of all training images, whatever is asked for: the trivial baseline of every table.",
+    summary="The mean of all training images for every frame: the trivial baseline of every table.",
     implementation="headbench.methods.trivial.method:MeanImage",
     trivial=True,
     presets=PRESETS,
@@ -30,7 +30,7 @@ NEAREST_CAMERA = MethodSpec(
     name="nearest-camera",
     default=True,
     demo=True,
-    summary="The training image of the nearest pose and camera, as it is: what memorising alone achieves.",
+    summary="The training image of the nearest pose and camera, unchanged: the result of pure memorisation.",
     implementation="headbench.methods.trivial.method:NearestCamera",
     trivial=True,
     config="headbench.methods.trivial.spec:NearestCameraConfig",

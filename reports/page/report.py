@@ -24,7 +24,7 @@ from ...bench.specs import CommandResult, MetricSpec
 from ..aggregate import summarise
 from ..drawing import colour_map
 from ..pareto.points import LATENCY, SIZE, SPEED, pareto_front
-from ..runs import Part, RunSet
+from ..runs import FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import COMPARISON, TITLES, layouts, table_of
 from ..tables import AVATAR_TITLE, Table
@@ -49,7 +49,7 @@ MEGABYTE = 10**6
 
 
 @dataclass(frozen=True)
-class Shown:
+class TitledTable:
     """A table with a heading."""
 
     title: str
@@ -112,7 +112,7 @@ def page_text(
         "title": f"headbench: {', '.join(name_of(run) for run in runs.runs)}",
         "tables": _parts(runs),
         "layouts": [
-            Shown(TITLES.get(name, name), table_of(runs, name))
+            TitledTable(TITLES.get(name, name), table_of(runs, name))
             for name in layouts(runs)
             if name != COMPARISON
         ],
@@ -253,17 +253,20 @@ def _data(
     }
 
 
-def _parts(runs: RunSet) -> list[Shown]:
+def _parts(runs: RunSet) -> list[TitledTable]:
     """The comparison of all frames, of each region and of each held-out sequence."""
-    found = [Shown("All frames", table_of(runs))]
+    found = [TitledTable("All frames", table_of(runs))]
     found += [
-        Shown(f"Region: {region}", table_of(runs.of(Part(region=region))))
+        TitledTable(f"Region: {region}", table_of(runs.of(FrameSelection(region=region))))
         for region in sorted(runs.rows.regions - {FULL})
     ]
     sequences = sorted({key.sequence for key in runs.keys.get("self_reenactment", ())})
     if len({key.sequence for keys in runs.keys.values() for key in keys}) > 1:
         measured = [name for name in sequences if name in runs.rows.sequences]
-        found += [Shown(f"Sequence: {name}", table_of(runs.of(Part(sequences=(name,))))) for name in measured]
+        found += [
+            TitledTable(f"Sequence: {name}", table_of(runs.of(FrameSelection(sequences=(name,)))))
+            for name in measured
+        ]
     return found
 
 
@@ -294,7 +297,7 @@ def _plots(runs: RunSet, metrics: Sequence[MetricSpec]) -> list[dict[str, Any]]:
 
 
 def _cost(runs: RunSet, label: str, cost: str) -> float | None:
-    """Size or median frame time, or the inverse of the mean rate if there is no median, as in `Point`."""
+    """Size or median frame time, or the inverse of the mean rate if there is no median, as in `ParetoPoint`."""
     if cost == "megabytes":
         return summarise(runs.rows, label, SIZE, "").value
     milliseconds, rate = (summarise(runs.rows, label, name, "").value for name in (LATENCY, SPEED))

@@ -13,7 +13,7 @@ from ...bench.specs import CommandResult
 from .settings import ParetoSettings
 
 if TYPE_CHECKING:
-    from .points import Point
+    from .points import ParetoPoint
 
 
 COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
@@ -28,13 +28,13 @@ def pareto(runs: Sequence[str], out: Path, task: str, metric_name: str = "", tim
     """Write ``points.csv`` and ``pareto.png`` of finished runs. Raises `InputError` for runs that cannot be compared."""
     from ..writers import csv_text
     from .plot import write_plot
-    from .points import Point, front_of, read_points
+    from .points import ParetoPoint, front_of, read_points
 
     points, left_out, metric, note = read_points([Path(r) for r in runs], task, metric_name, time)
     check_output_folder(out)
     rising = metric.higher_is_better
     fronts = {cost: front_of(points, cost, higher_is_better=rising) for cost in COSTS}
-    names = [field.name for field in fields(Point)]
+    names = [field.name for field in fields(ParetoPoint)]
     lines: list[list[object]] = [[*names, *(f"on_front_of_{cost}" for cost in COSTS)]]
     for index, point in enumerate(points):
         marks = [int(index in fronts[cost]) for cost in COSTS]
@@ -57,7 +57,7 @@ def pareto(runs: Sequence[str], out: Path, task: str, metric_name: str = "", tim
 
 
 def _text(
-    points: Sequence[Point],
+    points: Sequence[ParetoPoint],
     fronts: dict[str, list[int]],
     left_out: Sequence[str],
     label: str,

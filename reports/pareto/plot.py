@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.transforms import Bbox
 
 from ..plots import GREY, cost_axis, plot_file, show_missing, start_axes
-from .points import Point, front_of
+from .points import ParetoPoint, front_of
 
 MARKER = 7.0
 """Diameter of a point, in points of 1/72 inch."""
@@ -19,9 +19,14 @@ BESIDE = ((7, -8, "left"), (-7, 3, "right"), (7, 3, "left"), (-7, -8, "right"))
 
 
 def write_plot(
-    path: Path, points: Sequence[Point], costs: Mapping[str, str], quality: str, *, higher_is_better: bool
+    path: Path,
+    points: Sequence[ParetoPoint],
+    costs: Mapping[str, str],
+    quality: str,
+    *,
+    higher_is_better: bool,
 ) -> None:
-    """Draw quality over each cost (label by field of `Point`) side by side and write a PNG, atomically.
+    """Draw quality over each cost (label by field of `ParetoPoint`) side by side and write a PNG, atomically.
 
     Costs are on a logarithmic axis. Steps join the front of each series: the best quality of that series up to a cost.
     Points that no point of any series beats are filled; squares are trained avatars.
@@ -51,7 +56,7 @@ def write_plot(
 
 def _draw(
     axes: Axes,
-    points: Sequence[Point],
+    points: Sequence[ParetoPoint],
     cost: str,
     fronts: Mapping[str, Sequence[int]],
     best: Sequence[int],
@@ -79,7 +84,7 @@ def _draw(
     cost_axis(axes)
 
 
-def label_points(axes: Axes, points: Sequence[Point], cost: str, order: Sequence[int]) -> None:
+def label_points(axes: Axes, points: Sequence[ParetoPoint], cost: str, order: Sequence[int]) -> None:
     """Write the names of variants next to their points, in an order of their indices, without overlaps."""
     scale = axes.get_figure(root=True).dpi / 72  # type: ignore[union-attr]
     costs = {i: getattr(point, cost) for i, point in enumerate(points)}

@@ -32,7 +32,7 @@ SIZE, SPEED, LATENCY = "storage", "fps", "latency_p50"
 
 
 @dataclass(frozen=True)
-class Point:
+class ParetoPoint:
     """One method of one run, means over frames, subjects and seeds.
 
     ``megabytes`` and ``milliseconds`` are None where the run did not measure them. Milliseconds are the
@@ -56,9 +56,9 @@ class Point:
 
 
 def front_of(
-    points: Sequence[Point], cost: str, *, higher_is_better: bool, series: str | None = None
+    points: Sequence[ParetoPoint], cost: str, *, higher_is_better: bool, series: str | None = None
 ) -> list[int]:
-    """Indices of the front of all points, or of one series, whose cost (a field of `Point`) was measured."""
+    """Indices of the front of all points, or of one series, whose cost (a field of `ParetoPoint`) was measured."""
     among = [i for i, point in enumerate(points) if series in (None, point.series)]
     known = [i for i in among if getattr(points[i], cost) is not None]
     sign = 1.0 if higher_is_better else -1.0
@@ -68,7 +68,7 @@ def front_of(
 
 def read_points(
     folders: Sequence[Path], task: str, metric: str, time: str = ""
-) -> tuple[list[Point], list[str], MetricSpec, str]:
+) -> tuple[list[ParetoPoint], list[str], MetricSpec, str]:
     """Read every method of every run except trivial baselines; return points, omitted methods with reasons,
     the metric, and a note on frame times that are not comparable ("": all are).
 
@@ -76,7 +76,7 @@ def read_points(
     median latency, or the inverse of the frames per second. Raises `InputError` if runs were scored on
     different frames or protocols, if one lacks the task or the metric, and if no point remains.
     """
-    points: list[Point] = []
+    points: list[ParetoPoint] = []
     left_out: list[str] = []
     timings: dict[str, Conditions] = {}
     runs: list[RunData] = []
@@ -117,7 +117,9 @@ def read_points(
                 timings[label if len(folders) == 1 else f"{label} of {folder}"] = measured[timed][label]
             source, variant = (record.name, record.condition) if record.condition in derived else ("", "")
             costs = size.value, milliseconds
-            points.append(Point(str(folder), label, source, variant, quality.value, *costs, data.machine))
+            points.append(
+                ParetoPoint(str(folder), label, source, variant, quality.value, *costs, data.machine)
+            )
     if spec is None or not points:
         found_instead = "; ".join(left_out) or "none"
         raise InputError("runs", "", "a method, no trivial baseline, with a value", found_instead)

@@ -80,13 +80,13 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
 
     Raises `InputError` for runs, methods and metrics that do not fit.
     """
-    from ..runs import Part, RunSet
+    from ..runs import FrameSelection, RunSet
 
     if settings.baseline is not None:
         from ...bench.gate.command import compare_with_baseline
 
         return compare_with_baseline(Path(settings.runs[0]), Path(settings.baseline), settings)
-    part = Part(settings.region, settings.sequences)
+    part = FrameSelection(settings.region, settings.sequences)
     return compare_methods(RunSet.read([Path(folder) for folder in settings.runs], part), settings, progress)
 
 

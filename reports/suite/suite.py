@@ -6,7 +6,7 @@ from itertools import product
 from pathlib import Path
 
 from ...bench.engine.scoring import FULL
-from ..runs import Part, RunSet
+from ..runs import FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import table_of
 from ..writers import to_markdown
@@ -23,15 +23,15 @@ def suite_report(run: Path, method: str) -> str:
     ablations = [label for label, record in whole.records.items() if record.condition]
     runs = whole.only([label for label in whole.records if label not in ablations])
     tested = sorted({frame[1] for frame in runs.rows.frames("self_reenactment", FULL)})
-    parts = {"All frames": Part()}
-    parts |= {f"Region {region}": Part(region) for region in sorted(runs.rows.regions - {FULL})}
-    parts |= {f"Sequence {name}": Part(sequences=(name,)) for name in tested}
+    parts = {"All frames": FrameSelection()}
+    parts |= {f"Region {region}": FrameSelection(region) for region in sorted(runs.rows.regions - {FULL})}
+    parts |= {f"Sequence {name}": FrameSelection(sequences=(name,)) for name in tested}
     sections = [_section(title, runs.of(part), method) for title, part in parts.items()]
     if ablations:
         runs = whole.only([method, *ablations])
         for region, chosen in product((FULL, "face"), ((), *((name,) for name in tested))):
             title = ", ".join([f"Ablations of {method}", *([] if region == FULL else [region]), *chosen])
-            table = ablation_table(runs.of(Part(region, chosen)), method)
+            table = ablation_table(runs.of(FrameSelection(region, chosen)), method)
             sections.append(f"## {title}\n\n{to_markdown(table).strip()}")
     return "\n\n".join(sections) + "\n"
 

@@ -2,7 +2,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.bench.rows import ALL
-from headbench.reports.runs import Part, RunSet
+from headbench.reports.runs import FrameSelection, RunSet
 from headbench.reports.table_report import table_of, table_text
 
 
@@ -72,7 +72,9 @@ def cell(table, task, metric):
 
 
 def test_a_region_stands_for_the_whole_frame(faces):
-    whole, face = (table_of(RunSet.read([faces], part)) for part in (Part(), Part("face")))
+    whole, face = (
+        table_of(RunSet.read([faces], part)) for part in (FrameSelection(), FrameSelection("face"))
+    )
     frames = RunSet.read([faces]).rows.frames("novel_view", "full")
     early = len({frame for frame in frames if frame[2] == 0}) / len(frames)
     expected = cell(whole, "novel_view", "error") - 10 - 5 * early
@@ -86,7 +88,7 @@ def test_sequences_leave_tasks_without_them_out(faces):
     runs = RunSet.read([faces])
     free = {frame[1] for frame in runs.rows.frames("self_reenactment", "full")}
     assert not free & {frame[1] for frame in runs.rows.frames("novel_view", "full")}
-    part = RunSet.read([faces], Part(sequences=tuple(free)))
+    part = RunSet.read([faces], FrameSelection(sequences=tuple(free)))
     assert part.tasks == ("self_reenactment",)
     assert cell(table_of(part), "self_reenactment", "error") == cell(
         table_of(runs), "self_reenactment", "error"
@@ -97,8 +99,8 @@ def test_sequences_leave_tasks_without_them_out(faces):
 @pytest.mark.parametrize(
     ("part", "words"),
     [
-        (Part("nose"), "region: expected one of face, full, found nose"),
-        (Part(sequences=("X",)), "sequences: .* X"),
+        (FrameSelection("nose"), "region: expected one of face, full, found nose"),
+        (FrameSelection(sequences=("X",)), "sequences: .* X"),
     ],
 )
 def test_a_part_that_runs_do_not_have_is_refused(faces, part, words):
@@ -126,7 +128,15 @@ def half_failed(faces):
     return faces
 
 
-@pytest.mark.parametrize("part", [Part(), Part("face"), Part(sequences=("FREE",)), Part("face", ("FREE",))])
+@pytest.mark.parametrize(
+    "part",
+    [
+        FrameSelection(),
+        FrameSelection("face"),
+        FrameSelection(sequences=("FREE",)),
+        FrameSelection("face", ("FREE",)),
+    ],
+)
 def test_a_failed_subject_leaves_no_mean_of_the_others(half_failed, part):
     table = table_of(RunSet.read([half_failed], part))
     assert {cell.status for row in table.rows for cell in row.cells} == {"failed"}

@@ -22,21 +22,23 @@ LOWER_LID_DEPTH = 0.0046
 
 MOUTH_HALF_WIDTH = 0.0258
 MOUTH_CAVITY = ((0.0, -0.0500, 0.0400), (0.0265, 0.0160, 0.0305))  # ellipsoid: centre, radii
-SCULPTED_LIP_GAP = 0.0024  # the mouth is sculpted ajar, so that the lips come out as two sheets
-CLOSED_LIP_GAP = 0.0003  # what `close_mouth` leaves
-LIP_RING_HEIGHT = 0.0025  # of the rings of the lips over and under the closed slit: on the red, just outside
+SCULPTED_LIP_GAP = 0.0024  # the mouth is sculpted slightly open, to separate the lips
+CLOSED_LIP_GAP = 0.0003  # gap left by `close_mouth`
+LIP_RING_HEIGHT = (
+    0.0025  # heights of the rings of the lips above and below the closed slit: on the red, just outside
+)
 LIP_RING_REACH = 0.93  # where the rings end, in half widths of the mouth
 
 
 def canthal_height(x: FloatArray | float) -> FloatArray | float:
-    """Height over the centre of the eye of the line through the canthi, ``x`` from the centre of the eye."""
+    """Height of the line through the canthi above the centre of the eye, at ``x`` from the centre."""
     return -0.0004 + 0.055 * x
 
 
 def lid_curves(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Heights of the upper and lower lid margin over the centre of the eye, at ``x`` from that centre.
+    """Heights of the upper and lower lid margin above the centre of the eye, at ``x`` from the centre.
 
-    Outside the canthi the curves continue, crossed, so that the aperture closes.
+    The curves cross at the canthi, so that the aperture closes.
     """
     middle = (MEDIAL_CANTHUS + LATERAL_CANTHUS) / 2
     half = (LATERAL_CANTHUS - MEDIAL_CANTHUS) / 2
@@ -66,7 +68,7 @@ def eye_front(x: FloatArray, y: FloatArray, height: float) -> FloatArray:
 
 
 def close_mouth(vertices: FloatArray) -> FloatArray:
-    """Bring the lips of the head as sculpted, mouth ajar, together; smooth, and the identity elsewhere."""
+    """Close the lips of the head, which is sculpted with an open mouth; smooth, and the identity elsewhere."""
     x, y, z = vertices.T
     above = y - slit_height(x)
     lift = (SCULPTED_LIP_GAP - CLOSED_LIP_GAP) / 2

@@ -1,8 +1,8 @@
-"""Semantic expression shapes, named after the action units they play, and the model's own basis of them.
+"""Semantic expression shapes, named after their action units, and the model's basis of them.
 
 The model's expression directions are principal components of these shapes under a distribution of activations
-(another one for each version), so its coefficients are orthogonal, ordered by variance and mean nothing
-by name, as FLAME's do. `semantic_to_coefficients` leads from names to coefficients.
+(a different one for each version), so its coefficients are orthogonal, ordered by variance and without names, as in
+FLAME. `semantic_to_coefficients` converts names to coefficients.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ..geometry import mesh_edges, smoothstep, unique_pairs
 from .anatomy import EYE_CENTER, EYE_RADIUS, MOUTH_HALF_WIDTH, eye_front, lid_curves, lip_arc
 from .surface import MIRROR, SculptedHead, jaw_weight
 
-_MIXING_BITS = 25  # 2**-25 times 2**-27 m leaves two metres of room in a float64
+_MIXING_BITS = 25  # 2**-25 times 2**-27 m: exact up to two metres in float64
 _SWEEPS = 12  # of Jacobi rotations; 40 x 40 matrices need 8
 
 CORNER = (MOUTH_HALF_WIDTH, -0.0520, 0.0665)
@@ -36,7 +36,7 @@ def _gaussian(points: FloatArray, center: Vector | FloatArray, sigma: Vector | f
 
 @dataclass(frozen=True, eq=False)
 class Strokes:
-    """The surface with the strokes that shapes are made of. All act on the skin only."""
+    """The surface with the strokes that form shapes. All act only on the skin."""
 
     surface: SculptedHead
 
@@ -61,7 +61,7 @@ class Strokes:
         return weight[:, None] * np.array(millimetres) * 1e-3
 
     def compress(self, share: float, back: float) -> FloatArray:
-        """Press the lips: heights over the slit shrink by ``share``, the red moves ``back`` millimetres."""
+        """Press the lips: heights above the slit shrink by ``share``, the red moves ``back`` millimetres."""
         x, _, z = self.surface.vertices.T
         above = self.surface.above_slit
         near = np.exp(-((above / 0.0085) ** 2)) * (1 - smoothstep(np.abs(x) / MOUTH_HALF_WIDTH, 0.7, 1.15))
@@ -183,7 +183,7 @@ def semantic_shapes(surface: SculptedHead) -> dict[str, FloatArray]:
 class ExpressionBasis:
     """A version's expression directions (V, 3, E) and the matrix (K, E) from its shapes' activations to them.
 
-    ``names`` are the K shapes the basis plays, E at most K; a version with eyelid bases leaves the blinks to those.
+    ``names`` are the K shapes of the basis, E at most K; a version with eyelid bases has the blinks in these.
     """
 
     directions: FloatArray
@@ -203,8 +203,8 @@ def principal_basis(shapes: dict[str, FloatArray], deviation: FloatArray, seed: 
     -----
     With activations a ~ N(0, L L'), displacements are a'D. The SVD L'D = U S W' gives directions S W' = U'L'D,
     orthogonal and in order of variance, whose coefficients are N(0, 1); activations a have the coefficients
-    a inv(L') U. U are the eigenvectors of L'DD'L. The shapes are rounded first, and nothing that follows but the last
-    line depends on the order of a sum, so that all machines find the same directions: DD' and U'L'D are exact.
+    a inv(L') U. U are the eigenvectors of L'DD'L. The shapes are rounded first, and only the last line depends on the
+    order of summation, so that all machines find the same directions: DD' and U'L'D are exact.
     """
     stack = on_grid(np.stack([field.ravel() for field in shapes.values()]), LENGTH_BITS)
     random = np.random.default_rng(seed)
@@ -212,10 +212,10 @@ def principal_basis(shapes: dict[str, FloatArray], deviation: FloatArray, seed: 
     root = deviation[:, None] * mixing
     u = _eigenvectors(_product(_product(root.T, stack @ stack.T), root))
     directions = on_grid(_product(u.T, root.T), _MIXING_BITS) @ stack
-    # An eigenvector's sign is arbitrary: fix it.
+    # The sign of an eigenvector is arbitrary, so fix it.
     sign = np.sign(directions[np.arange(len(u)), np.abs(directions).argmax(axis=1)])
     directions *= sign[:, None]
-    # Where shapes depend on each other, one combination moves nothing.
+    # If shapes are linearly dependent, one combination has no effect.
     moving = on_grid(directions, LENGTH_BITS).any(axis=1)
     directions, u, sign = directions[moving], u[:, moving], sign[moving]
     vertices = len(next(iter(shapes.values())))
@@ -227,7 +227,7 @@ def principal_basis(shapes: dict[str, FloatArray], deviation: FloatArray, seed: 
 
 
 def _product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Product of small matrices, summed in one order everywhere, as BLAS's is not."""
+    """Product of small matrices with a fixed order of summation, unlike BLAS."""
     product: FloatArray = (a[:, :, None] * b[None]).sum(axis=1)
     return product
 
@@ -236,8 +236,8 @@ def _eigenvectors(matrix: FloatArray) -> FloatArray:
     """Eigenvectors of a symmetric (K, K) matrix, in columns, the largest eigenvalue's first.
 
     Jacobi rotations of disjoint pairs (Golub and Van Loan, "Matrix Computations", 4th edition, 8.5.3), in elementary
-    operations alone: the last digits of LAPACK's differ between machines, and small gaps between eigenvalues would
-    enlarge them.
+    operations, because LAPACK's last digits differ between machines, and small gaps between eigenvalues would amplify
+    the differences.
     """
     size = len(matrix)
     even = size + size % 2
@@ -251,16 +251,16 @@ def _eigenvectors(matrix: FloatArray) -> FloatArray:
         tangent = np.where(difference < 0.0, -twice, twice) / np.where(length > 0.0, length, 1.0)
         cosine = 1.0 / np.sqrt(1.0 + tangent**2)
         sine = tangent * cosine
-        for array in (rotated, rotated.T, vectors):  # of .T the columns are the rows
+        for array in (rotated, rotated.T, vectors):  # columns of the transpose are rows
             at_p, at_q = array[:, p], array[:, q]
             array[:, p], array[:, q] = cosine * at_p - sine * at_q, sine * at_p + cosine * at_q
-        order = np.concatenate([order[:1], np.roll(order[1:], 1)])  # every pair meets once a sweep
+        order = np.concatenate([order[:1], np.roll(order[1:], 1)])  # every pair once per sweep
     largest_first = np.argsort(-np.diag(rotated)[:size], kind="stable")
     return vectors[:size, largest_first]
 
 
-MEETING = 0.14  # where closing lids meet: share of the way from the lower to the upper margin
-LID_DEPTH = 0.0009  # height over the eyeball of the middle of a lid's margin
+MEETING = 0.14  # where closing lids meet: fraction of the way from the lower to the upper margin
+LID_DEPTH = 0.0009  # height of the middle of a lid's margin above the eyeball
 
 
 def margin_angles(x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -273,15 +273,15 @@ def margin_angles(x: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def lid_turn(surface: SculptedHead, upper: FloatArray | float, lower: FloatArray | float) -> FloatArray:
-    """(V, 3) displacement that turns the margins of the left eye's lids.
+    """(V, 3) displacement that rotates the lid margins of the left eye.
 
-    The margins, and the lids' inner sides, turn rigidly about the eyeball; the skin around follows by the
-    harmonic field between the margins and what stays at rest.
+    The margins and the inner sides of the lids rotate rigidly about the eyeball; the surrounding skin follows by the
+    harmonic field between the margins and fixed vertices.
 
     Parameters
     ----------
     upper, lower : FloatArray | float
-        Radians by which each margin turns, positive up; a number, or one for each vertex.
+        Rotation of each margin, radians, positive up; a number, or one for each vertex.
     """
     relative = surface.vertices - EYE_CENTER
     x, y, z = relative.T
@@ -303,7 +303,7 @@ def lid_turn(surface: SculptedHead, upper: FloatArray | float, lower: FloatArray
 
 
 def harmonic(surface: SculptedHead, field: FloatArray, free: NDArray[np.bool_]) -> FloatArray:
-    """The field with its values at ``free`` vertices made the mean of their neighbours' (uniform weights)."""
+    """The field with values at ``free`` vertices replaced by the mean of their neighbours (uniform weights)."""
     count = len(surface.vertices)
     edges = mesh_edges(surface.faces)
     pairs, _, _ = unique_pairs(np.concatenate([edges, edges[:, ::-1]]))
@@ -322,7 +322,7 @@ def blink(surface: SculptedHead) -> FloatArray:
     top, bottom = margin_angles(x)
     opening = np.maximum(top - bottom, 0)
     closed = lid_turn(surface, -(1 - MEETING) * opening, MEETING * opening)
-    # A shape moves along chords, which dip towards the eye half way: end a little proud of the ball.
+    # A shape moves along chords, which are closer to the eye half way, so the lid ends slightly in front of the ball.
     relative = surface.vertices + closed - EYE_CENTER
     distance = np.linalg.norm(relative, axis=1, keepdims=True)
     moved = np.linalg.norm(closed, axis=1, keepdims=True)
@@ -330,7 +330,7 @@ def blink(surface: SculptedHead) -> FloatArray:
 
 
 def keep_off_eyes(surface: SculptedHead, field: FloatArray, clearance: float = 0.0003) -> FloatArray:
-    """The displacement, pushed out wherever skin would enter an eyeball at rest by it."""
+    """The displacement, corrected where skin would enter an eyeball at rest."""
     held = field.copy()
     for ball in (EYE_CENTER, EYE_CENTER * [-1, 1, 1]):
         relative = surface.vertices + held - ball
@@ -346,7 +346,7 @@ Displacement = Callable[[FloatArray], FloatArray]
 
 
 def _along(axis: int, profile: Callable[[FloatArray], FloatArray]) -> Displacement:
-    """Displacement along an axis, its size given by a profile of position (N, 3) -> (N,) metres."""
+    """Displacement along an axis with a magnitude given by a profile of position, (N, 3) -> (N,) metres."""
     return lambda points: profile(points)[:, None] * np.eye(3)[axis]
 
 
@@ -368,7 +368,7 @@ def _pull(
     return displacement
 
 
-_LEFT_ALONE = (np.ones(3),)  # where faces are not symmetric
+_LEFT_ALONE = (np.ones(3),)  # asymmetry of faces
 
 # One standard deviation of each trait; Farkas (1994) gives about 4-5 % for the large measures.
 TRAITS: dict[str, Displacement] = {
@@ -413,7 +413,7 @@ TRAITS: dict[str, Displacement] = {
 
 
 def trait_field(name: str, points: FloatArray) -> FloatArray:
-    """(N, 3) displacement, metres, by one deviation of a trait; each eye and its lids move as one."""
+    """(N, 3) displacement by one standard deviation of a trait, metres; each eye moves together with its lids."""
     field = TRAITS[name](points)
     for ball in (EYE_CENTER, EYE_CENTER * MIRROR):
         rigid = TRAITS[name](ball[None])[0]
@@ -424,6 +424,6 @@ def trait_field(name: str, points: FloatArray) -> FloatArray:
 
 
 def identity_basis(surface: SculptedHead, seed: int) -> FloatArray:
-    """(V, 3, S) orthogonal directions; coefficients drawn from N(0, 1) make plausible people."""
+    """(V, 3, S) orthogonal directions; coefficients drawn from N(0, 1) give plausible people."""
     fields = {name: trait_field(name, surface.vertices) for name in TRAITS}
     return principal_basis(fields, np.ones(len(fields)), seed).directions

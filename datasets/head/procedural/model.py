@@ -1,4 +1,4 @@
-"""The default head as a model in FLAME's layout, in two versions with different bases over one topology."""
+"""The default head as a model in FLAME's layout, in two versions with one topology and different bases."""
 
 from __future__ import annotations
 
@@ -39,8 +39,7 @@ def procedural_head(version: str = "2023") -> HeadArrays:
     ----------
     version : str
         "2023" ("procedural2023") or "2020" ("procedural2020"). Both have the same topology and
-        template. In 2020 two eyelid bases represent the blinks, and shapes and directions differ a
-        little.
+        template. In 2020 two eyelid bases represent the blinks, and shapes and directions differ slightly.
 
     Raises
     ------
@@ -101,11 +100,11 @@ def full_version(version: str) -> str:
 
 
 def version_shapes(surface: SculptedHead, version: str) -> dict[str, FloatArray]:
-    """The semantic shapes (V, 3) as a version has them, metres at activation 1."""
+    """The semantic shapes (V, 3) of a version, metres at activation 1."""
     shapes = semantic_shapes(surface)
     if version != "procedural2020":
         return shapes
-    # The older version was "captured" less finely: strengths vary over the face, by up to 12 %.
+    # Simulates coarser capture of the older version: strengths vary over the face by up to 12 %.
     random = np.random.default_rng(_SEEDS[version])
     height, depth = surface.vertices[:, 1], surface.vertices[:, 2]
     changed = {}

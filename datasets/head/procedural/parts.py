@@ -1,7 +1,7 @@
 """Visible but untracked parts of the mouth: teeth, gums and tongue of the default head.
 
-They are rendered into synthetic captures and stand in no head model: as in a real capture, methods have to
-find out about them from the images. The wall of the mouth is part of the skin (region ``mouth_socket``).
+They are rendered in synthetic captures and are not in the head model: as in a real capture, methods must learn them
+from the images. The wall of the mouth is part of the skin (region ``mouth_socket``).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from .sculpture import resample
 from .surface import JAW, NECK, PARENTS
 
 # Mesiodistal widths from the midline, millimetres (Wheeler's Dental Anatomy), incisors to second premolar:
-# molars would stand in the wall of the mouth.
+# molars would intersect the wall of the mouth.
 UPPER_WIDTHS = (8.5, 6.5, 7.5, 7.0, 7.0)
 LOWER_WIDTHS = (5.2, 5.7, 7.0, 7.0, 7.2)
 ARCH_REACH = 0.029  # half width of the dental arch, metres
@@ -53,7 +53,7 @@ def render_parts(
     Parameters
     ----------
     shape : FloatArray | None
-        (S,) identity coefficients; the mean head if None. Parts follow the mouth's wall around them.
+        (S,) identity coefficients; the mean head if None. Parts follow the surrounding wall of the mouth.
     tongue_out : float
         0 places the tongue behind the lower teeth, 1 over the lower lip (the jaw should be open).
 
@@ -65,7 +65,7 @@ def render_parts(
     if "mouth_socket" not in head.regions or not head.version.startswith("procedural"):
         raise InputError(f"head model {head.version!r}", "regions", "a procedural head", "another head")
     if not 0 <= tongue_out <= 1:
-        raise InputError("render_parts", "tongue_out", "a share in [0, 1]", str(tongue_out))
+        raise InputError("render_parts", "tongue_out", "a number in [0, 1]", str(tongue_out))
     meshes = {
         "upper_teeth": (*_teeth(UPPER_WIDTHS, 0.0690, edge=-0.0530, root=-0.0430), NECK, "teeth"),
         "lower_teeth": (*_teeth(LOWER_WIDTHS, 0.0662, edge=-0.0518, root=-0.0600), JAW, "teeth"),
@@ -109,7 +109,7 @@ def _parabola_length(x: FloatArray) -> FloatArray:
 def _teeth(
     widths: tuple[float, ...], front: float, *, edge: float, root: float
 ) -> tuple[FloatArray, IntArray]:
-    """One row of teeth from ``root`` to ``edge`` heights: crowns that bulge and part, over an arch."""
+    """One row of teeth from ``root`` to ``edge`` heights along an arch, with separate convex crowns."""
     half = np.array(widths) * 1e-3
     every = np.concatenate([half[::-1], half])
     starts = np.concatenate([[0], np.cumsum(every)])[:-1] - half.sum()
@@ -133,7 +133,7 @@ def _teeth(
 
 
 def _gums(front: float, *, near: float, far: float) -> tuple[FloatArray, IntArray]:
-    """Gum from just over the necks of the teeth (``near``) to the vault or floor of the mouth (``far``)."""
+    """Gum from just above the necks of the teeth (``near``) to the roof or floor of the mouth (``far``)."""
     end = arch_length()
     place, normal = dental_arch(np.linspace(-end, end, 81), front)
     rows = []
@@ -154,7 +154,7 @@ def _strip(rows: list[FloatArray], *, flip: bool) -> tuple[FloatArray, IntArray]
 
 
 def tongue(out: float) -> tuple[FloatArray, IntArray]:
-    """Tongue between its rest (0) and put out (1): a flattened tube with a groove, closed at both ends."""
+    """Tongue from rest (0) to extended (1): a flattened tube with a groove, closed at both ends."""
     rest = np.array(
         # x, y, z of the middle, half width, half height
         [[0, -0.062, 0.016, 0.015, 0.0065], [0, -0.0565, 0.032, 0.017, 0.0072],
@@ -167,7 +167,7 @@ def tongue(out: float) -> tuple[FloatArray, IntArray]:
          [0, -0.0555, 0.094, 0.0120, 0.0036]]
     )  # fmt: skip
     path = resample((1 - out) * rest + out * put_out, TONGUE_SECTIONS)
-    # Round both ends: sections shrink over the last few like a half ellipse.
+    # Round both ends: the last few sections shrink like a half ellipse.
     end = np.minimum(np.arange(TONGUE_SECTIONS), np.arange(TONGUE_SECTIONS)[::-1])
     taper = np.sqrt(1 - (1 - np.clip((end + 0.25) / 4, 0, 1)) ** 2)
     around = np.linspace(0, 2 * np.pi, TONGUE_SECTORS, endpoint=False)
@@ -197,7 +197,7 @@ def tongue(out: float) -> tuple[FloatArray, IntArray]:
 
 
 def _follow(head: HeadAsset, shape: FloatArray, points: FloatArray, reach: float = 0.012) -> FloatArray:
-    """Identity's displacement at points inside the mouth: a Gaussian mean of its wall's."""
+    """Displacement by identity at points inside the mouth: a Gaussian mean over the wall."""
     wall = head.regions["mouth_socket"]
     moved = head.shape_basis[wall] @ shape
     squared = ((points[:, None] - head.template[wall][None]) ** 2).sum(axis=2)

@@ -34,7 +34,7 @@ from .anatomy import (
 )
 from .sculpture import EAR_ORIGIN, sculpture
 
-SHORTEST_EDGE = 0.00035  # metres; the sheets of lids and lips are sculpted several times further apart
+SHORTEST_EDGE = 0.00035  # metres; lids and lips are sculpted several times further apart
 LOW, HIGH = (0.0, FLOOR, -0.13), (0.115, 0.15, 0.11)
 
 
@@ -58,7 +58,7 @@ class SculptSettings:
 
 
 def edge_length(points: FloatArray) -> FloatArray:
-    """(N,) wanted length of the edges at each point, metres: fine at features, smoothly coarser away."""
+    """(N,) target edge length at each point, metres: fine at features, smoothly coarser elsewhere."""
     x, y, z = points.T
     eye = points - EYE_CENTER
     top, bottom = lid_curves(eye[:, 0])
@@ -90,7 +90,7 @@ def feature_points() -> FloatArray:
     x = np.linspace(0.97 * MEDIAL_CANTHUS, 0.97 * LATERAL_CANTHUS, 24)
     upper, lower = lid_curves(x)
     rims = [eye_front(x, y, 0.0010) for y in (upper + 0.0006, lower - 0.0006)]
-    lip = np.linspace(0, LIP_RING_REACH * MOUTH_HALF_WIDTH, 15)  # every other one is of the lips' rings
+    lip = np.linspace(0, LIP_RING_REACH * MOUTH_HALF_WIDTH, 15)  # every second one belongs to the lips' rings
     height = LIP_RING_HEIGHT + (SCULPTED_LIP_GAP - CLOSED_LIP_GAP) / 2
     for side in (1, -1):
         rims.append(np.column_stack([lip, slit_height(lip) + side * height, lip_arc(lip) + 0.004]))
@@ -98,7 +98,7 @@ def feature_points() -> FloatArray:
 
 
 def clean(vertices: FloatArray, faces: IntArray, *, merge: float, flip: bool) -> tuple[FloatArray, IntArray]:
-    """Largest piece of the mesh; vertices nearer than ``merge`` metres made one, slivers flipped if asked."""
+    """Largest piece of the mesh, with vertices nearer than ``merge`` metres merged, and slivers flipped if requested."""
     import pymeshlab
 
     meshes = pymeshlab.MeshSet()
@@ -116,7 +116,7 @@ def clean(vertices: FloatArray, faces: IntArray, *, merge: float, flip: bool) ->
 
 
 def mirrored(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
-    """Whole head from its left half, welded at x = 0, and each vertex's mirror image."""
+    """Full head from its left half, joined at x = 0, and each vertex's mirror image."""
     middle = np.abs(vertices[:, 0]) < 1e-9
     count = len(vertices)
     image = np.arange(count)
@@ -147,7 +147,7 @@ def sculpt(step: float, detail: float) -> tuple[FloatArray, IntArray, IntArray]:
 
 
 def _spaced(vertices: FloatArray, candidates: IntArray, spacing: FloatArray) -> IntArray:
-    """Those of the candidates, taken in order, that keep their ``spacing`` (V,) from all taken before."""
+    """Candidates, in order, with a distance of at least ``spacing`` (V,) from all previously selected ones."""
     taken: list[int] = []
     for vertex in candidates:
         if not taken or np.linalg.norm(vertices[taken] - vertices[vertex], axis=1).min() > spacing[vertex]:
@@ -180,8 +180,8 @@ def polygonise(
 ) -> tuple[FloatArray, IntArray]:
     """Zero set of ``field`` in the box, as vertices (V, 3) and outward triangles (F, 3).
 
-    The field is sampled at ``step`` only in blocks that its value at their centres says the surface may meet;
-    it must not grow faster than about 1.5 metres a metre.
+    The field is sampled at ``step`` only in blocks that the surface may cross according to its value at their centres;
+    its slope must not exceed about 1.5.
     """
     low, high = np.asarray(low, float), np.asarray(high, float)
     blocks = np.ceil((high - low) / (step * BLOCK)).astype(int)
@@ -200,13 +200,14 @@ def polygonise(
 
 
 def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(V,) a third of the area of the triangles around each vertex, square metres."""
+    """(V,) a third of the area of the triangles at each vertex, square metres."""
     share = triangle_areas(vertices, faces) / 3
     return np.bincount(faces.ravel(), np.repeat(share, 3), len(vertices)).astype(float)
 
 
 def surface_graph(vertices: FloatArray, faces: IntArray, size: FloatArray, *, diagonals: bool) -> csr_matrix:
-    """Edges of the mesh, and the short diagonals across them if asked, weighted by length over wanted length.
+    """Edges of the mesh, optionally with the short diagonals across them, weighted by length relative to the target
+    length.
 
     Diagonals make distances more even in all directions, but let one cluster leap over another.
     """
@@ -250,9 +251,9 @@ def coarsen(
     Parameters
     ----------
     vertices, faces : FloatArray, IntArray
-        The fine mesh, manifold, with at least about three edges per wanted edge.
+        The fine mesh, manifold, with at least about three edges per target edge.
     size : FloatArray
-        (V,) wanted edge length, metres.
+        (V,) target edge length, metres.
     fixed : IntArray
         Fine vertices that become coarse vertices unchanged.
     border : IntArray
@@ -298,7 +299,7 @@ def coarsen(
 def _centers(
     vertices: FloatArray, label: IntArray, density: FloatArray, seeds: IntArray, locked: int, border: IntArray
 ) -> IntArray:
-    """Each cluster's vertex nearest its centroid; among those on the most border lines it touches."""
+    """Each cluster's vertex nearest to its centroid, among those on most of its border lines."""
     total = np.bincount(label, density, len(seeds))
     centroid = (
         np.stack([np.bincount(label, density * vertices[:, k], len(seeds)) for k in range(3)], 1)

@@ -1,4 +1,4 @@
-"""The head as an implicit surface: primitives, smooth booleans, strokes, and what is made of them.
+"""The head as an implicit surface: primitives, smooth booleans, strokes, and the parts of the head.
 
 Every function works on points ``(N, 3)`` in metres and returns ``(N,)`` approximate signed distances,
 negative inside. The bounds are those of I. Quilez, "Distance functions" and "Smooth minimum".
@@ -39,13 +39,13 @@ def rotation_xyz(degrees: Point) -> FloatArray:
 
 
 def local(points: FloatArray, center: Point, degrees: Point | None = None) -> FloatArray:
-    """Points in the frame at ``center``, turned by ``degrees`` (see `rotation_xyz`)."""
+    """Points in the frame at ``center``, rotated by ``degrees`` (see `rotation_xyz`)."""
     relative = points - np.asarray(center, points.dtype)
     return relative if degrees is None else relative @ rotation_xyz(degrees).astype(points.dtype)
 
 
 def ellipsoid(points: FloatArray, center: Point, radii: Point, degrees: Point | None = None) -> FloatArray:
-    """Ellipsoid; exact on the surface and first-order right near it."""
+    """Ellipsoid; exact on the surface and correct to first order near it."""
     scaled = local(points, center, degrees) / np.asarray(radii, points.dtype)
     length = np.linalg.norm(scaled, axis=1)
     slope = np.linalg.norm(scaled / np.asarray(radii, points.dtype), axis=1)
@@ -53,7 +53,7 @@ def ellipsoid(points: FloatArray, center: Point, radii: Point, degrees: Point | 
 
 
 def capsule(points: FloatArray, a: Point, b: Point, radius_a: float, radius_b: float) -> FloatArray:
-    """Capsule between two points whose radius runs linearly from ``radius_a`` to ``radius_b``."""
+    """Capsule between two points with a radius from ``radius_a`` to ``radius_b``."""
     start = np.asarray(a, points.dtype)
     axis = np.asarray(b, points.dtype) - start
     relative = points - start
@@ -99,13 +99,13 @@ def stroke(points: FloatArray, center: Point, sigma: Point, degrees: Point | Non
 
 
 def ridge(points: FloatArray, knots: Sequence[Point], width: float, samples: int = 10) -> FloatArray:
-    """Weight in [0, 1] of a stroke along a spline: Gaussian of its distance, of deviation ``width``."""
+    """Weight in [0, 1] of a stroke along a spline: Gaussian of the distance with standard deviation ``width``."""
     distance = tube(points, knots, [0.0] * len(knots), samples)
     return np.exp(-0.5 * (distance / width) ** 2)
 
 
-# One row per height, metres: midline depth of the face without nose and lips, half width, depth of the widest
-# place, exponent of the superellipse that joins them.
+# One row per height, metres: midline depth of the face without nose and lips, half width, depth of the widest point,
+# exponent of the connecting superellipse.
 FACE_SECTIONS = np.array(
     [
         # y, front, half width, widest at, exponent
@@ -225,7 +225,7 @@ def add_eyes(head: FloatArray, points: FloatArray) -> FloatArray:
     head = head + 0.0007 * _crease(points, span[:5], 0.8 * lower[:5] - 0.0062, 0.0016)
     top, bottom = lid_curves(x)
     lens = intersection(y - top, bottom - y, 0.0016)
-    # Beyond the ball, at the corners, the opening has a floor; the cavity melts into it without a sliver.
+    # Outside the ball, at the corners, the opening has a floor, which blends into the cavity without slivers.
     floor = radius - 0.0006 - np.linalg.norm(np.stack([x * 0.80, y, z], 1), axis=1)
     opening = intersection(np.maximum(lens, -0.001 - z), floor, 0.001)
     cavity = np.linalg.norm(np.stack([x, y, z], 1), axis=1) - radius
@@ -233,7 +233,7 @@ def add_eyes(head: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _crease(points: FloatArray, x: FloatArray, y: FloatArray, width: float) -> FloatArray:
-    """Weight of a stroke seen from the front, along (x, y) from the centre of the eye, whatever the depth."""
+    """Weight of a stroke in front view, along (x, y) from the centre of the eye, for any depth."""
     center = EYE_CENTER.astype(points.dtype)
     flat = (points - center) * np.array([1, 1, 0], points.dtype)
     weight = ridge(flat, [(a, b, 0.0) for a, b in zip(x, y, strict=True)], width)
@@ -356,7 +356,7 @@ def add_ears(head: FloatArray, points: FloatArray) -> FloatArray:
     return subtraction(head, union(concha, cymba, 0.002), 0.0022)
 
 
-# Feature, and the box that holds all it changes: its lower and its upper corner.
+# Feature, and lower and upper corner of its bounding box.
 FEATURES: tuple[tuple[Callable[[FloatArray, FloatArray], FloatArray], Point, Point], ...] = (
     (add_eyes, (-0.01, -0.01, 0.02), (0.065, 0.055, 0.10)),
     (add_nose, (-0.01, -0.05, 0.04), (0.04, 0.045, 0.13)),
@@ -366,7 +366,7 @@ FEATURES: tuple[tuple[Callable[[FloatArray, FloatArray], FloatArray], Point, Poi
 
 
 def sculpture(points: FloatArray) -> FloatArray:
-    """Signed distance, about, of the head to ``points`` (N, 3) with x >= 0; mirror for the other half."""
+    """Approximate signed distance of ``points`` (N, 3) with x >= 0 to the head; mirror for the other half."""
     head: FloatArray = head_mass(points) - planes(points)
     for add, low, high in FEATURES:
         inside = np.all((points > np.asarray(low)) & (points < np.asarray(high)), axis=1)

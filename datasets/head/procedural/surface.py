@@ -1,4 +1,4 @@
-"""The sculpted surface at rest: skin and eyeballs, with what the rig asks of each vertex."""
+"""The sculpted surface at rest: skin and eyeballs, with vertex properties for the rig."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class SculptedHead:
         return vertex_normals(self.vertices, self.faces)
 
     def mirrored(self, field: FloatArray) -> FloatArray:
-        """A displacement field (V, 3), or values (V,), reflected to the other side."""
+        """A displacement field (V, 3), or values (V,), mirrored to the other side."""
         return field[self.mirror] * MIRROR if field.ndim == 2 else field[self.mirror]
 
     def nearest(self, point: FloatArray, among: IntArray | None = None) -> int:
@@ -168,13 +168,13 @@ JOINTS = np.array(
 
 
 def jaw_weight(surface: SculptedHead) -> FloatArray:
-    """(V,) share of the jaw: the lower lip and chin wholly, fading over cheek, throat and mouth."""
+    """(V,) weight of the jaw: 1 at the lower lip and chin, decreasing over cheek, throat and mouth."""
     x, y, z = surface.vertices.T
     u = np.abs(x) / MOUTH_HALF_WIDTH
     around = np.arctan2(np.abs(x), z + 0.002)  # 0.36 at the corner of the mouth, about 1.4 at the jaw's angle
     rise = 0.022 * smoothstep(around, 0.36, 1.4)
     below = rise - surface.above_slit
-    # The lips part like a cut in the middle; towards the corners and the cheek the change is gradual.
+    # In the middle the weight jumps between the lips; towards the corners and the cheek it is gradual.
     width = 0.0002 + 0.0075 * smoothstep(u, 0.74, 1.05) + 0.022 * smoothstep(around, 0.36, 0.80)
     depth = 0.0002 + 0.0095 * smoothstep(lip_arc(x) - z, 0.012, 0.050)
     width = np.where(surface.in_mouth & (u < 0.97), np.maximum(depth, width), width)
@@ -200,10 +200,10 @@ def skinning_weights(surface: SculptedHead) -> FloatArray:
 
 
 def joint_regressor(surface: SculptedHead) -> FloatArray:
-    """(5, V) rows of sum 1 that give `JOINTS` at rest.
+    """(5, V) joint regressor, rows sum to 1, that gives `JOINTS` at rest.
 
-    Each row is the evenest weighting of some vertices around its joint that reproduces it exactly; an eye's
-    joint is the mean of its ball.
+    Each row is the most even weighting of vertices around its joint that reproduces it exactly; an eye's joint is the
+    mean of its ball.
     """
     vertices = surface.vertices
     _x, y, z = vertices.T
@@ -223,7 +223,7 @@ def joint_regressor(surface: SculptedHead) -> FloatArray:
 
 
 def pose_basis(surface: SculptedHead) -> FloatArray:
-    """(V, 3, 36) correctives: as the jaw opens the cheeks hollow and the corners of the mouth draw in.
+    """(V, 3, 36) correctives: when the jaw opens, the cheeks become hollow and the corners of the mouth move inwards.
 
     They follow the sine of the opening angle, from the entries (2, 1) and (1, 2) of the jaw's R - I.
     """
@@ -248,7 +248,7 @@ def pose_basis(surface: SculptedHead) -> FloatArray:
 
 RING_LENGTH = 15
 
-# Landmarks seen from the front: (x, y) of the left one where there are two.
+# Landmarks in front view: (x, y) of the left one for pairs.
 _FRONT = {
     "nose_tip": (0, -0.0200),
     "nose_bridge": (0, 0.0200),

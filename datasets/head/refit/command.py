@@ -26,10 +26,10 @@ BLOCKS_FOLDER = "refit-blocks"
 def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progress) -> CommandResult:
     """Refit the tracking of a capture to another head model, with residuals in millimetres and a heat map.
 
-    Started again after a kill it continues at the block of timesteps it was at.
+    A killed command continues at the last block of timesteps when it is run again.
 
     Writes under ``settings.out`` the capture (images linked), ``refit.json`` with every timestep's residuals and
-    ``heat_map.png``. Raises `InputError` before any fitting where capture and head model do not go together.
+    ``heat_map.png``. Raises `InputError` before any fitting if capture and head model do not match.
     """
     from ...clip import check_apart
     from ...images import write_image
@@ -44,7 +44,7 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
         raise InputError(
             "command line", "--target", f"another head model than {clip.head.version}", target.version
         )
-    capture_plan(clip, settings.capture)  # What cannot be written again is found before the fit.
+    capture_plan(clip, settings.capture)  # Captures that cannot be rewritten are detected before the fit.
     check_apart(clip, out)
     refitted = refit(clip, target, settings.settings, folder=out / BLOCKS_FOLDER, progress=progress)
     write_image(out / "heat_map.png", draw_heat_map(refitted))

@@ -1,4 +1,4 @@
-"""A picture of where a refit leaves distances: the subject's neutral head, coloured by mean residual."""
+"""Heat map of a refit: the subject's neutral head, coloured by mean residual."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SHOWN = 99  # percentile of the residuals at the upper end of the scale
 
 
 def draw_heat_map(refitted: Refitted) -> ByteArray:
-    """(H, W, 3) picture of the head from three sides with a scale; vertices that were not fitted are grey."""
+    """(H, W, 3) image of the head from three sides with a scale; vertices that were not fitted are grey."""
     clip, report = refitted.clip, refitted.report
     neutral = PosedSubject.of(clip).neutral
     fitted = np.isfinite(report.vertex_mm)

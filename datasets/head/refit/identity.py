@@ -1,4 +1,4 @@
-"""Vertices that a fit uses, their targets on the source's surface, and the resulting identity."""
+"""Vertices of a fit, their targets on the source's surface, and the resulting identity."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _ROUNDS = 25
 """Maximum alternations of closest points and identity, for models of different topology."""
 
 _SETTLED = 1e-5
-"""Metres; the rounds end when the fitted face moves less than this on average."""
+"""Metres; iterations end when the fitted face moves less than this on average."""
 
 FARTHEST = 0.010
-"""Metres; a vertex whose closest point is farther has no counterpart."""
+"""Metres; a vertex has no counterpart if its closest point is farther."""
 
 _FACING = 0.5
-"""Least cosine between the normals of counterparts."""
+"""Minimum cosine between the normals of counterparts."""
 
 _MILLIMETRES = 1e3
 
@@ -63,7 +63,7 @@ class Matching:
 def fitted_vertices(head: HeadAsset, settings: RefitSettings) -> tuple[IntArray, FloatArray]:
     """Vertices of the face and the eyeballs, (n,) ascending, and their weights (n,).
 
-    Raises `InputError` where the head has no face region.
+    Raises `InputError` if the head has no face region.
     """
     weights = np.zeros(len(head.template))
     weights[region(head, FACE)] = 1.0
@@ -78,15 +78,16 @@ def fitted_vertices(head: HeadAsset, settings: RefitSettings) -> tuple[IntArray,
 
 
 def same_topology(one: HeadAsset, other: HeadAsset) -> bool:
-    """Whether vertices of the same index mean the same point."""
+    """Whether vertices of the same index are the same point."""
     return one.template.shape == other.template.shape and np.array_equal(one.faces, other.faces)
 
 
 def match(source: HeadAsset, neutral: FloatArray, target: HeadAsset, settings: RefitSettings) -> Matching:
     """Find counterparts and identity of the target for a subject's neutral head in the source's model.
 
-    Over one topology counterparts are equal indices. Else closest points on the source's surface, region by
-    region, found in turn with a rigid alignment and the identity, from an alignment of common regions' centres.
+    For equal topologies counterparts have equal indices. Otherwise they are closest points on the source's surface,
+    region by region, alternated with a rigid alignment and the identity, and initialised by aligning the centres of
+    common regions.
 
     Parameters
     ----------
@@ -191,9 +192,9 @@ class ClosestPoints(NamedTuple):
 def closest_points(points: FloatArray, vertices: FloatArray, faces: IntArray) -> ClosestPoints:
     """Exact closest points on a triangle mesh; degenerate triangles count as segments or points.
 
-    Triangles of like size are searched together, those of the smallest last: in the order of their centres'
-    distance, until the next centre is farther than the best distance so far plus the largest distance from a
-    centre to a corner among them.
+    Triangles of similar size are searched together, the smallest last, in the order of the distance of their centres,
+    until the next centre is farther than the best distance plus the largest distance from a centre to a corner in the
+    group.
     """
     corners = vertices[faces]
     centres = corners.mean(axis=1)
@@ -216,13 +217,13 @@ def _search(
     names: IntArray,
     found: ClosestPoints,
 ) -> None:
-    """Enter into ``found`` what is nearer than what it holds."""
+    """Update ``found`` with nearer points."""
     tree = cKDTree(centres)
     rest, tried = np.arange(len(points)), min(_FIRST_CANDIDATES, len(centres))
     while len(rest):
         away, candidates = tree.query(points[rest], k=tried)
         away, candidates = away.reshape(-1, tried), candidates.reshape(-1, tried)
-        # Most candidates are too far to matter: only those that may be nearest are measured.
+        # Only candidates that may be nearest are measured, since most are too far.
         row, column = np.nonzero(
             away <= (np.minimum(found.distance[rest], away[:, 0] + reach) + reach)[:, None]
         )
@@ -246,7 +247,7 @@ def _search(
 def _on_triangles(points: FloatArray, corners: FloatArray) -> FloatArray:
     """(..., 3) barycentric weights of the points of triangles (..., 3, 3) closest to points (..., 3).
 
-    The foot in the plane if it is inside, else the nearest of the closest points on the three edges.
+    This is the foot in the plane if it is inside, else the nearest of the closest points on the three edges.
     """
     a, b, c = np.moveaxis(corners, -2, 0)
     ab, ac, ap = b - a, c - a, points - a

@@ -1,18 +1,18 @@
-"""The least-squares problem of one timestep, reduced so that its cost does not depend on the number of vertices.
+"""The least-squares problem of one timestep, reduced to a cost independent of the number of vertices.
 
 In the frame of the head (neck joint at rest), with x = X z the unposed vertices for
 z = (expression, eyelids, correctives, 1), linear blend skinning is
 
     v = x + lids + sum_j w_j (R_j - I) (x - c_j),      c_j = K_j z the pivot of joint j,
 
-for the jaw, the eyes and, where the neck turns, the root seen from the head. With D_j = R_j - I that is linear in z
+for the jaw, the eyes and, if the neck rotates, the root relative to the head. With D_j = R_j - I that is linear in z
 and in the entries of D_j: row r of v is ``(X_r + sum_jc D_j[r, c] F_jc) z`` with ``F_jc = w_j (X_c - K_jc)``.
 So the squared distance to a target is a quadratic in z whose matrix is a sum of constant Gram matrices, each times
-a product of at most two entries of D. They are made once for a subject; a timestep contributes the products of its
+a product of at most two entries of D. They are computed once per subject; a timestep contributes the products of its
 target with X and F. For given angles the best coefficients then follow in closed form (variable projection: Golub
 and Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares problems whose variables
 separate", SIAM J. Numer. Anal. 10, 1973), and by the envelope theorem the gradient with respect to the angles is the
-partial one. The searched angles are nine at most.
+partial one. At most nine angles are searched.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ class Evaluation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Terms:
-    """Constant symmetric matrices, lower triangles packed in rows, and which product of D's entries goes with each.
+    """Constant symmetric matrices, lower triangles packed in rows, and the product of entries of D for each.
 
-    The first row goes with 1, the next ones with single entries of D, the rest with entries of A'A, A being the
+    The first row is multiplied by 1, the next ones by single entries of D, the rest by entries of A'A, where A is the
     D_j side by side, (3, 3 M).
     """
 
@@ -110,7 +110,7 @@ class FitProblem:
         self.bound = np.array(limits, dtype=np.float64)
 
         unposed, lid_part, pivots = self._columns(head, canonical)
-        self._plain = unposed + lid_part  # (n, 3, N), millimetres as all that follows
+        self._plain = unposed + lid_part  # (n, 3, N), millimetres, like all following values
         skin = np.asarray(head.skinning_weights[vertices], dtype=np.float64)
         turning = ([ROOT] if keep else []) + list(SEARCHED)
         self._turning = [joint for joint in turning if skin[:, joint].any()]
@@ -134,7 +134,7 @@ class FitProblem:
         targets : FloatArray
             (T, n, 3) metres, in the frame of the head.
         necks : FloatArray
-            (T, 3, 3) rotations of the neck joint; read only where the settings keep them.
+            (T, 3, 3) rotations of the neck joint; used only if the settings keep them.
         """
         wanted = _MILLIMETRES * np.asarray(targets, dtype=np.float64)
         weighted = wanted * self._share[:, None]
@@ -195,9 +195,9 @@ class FitProblem:
         return self._skinned(frame, bends, np.concatenate([coefficients, self._fixed(frame, bends)]))
 
     def directions(self, frame: FrameTerms, angles: FloatArray) -> FloatArray:
-        """(n, 3, E + L) how the fitted vertices move with the coefficients at angles (9,), metres.
+        """(n, 3, E + L) derivatives of the fitted vertices by the coefficients at angles (9,), metres.
 
-        The dense matrix that `evaluate` never makes; for checks and for solvers that need it.
+        This is the dense matrix that `evaluate` avoids, for checks and for solvers that need it.
         """
         bends = matrices_and_derivatives(angles.reshape(-1, 3))[0] - np.eye(3)
         size = self._plain.shape[2]
@@ -212,7 +212,7 @@ class FitProblem:
         return np.asarray(result / _MILLIMETRES)
 
     def _columns(self, head: HeadAsset, canonical: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(n, 3, N) vertices without and eyelids alone, and (J, 3, N) joints, by the columns of z; millimetres."""
+        """(n, 3, N) vertices without eyelids, (n, 3, N) eyelids alone, and (J, 3, N) joints, by the columns of z; millimetres."""
         rows, lids = self.vertices, self._free_size - self.expression_size
         columns = [9 * (joint - 1) + entry for joint, entry in self._correctives]
         expression = np.asarray(head.expression_basis, dtype=np.float64)
@@ -242,7 +242,7 @@ class FitProblem:
         return np.repeat(1 / arms, 3)
 
     def _fixed(self, frame: FrameTerms, bends: FloatArray) -> FloatArray:
-        """(N - E - L,) the part of z that the angles give: correctives' entries of R - I, and 1."""
+        """(N - E - L,) the part of z determined by the angles: entries of R - I for correctives, and 1."""
         by_joint = {NECK: frame.neck - np.eye(3)} | dict(zip(SEARCHED, bends))
         return np.array([*(by_joint[joint].flat[entry] for joint, entry in self._correctives), 1.0])
 
@@ -269,7 +269,7 @@ class FitProblem:
         return _Terms(np.stack(kept), np.array(single, dtype=np.int64), np.array(double, dtype=np.int64))
 
     def _turned_product(self, one: int, other: int) -> FloatArray:
-        """F_jc' W F_kd over the vertices that both joints turn; ``one`` is 3 j + c, ``other`` 3 k + d."""
+        """F_jc' W F_kd over the vertices that both joints move; ``one`` is 3 j + c, ``other`` 3 k + d."""
         (rows, turned), (other_rows, other_turned) = self._turned[one // 3], self._turned[other // 3]
         _, here, there = np.intersect1d(rows, other_rows, assume_unique=True, return_indices=True)
         weighted = self._share[rows[here], None] * turned[here, one % 3]
@@ -296,7 +296,7 @@ def solve_bounded(gram: FloatArray, right: FloatArray, bound: FloatArray) -> Flo
 
     Projected Newton steps (Bertsekas, "Projected Newton methods for optimization problems with simple
     constraints", SIAM J. Control Optim. 20, 1982): components held at their bound by the gradient are fixed, the
-    others take a Newton step, cut back until it descends. Without active bounds that is one Cholesky solution.
+    others take a Newton step, shortened until it descends. Without active bounds that is one Cholesky solution.
 
     Parameters
     ----------
@@ -410,5 +410,5 @@ def solve_frame(
     try:
         search.optimize(first)
     except (nlopt.RoundoffLimited, nlopt.runtime_error):
-        pass  # No step descends further, or a line search gave up: the best point so far is the answer.
+        pass  # No step descends further, or a line search failed: the best point so far is the result.
     return best[0]._replace(evaluations=count)

@@ -25,18 +25,18 @@ from .problem import FitProblem, angle_bounds, solve_frame
 from .settings import RefitSettings
 
 BLOCK = 64
-"""Timesteps that are fitted, and kept on disk, together; the first of each starts from the source's angles."""
+"""Number of timesteps per block, which is fitted and stored together; the first one starts from the source's angles."""
 
 
 class Refitted(NamedTuple):
-    """A refitted clip and how well it fits."""
+    """A refitted clip and its residuals."""
 
     clip: CaptureClip
     report: RefitReport
 
 
-# The number of threads decides how sums are rounded, and by that whether blocks kept earlier fit and what the
-# refitted clip's fingerprint is: a run that continues with another number would find another clip.
+# The number of threads affects the rounding of sums, and thus the stored blocks and the fingerprint of the refitted
+# clip: continuing with another number would give another clip.
 @threadpool_limits.wrap(limits=1)
 def refit(
     clip: CaptureClip,
@@ -73,7 +73,7 @@ def refit(
     _check_tracking(clip)
     target = _with_same_teeth(clip.head, target)
     if settings.static_offset == "residual" and not same_topology(clip.head, target):
-        expected = "two head models over one topology, to keep a residual as static offset"
+        expected = "two head models with one topology, to keep a residual as static offset"
         remedy = "Set static_offset to zero."
         raise InputError(f"head model {target.version!r}", "faces", expected, "different ones", remedy)
     neutral = PosedSubject.of(clip).neutral
@@ -126,14 +126,14 @@ def _check_tracking(clip: CaptureClip) -> None:
 
 
 def _with_same_teeth(source: HeadArrays, target: HeadArrays) -> HeadArrays:
-    """The target with teeth where the source has them and they are all that the topologies differ in."""
+    """The target with teeth if the source has them and the topologies differ only by them."""
     teeth = len(source.regions.get("teeth", ()))
     if teeth and "teeth" not in target.regions and len(source.template) == len(target.template) + teeth:
         return with_teeth(target)
     return target
 
 
-_FORMAT = 1  # of the blocks on disk; counts up when the fit changes
+_FORMAT = 1  # format of the stored blocks; increased when the fit changes
 _MILLIMETRES = 1e3
 
 PER_TIMESTEP = (
@@ -155,7 +155,7 @@ _log = logging.getLogger(__name__)
 
 
 class BlockFitter:
-    """Everything that stays the same over the timesteps of a refit."""
+    """Data shared by all timesteps of a refit."""
 
     def __init__(
         self,
@@ -209,7 +209,7 @@ class BlockFitter:
         return columns | self._residuals(poses, columns, counterparts)
 
     def fit_once(self, poses: Sequence[HeadPose], folder: Path | None, index: int) -> dict[str, FloatArray]:
-        """`fit`, or what an earlier call with the same input left in ``folder``."""
+        """`fit`, or the result stored in ``folder`` by an earlier call with the same input."""
         if folder is None:
             return self.fit(poses)
         inputs = [[pose.expression, pose.rotation, pose.neck, pose.jaw, pose.eyes] for pose in poses]
@@ -232,7 +232,7 @@ class BlockFitter:
     def pose(
         self, pose: HeadPose, timestep: int | None, columns: dict[str, FloatArray], row: int
     ) -> HeadPose:
-        """The refitted pose in a row of the columns."""
+        """The refitted pose of a row of the columns."""
         size = self.target.expression_basis.shape[2]
         coefficients, angles = columns["coefficients"][row], columns["angles"][row]
         return HeadPose(
@@ -251,7 +251,7 @@ class BlockFitter:
     def report(
         self, timesteps: Sequence[int], columns: dict[str, FloatArray], vertex_sums: FloatArray
     ) -> RefitReport:
-        """Put the residuals of all timesteps together."""
+        """Combine the residuals of all timesteps."""
         limits = np.concatenate([self._problem.bound, angle_bounds(self.settings)])
         size = self.target.expression_basis.shape[2]
         lids = len(self._problem.bound) - size
@@ -295,7 +295,7 @@ class BlockFitter:
     def _residuals(
         self, poses: Sequence[HeadPose], columns: dict[str, FloatArray], counterparts: FloatArray
     ) -> dict[str, FloatArray]:
-        """Distances of the finished meshes in the world, by the head model itself and not by the fit's algebra."""
+        """Distances of the final meshes in the world, computed by the head model independently of the fit."""
         fitted = [self.pose(pose, None, columns, row) for row, pose in enumerate(poses)]
         meshes = self._subject.meshes(fitted)
         gaps = _MILLIMETRES * np.linalg.norm(meshes[:, self.matching.vertices] - counterparts, axis=2)
@@ -321,7 +321,7 @@ class FrameResidual:
     p95_mm: float
     max_mm: float
     eyeballs_mm: float
-    """Mean over the eyeballs; 0 where they were not fitted."""
+    """Mean over the eyeballs; 0 if they were not fitted."""
     at_bound: tuple[str, ...]
     """Parameters that ended at a bound, such as "expression[3]" or "jaw[0]"."""
     evaluations: int
@@ -354,7 +354,7 @@ class RefitReport:
     shape_at_bound: tuple[str, ...]
 
     def summary(self) -> dict[str, Any]:
-        """Means over the timesteps and the worst of them, as plain values."""
+        """Means over the timesteps and the worst one, as plain values."""
         worst = max(self.frames, key=lambda frame: frame.mean_mm)
         means = ("mean_mm", "p95_mm", "eyeballs_mm")
         return {

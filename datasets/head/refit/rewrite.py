@@ -1,4 +1,4 @@
-"""Write a clip with other tracking as a capture of its own; PNG files that no step changes are linked."""
+"""Write a clip with other tracking as a new capture; PNG files that no step changes are linked."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from ...ga.writer import CapturePlan, CaptureWriter, SequencePlan
 def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress) -> Path:
     """Write the clip under ``out`` in the GaussianAvatars/VHAP layout; return the union folder.
 
-    Frames keep their sequence and camera; splits, exclusions and background stay as they are. The timesteps of a
-    sequence are numbered anew, from 0 without a gap as the layout wants it.
+    Frames keep their sequence and camera; splits, exclusions and background are unchanged. The timesteps of a sequence
+    are renumbered from 0 without a gap, as the layout requires.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress
 
 
 def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePlan, dict[int, int]]:
-    """Plan of the capture a clip makes, and each timestep's number in its sequence there.
+    """Plan of the capture for a clip, and each timestep's number in its sequence.
 
     Raises `InputError` as `write_capture` does, naming ``source``, the capture the clip was read from.
     """
@@ -66,7 +66,7 @@ def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePla
         for key in keys:
             placed = "novel_view" if key.camera in novel else "train"
             if split != ("self_reenactment" if index[key.timestep] in held.get(key.sequence, ()) else placed):
-                expected = "splits by held-out timesteps and cameras, which the layout can hold"
+                expected = "splits by held-out timesteps and cameras, which the layout can represent"
                 raise InputError(where, "splits", expected, f"{key} in {split}")
     shared = {key.sequence for name in ("train", "novel_view") for key in clip.splits[name]}
     background = tuple(float(value) for value in clip.background)
@@ -95,7 +95,7 @@ def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePla
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Make ``target`` the same file as ``source``, or a copy where the file system cannot link; atomically."""
+    """Link ``target`` to ``source``, or copy it if the file system does not support links; atomically."""
     if target.exists() and os.path.samefile(source, target):
         return
     with atomic_path(target) as temporary:
@@ -111,8 +111,7 @@ def _is_png(path: Path | None) -> TypeGuard[Path]:
 
 
 def _check_excluded(clip: CaptureClip, where: str) -> None:
-    """The layout excludes timesteps, each for one reason: anything else would exclude further frames, or lose a
-    reason."""
+    """Check exclusions: the layout can exclude only whole timesteps, each for one reason."""
     of_timestep: dict[int, FrameKey] = {}
     for key in sorted(clip.files):
         first = of_timestep.setdefault(key.timestep, key)

@@ -15,30 +15,29 @@ Algorithm = Literal["slsqp", "lbfgs", "mma"]
 
 @dataclass(frozen=True)
 class RefitSettings:
-    """How tracking is re-fitted to another head model.
+    """Settings of the refit of tracking to another head model.
 
-    The defaults follow published practice for monocular methods: vertex distances over the facial region decide,
-    identity comes from the neutral head, neither static offset nor neck rotation is kept.
+    The defaults follow published practice for monocular methods: vertex distances over the facial region are
+    minimised, identity is fitted to the neutral head, and neither static offset nor neck rotation is kept.
     """
 
     static_offset: Literal["zero", "residual"] = "zero"
-    """What the target's identity cannot express of the neutral head: dropped, or kept as a static offset
-    (one topology only)."""
+    """Residual of the neutral head after fitting identity: dropped, or kept as a static offset (only for equal topologies)."""
 
     neck: Literal["fold", "keep"] = "fold"
-    """The neck's rotation: folded into the head's, as monocular trackers have it, or kept."""
+    """Rotation of the neck: merged into the head's, as in monocular trackers, or kept."""
 
     eyeballs: float = 1.0
-    """Weight of an eyeball's vertex against one of the face; 0 leaves the eyes where they were."""
+    """Weight of an eyeball's vertex relative to the face; 0 leaves the eyes unchanged."""
 
     lips: float = 1.0
-    """Weight of a lip vertex against other vertices of the face."""
+    """Weight of a lip vertex relative to other vertices of the face."""
 
     eye_region: float = 1.0
-    """Weight of a vertex around the eyes against other vertices of the face."""
+    """Weight of a vertex around the eyes relative to other vertices of the face."""
 
     prior_mm: float = 0.005
-    """A coefficient of one standard deviation costs as much as this root mean square distance, millimetres."""
+    """Regularisation: root mean square distance with the same cost as a coefficient of one standard deviation, millimetres."""
 
     coefficient_bound: float = 6.0
     """Largest magnitude of identity and expression coefficients, standard deviations."""
@@ -53,10 +52,10 @@ class RefitSettings:
     """Largest magnitude of each component of an eye's axis-angle, radians."""
 
     algorithm: Algorithm = "slsqp"
-    """Which of nlopt's algorithms finds the angles."""
+    """Algorithm of nlopt for the angles."""
 
     tolerance: float = 1e-5
-    """An angle is found when a step changes it by less than this, radians."""
+    """Tolerance of the angles, radians."""
 
     evaluations: int = 200
     """Maximum number of evaluations per frame."""
@@ -72,7 +71,7 @@ class RefitSettings:
 
 @dataclass(frozen=True)
 class RefitCommandSettings(CaptureOptions):
-    """What ``headbench prepare refit`` takes."""
+    """Settings of ``headbench prepare refit``."""
 
     capture: Annotated[str, tyro.conf.Positional]
     """Capture, in a layout that a reader knows."""

@@ -2,8 +2,8 @@
 
 A tracking file poses FLAME 2023 without global rotation and translation, then maps it to the world by
 ``x -> scale R x + translation``, with R = `rotation` as Euler angles about the axes X, Y and Z that turn with the head.
-Here a head has no scale and turns about its root joint: the world is divided by the scale, which no image shows, since
-camera positions are divided as well.
+Here a head has no scale and rotates about its root joint: the world including camera positions is divided by the
+scale, which does not change images.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .tracks import MEMBERS, BenchmarkTrack, tracking_file
 
 MOST_SCALE = 1000.0
 EULER_TOLERANCE = 1e-3
-"""Largest difference of an entry of a rotation matrix as the file has it and as its angles give it."""
+"""Maximum difference between entries of a rotation matrix in the file and from its angles."""
 
 
 @dataclass(frozen=True, eq=False)

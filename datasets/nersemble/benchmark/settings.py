@@ -21,13 +21,13 @@ class SubmissionRenderSettings:
     """The benchmark's folder, as nersemble-benchmark-download leaves it: it holds mono_flame_avatar/."""
 
     participant: str
-    """Whom the avatar shows: 393, 404, 461, 477 or 486."""
+    """Participant of the avatar: 393, 404, 461, 477 or 486."""
 
     out: str
     """Folder to write: OUT/PARTICIPANT/SEQUENCE_TIMESTEP_SERIAL.png."""
 
     head: str | None = None
-    """FLAME 2023 (flame2023.pkl); default: the head model that lies beside the avatar."""
+    """FLAME 2023 (flame2023.pkl); default: the head model beside the avatar."""
 
     method: str = ""
     """Method of the avatar as package.module:SPEC, where it is not registered."""

@@ -1,4 +1,4 @@
-"""Submissions to the NeRSemble benchmark: a zip of videos. Written from frames, checked as the server checks it, and more."""
+"""Submissions to the NeRSemble benchmark: writing a zip of videos from frames, and checking it like the server does."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from .tracks import CRF, TRACKS, BenchmarkTrack, Video
 MOST_ENTRIES = 10_000
 MOST_VIDEO_BYTES = 2**32
 MOST_PER_BYTE = 20
-"""Bytes that entries may unpack to for each of the zip: videos do not compress."""
+"""Maximum ratio of unpacked to packed bytes; videos do not compress."""
 COMPARED = 24
-"""Frames of a video that are compared with what was encoded, evenly spaced."""
+"""Number of evenly spaced frames of a video that are compared with the encoded ones."""
 _FRAME = re.compile(r"(?P<sequence>.+)_(?P<timestep>\d{5,})_(?P<camera>[^_]+)\.png")
 _CODECS = {"avc1": "H.264", "h264": "H.264", "H264": "H.264"}
 
@@ -117,7 +117,7 @@ def _by_camera(folder: Path, participant: str, method: str) -> dict[tuple[str, s
 
 
 def _check_lengths(where: Path, track: BenchmarkTrack, counts: dict[Video, int]) -> None:
-    """Cameras of a sequence have one length; the sequences of a participant have as many frames as is published."""
+    """Check that cameras of a sequence have equal lengths, and sequences of a participant the published number of frames."""
     by_sequence: dict[tuple[str, str], set[int]] = {}
     for video, count in counts.items():
         by_sequence.setdefault((video.participant, video.sequence), set()).add(count)
@@ -150,7 +150,7 @@ class Encoded(NamedTuple):
 def write_submission(
     frames: dict[Video, list[Path]], track: BenchmarkTrack, out: Path, progress: Progress
 ) -> list[Encoded]:
-    """Encode all videos and write the zip, whole or not at all; say what the encoding cost."""
+    """Encode all videos and write the zip atomically; return the encoding errors."""
     ffmpeg()
     check_writable(out, "ZIP")
     done = []
@@ -173,7 +173,7 @@ def write_submission(
 
 
 def _encoding_error(path: Path, frames: Sequence[Path]) -> float:
-    """Mean squared error of decoded frames against those encoded, some of them; raises where a frame is missing."""
+    """Mean squared error of some decoded frames; raises if a frame is missing."""
     chosen = {int(i) for i in np.linspace(0, len(frames) - 1, min(COMPARED, len(frames)))}
     errors = []
     count = 0
@@ -206,7 +206,7 @@ def decibels(error: float) -> float:
 
 
 def after_encoding(psnr: float, error: float) -> float:
-    """PSNR that renders of ``psnr`` have after an encoding of that mean squared error, the two errors being unrelated."""
+    """PSNR of renders of ``psnr`` after an encoding of that mean squared error, for uncorrelated errors."""
     return decibels(255**2 / 10 ** (psnr / 10) + error)
 
 
@@ -224,7 +224,8 @@ class Issues:
 def check_submission(
     file: Path, data: Path | None, name: str, progress: Progress
 ) -> tuple[BenchmarkTrack, Issues]:
-    """Look at a zip as the server does (files, frame counts, sizes), and beyond: every frame decoded, codec, rate.
+    """Check a zip like the server does (files, frame counts, sizes), and also decode every frame and check codec and
+    rate.
 
     Parameters
     ----------
@@ -278,7 +279,7 @@ def _unpack(file: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: 
 
 
 def _check_video(path: Path, video: Video, track: BenchmarkTrack, issues: Issues) -> int:
-    """Decode a video; note what is wrong with it, return how many frames it has."""
+    """Decode a video; record its faults, return its number of frames."""
     try:
         declared, size = probe_video(path)
     except InputError as error:

@@ -15,13 +15,13 @@ from ....bench.io.arrays import Member, read_arrays
 
 TrackName = Literal["nvs", "mono_flame_avatar"]
 TRACKING_FILE = "flame2023_tracking_v2.npz"
-"""Of the second version of the track; submissions by the first one, without ``_v2``, are no longer taken."""
+"""File of the second version of the track; submissions by the first one, without ``_v2``, are no longer accepted."""
 CRF = 14
 """Constant rate factor of H.264 that submissions are encoded with."""
 
 
 class Video(NamedTuple):
-    """A video of a submission; ``frames`` is None where only the benchmark's own files say how many it has."""
+    """A video of a submission; ``frames`` is None if the number is only in the benchmark's files."""
 
     participant: str
     sequence: str
@@ -46,8 +46,6 @@ class BenchmarkTrack:
         (width, height) in pixels.
     sequences : Mapping[str, Mapping[str, int | None]]
         Sequences to render, by participant, with the number of frames if it is published.
-    train_serial : str
-        The camera of the training videos; "" if there are several.
     totals : Mapping[str, int] | None
         Published number of frames of all sequences of a participant together.
     """
@@ -57,13 +55,12 @@ class BenchmarkTrack:
     fps: float
     sequences: Mapping[str, Mapping[str, int | None]]
     serials: tuple[str, ...]
-    train_serial: str = ""
     totals: Mapping[str, int] | None = None
 
     def videos(self, data: Path | None = None) -> Iterator[Video]:
         """All videos of a submission.
 
-        ``data`` is the benchmark's folder; the tracking in it tells how many frames there are where that is not published.
+        ``data`` is the benchmark's folder; its tracking gives the number of frames if that is not published.
         Raises `InputError` for tracking that is missing or damaged.
         """
         for participant, sequences in self.sequences.items():
@@ -95,15 +92,13 @@ MONO = BenchmarkTrack(
     24.3,
     {name: dict.fromkeys(_TEST_SEQUENCES) for name in ("393", "404", "461", "477", "486")},
     ("222200037", "222200046", "220700191", "222200039"),
-    train_serial="222200037",
     totals={"393": 816, "404": 665, "461": 486, "477": 530, "486": 608},
 )
 TRACKS: Mapping[TrackName, BenchmarkTrack] = {track.name: track for track in (NVS, MONO)}
 
 
 def tracking_file(data: Path, participant: str, sequence: str) -> Path:
-    """Tracking of a sequence in the benchmark's folder. Raises `InputError` if it is missing or of version
-    1."""
+    """Tracking of a sequence in the benchmark's folder. Raises `InputError` if it is missing or of version 1."""
     folder = data / "mono_flame_avatar" / participant / "sequences" / sequence / "tracking"
     path = folder / TRACKING_FILE
     if not path.is_file():

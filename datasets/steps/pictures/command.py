@@ -18,7 +18,7 @@ from ...options import CaptureOptions
 
 @dataclass(frozen=True)
 class StepsSettings(CaptureOptions):
-    """Draw the jaw bases and the expression clusters that a capture's training frames give."""
+    """Plot the jaw bases and expression clusters of a capture's training frames."""
 
     capture: tyro.conf.Positional[str]
     """Capture, in a layout that a reader knows."""
@@ -33,10 +33,10 @@ class StepsSettings(CaptureOptions):
     """Expression clusters at most."""
 
     seed: int = 0
-    """Seeds the choice of landmarks in long captures."""
+    """Seed of the choice of landmarks in long captures."""
 
     variant: Literal["paper", "official"] = "paper"
-    """"official" shows what the published code makes: jaw bases from held-out poses (a leak, and said so)."""
+    """"official" shows the result of the published code: jaw bases from held-out poses (a leak, which is stated)."""
 
 
 JAW_PICTURE, CLUSTER_PICTURE, NUMBERS = "jaw_bases.png", "expression_clusters.png", "steps.json"

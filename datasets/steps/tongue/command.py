@@ -20,25 +20,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TongueSettings(CaptureOptions):
-    """Which capture to look at, and how."""
+    """Settings of the search for frames with the tongue."""
 
     capture: Annotated[str, tyro.conf.Positional]
     """Capture, in a layout that a reader knows, or a folder of several subjects' captures."""
 
     out: str
-    """Folder for tongue.yaml and the contact sheets. Overrides in a tongue.yaml that is there are kept."""
+    """Folder for tongue.yaml and the contact sheets. Overrides in an existing tongue.yaml are kept."""
 
     masks: str | None = None
     """FLAME_masks.pkl, for a head model without regions."""
 
     threshold: float | None = None
-    """Area in mm2 from which on a frame is left out; by default chosen for each subject between 20 and 60."""
+    """Minimum area in mm2 of excluded frames; by default chosen for each subject between 20 and 60."""
 
     cameras: int = 4
-    """How many cameras to look through: those that the mouth faces most."""
+    """Number of cameras to evaluate, the most frontal ones for the mouth."""
 
     frames: int = 60
-    """How many frames to show on a contact sheet: the highest areas."""
+    """Number of frames on a contact sheet, those with the largest areas."""
 
 
 DECISIONS_FILE = "tongue.yaml"
@@ -47,7 +47,7 @@ DECISIONS_FILE = "tongue.yaml"
 def tongue(settings: TongueSettings, progress: Progress) -> CommandResult:
     """Find the frames that show the tongue, for review on a contact sheet and with overrides.
 
-    Raises `InputError` before any image is looked at, for captures and decisions that cannot be read.
+    Raises `InputError` before any image is read, for captures and decisions that cannot be read.
     """
     from ..exclude import read_exclusions, write_exclusions
 
@@ -103,7 +103,7 @@ def _check(settings: TongueSettings) -> None:
 
 
 def _summary(subject: str, decided: Exclusions) -> str:
-    """Tell a person what was decided, sequence by sequence."""
+    """Summary of the decisions by sequence."""
     from ..exclude import KEEP
 
     reasons = decided.reasons()
@@ -117,7 +117,7 @@ def _summary(subject: str, decided: Exclusions) -> str:
         sequences.setdefault(frame.sequence if frame else "in no camera", []).append(timestep)
     lines += [f"  {name}: {_ranges(timesteps)}" for name, timesteps in sequences.items()]
     if near := _near(decided):
-        lines.append(f"  Worth a look, near the threshold: {_ranges(near)}")
+        lines.append(f"  To review, near the threshold: {_ranges(near)}")
     if unseen := [t for t, frame in decided.frames.items() if frame.reason.startswith("mouth not seen")]:
         lines.append(f"  Mouth not seen, kept: {_ranges(unseen)}")
     if decided.overrides:
@@ -137,7 +137,7 @@ def _data(decided: Exclusions) -> dict[str, object]:
 
 
 def _near(decided: Exclusions) -> list[int]:
-    """Timesteps that nobody has decided and whose score is within `NEAR` of the threshold."""
+    """Timesteps without override whose score is within `NEAR` of the threshold."""
     from .evidence import NEAR
 
     low, high = decided.threshold / NEAR, decided.threshold * NEAR

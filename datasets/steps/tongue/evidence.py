@@ -1,13 +1,12 @@
-"""Evidence that something other than the subject's lips and chin covers them, in every pixel of the mouth's
-map.
+"""Evidence of objects in front of lips and chin, in every pixel of the mouth's map.
 
-The cue is pigment. Melanin, which colours skin and (less) lips, takes more blue than green; blood takes both alike.
-The tongue has blood and no melanin, so its green to blue ratio is below that of the skin around it, whereas blush,
-pallor, wrinkles, shadows and an opened mouth leave that ratio of skin and lips as it is. (Absorption: S. Jacques,
+The cue is pigment. Melanin, which colours skin and (less) lips, absorbs more blue than green; blood absorbs both
+equally. The tongue has blood and no melanin, so its green to blue ratio is below that of the surrounding skin, whereas
+blush, pallor, wrinkles, shadows and an open mouth do not change that ratio of skin and lips. (Absorption: S. Jacques,
 "Optical properties of biological tissues: a review", Physics in Medicine and Biology 58, 2013, section 3.)
 
-Every comparison is with the subject's own canonical map (the median over timesteps), camera by camera, and forgives
-what the tracker may have shifted: a pixel counts only if nothing within `FORGIVEN` of its place looks like it.
+Every comparison is with the subject's canonical map (the median over timesteps), camera by camera, and tolerates
+tracking errors: a pixel counts only if no pixel within `FORGIVEN` of its position looks similar.
 """
 
 from __future__ import annotations
@@ -28,22 +27,22 @@ FORGIVEN = 0.003
 """Metres within which the canonical map is searched for a pixel's colour: three times a tracker's usual error."""
 
 LOOKS = 3.0
-"""Standard deviations from which on a pixel counts as covered."""
+"""Minimum standard deviations of covered pixels."""
 
 CONNECTED = 8.0
-"""Millimetres below the line between the lips within which what comes out of the mouth has to begin. The first
-three are blind: there `FORGIVEN` lets the dark of the closed mouth explain what is seen."""
+"""Maximum distance below the line between the lips at which an object from the mouth must start, millimetres. The
+first three are blind because `FORGIVEN` matches them with the dark of the closed mouth."""
 
 PIGMENT_LOST = 0.35
-"""Share of the way from the skin's own green to blue ratio to that of tissue without melanin (about 1) that a pixel
-has to go: flushed, shaded lips go up to a quarter of it, a tongue more than half."""
+"""Minimum position of a pixel between the skin's green to blue ratio (0) and that of tissue without melanin (1):
+flushed, shaded lips reach a quarter, a tongue more than half."""
 
-_LEAST_PIGMENT = 0.1  # log units; of paler skin than that, noise would be taken for a share
+_LEAST_PIGMENT = 0.1  # log units; for paler skin, noise would dominate
 _DARK = 0.001  # linear light added to every channel: below it ratios are noise
 _DARKER, _PALER = 1.0, 0.25  # log units that a tongue may be darker, or less red, than what is nearby
 _FLOORS = {"pink": 0.02, "red": 0.05, "light": 0.10}  # least spread, log units: quantisation and image noise
-_LEAST_SEEN = 0.2  # share of the timesteps that must show a pixel for it to have a canonical colour
-_LIMIT = 6.0  # standard deviations beyond which more is no better
+_LEAST_SEEN = 0.2  # minimum fraction of timesteps in which a pixel with a canonical colour is visible
+_LIMIT = 6.0  # upper limit of standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +58,7 @@ class MouthEvidence:
     strength : FloatArray
         (T, H, W) float16 standard deviations by which each pixel looks covered; 0 if not seen.
     seen : FloatArray
-        (T,) fraction of the lower lip that some camera saw.
+        (T,) fraction of the lower lip visible to some camera.
     """
 
     areas: FloatArray
@@ -69,7 +68,7 @@ class MouthEvidence:
 
 
 def find_evidence(colours: MouthColours, atlas: MouthAtlas) -> MouthEvidence:
-    """Look for what covers the mouth, camera by camera, and combine what the cameras see."""
+    """Search for objects in front of the mouth, camera by camera, and combine the results."""
     count, cameras = colours.seen.shape[:2]
     total = np.zeros((count, *atlas.inside.shape), np.float32)
     looks = np.zeros((count, *atlas.inside.shape), np.uint8)
@@ -77,7 +76,7 @@ def find_evidence(colours: MouthColours, atlas: MouthAtlas) -> MouthEvidence:
         strength, known = _camera_strength(colours.colours[:, camera], colours.seen[:, camera], atlas)
         total += strength
         looks += known
-    # The mean, of values that are bounded: what one camera alone sees before the skin is not upon it.
+    # The mean of bounded values: an object that only one camera sees in front of the skin is not on it.
     strength = total / np.maximum(looks, 1)
     patches = np.stack([mouth_patch(part, atlas) for part in strength])
     areas = patches.sum(axis=(1, 2)) * (PITCH * 1e3) ** 2
@@ -106,8 +105,7 @@ def mouth_patch(strength: FloatArray, atlas: MouthAtlas) -> np.ndarray:
 def _camera_strength(
     colours: ByteArray, seen: np.ndarray, atlas: MouthAtlas
 ) -> tuple[FloatArray, np.ndarray]:
-    """(T, H, W) standard deviations by which each pixel looks covered to one camera, and whether it is
-    visible."""
+    """(T, H, W) standard deviations by which each pixel looks covered to one camera, and whether it is visible."""
     known = seen & (seen.mean(axis=0) > _LEAST_SEEN)
     rows = known.any(axis=(1, 2))
     strength = np.zeros(known.shape, np.float32)
@@ -125,7 +123,7 @@ def _strength(values: dict[str, FloatArray], known: np.ndarray) -> FloatArray:
         value[~known] = np.nan
         canonical = np.zeros(enough.shape, np.float32)
         canonical[enough] = np.nanmedian(value[:, enough], axis=0)
-        # Light and white balance of the moment, or a flush of the whole face.
+        # Compensates light and white balance, or a flush of the whole face.
         value -= np.nanmedian((value - canonical)[:, enough], axis=1)[:, None, None]
         deviation = np.zeros_like(canonical)
         deviation[enough] = 1.4826 * np.nanmedian(np.abs(value - canonical)[:, enough], axis=0)
@@ -153,14 +151,14 @@ def _features(colours: ByteArray, seen: np.ndarray) -> dict[str, FloatArray]:
 
 
 NEVER, ALWAYS = 20.0, 60.0
-"""mm². Up to the first, what looks covered is put down to the tracker: along a lip of 50 mm, a line that is off by
-a pixel of the map in a quarter of its length makes as much. From the second on it is a third of the lower lip."""
+"""mm². Covered areas up to the first are attributed to tracking errors: an error of one pixel of the map along a
+quarter of a lip of 50 mm gives as much. The second is a third of the lower lip."""
 
 NEAR = 1.5
-"""Factor around the threshold within which a decision deserves a look."""
+"""Factor around the threshold within which a decision should be reviewed."""
 
 TONGUE = "tongue out"
-_SEEN = 0.25  # share of the lower lip below which a frame says nothing
+_SEEN = 0.25  # minimum visible fraction of the lower lip
 
 
 def choose_threshold(areas: FloatArray) -> tuple[float, str]:

@@ -1,7 +1,7 @@
-"""The mouth's own picture plane: a map of lips and chin that every frame is brought into.
+"""A map of lips and chin to which every frame is resampled.
 
 The map looks at the subject's neutral mesh from straight ahead. Each of its pixels is a point on the surface (a
-triangle and barycentric weights), so that a pixel means one place of the skin, whatever the pose and the camera.
+triangle and barycentric weights), so that a pixel is one point of the skin for any pose and camera.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ PITCH = 0.0015
 """Edge length of a pixel of the map, metres: about half the height of the first visible part of a tongue."""
 
 _SIDE, _ABOVE, _BELOW = 0.75, 0.30, 1.0  # of the mouth's width, from its middle
-_REACH = 2.4  # widths of the mouth; what lies farther away cannot hide it from a camera in front
-_FRONT = 0.25  # z of the neutral normal from which on a surface counts as facing front
+_REACH = 2.4  # widths of the mouth; farther triangles cannot hide it from a camera in front
+_FRONT = 0.25  # minimum z of the neutral normal of front-facing surface
 _INNER = ("mouth_socket", "teeth", "gums_and_tongue")  # regions that are behind the lips, seen from outside
 _FAR = 50.0  # metres; from there perspective is below a tenth of a millimetre
 
@@ -84,7 +84,7 @@ class MouthAtlas:
 
 
 def mouth_atlas(clip: Clip) -> MouthAtlas:
-    """Lay the map over a clip's subject.
+    """Create the map for a clip's subject.
 
     Raises `InputError` where the head lacks the regions "lips" or "face", or its lower lip does not follow the jaw.
     """
@@ -135,7 +135,7 @@ def mouth_atlas(clip: Clip) -> MouthAtlas:
 
 
 def _map_camera(centre: FloatArray, mouth: float) -> Camera:
-    """Look along -z at the middle of the mouth from so far that the picture is parallel."""
+    """Camera along -z at the middle of the mouth, far enough for a parallel projection."""
     columns = 2 * int(np.ceil(_SIDE * mouth / PITCH))
     above, below = (int(np.ceil(share * mouth / PITCH)) for share in (_ABOVE, _BELOW))
     world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -175,10 +175,10 @@ def _lip_line(lips: np.ndarray, lower: np.ndarray, camera: Camera) -> FloatArray
 
 
 FACING = np.cos(np.radians(62.0))
-"""Cosine of the angle between surface and line of sight beyond which a pixel of the image says little."""
+"""Minimum cosine of the angle between normal and line of sight for a reliable pixel."""
 
 _MOUTH_FACING = np.cos(np.radians(55.0))
-_HIDDEN = 0.0025  # metres behind the surface in front from which on a point counts as hidden
+_HIDDEN = 0.0025  # minimum distance of hidden points behind the front surface, metres
 _MARGIN = 3  # pixels around the mouth
 _MESHES = 32  # posed at once
 
@@ -206,7 +206,7 @@ class MouthColours:
 
 
 def frames_by_timestep(clip: Clip) -> dict[int, dict[str, FrameKey]]:
-    """Every frame of a clip, excluded ones too: key by camera, by timestep."""
+    """Every frame of a clip, including excluded ones: key by camera, by timestep."""
     found: dict[int, dict[str, FrameKey]] = {}
     for key in sorted({*(k for keys in clip.splits.values() for k in keys), *clip.excluded}):
         found.setdefault(key.timestep, {})[key.camera] = key
@@ -216,7 +216,7 @@ def frames_by_timestep(clip: Clip) -> dict[int, dict[str, FrameKey]]:
 def facing_cameras(clip: Clip, atlas: MouthAtlas, count: int) -> list[str]:
     """Ids of the ``count`` cameras that the mouth faces most, over poses spread along the clip.
 
-    Raises `InputError` where it faces none within 55 degrees.
+    Raises `InputError` if it faces none within 55 degrees.
     """
     timesteps = list(frames_by_timestep(clip))
     spread = [timesteps[i] for i in np.unique(np.linspace(0, len(timesteps) - 1, 15).round().astype(int))]
@@ -264,9 +264,7 @@ def sample_clip(
 
     subject = PosedSubject.of(clip, torch.float32)
     with ThreadPoolExecutor(min(processor_count(), 8)) as pool:
-        for start in range(
-            0, len(timesteps), _MESHES
-        ):  # a pool takes all of its jobs, and their meshes, at once
+        for start in range(0, len(timesteps), _MESHES):  # a pool would take all jobs and their meshes at once
             part = timesteps[start : start + _MESHES]
             meshes = subject.meshes([clip.poses[t] for t in part]).astype(np.float64)
             rows = range(start, start + len(part))
@@ -314,7 +312,7 @@ def sample_image(
 def _crop(image: ByteArray, camera: Camera, pixels: FloatArray, depth: float) -> tuple[ByteArray, Camera]:
     """The image around points (N, 2), reduced by area to about the map's pitch, and the camera that took it.
 
-    Finer images are reduced because noise and pores would be sampled otherwise.
+    Finer images are reduced to avoid sampling noise and pores.
     """
     factor = max(1, round(float(PITCH * camera.K[0, 0] / depth)))
     size = np.array([camera.width, camera.height])

@@ -1,4 +1,4 @@
-"""A contact sheet to review decisions by: mouths by score, what looks covered outlined, the decision as a frame."""
+"""A contact sheet for review: mouths by score, with outlines of covered areas and the decision as a frame."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def write_sheet(
     ``timesteps`` are those of the evidence, in its order.
 
     Overrides are shown however low their score. A frame is red where the timestep is left out, green where it is
-    kept, and has an orange bar where the score is near the threshold. Each mouth is as the first of
-    ``decided.cameras`` that has the timestep sees it.
+    kept, and has an orange bar where the score is near the threshold. Each mouth is shown by the first of
+    ``decided.cameras`` that has the timestep.
     """
     reasons = decided.reasons()
-    # Among equal scores, mostly zeros, those next to a frame left out: there the tongue comes and goes.
+    # Among equal scores, mostly zeros, prefer those next to an excluded frame, where the tongue appears and disappears.
     away = [min((abs(t - other) for other in reasons), default=0) for t in timesteps]
     order = sorted(range(len(timesteps)), key=lambda row: (-float(evidence.areas[row]), away[row]))
     shown = order[:count] + [row for row in order[count:] if timesteps[row] in decided.overrides]

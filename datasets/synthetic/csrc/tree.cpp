@@ -148,7 +148,7 @@ std::int32_t Tree::add(Part* parts, std::int32_t part) {
     open[count++] = opened.right;
   }
   for (int lane = 0; lane < kWide; ++lane) {
-    std::int32_t child = 0;  // the root is nobody's child: a lane without one
+    std::int32_t child = 0;  // the root is not a child, so 0 marks an empty lane
     if (lane < count) {
       const Part& below = parts[open[lane]];
       if (below.left >= 0)

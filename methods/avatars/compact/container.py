@@ -30,7 +30,7 @@ from ...shared.tensor_files import check_tensors, read_safetensors
 KEY, VERSION = "compact", 1
 MAX_ARRAYS = 64
 MOST, MOST_PER_BYTE = 2**22, 16
-"""Numbers of all arrays of a file: 4 million, and 16 for each packed byte. Avatars have one or two for each byte; the
+"""Maximum number of array elements in a file: 4 million plus 16 per packed byte. Avatars have one or two per byte; the
 coder packs zeros ten thousand times smaller."""
 
 
@@ -127,10 +127,10 @@ def pack(values: np.ndarray) -> bytes:
 
 
 def unpack(packed: bytes, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Give the array that `pack` was given, of a shape and one of `DTYPES` known beforehand.
+    """Inverse of `pack` for a known shape and one of `DTYPES`.
 
-    Memory is bounded by them: a stream that holds more is left as soon as it does. Raises ValueError, with what is
-    wrong, for a stream that is damaged or holds any other number of bytes.
+    Decompression stops as soon as a stream exceeds their size, which bounds memory. Raises ValueError for a damaged
+    stream and for one with another number of bytes.
     """
     kind = DTYPES[dtype]
     size = int(np.prod(shape, dtype=object)) * kind.itemsize
@@ -155,7 +155,7 @@ def coded(values: FloatArray, step: FloatArray | float) -> np.ndarray:
 
 
 class Arrays:
-    """Arrays of a file, each to be taken once. Raises `InputError` where one is missing or of another size."""
+    """Arrays of a file; each can be taken once. Raises `InputError` where one is missing or of another size."""
 
     def __init__(self, path: Path, content: Content):
         self.path, self.steps, self.text = path, content.steps, content.text
@@ -171,7 +171,7 @@ class Arrays:
         return float(self.steps[name])
 
     def take(self, name: str, *shape: int | None) -> np.ndarray:
-        """The array of a name, of a shape in which None fits any size."""
+        """Take an array by name and shape; None in the shape matches any size."""
         if name not in self._left:
             raise InputError(self.path, name, "an array of that name", "none")
         values = self._left.pop(name)
@@ -182,14 +182,14 @@ class Arrays:
         return values
 
     def integers(self, name: str, *shape: int | None) -> np.ndarray:
-        """The same for whole numbers."""
+        """Take an array of integers."""
         values = self.take(name, *shape)
         if values.dtype.kind != "u":
             raise InputError(self.path, name, "whole numbers", str(values.dtype))
         return values
 
     def floats(self, name: str, *shape: int | None) -> FloatArray:
-        """The same for finite float32 numbers."""
+        """Take an array of finite float32 numbers."""
         values = self.take(name, *shape)
         if values.dtype.kind != "f" or not np.isfinite(values).all():
             raise InputError(self.path, name, "finite numbers", f"{values.dtype} or non-finite numbers")
@@ -219,7 +219,7 @@ def dequantise(folded: np.ndarray, step: FloatArray | float) -> FloatArray:
     """The multiples of ``step`` that `quantise` rounded to, float32."""
     wide = folded.astype(np.int64)
     whole = np.where(wide % 2 == 1, -(wide + 1) // 2, wide // 2)
-    with np.errstate(over="ignore"):  # what overflows becomes infinite and is refused with all such numbers
+    with np.errstate(over="ignore"):  # overflow gives infinity, which is refused
         return (whole * np.asarray(step, np.float64)).astype(np.float32)
 
 
@@ -232,9 +232,9 @@ def narrow(values: np.ndarray) -> np.ndarray:
 def smallest_three(quats: FloatArray) -> FloatArray:
     """(N, 3) imaginary parts of quaternions (w, x, y, z) that turn a Gaussian as the given ones do, with w largest.
 
-    A Gaussian looks the same after half a turn about any of its axes, and the quaternion's sign never matters; one of
-    these changes brings the largest component to the front and makes it positive. So neither its number nor its sign
-    needs to be stored, and no component that is stored exceeds 1/sqrt(2).
+    Half a turn about an axis of a Gaussian and the sign of its quaternion do not change it; one of these changes moves
+    the largest component to the front and makes it positive. Neither its index nor its sign needs to be stored, and no
+    stored component exceeds 1/sqrt(2).
     """
     unit = np.asarray(quats, np.float64)
     unit = unit / np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)

@@ -19,14 +19,14 @@ from .precision import Precision
 
 MATRICES = (FIRST_LAYER, LAST_LAYER, *(f"line_direction_{layer}" for layer in range(3)))
 MAX_TABLE = 2**25
-"""Numbers of a plane or of all lines, those left out included; 512 x 512 samples of 128 channels."""
-SENSITIVITY_FLOOR = 1e-6  # a channel that changes nothing may have any step, but a finite one
+"""Maximum size of a plane or of all lines, including omitted samples: 512 x 512 samples of 128 channels."""
+SENSITIVITY_FLOOR = 1e-6  # a channel without effect may have any finite step
 
 
 def encode_field(
     tensors: Mapping[str, Tensor], positions: Tensor, precision: Precision
 ) -> dict[str, np.ndarray]:
-    """Arrays of everything that splats share; their steps, which differ by channel and row, are among them.
+    """Arrays of all shared tensors, and their steps by channel and row.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def _decode_lines(arrays: Arrays) -> FloatArray:
 
 
 def _check_size(arrays: Arrays, name: str, size: int) -> None:
-    """Raise `InputError` where what was left out, which takes no bytes, would make a table too large."""
+    """Raise `InputError` if a table would be too large with its omitted samples, which take no bytes."""
     if size > MAX_TABLE:
         raise InputError(arrays.path, name, f"a table of at most {MAX_TABLE} numbers", str(size))
 
@@ -123,7 +123,7 @@ def negligible_lines(tensors: Mapping[str, Tensor], step: float) -> np.ndarray:
 
 
 def _used_samples(tensors: Mapping[str, Tensor], positions: Tensor) -> list[np.ndarray]:
-    """(S,) for each plane: whether some splat reads a sample. Whatever has a gradient is read."""
+    """(S,) for each plane: whether any splat reads the sample, that is, whether it has a gradient."""
     ones = {name: torch.ones(len(tensors[name]), 1, requires_grad=True) for name in PLANES}
     box = Bounds(*tensors["plane_box"].cpu())
     with torch.enable_grad():
@@ -133,7 +133,7 @@ def _used_samples(tensors: Mapping[str, Tensor], positions: Tensor) -> list[np.n
 
 
 def _color_sensitivity(tensors: Mapping[str, Tensor]) -> FloatArray:
-    """(C,) change of colour by a unit of each plane channel, were all hidden units at work with random signs."""
+    """(C,) change of colour per unit of each plane channel, if all hidden units were active with random signs."""
     first, last = _numpy(tensors[FIRST_LAYER]), _numpy(tensors[LAST_LAYER])
     channels = sum(tensors[name].shape[1] for name in PLANES)
     weight = C0 * np.linalg.norm(last, axis=0)
@@ -158,7 +158,7 @@ HARMONICS = ("sh_dc", "sh_rest")
 SIZE_FLOOR = 0.02
 """Splats smaller than this, in the unit of their triangle, are placed as finely as one of this size."""
 LARGEST = 80.0
-"""Logarithms are cut here, so that no file makes the size overflow."""
+"""Logarithms are clamped here, so that sizes cannot overflow."""
 
 
 def encode_splats(
@@ -178,7 +178,7 @@ def encode_splats(
     means, logits, log_scales, quats, triangles = (part.numpy() for part in columns.values())
     deltas = np.diff(triangles[:, 0].astype(np.int64), prepend=0)
     if (deltas < 0).any():
-        raise ValueError("splats: expected in the order of their triangles, found another")
+        raise ValueError("splats: expected to be sorted by triangle, found another order")
     steps = {part: getattr(precision, part) for part in ("scales", "positions", "rotations", "opacities")}
     scales = coded(log_scales.T, precision.scales)
     as_read = dequantise(scales, precision.scales) if precision.scales else scales

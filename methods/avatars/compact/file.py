@@ -11,7 +11,7 @@ import torch
 from ....bench.contracts import HeadAsset
 from ....bench.errors import InputError
 from ...ours.field import PLANES, CanonicalFrames
-from ...ours.storage import PER_SPLAT, RESIDUAL, SPLAT_WIDTHS, Field, checked_field
+from ...ours.storage import PER_SPLAT, RESIDUAL, SPLAT_WIDTHS, StoredField, checked_field
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import SubjectMesh
 from .container import Arrays, Content, coded, packed_sizes, read_content, write_content
@@ -40,17 +40,17 @@ PARTS: Mapping[str, tuple[str, ...]] = {
     "networks": (*MATRICES, "line_gain", "line_bias"),
     "subject": ("shape", "static_offset"),
 }
-"""Parts of an avatar by the beginnings of their arrays' names; what is in none of them is "other"."""
+"""Parts of an avatar by the prefixes of their array names; all other arrays are "other"."""
 
 
-def encode(field: Field, subject: Subject, head: HeadAsset, precision: Precision) -> Content:
+def encode(field: StoredField, subject: Subject, head: HeadAsset, precision: Precision) -> Content:
     """Content of the compact file of an avatar whose splats are sorted by triangle (`simplify`)."""
     tensors = {name: value.cpu() for name, value in field.tensors.items()}
     splats, steps = encode_splats(tensors, precision, "rotation" in field.dynamic)
     person = encode_subject(subject, precision)
     steps |= person.steps
     text = {**person.text, "dynamic": ",".join(field.dynamic)}
-    # Where the reader will put the splats decides which samples of the planes they need.
+    # Decoded positions decide which samples of the planes are needed.
     read = Arrays(Path(), Content({**splats, **person.arrays}, text, steps))
     table = decode_splats(read)["splats"]
     stored = decode_subject(read, head)
@@ -63,8 +63,8 @@ def encode(field: Field, subject: Subject, head: HeadAsset, precision: Precision
     return Content({**splats, **shared, **person.arrays, **other}, text, steps)
 
 
-def decode(path: Path, content: Content, head: HeadAsset, device: str) -> tuple[Subject, Field]:
-    """Subject and field of such a content. Raises `InputError`, which names ``path``, where it does not fit."""
+def decode(path: Path, content: Content, head: HeadAsset, device: str) -> tuple[Subject, StoredField]:
+    """Subject and field of the content of a compact file. Raises `InputError`, naming ``path``, for invalid content."""
     arrays = Arrays(path, content)
     subject = decode_subject(arrays, head)
     tensors = {**decode_splats(arrays), **decode_field(arrays)}
@@ -75,22 +75,24 @@ def decode(path: Path, content: Content, head: HeadAsset, device: str) -> tuple[
     return subject, field._replace(tensors={name: value.to(device) for name, value in tensors.items()})
 
 
-def write_compact(path: Path, field: Field, subject: Subject, head: HeadAsset, precision: Precision) -> None:
+def write_compact(
+    path: Path, field: StoredField, subject: Subject, head: HeadAsset, precision: Precision
+) -> None:
     """Write a compact file whole or not at all."""
     write_content(path, encode(field, subject, head, precision))
 
 
-def read_compact(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Field]:
+def read_compact(path: Path, head: HeadAsset, device: str) -> tuple[Subject, StoredField]:
     """Read what `write_compact` wrote. Raises `InputError` for anything else, before it takes more memory."""
     return decode(path, read_content(path), head, device)
 
 
 def part_sizes(content: Content) -> dict[str, int]:
-    """Bytes by part, as packed; the file has a header of a few kB besides."""
+    """Packed bytes by part, without the header of a few kB."""
     return _by_part(packed_sizes(content.arrays))
 
 
-def exact_sizes(field: Field, subject: Subject) -> dict[str, int]:
+def exact_sizes(field: StoredField, subject: Subject) -> dict[str, int]:
     """Bytes by part of the exact files, without their headers."""
     sizes = {name: value.nbytes for name, value in field.tensors.items() if name != "splats"}
     widths = {"opacities": "logits", "means": "positions", "quats": "rotations", "binding": "triangles"}
@@ -108,7 +110,7 @@ def _by_part(sizes: Mapping[str, int]) -> dict[str, int]:
 
 
 def encode_subject(subject: Subject, precision: Precision) -> Content:
-    """The part of a compact file that says whom it shows."""
+    """Arrays of the subject in a compact file."""
     arrays = {
         "shape": subject.shape.astype(np.float32),
         "static_offset": coded(subject.static_offset.T, precision.subject),
@@ -118,7 +120,7 @@ def encode_subject(subject: Subject, precision: Precision) -> Content:
 
 
 def decode_subject(arrays: Arrays, head: HeadAsset) -> Subject:
-    """Whom a compact file shows. Raises `InputError` where that does not fit the head model."""
+    """Subject of a compact file. Raises `InputError` if it does not fit the head model."""
     for key in ("name", "head_model"):
         if key not in arrays.text:
             raise InputError(arrays.path, f"text, {key}", "a string", "none")

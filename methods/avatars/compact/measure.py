@@ -1,4 +1,4 @@
-"""Store an avatar compactly, and say what that costs in quality, part by part."""
+"""Store an avatar compactly, and measure the loss of quality by part."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ....bench.errors import InputError
 from ....bench.io.images import quantise
 from ....bench.specs import CommandResult
 from ...ours.avatar import OursAvatar
-from ...ours.storage import Field
+from ...ours.storage import StoredField
 from ...shared.avatar_files import read_shared_head, save_shared_head
 from ...shared.losses import picture_ssim, psnr, squared_error
 from ...shared.schedule import evenly
@@ -33,14 +33,14 @@ SIMPLIFIED, WHOLE = "left out", "all"
 def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) -> CommandResult:
     """Store an avatar of the method "ours", and measure its size and quality; see the settings.
 
-    Raises `InputError` for a folder without the exact file of an avatar of ours, and for the capture of another
-    subject.
+    Raises `InputError` for a folder without the exact file of an avatar of method "ours", and for the capture of
+    another subject.
     """
     stored, out = open_avatar(Path(settings.avatar)), Path(settings.out)
     folder = stored.folder
     if not isinstance(stored.load(), OursAvatar):
         found = f"an avatar of {stored.record['method']}"
-        raise InputError(folder, "", "the exact file of an avatar of ours", found)
+        raise InputError(folder, "", "the exact file of an avatar of method ours", found)
     exact = OursAvatar.read(folder, "cpu", exact=True)
     head = read_shared_head(folder)
     clip = None
@@ -80,14 +80,14 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
 
 
 def _costs(
-    field: Field,
+    field: StoredField,
     exact: OursAvatar,
     head: HeadAsset,
     precision: Precision,
     comparison: Comparison,
     progress: Progress,
 ) -> dict[str, dict[str, float | None]]:
-    """Quality with one part rounded alone, by part; with all; and with none, only what no pose shows left out."""
+    """Quality with each part rounded alone, with all parts rounded, and with invisible splats removed only."""
     variants = {
         part.name: replace(EXACT, **{part.name: getattr(precision, part.name)}) for part in fields(precision)
     }
@@ -153,25 +153,25 @@ def _row(
 
 
 class Quality(NamedTuple):
-    """Quality of an avatar's pictures."""
+    """Quality of an avatar's renders."""
 
     psnr: float
     """dB against the ground truth, mean over frames; NaN without one."""
     ssim: float
-    """Against the truth, likewise; by the training's own window."""
+    """SSIM against the ground truth, mean over frames, with the window used in training."""
     psnr_exact: float
-    """dB against the exact avatar's pictures, of the mean squared error over all frames; infinite where equal."""
+    """dB against the renders of the exact avatar, from the mean squared error over all frames; infinite if equal."""
 
 
 class Comparison:
-    """Held-out frames of a clip as the exact avatar draws them, and as they are.
+    """Held-out frames of a clip: renders of the exact avatar, and ground truth.
 
     Parameters
     ----------
     frames : int
         Number of frames, spread evenly over both held-out splits.
     scale : int
-        Enlargement of the pictures; above 1 there is no ground truth.
+        Enlargement of the renders; above 1 there is no ground truth.
     """
 
     def __init__(self, clip: Clip, exact: OursAvatar, frames: int, scale: int = 1):
@@ -183,7 +183,7 @@ class Comparison:
         self.exact = self._quality(self._exact)
 
     def __call__(self, avatar: OursAvatar) -> Quality:
-        """Quality of another avatar's pictures of the same frames."""
+        """Quality of another avatar on the same frames."""
         return self._quality(self._pictures(avatar))
 
     def _pictures(self, avatar: OursAvatar) -> list[ByteArray]:
@@ -206,7 +206,7 @@ class Comparison:
 
 
 def avatar_of(content: Content, head: HeadAsset) -> OursAvatar:
-    """The avatar that a compact file of such a content would give."""
+    """The avatar decoded from the content of a compact file."""
     subject, field = decode(Path(COMPACT_FILE), content, head, "cpu")
     mesh = SubjectMesh(head, subject.shape, subject.static_offset, "cpu")
     return OursAvatar([], mesh, subject, field, "cpu")

@@ -9,9 +9,9 @@ from dataclasses import dataclass, fields
 class Precision:
     """Quantisation steps of the parts of a compact avatar; smaller is finer, and 0 keeps a part as float32.
 
-    Each step is in a unit in which equal errors look equally bad, so that one number serves a whole part, whatever
-    its range: the entropy coder, not a fixed number of bits, pays for rare large values. The defaults cost less than
-    0.1 dB together (``headbench export compact --compare`` measures each).
+    Each step is in a unit in which equal errors are equally visible, so that one number serves a whole part. The range
+    of values needs no fixed number of bits because values are entropy-coded. The defaults cost less than 0.1 dB
+    together (``headbench export compact --compare`` measures each).
     """
 
     positions: float = 0.08
@@ -27,7 +27,7 @@ class Precision:
     """Step of opacity logits: an opacity is off by 0.0125 at most."""
 
     harmonics: float = 0.02
-    """Step of spherical-harmonics coefficients, if they hold the colour: 0.0056 of colour in degree 0."""
+    """Step of spherical-harmonics coefficients, if colours are stored as such: 0.0056 of colour in degree 0."""
 
     colors: float = 0.02
     """Step of the separate colours of splats, added to those of the planes."""

@@ -12,7 +12,7 @@ from .precision import Precision
 
 @dataclass(frozen=True)
 class CompactSettings(CaptureOptions):
-    """Store an avatar of ours in about a fifteenth of its bytes."""
+    """Store an avatar of method ours in about a fifteenth of its bytes."""
 
     avatar: AvatarFolder
 
@@ -20,8 +20,8 @@ class CompactSettings(CaptureOptions):
     """Folder to write: the compact file, and the head model beside it."""
 
     compare: str | None = None
-    """Capture that the avatar was trained on. Splats that none of its training poses shows are left out, and the
-    quality is measured on its held-out frames."""
+    """Capture that the avatar was trained on. Splats that are invisible in all training poses are removed, and quality
+    is measured on held-out frames."""
 
     frames: int = 8
     """With --compare: held-out frames to compare on, evenly spread over both held-out splits."""
@@ -31,7 +31,7 @@ class CompactSettings(CaptureOptions):
     avatar."""
 
     precision: Precision = field(default_factory=Precision)
-    """How finely each part is stored."""
+    """Quantisation steps of each part."""
 
     dependent = (DependentOptions(("frames", "scale", "reader", "head", "cy", "set"), "compare"),)
 

@@ -34,7 +34,7 @@ TRIANGLES = "binding"
 
 
 def variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
-    """The variants of `recipes.GA`. Tracking refined in training serves each of them as it does the whole avatar."""
+    """The variants of `recipes.GA`. All variants use the tracking refined in training."""
     whole, head = GAAvatar.read(folder, device), read_shared_head(folder)
     weights = contributions(whole, training_views(clip))
     for recipe in GA:
@@ -43,7 +43,7 @@ def variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
 
 
 def _make(whole: GAAvatar, head: HeadAsset, rows: Tensor, recipe: Recipe, device: str, out: Path) -> GAAvatar:
-    """Write what a recipe leaves of an avatar; return what is read back."""
+    """Write an avatar reduced by a recipe; return the avatar that is read back."""
     splats = {name: value.index_select(0, rows) for name, value in whole.splat_tensors.items()}
     binding = whole.binding.index_select(0, rows)
     if recipe.degree is not None:

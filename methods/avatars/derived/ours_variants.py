@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ....bench.contracts import Clip, HeadAsset, Variant
 from ...ours.avatar import OursAvatar
-from ...ours.storage import FIELD_FILE, PER_SPLAT, Field, checked_field, read_field, save_field
+from ...ours.storage import FIELD_FILE, PER_SPLAT, StoredField, checked_field, read_field, save_field
 from ...shared.avatar_files import SUBJECT_FILE, read_shared_head, save_shared_head, write_subject
 from ...shared.subject_mesh import SubjectMesh
 from ..compact.file import COMPACT_FILE, read_compact, write_compact
@@ -32,7 +32,7 @@ from .recipes import (
 
 EXACT_PARTS = ("plane_box", "line_box", "jaw_bases")
 TRIANGLES = "triangles"
-_ANY = 1 << 30  # more samples than anything has
+_ANY = 1 << 30  # no reduction
 
 
 def variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
@@ -47,8 +47,8 @@ def variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
         yield Variant(recipe.name, recipe.summary, partial(_make, whole, head, rows, recipe, device))
 
 
-def _idle(recipe: Recipe, field: Field) -> bool:
-    """Whether a recipe asks for fewer samples of planes or lines, and nothing else, in vain."""
+def _idle(recipe: Recipe, field: StoredField) -> bool:
+    """Whether a recipe only reduces samples of planes or lines, and the avatar has no more samples than that."""
     if replace(recipe, planes=None, lines=None) != Recipe():
         return False
     changed = _resampled(field.tensors, recipe)
@@ -62,18 +62,18 @@ def _resampled(tensors: dict[str, Tensor], recipe: Recipe) -> dict[str, Tensor]:
 def _make(
     whole: OursAvatar, head: HeadAsset, rows: Tensor, recipe: Recipe, device: str, out: Path
 ) -> OursAvatar:
-    """Write what a recipe leaves of an avatar; return what is read back."""
+    """Write an avatar reduced by a recipe; return the avatar that is read back."""
     tensors = dict(whole.field.tensors)
     for name in PER_SPLAT:
         if name in tensors:
             tensors[name] = tensors[name].index_select(0, rows)
     tensors = _resampled(tensors, recipe)
-    field = Field(tensors, whole.field.dynamic)
+    field = StoredField(tensors, whole.field.dynamic)
     save_shared_head(out, head)
     subject = whole.subject
     if recipe.storage == "compact":
         path, precision = out / COMPACT_FILE, Precision()
-        # Sorts the splats by triangle and leaves out lines that would be rounded to nothing.
+        # Sorts the splats by triangle and removes lines that would be rounded to zero.
         field = simplify(OursAvatar([], whole.mesh, subject, field, device), [], precision)
         write_compact(path, field, subject, head, precision)
         subject, field = read_compact(path, head, device)

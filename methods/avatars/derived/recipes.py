@@ -24,7 +24,7 @@ STORAGE_SUMMARIES: dict[Storage, str] = {
     "exact": "",
     "half": "16-bit floats",
     "8bit": "8 bits between each column's extremes",
-    "compact": "quantised by what shows, entropy-coded",
+    "compact": "quantised by visible effect, entropy-coded",
 }
 # Both avatars of a capture at 144x208 (20,000 splats, 2,000 iterations) lost 0.3 and 0.8 dB, and twice their LPIPS, by
 # the earlier ones, for no measurable processor time; hence no other variant has them.
@@ -34,7 +34,7 @@ EARLIER = Cutoffs(4 / 255, 1e-2)
 
 @dataclass(frozen=True)
 class Recipe:
-    """Changes of an avatar, made in this order; None and 1 leave as it is.
+    """Changes of an avatar, applied in this order; None and 1 change nothing.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Recipe:
     @property
     def summary(self) -> str:
         """Description of the change."""
-        cutoffs = f"alpha from {self.cutoffs.alpha_min:.3f}, light from {self.cutoffs.transmittance_min:g} on"
+        cutoffs = f"alpha from {self.cutoffs.alpha_min:.3f}, transmittance from {self.cutoffs.transmittance_min:g} on"
         parts = [
             f"the {self.splats:.0%} of splats that contribute most" if self.splats < 1 else "",
             "" if self.degree is None else f"harmonics up to degree {self.degree}",
@@ -114,12 +114,12 @@ def training_views(clip: Clip, count: int = VIEWS) -> list[tuple[Camera, HeadPos
 
 
 def contributions(avatar: SplatAvatar, views: Sequence[tuple[Camera, HeadPose]]) -> Tensor:
-    """(N,) blending weights of each splat, summed over all pixels of all views; see `contribution`."""
+    """(N,) blending weight of each splat, summed over all pixels of all views; see `contribution`."""
     return torch.stack([contribution(avatar.splats(pose), camera) for camera, pose in views]).sum(0)
 
 
 def most_contributing(weights: Tensor, fraction: float) -> Tensor:
-    """Numbers, rising, of the given fraction of splats that contribute most; ties by number."""
+    """Ascending indices of the given fraction of splats that contribute most; ties by index."""
     count = max(1, round(fraction * len(weights)))
     return torch.argsort(weights, descending=True, stable=True)[:count].sort().values
 
@@ -127,11 +127,12 @@ def most_contributing(weights: Tensor, fraction: float) -> Tensor:
 Kind = Literal["half", "8bit"]
 LEVELS = 255
 LOW, STEP = "/low", "/step"
-"""Endings of the names under which an 8-bit tensor's lowest values and steps lie, by column."""
+"""Name suffixes of an 8-bit tensor's lowest values and steps by column."""
 
 
 def write_reduced(path: Path, tensors: Mapping[str, Tensor], kind: Kind, exact: Collection[str] = ()) -> None:
-    """Write float tensors as 16-bit floats ("half") or 8-bit numbers ("8bit"); those in ``exact``, vectors and whole numbers as they are."""
+    """Write float tensors as 16-bit floats ("half") or 8-bit numbers ("8bit"); tensors in ``exact``, vectors and
+    integers are unchanged."""
     stored: dict[str, Tensor] = {}
     for name, value in tensors.items():
         if name in exact or value.ndim < 2 or not value.is_floating_point():
@@ -196,9 +197,9 @@ def _coarser_plane(plane: Tensor, resolution: int) -> Tensor:
 
 
 def fitting_matrix(samples: int, fewer: int) -> Tensor:
-    """(fewer, samples) float64: takes samples to the fewer ones that interpolate back to them in least squares.
+    """(fewer, samples) float64 matrix from samples to the fewer samples that interpolate them best in least squares.
 
-    Samples lie evenly with the outermost on the ends (align-corners), ``fewer`` from 2 to ``samples``.
+    Samples are evenly spaced with the outermost on the ends (align-corners); ``fewer`` is from 2 to ``samples``.
     """
     places = torch.linspace(0, fewer - 1, samples, dtype=torch.float64)
     nodes = torch.arange(fewer, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Bakes avatars of splats for a web page, whatever method they are of: by looking at their splats in chosen poses."""
+"""Bakes splat avatars of any method for a web page by sampling their splats in chosen poses."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from ..views import camera_at, direction_of, visibility
 from .model import JOINTS, Slider, WebAvatar, blended, rotation_of, slider_motions
 
 AWAY_M = 1.0
-"""Distance at which colours are looked at."""
+"""Distance of the camera at which colours are sampled."""
 FEW_DIRECTIONS = ((0.0, 0.0), (0.7, 0.0), (-0.7, 0.0))
-"""Azimuth and elevation from which the change of colours by a slider is looked at."""
+"""Azimuth and elevation of the views in which the change of colours by a slider is sampled."""
 TRIAL_TURN = 0.25
 LOGIT_MAX = 8.0
 
@@ -56,7 +56,7 @@ class Source:
     joints: FloatArray
 
     def pose(self, sliders: Sequence[Slider], values: Sequence[float] | FloatArray) -> HeadPose:
-        """The pose that sliders ask for."""
+        """The pose for given slider values."""
         parts = {
             name: np.array(getattr(self.rest, name), np.float64)
             for name in ("expression", "neck", "jaw", "eyes")
@@ -79,7 +79,7 @@ class Source:
         return replace(view, world_to_camera=view.world_to_camera @ motion)
 
     def seen(self, pose: HeadPose, camera: Camera | None = None) -> Seen:
-        """The splats of a pose, coloured as a camera of the head's frame sees them."""
+        """The splats of a pose with their colours for a camera in the head's frame."""
         found = self.avatar.splats(pose, None if camera is None else self.camera(camera))
         rotation = self.rotation
         means = (found.means - self.root - self.rest.translation) @ rotation + self.root
@@ -102,7 +102,7 @@ class Source:
 def bake(
     source: Source, sliders: tuple[Slider, ...], degree: int, directions: int, progress: Progress
 ) -> WebAvatar:
-    """Look at the avatar with each slider at its step, and from all around; see `WebAvatar`."""
+    """Sample the avatar with each slider at its step, and from all directions; see `WebAvatar`."""
     total = len(sliders) + 1
     rest = source.seen(source.rest)
     middle = rest.means.mean(axis=0)
@@ -115,7 +115,7 @@ def bake(
         name: [] for name in ("means", "turns", "log_scales", "logits", "colors")
     }
     for number, slider in enumerate(sliders):
-        # Both ways, where the slider goes both ways: what is linear is kept, what bends to one side is not.
+        # Central differences for sliders with two sides keep only the linear part.
         steps = [slider.step] if slider.low >= 0 else [slider.step, -slider.step]
         changes = [_change(source, rest, slider, step, weights, few, colors) for step in steps]
         for name, change in morphs.items():
@@ -153,7 +153,7 @@ def _weights(source: Source, rest: Seen) -> FloatArray:
             products += ((moved - rest.means) * rigid).sum(axis=1)
             squares += (rigid**2).sum(axis=1)
         moves[:, joint] = (products / np.maximum(squares, 1e-12)).clip(0.0, 1.0)
-    # What the neck alone moves: it takes the jaw and the eyes along.
+    # Weights of the neck alone, which also moves jaw and eyes.
     moves[:, 0] = (moves[:, 0] - moves[:, 1:].sum(axis=1)).clip(0.0, 1.0)
     return np.asarray(moves / np.maximum(moves.sum(axis=1, keepdims=True), 1.0))
 
@@ -185,7 +185,7 @@ def _change(
 
 
 def _harmonics(source: Source, middle: FloatArray, degree: int, directions: int) -> FloatArray:
-    """(N, 3, K): least squares over directions, weighted by how much each splat shows; see `fit_harmonics`."""
+    """(N, 3, K): least squares over directions, weighted by the visibility of each splat; see `fit_harmonics`."""
 
     def radiance(direction: torch.Tensor) -> torch.Tensor:
         far = camera_at(middle + FAR_M * direction.numpy())
@@ -207,7 +207,7 @@ def _turned(
     degree: int,
     middle: FloatArray,
 ) -> bool:
-    """Whether colours turn with the head: which of both explains better what a turned neck shows."""
+    """Whether colours rotate with the head, which is decided by the fit to a pose with a rotated neck."""
     turn = next((slider for slider in sliders if slider.joints == (0,) and slider.axis == 1), None)
     if turn is None or degree == 0:
         return False

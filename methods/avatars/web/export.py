@@ -1,4 +1,4 @@
-"""Writes the page of an avatar, and measures what it loses."""
+"""Export of an avatar as a web page, and the loss of quality."""
 
 from __future__ import annotations
 
@@ -29,20 +29,21 @@ from .payload import decode, encode, quaternions
 from .settings import ExportHtmlSettings
 
 DIRECTIONS = 96
-"""Viewing directions, even over the sphere, at which colours are looked at."""
+"""Number of viewing directions, evenly spread over the sphere, in which colours are sampled."""
 COEFFICIENT = 2.0
-"""How far sliders of expressions go where no capture tells: standard deviations of FLAME's coefficients."""
+"""Range of expression sliders without a capture: standard deviations of FLAME's coefficients."""
 BEYOND = 1.5
-"""How much farther they go than the largest coefficient tracked in training."""
+"""Range of expression sliders with a capture, relative to the largest coefficient tracked in training."""
 JAW, JAW_SIDE, NECK, EYES = 0.4, 0.12, 0.4, 0.4
 """Radians."""
 VIEWS = ((0.0, 0.0), (0.6, 0.0), (-0.6, 0.2))
-"""Azimuth and elevation, radians, from which the loss is measured."""
+"""Azimuth and elevation, radians, of the views in which the loss is measured."""
 SIZE = 320
 TOGETHER = ("expression 1", "expression 2", "jaw open")
-"""Sliders that are also tried at their upper ends at once: morphs add up, avatars need not."""
+"""Number of sliders that are also tested together at their upper ends, since avatars need not be additive as morphs
+are."""
 DISTANCE_BY_HEIGHT = 2.6
-"""Distance of the camera by the extent of the splats."""
+"""Distance of the camera relative to the extent of the splats."""
 
 
 def export_page(settings: ExportHtmlSettings, progress: Progress = no_progress) -> CommandResult:
@@ -78,13 +79,13 @@ def export_page(settings: ExportHtmlSettings, progress: Progress = no_progress) 
     size = out.stat().st_size
     worst = min(losses, key=lambda name: losses[name])
     text = f"{out}: {len(baked.means)} splats, {len(sliders)} sliders, {size / 1e6:.2f} MB; PSNR against headbench's renderer: "
-    text += ", ".join(f"{name} {value:.1f}" for name, value in losses.items()) + f" dB; the least: {worst}"
+    text += ", ".join(f"{name} {value:.1f}" for name, value in losses.items()) + f" dB; minimum: {worst}"
     return CommandResult(text, {"out": out, "splats": len(baked.means), "bytes": size, "psnr": losses})
 
 
 def _reach(poses: Sequence[HeadPose], version: str, reach: FloatArray) -> FloatArray:
     if poses[0].head_model != version:
-        return reach  # tracked with another head model, as captures of gbs are
+        return reach  # tracked with another head model, as for gbs
     largest = np.abs([pose.expression for pose in poses]).max(axis=0)
     return np.asarray(np.where(largest > 0, BEYOND * largest, reach))
 
@@ -112,7 +113,7 @@ def make_sliders(reach: FloatArray) -> tuple[Slider, ...]:
 
 
 def fill_page(content: bytes, title: str) -> str:
-    """The page around the bytes of an avatar: script and style within, nothing else may be loaded."""
+    """The page with the bytes of an avatar, script and style in it; it may load nothing else."""
     from jinja2 import Environment, FileSystemLoader
 
     here = Path(__file__).parent
@@ -134,7 +135,7 @@ def fill_page(content: bytes, title: str) -> str:
 def measure_losses(
     source: Source, page: WebAvatar, view: Mapping[str, Any], progress: Progress
 ) -> dict[str, float]:
-    """Least PSNR in dB, by group of sliders, each at its ends and seen from `VIEWS`, against the avatar itself."""
+    """Minimum PSNR in dB against the avatar itself, by group of sliders, each at its ends, over `VIEWS`."""
     trials = [("rest", np.zeros(len(page.sliders)))]
     for number, slider in enumerate(page.sliders):
         group = "expressions" if not slider.joints else slider.name.split()[0]
@@ -160,7 +161,7 @@ def measure_losses(
 
 
 def draw(moved: Moved, camera: Camera) -> FloatArray:
-    """(H, W, 3) of splats given by axes, on white, by headbench's renderer."""
+    """(H, W, 3) image of splats given by axes, on white, by headbench's renderer."""
     turns, scales, _ = np.linalg.svd(moved.axes)
     turns = turns * np.sign(np.linalg.det(turns))[:, None, None]
     means, quats, sizes, opacities, colors = (

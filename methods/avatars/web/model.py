@@ -1,6 +1,7 @@
-"""An avatar as a web page has it: splats, linear morphs, skinning by a few joints, harmonics.
+"""The avatar of a web page: splats, linear morphs, skinning by a few joints, harmonics.
 
-All in the frame of the head: the root joint does not turn, x to the head's left, y up, z to the front; metres.
+All values are in the head's frame, metres: the root joint does not rotate, x points to the head's left, y up, z to the
+front.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ PARENTS = (-1, 0, 0, 0)
 
 
 class Slider(NamedTuple):
-    """Something that can be moved: an expression, or a turn of joints about an axis. It brings a morph of its own.
+    """An expression, or a rotation of joints about an axis, with its morph.
 
     Attributes
     ----------
     joints : tuple[int, ...]
-        Indices into `JOINTS` of the joints that it turns; none for an expression.
+        Indices into `JOINTS` of the joints that it rotates; none for an expression.
     axis : int
         0, 1 or 2 for x, y, z.
     low, high : float
@@ -65,14 +66,14 @@ class WebAvatar:
         (N, 3, K), in 3DGS' order and signs, as functions of the direction from the camera to the
         splat.
     turned : bool
-        Whether harmonics turn with the head; otherwise they are fixed in the world.
+        Whether harmonics rotate with the head; otherwise they are fixed in the world.
     weights : FloatArray
         (N, 4) skinning weights of `JOINTS`; the remainder to 1 stays with the shoulders.
     joints : FloatArray
         (4, 3) positions.
     d_means, d_turns, d_log_scales, d_logits, d_colors : FloatArray
-        (M, N, 3), (M, N, 3), (M, N, 3), (M, N), (M, N, 3): what is added at ``step`` before skinning;
-        turns are rotation vectors.
+        (M, N, 3), (M, N, 3), (M, N, 3), (M, N), (M, N, 3): changes at ``step`` before skinning; turns are rotation
+        vectors.
     """
 
     means: FloatArray
@@ -91,7 +92,7 @@ class WebAvatar:
     d_colors: FloatArray
 
     def moved(self, values: FloatArray, center: FloatArray) -> Moved:
-        """The splats with the sliders at (M,) values, coloured as seen from a (3,) point."""
+        """The splats with the sliders at (M,) values, and their colours seen from a (3,) point."""
         steps = np.asarray(values, np.float64) / [slider.step for slider in self.sliders]
 
         def added(morphs: FloatArray) -> FloatArray:
@@ -115,7 +116,7 @@ class WebAvatar:
 def slider_motions(
     sliders: tuple[Slider, ...], values: FloatArray, joints: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """(4, 3, 3) and (4, 3): where each joint takes a point; the neck takes the others along."""
+    """(4, 3, 3) rotations and (4, 3) offsets of the joints; the neck also moves the others."""
     turns = np.zeros((len(JOINTS), 3))
     for slider, value in zip(sliders, values):
         for joint in slider.joints:

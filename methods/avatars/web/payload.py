@@ -1,4 +1,4 @@
-"""The bytes of an avatar in a page: quantised columns behind a JSON header, packed by deflate.
+"""The bytes of an avatar in a page: a JSON header and quantised columns, compressed by deflate.
 
 A 32-bit little-endian length, the header as UTF-8, then for each array of the header its columns one after another, N values
 each: 8-bit values, or 16-bit ones as a plane of low bytes and a plane of high bytes. A value is ``low + step * q`` of its column.
@@ -23,7 +23,7 @@ from .model import Slider, WebAvatar
 
 FORMAT = 1
 LOWEST_LOG_SCALE = -14.0
-"""A micrometre: what is thinner looks the same."""
+"""A micrometre; thinner splats look the same."""
 LEAST = {
     "harmonics": 0.006,
     "d_means": 2e-5,
@@ -32,15 +32,16 @@ LEAST = {
     "d_logits": 0.04,
     "d_colors": 0.004,
 }
-"""Least steps, in the units of each: finer ones would store what cannot be seen. Metres, radians, powers of e, logits, 1."""
+"""Minimum steps, in the units of each (metres, radians, powers of e, logits, 1); finer steps would be invisible."""
 MOST_OF = 0.9995
-"""Part of the harmonics of an order that the range of their column has to hold; few outliers would make all others coarse."""
+"""Fraction of the harmonics of an order that the range of their column has to contain; a few outliers would make all
+others coarse."""
 
 
 def encode(avatar: WebAvatar, view: Mapping[str, Any]) -> bytes:
     """Quantise and pack. Means have 16 bits, everything else 8.
 
-    ``view`` is where the page begins: ``distance`` in metres from ``target``, (3,).
+    ``view`` is the initial view: ``distance`` in metres from ``target``, (3,).
     """
     count = len(avatar.means)
     arrays: list[dict[str, Any]] = []
@@ -69,7 +70,7 @@ def encode(avatar: WebAvatar, view: Mapping[str, Any]) -> bytes:
         add(name, columns, low, (high - low) / (2**bits - 1), bits)
 
     def add_signed(name: str, values: FloatArray, largest: FloatArray, least: float = 0.0) -> None:
-        # Level 128 is 0, exactly: most splats are not moved by most sliders.
+        # Level 128 is exactly 0, since most sliders do not move most splats.
         step = np.maximum(np.asarray(largest) / 127, least)
         add(name, values, -128 * step, step)
 
@@ -110,7 +111,7 @@ def encode(avatar: WebAvatar, view: Mapping[str, Any]) -> bytes:
 
 
 def decode(content: bytes) -> WebAvatar:
-    """Decode the bytes as a page does: the reference for its script."""
+    """Decode the bytes as a page does; the reference for its script."""
     whole = zlib.decompress(content, -15)
     (length,) = struct.unpack_from("<I", whole)
     header = json.loads(whole[4 : 4 + length])

@@ -10,22 +10,23 @@ from ..settings import AvatarOptions
 
 @dataclass(frozen=True)
 class ExportHtmlSettings(AvatarOptions):
-    """Write one HTML file with an avatar in it and sliders that move it; it needs no network and no other file.
+    """Write an avatar as one HTML file with sliders; it needs no network and no other file.
 
-    Of methods with splats. Browsers with WebGL2 draw it. The findings tell the bytes, and what the page loses against the avatar's own frames.
+    For methods with splats, and browsers with WebGL2. Prints the number of bytes, and the loss of quality against the
+    avatar's own frames.
     """
 
     capture: str | None = None
-    """Capture whose poses say how far sliders go and how the head is held; without one they go to 2 both ways."""
+    """Capture whose poses determine the range of the sliders and the pose of the head; without one the range is -2 to 2."""
 
     expressions: int = 10
-    """Sliders for so many leading expressions."""
+    """Number of leading expressions with sliders."""
 
     degree: int = 3
-    """Of the spherical harmonics that hold colours by viewing direction: 0 to 3. Fewer take fewer bytes."""
+    """Degree of the spherical harmonics of view-dependent colours, 0 to 3; a lower degree takes fewer bytes."""
 
     title: str = ""
-    """Of the page; default: the name of the subject."""
+    """Title of the page; default: the name of the subject."""
 
     dependent = (DependentOptions(("reader", "head", "cy", "set"), "capture"),)
 

@@ -101,7 +101,7 @@ class Marcher {
     Vec3 cells;          // the position in cells of the grid
   };
 
-  // Lattice points that are looked at together may lie so many apart.
+  // Maximum distance of lattice points that are evaluated together.
   static constexpr std::int32_t kBeside = 1;
 
   struct Together {

@@ -60,7 +60,7 @@ class Posed {
 
   const Tree& tree() const { return *tree_; }
   const std::vector<Box>& boxes() const { return boxes_; }
-  float together() const { return together_; }  // points within so many metres of their middle are searched for together
+  float together() const { return together_; }  // maximum distance from their middle, metres, of points that are searched together
 
   // Writes the triangles and the squared distances of queries.
   void nearest(Queries& queries) const {

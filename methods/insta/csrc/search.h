@@ -46,7 +46,7 @@ struct Search {
   const WideBox* boxes;
   const WideTriangles* leaves;
   const std::int32_t* leaf_of;  // by triangle
-  float together;               // points within so many metres of their middle are searched for together
+  float together;               // maximum distance from their middle, metres, of points that are searched together
 };
 
 // Up to kLanes points, the triangle nearest to each and its squared distance; -1 and infinity for one that is not finite. Of

@@ -1,4 +1,4 @@
-"""Captures and lists of frames in the form that GaussianAvatars' loader reads."""
+"""Export of captures and lists of frames for GaussianAvatars' loader."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ MARK_LEVELS, MARK_STEP = 16, 16
 def write_training(
     clip: Clip, tracking: OfficialTracking, work: Workplace, progress: Progress
 ) -> dict[str, FrameKey]:
-    """Write the training frames as a capture without any other: timesteps numbered from 0, other splits empty.
+    """Write only the training frames as a capture: timesteps numbered from 0, other splits empty.
 
-    Returns the key of every image by its place. The loader opens the JSONs of all three splits, takes the static offset
+    Returns the key of every image by its path. The loader opens the JSONs of all three splits, takes the static offset
     from timestep 0, and chooses its dynamic reader by the canonical parameters, whose content it never reads.
     """
     timesteps = sorted({key.timestep for key in clip.splits["train"]})
@@ -55,9 +55,9 @@ def write_training(
 def write_list(frames: Sequence[Listed], tracking: OfficialTracking, work: Workplace) -> list[HeadPose]:
     """Write frames to render as the test split of a capture; return the pose of each of its timesteps.
 
-    The image of each is a mark, one colour that tells its number: the loader reads it as ground truth and the renderer
-    writes it beside the render, so that `check_mark` sees which frame a file shows. The training split, which the loader
-    takes the scene's size from, is the first frame.
+    The image of each is a mark, a single colour that encodes its number. The loader reads it as ground truth and the
+    renderer writes it beside the render, so that `check_mark` can identify the frame of a file. The training split,
+    from which the loader takes the scene's size, is the first frame.
     """
     poses: list[HeadPose] = []
     number: dict[int, int] = {}
@@ -78,26 +78,26 @@ def write_list(frames: Sequence[Listed], tracking: OfficialTracking, work: Workp
 
 
 def mark(number: int) -> ByteArray:
-    """(3,) colour that tells a frame's number, modulo 4,096."""
+    """(3,) colour that encodes a frame's number modulo 4,096."""
     digits = [number // MARK_LEVELS**place % MARK_LEVELS for place in range(3)]
     return np.array([MARK_STEP * digit + MARK_STEP // 2 for digit in digits], np.uint8)
 
 
 def check_mark(path: Path, number: int) -> None:
-    """Raise `InputError` where a file is not the mark of a frame: what is rendered there is another one."""
+    """Raise `InputError` if a file is not the mark of a frame, so that another frame was rendered."""
     check_mark_in(read_png(path), path, number)
 
 
 def check_mark_in(image: ByteArray, path: Path, number: int) -> None:
-    """Raise `InputError` where the pixels of a part of a file are not the mark of a frame; see `check_mark`."""
+    """Raise `InputError` if the pixels of a part of a file are not the mark of a frame; see `check_mark`."""
     pixels = image.reshape(-1, 3).astype(int)
     off = int(np.abs(pixels - mark(number).astype(int)).max())
     if off >= MARK_STEP // 2:
-        raise InputError(path, "", f"the mark of frame {number}", "that of another: the order was changed")
+        raise InputError(path, "", f"the mark of frame {number}", "that of another: the order has changed")
 
 
 def read_window(frame: Listed, path: Path) -> ByteArray:
-    """A render at the size of its camera. Raises `InputError` for one that is not of its window's size."""
+    """A render at the size of its camera. Raises `InputError` for a render of another size than its window."""
     window = around(frame.camera)
     image = read_png(path)
     wanted = (window.camera.height, window.camera.width)

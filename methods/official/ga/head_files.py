@@ -1,7 +1,7 @@
-"""A head model as the files that GaussianAvatars' code opens: FLAME's pickle, its masks, a template, landmarks.
+"""Files of a head model for GaussianAvatars' code: FLAME's pickle, its masks, a template, landmarks.
 
-Their paths are relative to the program's working directory, so that a clip's own head model stands in for the one in the
-checkout. The code adds teeth, hung on thirty vertices that it knows by number, and reads 300 and 100 coefficients: a
+Their paths are relative to the program's working directory, so that a clip's own head model replaces the one in the
+checkout. The code adds teeth, attached to thirty vertices with fixed indices, and reads 300 and 100 coefficients: a
 head of another topology is renumbered so that these vertices are its lips, one with fewer coefficients is padded.
 """
 
@@ -45,14 +45,14 @@ MASKS = (
     ),
     *("eye_region", "nose", "lips", "right_eye_region", "left_eye_region"),
 )
-"""Regions of FLAME's masks; one that a head does not have is left empty."""
+"""Regions of FLAME's masks; those that a head lacks are empty."""
 LANDMARKS = 70
 MOST_TEMPLATE = 2**26
 
 
 @dataclass(frozen=True, eq=False)
 class OfficialHead:
-    """A head model as their code is given it: without teeth, its vertices in their order.
+    """A head model for their code: without teeth, with vertices in their order.
 
     Attributes
     ----------
@@ -66,15 +66,15 @@ class OfficialHead:
 
     @classmethod
     def of(cls, head: HeadAsset, checkout: Path) -> OfficialHead:
-        """Fit a clip's head model to their code. Raises `InputError` where it does not."""
+        """Convert a clip's head model for their code. Raises `InputError` if that is impossible."""
         own = cls.numbered(head)
         if _same_faces(own.faces, checkout / TEMPLATE_FILE):
-            return own  # FLAME's own topology: their numbers are right as they are
+            return own  # FLAME's own topology: their indices are valid
         return own._with_lips(_their_rings(checkout), f"head model {head.version!r}")
 
     @classmethod
     def numbered(cls, head: HeadAsset) -> OfficialHead:
-        """A head with its own numbers, its teeth left out. Raises `InputError` for bases and joints of other sizes."""
+        """A head with its own indices, without teeth. Raises `InputError` for bases and joints of other sizes."""
         where = f"head model {head.version!r}"
         for name, size, most in (
             ("identity", head.shape_basis.shape[2], FLAME_IDENTITY_SIZE),
@@ -82,7 +82,10 @@ class OfficialHead:
         ):
             if size > most:
                 raise InputError(
-                    where, f"{name} basis", f"at most {most} directions; their code reads no more", f"{size}"
+                    where,
+                    f"{name} basis",
+                    f"at most {most} directions, as many as their code reads",
+                    f"{size}",
                 )
         if list(head.parents) != [-1, 0, 1, 1, 1]:
             raise InputError(
@@ -95,11 +98,11 @@ class OfficialHead:
         return cls(head, kept, number[faces])
 
     def _with_lips(self, wanted: tuple[IntArray, IntArray], where: str) -> OfficialHead:
-        """Number the vertices anew so that those wanted are the rings of the lips."""
+        """Renumber the vertices so that the given indices are the rings of the lips."""
         rings = [np.searchsorted(self.order, ring) for ring in lip_rings(self.head)]
         for ring, numbers in zip(rings, wanted):
             if len(ring) != len(numbers):
-                expected = f"rings of {len(numbers)} vertices, on which their code hangs teeth"
+                expected = f"rings of {len(numbers)} vertices, to which their code attaches teeth"
                 raise InputError(where, " and ".join(RING_REGIONS), expected, f"{len(ring)}")
         lips, places = np.concatenate(rings), np.concatenate(wanted)
         count = max(len(self.order), int(places.max()) + 1)
@@ -113,7 +116,7 @@ class OfficialHead:
         return OfficialHead(self.head, np.where(old < 0, -1, self.order[old]), new[self.faces])
 
     def vertices(self, values: FloatArray) -> FloatArray:
-        """Values per vertex, in their order; 0 for vertices that stand for nothing."""
+        """Values per vertex, in their order; 0 for vertices without a counterpart."""
         taken = np.asarray(values)[np.maximum(self.order, 0)]
         taken[self.order < 0] = 0
         return taken
@@ -154,7 +157,7 @@ class OfficialHead:
 
 @dataclass(frozen=True, eq=False)
 class OfficialTracking:
-    """Tracked parameters of one subject as their code reads them."""
+    """Tracked parameters of one subject for their code."""
 
     head: OfficialHead
     shape: FloatArray
@@ -165,7 +168,7 @@ class OfficialTracking:
         save_npz(path, self.parameters(pose))
 
     def parameters(self, pose: HeadPose) -> dict[str, np.ndarray]:
-        """Parameters of one timestep, padded: ``shape`` (300,), ``static_offset`` (1, V, 3), all else with one row.
+        """Parameters of one timestep, padded: ``shape`` (300,), ``static_offset`` (1, V, 3), all others with one row.
 
         Raises `InputError` for a pose of another head model.
         """
@@ -180,16 +183,16 @@ class OfficialTracking:
 
 
 def obj_text(vertices: FloatArray, faces: IntArray) -> str:
-    """A mesh as an OBJ file, with one texture coordinate for all corners: nothing of it is ever drawn."""
+    """A mesh as an OBJ file, with one texture coordinate for all corners because it is never drawn."""
     lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices]
     lines += ["vt 0 0", *("f {}/1 {}/1 {}/1".format(*face) for face in np.asarray(faces) + 1)]
     return "\n".join(lines) + "\n"
 
 
 def write_landmarks(path: Path, sizes: Mapping[str, tuple[int, ...]]) -> None:
-    """Write landmarks that code loads and never asks for: all of them on the first triangle.
+    """Write landmarks, which the code loads and never uses, all on the first triangle.
 
-    ``sizes`` is how many by their prefix. A record of fields is read like the dictionary of FLAME's own file.
+    ``sizes`` is their number by prefix. A structured array is read like the dictionary of FLAME's own file.
     """
     fields = []
     for name, size in sizes.items():
@@ -202,7 +205,7 @@ def write_landmarks(path: Path, sizes: Mapping[str, tuple[int, ...]]) -> None:
 
 
 def pickled(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Arrays by name as a pickle that every version of numpy reads: it calls nothing but ``numpy.ndarray``."""
+    """Arrays by name as a pickle that every version of numpy can read: it only calls ``numpy.ndarray``."""
     from io import BytesIO
 
     stream = BytesIO()
@@ -213,7 +216,7 @@ def pickled(arrays: Mapping[str, np.ndarray]) -> bytes:
 class ArrayPickler(pickle.Pickler):
     """Writes an array as a call of its class with shape, type and bytes.
 
-    How numpy itself pickles an array names a module that moved with version 2, which older versions cannot find.
+    Pickles by numpy itself name a module that moved with version 2, which older versions cannot find.
     """
 
     def reducer_override(self, value: Any) -> Any:
@@ -230,7 +233,7 @@ def padded(values: FloatArray, size: int) -> FloatArray:
 
 
 def _their_rings(checkout: Path) -> tuple[IntArray, IntArray]:
-    """The vertices of the upper and the lower lip that their teeth hang on, as their source has them."""
+    """Indices of the upper and lower lip vertices to which their source attaches teeth."""
     rings = []
     for name in RING_REGIONS:
         pattern = rf'"{name}",\s*torch\.tensor\(\[\s*([\d,\s]+?),?\s*\]\)'
@@ -240,7 +243,7 @@ def _their_rings(checkout: Path) -> tuple[IntArray, IntArray]:
 
 
 def _same_faces(faces: IntArray, template: Path) -> bool:
-    """Whether the triangles are those of the template in the checkout; False where it has none."""
+    """Whether the triangles are those of the template in the checkout; False if there is none."""
     if not template.is_file():
         return False
     text = read_bytes(template, "an OBJ file", MOST_TEMPLATE).decode(errors="replace")

@@ -41,7 +41,7 @@ from .windows import check_square_pixels
 PLY_FILE, TRACKING_FILE, ARGUMENTS_FILE = "point_cloud.ply", "driving.npz", "cfg_args"
 PARAMETERS_FILE = "flame_param.npz"
 TEETH_VERTICES = len(ROWS) * RING_LENGTH
-"""Vertices that their head model adds to FLAME's."""
+"""Number of vertices that their head model adds to FLAME's."""
 RENDERS, TRUTHS = "renders", "gt"
 _PROGRESS, _LOSS = re.compile(r"Training progress:.*?(\d+)/\d+ \["), re.compile(r"Loss=([\d.]+)")
 _DRAWN = re.compile(r"Rendering progress:.*?(\d+)/\d+ ")
@@ -76,7 +76,7 @@ THEIR_NAMES = {
     "eyes": "eyes_pose",
     "translation": "translation",
 }
-"""Tracked values by our name: theirs."""
+"""Their name of each tracked value."""
 
 
 class GALayoutMethod(OfficialMethod[Config]):
@@ -85,7 +85,7 @@ class GALayoutMethod(OfficialMethod[Config]):
     shimmed = "bound splats"
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
-        """Refuse other backgrounds than white and black, pixels that are not square, heads that their code cannot take."""
+        """Check that the background is white or black, pixels are square and the head is supported by their code."""
         where = f"clip {clip.subject}"
         _white(clip.background, where)
         for name in sorted({key.camera for keys in clip.splits.values() for key in keys}):
@@ -95,7 +95,7 @@ class GALayoutMethod(OfficialMethod[Config]):
     def export(
         self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
     ) -> dict[str, FrameKey]:
-        """The training frames in GaussianAvatars' layout, the head model in FLAME's files."""
+        """Write the training frames in GaussianAvatars' layout, and the head model as FLAME's files."""
         head = OfficialHead.of(clip.head, checkout.folder)
         head.write(work.program)
         subject = Subject.of(clip)
@@ -104,7 +104,7 @@ class GALayoutMethod(OfficialMethod[Config]):
         )
 
     def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
-        """Their script, with densification and learning rates on the course that a run of this length has."""
+        """Their script, with densification and learning rates scaled to the length of the run."""
         iterations = fit.budget.iterations or 0
         white = _white(fit.clip.background, f"clip {fit.clip.subject}")
         schedule = _schedule(iterations)
@@ -120,7 +120,7 @@ class GALayoutMethod(OfficialMethod[Config]):
             "--densify_until_iter": max(0, schedule.stop),
             "--opacity_reset_interval": schedule.reset_every,
             "--save_iterations": iterations,
-            "--test_iterations": -1,  # their own scores of held-out frames, which there are none of
+            "--test_iterations": -1,  # their own evaluation of held-out frames, which the export lacks
             "--checkpoint_iterations": -1,
         }
         flags = ["--eval", "--bind_to_mesh", *(["--white_background"] if white else [])]
@@ -128,11 +128,11 @@ class GALayoutMethod(OfficialMethod[Config]):
         return [*checkout.python, str(checkout.folder / "train.py"), *words, *flags]
 
     def done(self, line: str) -> tuple[int, str] | None:
-        """From the progress bar of their training."""
+        """Parse the progress bar of their training."""
         return trained(line)
 
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
-        """Their splats and arguments; the subject is stored without the zeros that their file has beside it."""
+        """Keep their splats and arguments; the subject is stored without the zeros of their file."""
         made = self._made(work, fit.budget.iterations or 0)
         for name in self._model_files():
             copy_file(made / name, fit.out / name)
@@ -140,7 +140,7 @@ class GALayoutMethod(OfficialMethod[Config]):
         return {}
 
     def files(self, folder: Path) -> list[Path]:
-        """Splats, subject, and the arguments that their renderer reads again."""
+        """Splats, subject, and the arguments that their renderer reads."""
         return [folder / name for name in (*self._model_files(), SUBJECT_FILE, ARGUMENTS_FILE)]
 
     def write_list(
@@ -151,7 +151,7 @@ class GALayoutMethod(OfficialMethod[Config]):
         checkout: Checkout,
         work: Workplace,
     ) -> None:
-        """The frames as a test split, and a model folder whose parameters are those of the frames."""
+        """Write the frames as a test split, and a model folder with the parameters of the frames."""
         trained_on = (folder / ARGUMENTS_FILE).read_text(errors="replace")
         if _white(background, "render") != ("white_background=True" in trained_on):
             expected = "the background that it was trained on; their renders have no coverage"
@@ -169,7 +169,7 @@ class GALayoutMethod(OfficialMethod[Config]):
         copy_file(folder / ARGUMENTS_FILE, work.model / ARGUMENTS_FILE)
         values = [tracking.parameters(pose) for pose in poses]
         moving = {name: np.concatenate([value[name] for value in values]) for name in THEIR_NAMES.values()}
-        # Their training saves offsets with rows for the teeth that their head model adds, and their renderer reads them so.
+        # Their training saves offsets with rows for the teeth of their head model, and their renderer expects them.
         offset = np.pad(values[0]["static_offset"], [(0, 0), (0, TEETH_VERTICES), (0, 0)])
         still = {"shape": values[0]["shape"], "static_offset": offset}
         arrays = {**moving, **still, **self._more_parameters(len(poses), still["static_offset"])}
@@ -183,7 +183,7 @@ class GALayoutMethod(OfficialMethod[Config]):
         return [*checkout.python, str(checkout.folder / "render.py"), *words, "--skip_train", "--skip_val"]
 
     def drawn(self, line: str) -> int | None:
-        """From the progress bar of their renderer."""
+        """Parse the progress bar of their renderer."""
         return rendered(line)
 
     def render_folder(self, folder: Path, work: Workplace) -> Path:
@@ -195,13 +195,13 @@ class GALayoutMethod(OfficialMethod[Config]):
         return f"{number:05d}.png"
 
     def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
-        """A render, once the ground truth that they wrote beside it has shown which frame it is."""
+        """A render, after its frame is verified by the ground truth written beside it."""
         check_mark(path.parent.parent / TRUTHS / path.name, frame.number)
         return opaque(read_window(frame, path))
 
     def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """Notes for readers of results."""
-        differences = ["the capture has no held-out frames in it; cameras and timesteps are numbered anew"]
+        """Leaks and differences, for readers of results."""
+        differences = ["the capture has no held-out frames; cameras and timesteps are renumbered"]
         moved = [
             c
             for c in clip.cameras.values()
@@ -209,7 +209,7 @@ class GALayoutMethod(OfficialMethod[Config]):
         ]
         if moved:
             differences.append(
-                "their code takes the middle of the image for the principal point: images are cut so that it is "
+                "their code assumes the principal point in the middle of the image: images are cropped accordingly "
                 f"({len(moved)} of {len(clip.cameras)} cameras)"
             )
         if eyelids_are_lost(clip.head):
@@ -243,7 +243,7 @@ class GAOfficial(GALayoutMethod[GAOfficialConfig]):
     config_class, repository = GAOfficialConfig, GA_REPOSITORY
 
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
-        """Besides, the tracking that their training refined."""
+        """Also keep the tracking refined by their training."""
         kept = super().keep(fit, work)
         timesteps = np.array(sorted({key.timestep for key in fit.clip.splits["train"]}))
         _refined(fit.clip, timesteps, self._made(work, fit.budget.iterations or 0)).save(
@@ -271,13 +271,13 @@ def _refined(clip: Clip, timesteps: np.ndarray, made: Path) -> RefinedTracking:
 
 
 def trained(line: str) -> tuple[int, str] | None:
-    """Iterations and loss of the progress bar that training scripts derived from 3DGS's draw."""
+    """Iterations and loss in the progress bar of training scripts derived from 3DGS."""
     match, loss = _PROGRESS.search(line), _LOSS.search(line)
     return None if match is None else (int(match[1]), f"loss {loss[1]}" if loss else "")
 
 
 def rendered(line: str) -> int | None:
-    """Frames of the progress bar that render scripts derived from 3DGS's draw."""
+    """Frames in the progress bar of render scripts derived from 3DGS."""
     match = _DRAWN.search(line)
     return None if match is None else int(match[1])
 
@@ -290,15 +290,16 @@ def free_port() -> int:
 
 
 def _schedule(iterations: int) -> DensifySchedule:
-    """When splats are added in a run of this length: fractions of the published one, as in the native method."""
+    """Densification schedule of a run of this length, with the published fractions, as in the native method."""
     return DensifySchedule.of(SplatTraining(), Timeline(iterations, PAPER_ITERATIONS), white=True)
 
 
 def _first_round(schedule: DensifySchedule) -> int:
-    """Iteration after which their rounds begin; their code resets opacities at it, on white, however short the run.
+    """Iteration after which their densification begins; on white, their code resets opacities there in runs of any
+    length.
 
-    The native methods have no such reset in a short run. Where their first round comes later in any case, the start is
-    put at 0, which no iteration is.
+    The native methods have no such reset in a short run. If their first round is later in any case, the start is set
+    to 0, which is no iteration.
     """
     if schedule.first_reset is None and schedule.start < schedule.every:
         return 0
@@ -309,7 +310,7 @@ def _white(background: Sequence[float] | FloatArray, where: str) -> bool:
     """Whether a background is white. Raises `InputError` for one that is neither white nor black."""
     levels = [float(value) for value in background]
     if levels not in ([1.0] * 3, [0.0] * 3):
-        raise InputError(where, "background", "white or black; the code knows no others", str(tuple(levels)))
+        raise InputError(where, "background", "white or black, which the code supports", str(tuple(levels)))
     return levels[0] == 1.0
 
 

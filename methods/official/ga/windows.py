@@ -1,4 +1,4 @@
-"""Cameras for code that takes the middle of the image for the principal point: windows of the image, centred on it."""
+"""Windows of images centred on the principal point, for code that assumes it in the middle of the image."""
 
 from __future__ import annotations
 
@@ -39,39 +39,39 @@ class Window:
     top: int
 
     def cut(self, image: ByteArray) -> ByteArray:
-        """Content of a camera's image inside the box."""
+        """Crop of a camera's image to the box."""
         rows = slice(self.top, self.top + self.camera.height)
         return np.ascontiguousarray(image[rows, self.left : self.left + self.camera.width])
 
     def uncut(self, image: Image, camera: Camera) -> Image:
-        """The image of the camera, out of one of the box, which lies around it."""
+        """The image of the camera, cropped from one of the box around it."""
         rows = slice(-self.top, camera.height - self.top)
         return cast(Image, np.ascontiguousarray(image[rows, -self.left : camera.width - self.left]))
 
     def padded(self, image: ByteArray, fill: int) -> ByteArray:
-        """An image (H, W, C) of the camera inside the box, which lies around it, and ``fill`` beyond the image."""
+        """An image (H, W, C) of the camera, padded with ``fill`` to the box around it."""
         whole = np.full((self.camera.height, self.camera.width, image.shape[2]), fill, np.uint8)
         whole[-self.top : image.shape[0] - self.top, -self.left : image.shape[1] - self.left] = image
         return whole
 
 
 def inside(camera: Camera) -> Window:
-    """The largest window inside the image: what training is shown, since nothing is known beyond the image."""
+    """The largest window inside the image, for training, since nothing is known beyond the image."""
     return _window(camera, grow=False)
 
 
 def around(camera: Camera) -> Window:
-    """The smallest window around the image: what is rendered, and the image cut out of it again."""
+    """The smallest window around the image, for rendering; the image is cropped from it."""
     return _window(camera, grow=True)
 
 
 def check_square_pixels(camera: Camera, where: str) -> None:
-    """Raise `InputError` for a camera whose pixels are not square, or skewed, by so much that it shows."""
+    """Raise `InputError` for a camera with visibly non-square or skewed pixels."""
     K = np.asarray(camera.K, np.float64)
     off = max(abs(K[1, 1] / K[0, 0] - 1) * camera.height, abs(K[0, 1] / K[0, 0]) * camera.width) / 2
     if off > LARGEST_ERROR:
         found = f"focal lengths {K[0, 0]:.2f} and {K[1, 1]:.2f}, skew {K[0, 1]:.2f}"
-        raise InputError(where, f"camera {camera.id}", "square pixels; the code knows no others", found)
+        raise InputError(where, f"camera {camera.id}", "square pixels, which the code supports", found)
 
 
 def _window(camera: Camera, *, grow: bool) -> Window:
@@ -88,21 +88,22 @@ def _window(camera: Camera, *, grow: bool) -> Window:
 
 
 def _span(size: int, center: float, grow: bool) -> tuple[int, int, float]:
-    """Length and begin of a window along one axis, and how far right of its middle the principal point is.
+    """Length and start of a window along one axis, and the offset of the principal point to the right of its middle.
 
-    The last is a quarter of a pixel at most, since begins and ends are whole pixels.
+    The offset is at most a quarter of a pixel, since starts and ends are whole pixels.
     """
     shift = math.floor(size - 2 * center + 0.5)
     length = size + abs(shift) if grow else size - abs(shift)
     if length < 1:
         raise InputError("camera", "K", f"a principal point inside the image, {size} pixels", f"{center:.1f}")
-    # Shift > 0: the principal point lies left of the middle. Growing adds to the left, shrinking takes from the right.
+    # Shift > 0: the principal point lies left of the middle. Growing adds pixels at the left, shrinking removes them
+    # at the right.
     begin = (-shift if shift > 0 else 0) if grow else (0 if shift > 0 else -shift)
     return length, begin, center - begin - length / 2
 
 
 def _towards(direction: FloatArray) -> FloatArray:
-    """The smallest rotation that turns a direction into the optical axis."""
+    """The smallest rotation from a direction to the optical axis."""
     unit = direction / np.linalg.norm(direction)
     axis = np.cross(unit, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
@@ -130,7 +131,7 @@ def square(camera: Camera, side: int) -> Window:
 
 
 def square_side(cameras: Iterable[Camera]) -> int:
-    """The smallest side of a square window that `square` can put around the image of each camera."""
+    """The smallest side of a square window by `square` around the image of each camera."""
     cameras = list(cameras)
     shortest = max(max(camera.width, camera.height) for camera in cameras)
     return next(side for side in itertools.count(shortest) if all(_encloses(c, side) for c in cameras))
@@ -145,6 +146,6 @@ def _encloses(camera: Camera, side: int) -> bool:
 
 
 def _centred(center: float, side: int) -> tuple[int, float]:
-    """Begin of a window with a point in its middle, and how far right of the middle, half a pixel at most, it is."""
+    """Start of a window with a point in its middle, and the offset of the point to the right of the middle, at most half a pixel."""
     begin = math.floor(center - side / 2 + 0.5)
     return begin, center - begin - side / 2

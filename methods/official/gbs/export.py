@@ -1,7 +1,7 @@
-"""Videos in the form that GaussianBlendshapes' loader reads, which is Metrical Tracker's and INSTA's.
+"""Export of videos for GaussianBlendshapes' loader, in the format of Metrical Tracker and INSTA.
 
 ``checkpoint/00000.frame``, a torch file of numpy arrays for each frame; ``images/00000.png``, straight alpha;
-``canonical.obj``. Frames are numbered without a gap, and which is which is in a map of ours.
+``canonical.obj``. Frames are numbered without gaps; a separate map has their keys.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from ..method import Listed, Workplace, write_placeholder
 from ..video import cameras_at_rest, six_numbers, straight_rgba
 
 SOURCES = ("*.py", "config/*.py", "FLAME/*.py", "utils/*.py")
-"""Their program, which is run from a copy: it opens the eyelid bases beside its own file, whatever head it is given."""
+"""Their program, which is run from a copy because it opens the eyelid bases beside its own file."""
 BILLBOARDS = ("data/up_billboard_tri.obj", "data/down_billboard_tri.obj")
 MODEL_FILE, LANDMARKS_FILE = "data/FLAME2020/generic_model.pkl", "data/landmark_embedding.npy"
 BACK_FILE, NECK_FILE = "data/FLAME2020/back_of_head.txt", "data/FLAME2020/neck_exclude_vertex.txt"
@@ -48,9 +48,9 @@ MEDIAPIPE_FILE, MEDIAPIPE_LANDMARKS = "FLAME/mediapipe/mediapipe_landmark_embedd
 LANDMARKS = {"static_lmk": (51,), "dynamic_lmk": (79, 17)}
 LOADER, CONFIG = "FLAME/dataset.py", "config/config_blendshapes.py"
 TEXTURE_SIZE = 140
-"""Texture coefficients of a frame; loaded and never used."""
+"""Number of texture coefficients of a frame, which are loaded and never used."""
 GRIDS = {"WeightID_256.pt": "grid_id", "Weight5node_256.pt": "tar_feature"}
-"""Files of their look-up grids, and what is looked up."""
+"""Files of their look-up grids, and the values looked up."""
 
 
 def held_out(checkout: Checkout) -> int:
@@ -59,9 +59,9 @@ def held_out(checkout: Checkout) -> int:
 
 
 class VideoHead:
-    """A head model and one identity as their code is given them: teeth left out, the static offset in the template.
+    """A head model and one identity for their code: without teeth, with the static offset in the template.
 
-    Raises `InputError` where their code cannot take the head.
+    Raises `InputError` if their code does not support the head.
     """
 
     def __init__(self, subject: Subject, head: Any, checkout: Checkout):
@@ -71,13 +71,13 @@ class VideoHead:
         self._checkout = checkout.folder
         eyelids = read_npy(self._checkout / EYELID_FILES[0])
         self.is_flames = len(eyelids) == len(self.official.order)
-        """Whether vertices and triangles are FLAME's, so that what their code knows by number is right."""
+        """Whether vertices and triangles are FLAME's, so that indices in their code are valid."""
         if not self.is_flames:
             self._back = self._triangles("scalp")
             self._offset = self._mouth() - self._cylinder(checkout)
 
     def write_program(self, folder: Path) -> None:
-        """Write their program and the files that it opens by its working directory."""
+        """Write their program and the files that it opens relative to its working directory."""
         for pattern in SOURCES:
             for path in sorted(self._checkout.glob(pattern)):
                 name = path.relative_to(self._checkout).as_posix()
@@ -102,14 +102,14 @@ class VideoHead:
         self._write_lists(folder)
 
     def write_identity(self, folder: Path) -> None:
-        """Write the canonical mesh, and for heads that are not FLAME's where the mouth is."""
+        """Write the canonical mesh and, for heads other than FLAME's, the position of the mouth."""
         head, neutral = self.official, self.posed.neutral
         write_text(folder / "canonical.obj", obj_text(head.vertices(neutral), head.faces))
         if not self.is_flames:
             write_text(folder / "offset.txt", "{:.9g} {:.9g} {:.9g}\n".format(*self._offset))
 
     def frame(self, camera: Camera, pose: HeadPose) -> dict[str, dict[str, np.ndarray]]:
-        """Content of a frame's file, of a camera in the head's frame: arrays with a leading axis of one."""
+        """Content of a frame's file with the camera in the head's frame: arrays with a leading axis of one."""
         world, K = np.asarray(camera.world_to_camera, np.float64), np.asarray(camera.K, np.float64)
         eyelids = np.zeros(2) if pose.eyelids is None else pose.eyelids
         flame: dict[str, FloatArray] = {
@@ -121,7 +121,7 @@ class VideoHead:
             "eyelids": eyelids,
         }
         # PyTorch3D's camera, x to the left and y up, lengths in halves of the image's smaller side. It draws the mesh
-        # beside the renders; splats are projected by OpenCV's, which follows.
+        # beside the renders; splats are projected by the OpenCV camera below.
         turned = np.diag([-1.0, -1.0, 1.0])
         half = min(camera.width, camera.height) / 2
         middle = np.array([camera.width, camera.height]) / 2
@@ -139,7 +139,7 @@ class VideoHead:
         }
 
     def _write_lists(self, folder: Path) -> None:
-        """Triangles of the back of the head and vertices of the neck: theirs, or ours where the head is another."""
+        """Triangles of the back of the head and vertices of the neck: theirs for FLAME, else those of the head's regions."""
         if self.is_flames:
             for name in (BACK_FILE, NECK_FILE):
                 content = read_bytes(self._checkout / name, "a list of numbers", MOST_TEMPLATE)
@@ -150,7 +150,7 @@ class VideoHead:
             write_text(folder / name, "".join(f"{number}\n" for number in numbers))
 
     def _triangles(self, region: str) -> np.ndarray:
-        """Triangles of a region, by their numbers in their mesh."""
+        """Triangles of a region, by their indices in the exported mesh."""
         head = self.official.head
         faces_in_region(head, region)  # its error names what is missing
         inside = np.isin(self.official.order, head.regions[region])
@@ -166,7 +166,7 @@ class VideoHead:
         """(3,) middle of the box around the teeth, metres."""
         head = with_teeth_where_possible(head_arrays(self.official.head))
         if "teeth" not in head.regions:
-            expected = "lips, behind which their code puts teeth"
+            expected = "lips, behind which their code places teeth"
             raise InputError(f"head model {head.version!r}", "regions", expected, "none")
         offset = np.zeros((len(head.template), 3))
         offset[: len(self.identity.static_offset)] = self.identity.static_offset
@@ -175,7 +175,7 @@ class VideoHead:
 
     @staticmethod
     def _cylinder(checkout: Checkout) -> FloatArray:
-        """(3,) the middle of the room that their teeth are held in, metres."""
+        """(3,) middle of the volume to which their teeth are limited, metres."""
         numbers = checkout.constant(CONFIG, r"cylinder_params = \[([^\]]+)\]", "cylinder_params")
         return np.array([float(number) for number in numbers.split(",")[:3]])
 
@@ -183,10 +183,10 @@ class VideoHead:
 def write_training(
     clip: Clip, head: VideoHead, placeholders: int, work: Workplace, progress: Progress
 ) -> dict[str, FrameKey]:
-    """Write the training frames as a video, and behind them the frames that their loader holds out: placeholders.
+    """Write the training frames as a video, followed by placeholders for the frames that their loader holds out.
 
     A placeholder has an image of one pixel, and pose and camera of the first training frame. Returns the key of every
-    other image by its place.
+    other image by its path.
     """
     keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
     views = [(clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys]
@@ -209,8 +209,8 @@ def write_training(
 def write_list(frames: Sequence[Listed], head: VideoHead, work: Workplace) -> None:
     """Write frames to render as a video whose images are marks, see `..ga.export.mark`.
 
-    Their renderer fills two look-up grids of 256^3 nodes first, which takes minutes, and reads all that it needs of them
-    from the checkpoint instead. Grids of one node, in the files that it keeps them in, spare it that.
+    Their renderer first fills two look-up grids of 256^3 nodes, which takes minutes, although it reads the required
+    values from the checkpoint. Grids of one node in its cache files avoid that.
     """
     head.write_identity(work.input)
     cameras = cameras_at_rest(head.posed, [(frame.camera, frame.pose) for frame in frames])
@@ -226,17 +226,17 @@ def write_list(frames: Sequence[Listed], head: VideoHead, work: Workplace) -> No
 
 
 def image_name(number: int) -> str:
-    """Place of a frame's image."""
+    """Path of a frame's image."""
     return f"images/{number:05d}.png"
 
 
 def frame_name(number: int) -> str:
-    """Place of a frame's parameters."""
+    """Path of a frame's parameters."""
     return f"checkpoint/{number:05d}.frame"
 
 
 def write_torch(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a file for ``torch.load`` whose numpy arrays every version of numpy reads."""
+    """Write a file for ``torch.load`` with numpy arrays that every version of numpy can read."""
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         torch.save(dict(content), stream, pickle_module=_ArrayPickles)
 

@@ -44,10 +44,10 @@ FILES = {
         "acc": ".npy",
     }.items()
 }
-"""What their renderer opens, by the begin of its name, which goes on with the iteration; and what we call it."""
+"""Prefixes of the files that their renderer opens, which end in the iteration, and their stored names."""
 BACKGROUND_FILE = "background.json"
 MODEL_SOURCE, GRID_NODES = "FLAME/face_gs_model.py", 256
-"""Where their code fills grids of the nearest triangles and of skinning weights, and nodes a side of either."""
+"""Places in their code that fill grids of nearest triangles and skinning weights, and number of nodes per side."""
 SHRINK = """
 import sys, torch
 for path in sys.argv[1:]:
@@ -55,10 +55,10 @@ for path in sys.argv[1:]:
     kept = tuple({} if isinstance(part, dict) and "param_groups" in part else part for part in state)
     torch.save((kept, iteration), path)
 """
-"""Takes the optimiser's state out of checkpoints, two thirds of them, which their renderer opens and drops."""
+"""Removes the optimiser's state, two thirds of their size, from checkpoints, since their renderer ignores it."""
 
 WITHOUT_FIX = "2952da7d246e5790140dbb477d1468214564f092"
-"""The commit that this adapter was written for."""
+"""The commit that the adapter was written for."""
 
 
 class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
@@ -75,15 +75,15 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
             *("simple_knn._C", "point_cloud_utils", "plyfile", "cv2", "tqdm", "numpy"),
         ),
         "from diff_gaussian_rasterization import RotSH3_C3, CompositeBlendShape, InvMat3x3",
-        "Its rasteriser and its simple-knn have the names of others': install those of its own submodules folder, in an "
-        "environment of their own.",
+        "Its rasteriser and its simple-knn have the same names as others: install those of its submodules folder in a "
+        "separate environment.",
     )
     shimmed = "blendshapes"
-    # Their frames and checkpoints hold more than tensors, which newer versions of torch read only where they are told to.
+    # Their frames and checkpoints contain more than tensors, which newer versions of torch read only if requested.
     variables: ClassVar[Mapping[str, str]] = {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
-        """Refuse a clip without masks, and a head that their code cannot take."""
+        """Refuse a clip without masks, and a head that their code does not support."""
         check_masks(clip)
         held_out(checkout)
         VideoHead(Subject.of(clip), clip.head, checkout)
@@ -91,13 +91,13 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
     def export(
         self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
     ) -> dict[str, FrameKey]:
-        """The training frames as a tracked video, their program beside the files that it opens."""
+        """Write the training frames as a tracked video, and their program with the files that it opens."""
         head = VideoHead(Subject.of(clip), clip.head, checkout)
         head.write_program(work.program)
         return write_training(clip, head, held_out(checkout), work, progress)
 
     def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
-        """Their script, with densification and the fall of the learning rate on the course of a run of this length."""
+        """Their script, with densification and decay of the learning rate scaled to the length of the run."""
         iterations = fit.budget.iterations or 0
         published = BlendshapeTraining()
         timeline = Timeline(iterations, published.schedule_length)
@@ -110,38 +110,38 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
             "--densify_from_iter": schedule.start,
             "--densification_interval": schedule.every,
             "--densify_until_iter": max(0, schedule.stop),
-            "--opacity_reset_interval": schedule.prune_extent_from,  # opacities are never reset; sizes are cut from then on
+            "--opacity_reset_interval": schedule.prune_extent_from,  # opacities are never reset; large splats are removed from then on
             "--checkpoint_iterations": iterations,
-            "--test_iterations": 0,  # their own scores of held-out frames, which are placeholders
+            "--test_iterations": 0,  # their own evaluation of held-out frames, which are placeholders
         }
         words = [str(word) for pair in options.items() for word in pair]
         return [*checkout.python, str(work.program / "train.py"), *words]
 
     def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
-        """Coarser look-up grids: their C++ code fills 256^3 nodes in minutes, stand-ins take hours."""
+        """Coarser look-up grids: their C++ code fills 256^3 nodes in minutes, the stand-ins in hours."""
         return [
             (MODEL_SOURCE, f"N_res{grid} = {GRID_NODES}\n", f"N_res{grid} = {GRID_NODES // 2}\n")
             for grid in (1, 2)
         ]
 
     def patches_for_order(self) -> list[Patch]:
-        """They draw the number of a frame; the one that is due takes its place."""
+        """They draw the index of a frame at random; it is replaced by the next of the given order."""
         drawn = "viewpoint_stack.pop(random.randint(0, len(viewpoint_stack)-1))"
         return [("train.py", drawn, "int(images_in_order[iteration - 1])")]
 
     def image_name(self, path: str) -> str:
-        """The number of a frame."""
+        """The index of a frame."""
         return str(int(Path(path).stem))
 
     def shrink_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str] | None:
-        """Run in their interpreter, on the device that the tensors are to be read back to."""
+        """Run in their interpreter, on the device to which tensors are loaded."""
         names = [
             f"{name}{fit.budget.iterations}.pth" for name, ours in FILES.items() if ours.endswith(".pth")
         ]
         return [*checkout.python, "-c", SHRINK, *(str(work.model / name) for name in names)]
 
     def done(self, line: str) -> tuple[int, str] | None:
-        """From the progress bar of their training."""
+        """Parse the progress bar of their training."""
         return trained(line)
 
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
@@ -151,7 +151,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         return {}
 
     def files(self, folder: Path) -> list[Path]:
-        """Splats, what their differences begin with, and the subject."""
+        """Splats, initial values of their differences, and the subject."""
         return [folder / name for name in (*FILES.values(), SUBJECT_FILE)]
 
     def write_list(
@@ -162,18 +162,18 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         checkout: Checkout,
         work: Workplace,
     ) -> None:
-        """The frames as a video, and a model folder that leads to the avatar's files."""
+        """Write the frames as a video, and a model folder with links to the avatar's files."""
         model = read_shared_head(folder)
         head = VideoHead(read_subject(folder / SUBJECT_FILE, model), model, checkout)
         head.write_program(work.program)
         write_list(frames, head, work)
         for name, ours in FILES.items():
-            # Gigabytes, which are read alone.
+            # Gigabytes, which are only read.
             (work.model / f"{name}1{Path(ours).suffix}").symlink_to((folder / ours).absolute())
         write_json(work.root / BACKGROUND_FILE, {"background": [float(level) for level in background]})
 
     def render_command(self, folder: Path, checkout: Checkout, work: Workplace) -> list[str]:
-        """Their script for all frames of a video, whatever split their loader takes them for."""
+        """Their script for all frames of a video, regardless of their loader's split."""
         options: dict[str, Any] = {
             "--source_path": work.input,
             "--model_path": work.model,
@@ -186,11 +186,11 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         return [*checkout.python, str(work.program / "test.py"), *words]
 
     def drawn(self, line: str) -> int | None:
-        """From the progress bar of their renderer."""
+        """Parse the progress bar of their renderer."""
         return rendered(line)
 
     def render_folder(self, folder: Path, work: Workplace) -> Path:
-        """Renders of the whole video, and what is written beside them."""
+        """Renders of the whole video, and the files beside them."""
         return work.model / "seq" / "split_1"
 
     def render_name(self, number: int) -> str:
@@ -198,11 +198,11 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         return f"pred_{number:05d}.png"
 
     def is_render(self, name: str) -> bool:
-        """Not the ground truth, meshes, masks and mouths that their script writes into the same folder."""
+        """Excludes the ground truth, meshes, masks and mouths that their script writes into the same folder."""
         return name.startswith("pred_") and not name.startswith("pred_mask_")
 
     def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
-        """A render on black and its coverage, put on the background asked for, once the ground truth shows the frame."""
+        """A render on black, composited on the background by its coverage, after its frame is verified by the ground truth."""
         number = path.name.removeprefix("pred_")
         check_mark(path.with_name(f"gt_{number}"), frame.number)
         parts = []
@@ -217,10 +217,10 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         return Frame(np.clip(rgb + (1 - alpha[..., None]) * ground, 0, 1), alpha)
 
     def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """Notes for readers of results."""
+        """Leaks and differences, for readers of results."""
         differences = [
-            "frames are numbered anew; those at the end, which their code holds out, are placeholders of one pixel",
-            "the background is taken out of half-covered pixels, and the static offset is part of the template",
+            "frames are renumbered; those at the end, which their code holds out, are placeholders of one pixel",
+            "the background is removed from partly covered pixels, and the static offset is part of the template",
         ]
         if clip.head.expression_basis.shape[2] < EXPRESSION_SIZE:
             size = clip.head.expression_basis.shape[2]

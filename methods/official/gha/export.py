@@ -1,4 +1,4 @@
-"""Captures and lists of frames in the form that Gaussian Head Avatar's datasets read."""
+"""Export of captures and lists of frames for Gaussian Head Avatar's datasets."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ..ga.windows import Window, square, square_side
 from ..method import Listed, Workplace
 
 MOUTH_ROWS = slice(48, 66)
-"""Landmarks that their code takes for the mouth, about which it adds points; it gives no other landmark a meaning."""
+"""Landmarks of the mouth in their code, around which it adds points; other landmarks have no special role."""
 COARSE = 256
 """Side of the images for the mesh head, as their preprocessing writes them."""
 MARK_SIDE = 8
@@ -33,7 +33,7 @@ IMAGES, PARAMETERS, CAMERAS = "images", "params", "cameras"
 
 @dataclass(frozen=True, eq=False)
 class GHATracking:
-    """Tracked parameters of one subject as their code reads them: those of the native method.
+    """Tracked parameters of one subject for their code, as in the native method.
 
     A point of the canonical head is ``R (S x) + T`` in the world: R, T of the head's root and neck, S metres a unit.
 
@@ -49,7 +49,7 @@ class GHATracking:
 
     @classmethod
     def of(cls, head: HeadAsset, subject: Subject) -> GHATracking:
-        """Landmarks of a subject. Raises `InputError` for a head model without a face or lips."""
+        """Landmarks of a subject. Raises `InputError` for a head model without face or lips."""
         if not len(head.regions.get("lips", ())):
             known = ", ".join(sorted(head.regions)) or "no regions"
             raise InputError(f"head model {head.version!r}", "regions", "a region 'lips'", known)
@@ -86,10 +86,10 @@ class GHATracking:
 def write_training(
     clip: Clip, tracking: GHATracking, work: Workplace, progress: Progress
 ) -> dict[str, FrameKey]:
-    """Write the training frames alone: timesteps and cameras numbered from 0. Returns the key of every image.
+    """Write only the training frames, with timesteps and cameras numbered from 0. Returns the key of every image.
 
-    Files are PNG under the names that their loader asks for, which end in ``.jpg``; it knows an image by its content.
-    Beyond the image's border nothing is ``visible``, so that no loss is taken there.
+    Files are PNG under the names of their loader, which end in ``.jpg``; it detects the format by content. Nothing
+    beyond the image's border is ``visible``, so there is no loss.
     """
     side, frames = training_side(clip), whole_timesteps(clip)
     names = sorted({key.camera for key in clip.splits["train"]})
@@ -109,7 +109,7 @@ def write_training(
             folder = work.input / PARAMETERS / frame
             save_npz(folder / "params.npz", tracking.parameters(clip.poses[timestep]))
             _save_array(folder / "lmk_3d.npy", tracking.landmarks(clip.poses[timestep]))
-            # All points stand among the landmarks; of these vertices their loader would take each hundredth besides.
+            # All points are landmarks; their loader would add every hundredth of these vertices.
             _save_array(folder / "vertices.npy", np.zeros((0, 3), np.float32))
     return images
 
@@ -117,11 +117,11 @@ def write_training(
 def write_list(
     frames: Sequence[Listed], tracking: GHATracking, side: int, work: Workplace
 ) -> list[tuple[Path, list[int]]]:
-    """Write frames to render, those of each camera in a folder of their own; return the folders and frame numbers.
+    """Write frames to render, with a folder for each camera; return the folders and frame numbers.
 
-    Their renderer halves the way from what it showed before to each frame's expression and pose. What is written lies as
-    far beyond the frame, so that it arrives at the frame itself. It writes the image beside the render: here a mark that
-    tells the frame's number.
+    Their renderer shows the mean of the previous parameters and those of the frame. The parameters written are
+    extrapolated so that this mean is the frame's own. It writes the image beside the render, here a mark that encodes
+    the frame's number.
     """
     groups: dict[tuple[Any, ...], list[Listed]] = {}
     for frame in frames:
@@ -131,7 +131,9 @@ def write_list(
     written = []
     with grouped_writes():
         for index, group in enumerate(groups.values()):
-            folder = work.input / f"camera_{index:04d}"  # a number would not be a name to their configuration
+            folder = (
+                work.input / f"camera_{index:04d}"
+            )  # their configuration does not accept a number as a name
             write_camera(folder / "camera.npz", square(group[0].camera, side).camera)
             shown: dict[str, FloatArray] = {}
             for place, frame in enumerate(group):
@@ -144,9 +146,9 @@ def write_list(
 
 
 def overshot(wanted: Mapping[str, FloatArray], shown: dict[str, FloatArray]) -> dict[str, FloatArray]:
-    """Parameters that a renderer which shows half of them and half of what it showed before takes to those wanted.
+    """Parameters from which a renderer that averages with the previous ones gets those wanted.
 
-    ``shown`` is what it showed before, empty at first; what it shows then is put there, with its rounding.
+    ``shown`` has the previous parameters, initially none, and is updated with rounding.
     """
     given: dict[str, FloatArray] = {name: np.asarray(value, np.float32) for name, value in wanted.items()}
     half = np.float32(0.5)
@@ -166,12 +168,12 @@ def write_camera(path: Path, camera: Camera) -> None:
 
 
 def training_side(clip: Clip) -> int:
-    """Side of the square images that all training cameras have."""
+    """Side of the square images of all training cameras."""
     return square_side(clip.cameras[name] for name in {key.camera for key in clip.splits["train"]})
 
 
 def whole_timesteps(clip: Clip) -> dict[int, dict[str, FrameKey]]:
-    """Training frames by timestep and camera. Raises `InputError` for a timestep that some camera does not show."""
+    """Training frames by timestep and camera. Raises `InputError` for a timestep that some camera lacks."""
     names = sorted({key.camera for key in clip.splits["train"]})
     frames: dict[int, dict[str, FrameKey]] = {}
     for key in sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera)):
@@ -179,8 +181,8 @@ def whole_timesteps(clip: Clip) -> dict[int, dict[str, FrameKey]]:
     for timestep, keys in frames.items():
         missing = [name for name in names if name not in keys]
         if missing:
-            expected = f"a training frame of each of {len(names)} cameras; their loader asks for all of them"
-            remedy = "Leave the timestep or the camera out of the capture."
+            expected = f"a training frame of each of {len(names)} cameras, which their loader requires"
+            remedy = "Remove the timestep or the camera from the capture."
             raise InputError(
                 f"clip {clip.subject}",
                 f"timestep {timestep}",
@@ -192,9 +194,10 @@ def whole_timesteps(clip: Clip) -> dict[int, dict[str, FrameKey]]:
 
 
 def _images(clip: Clip, key: FrameKey, window: Window) -> dict[str, ByteArray]:
-    """Files of a frame that their loaders read, by the first part of the name.
+    """Files of a frame for their loaders, by prefix of the name.
 
-    The mask of the second stage is white: it serves to lay images on white, which they lie on already.
+    The mask of the second stage, which serves to composite images on white, is white because images are already on
+    white.
     """
     image = clip.image(key)
     mask = clip.mask(key)
@@ -212,7 +215,7 @@ def _images(clip: Clip, key: FrameKey, window: Window) -> dict[str, ByteArray]:
 
 
 def _resized(image: Any, side: int) -> Any:
-    """A square image at another size: area means where it shrinks, linear where it grows."""
+    """A square image at another size: area means when shrinking, linear when growing."""
     if image.shape[0] == side:
         return image
     how = cv2.INTER_AREA if side < image.shape[0] else cv2.INTER_LINEAR
@@ -220,7 +223,7 @@ def _resized(image: Any, side: int) -> Any:
 
 
 def read_render(path: Path, frame: Listed, side: int, rendered: int) -> tuple[ByteArray, FloatArray]:
-    """The image beside a render, and the render (H, W, 3) in [0, 1] at its camera's size.
+    """The image beside a render, and the (H, W, 3) render in [0, 1] at its camera's size.
 
     Raises `InputError` for a file that is not two squares of ``rendered`` pixels.
     """

@@ -50,7 +50,7 @@ NETWORKS = ("gaussianhead_latest", "supres_latest")
 SIDE_FILE = "square.json"
 TETRAHEDRA = "assets/tets_data.npz"
 RENDERED = 2048
-"""Side of their renders: 512 splatted pixels, which their renderer fixes, and four times as many after it."""
+"""Side of their renders: four times 512 splatted pixels, a constant of their renderer."""
 MOST_SIDE, MOST_LAUNCHER, SHORTEST = 1 << 15, 1 << 16, 2
 _DONE = re.compile(r"^headbench: iteration (\d+) loss ([\d.]+|nan|inf)")
 _DRAWN = re.compile(r"^headbench: drawn (\d+)")
@@ -64,7 +64,7 @@ GHA_REPOSITORY = Repository(
         *("simple_knn._C", "lpips", "yacs.config", "einops", "tensorboardX", "prefetch_generator"),
         *("skimage.io", "cv2", "tqdm"),
     ),
-    downloads={TETRAHEDRA: "Download it from the link on the repository's page, and put it there."},
+    downloads={TETRAHEDRA: "Download it from the link on the repository's page, and save it there."},
 )
 
 
@@ -75,18 +75,20 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
     config_class, repository = GHAOfficialConfig, GHA_REPOSITORY
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
-        """Refuse other backgrounds than white, skewed pixels, timesteps with cameras missing, a head without a face."""
+        """Check that the background is white, pixels are not skewed, timesteps have all cameras and the head has a face."""
         where = f"clip {clip.subject}"
         _check_white(clip.background, where)
         for name in sorted({key.camera for keys in clip.splits.values() for key in keys}):
             skew = abs(float(clip.cameras[name].K[0, 1]))
             if skew > 1e-3 * float(clip.cameras[name].K[0, 0]):
-                raise InputError(where, f"camera {name}", "no skew; the code knows none", f"{skew:.2f}")
+                raise InputError(
+                    where, f"camera {name}", "no skew, which the code does not support", f"{skew:.2f}"
+                )
         whole_timesteps(clip)
         GHATracking.of(clip.head, Subject.of(clip))
 
     def check_length(self, iterations: int, checkout: Checkout) -> None:
-        """Refuse a run without an iteration for each of the two stages."""
+        """Refuse a run with less than an iteration for each of the two stages."""
         if iterations < SHORTEST:
             expected = f"{SHORTEST} or more, one for each stage"
             raise InputError(f"settings.{self.name}", "budget.iterations", expected, f"{iterations}")
@@ -94,14 +96,14 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
     def export(
         self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
     ) -> dict[str, FrameKey]:
-        """The training frames in their layout; the tetrahedra where their program looks for them."""
+        """Write the training frames in their layout, and the tetrahedra file."""
         target = work.program / TETRAHEDRA
         target.parent.mkdir(parents=True)
         os.symlink(checkout.folder / TETRAHEDRA, target)
         return write_training(clip, GHATracking.of(clip.head, Subject.of(clip)), work, progress)
 
     def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
-        """Both of their scripts, one after the other, by the launcher."""
+        """Both of their scripts, run one after the other by the launcher."""
         mesh, gaussians = self._lengths(fit.budget.iterations or 0)
         clip = fit.clip
         cameras = len({key.camera for key in clip.splits["train"]})
@@ -147,19 +149,19 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
         return self._staged(checkout, work, parts, fit.seed)
 
     def done(self, line: str) -> tuple[int, str] | None:
-        """From the launcher, which counts both stages."""
+        """Parse the output of the launcher, which counts both stages."""
         match = _DONE.search(line)
         return None if match is None else (int(match[1]), f"loss {match[2]}")
 
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
-        """Their Gaussians with the networks that drive them, and super-resolution."""
+        """Keep their Gaussians with the networks that drive them, and super-resolution."""
         for name in NETWORKS:
             copy_file(_checkpoints(work, "gaussianhead") / name, fit.out / name)
         write_json(fit.out / SIDE_FILE, {"side": training_side(fit.clip)})
         return {}
 
     def files(self, folder: Path) -> list[Path]:
-        """Gaussians, networks, subject, and the side of the images that it was trained on."""
+        """Gaussians, networks, subject, and the side of the training images."""
         return [folder / name for name in (*NETWORKS, SUBJECT_FILE, SIDE_FILE)]
 
     def write_list(
@@ -170,7 +172,7 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
         checkout: Checkout,
         work: Workplace,
     ) -> None:
-        """The frames of each camera as an application of their own, all run by the launcher."""
+        """Write the frames of each camera as a separate application, all run by the launcher."""
         _check_white(background, "render")
         head = read_shared_head(folder)
         tracking = GHATracking.of(head, read_subject(folder / SUBJECT_FILE, head))
@@ -214,7 +216,7 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
         return None if match is None else int(match[1])
 
     def render_folder(self, folder: Path, work: Workplace) -> Path:
-        """Folder that the launcher writes them to."""
+        """Output folder of the launcher."""
         return work.model / "renders"
 
     def render_name(self, number: int) -> str:
@@ -222,26 +224,26 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
         return f"{number:06d}.png"
 
     def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
-        """A render, once the image beside it has shown which frame it is."""
+        """A render, after its frame is verified by the image beside it."""
         beside, render = read_render(path, frame, _side(work.root), RENDERED)
         check_mark_in(beside, path, frame.number)
         return opaque_colours(render)
 
     def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """Notes for readers of results."""
+        """Leaks and differences, for readers of results."""
         side = training_side(clip)
         codes = code_size(clip.head)
         differences = [
-            "the capture has no held-out frames in it; cameras and timesteps are numbered anew",
-            f"the head model's {codes} values of expression, jaw, eyes and eyelids stand for 64 expression coefficients "
-            + "of the Basel Face Model; the networks' first layers are as wide as that needs",
+            "the capture has no held-out frames; cameras and timesteps are renumbered",
+            f"the head model's {codes} values of expression, jaw, eyes and eyelids replace the 64 expression coefficients "
+            + "of the Basel Face Model; the first layers of the networks have the width that this requires",
             "landmarks are vertices of the head model: 48 of the face, 18 of the lips, and more of the face in place of "
             + "each hundredth vertex of the Basel Face Model",
-            f"images are laid in squares of {side} pixels with the principal point in the middle; nothing beyond the "
-            + f"image's border enters a loss. Their loader takes squares to {RENDERED} pixels; renders are taken back",
+            f"images are placed in squares of {side} pixels with the principal point in the middle; nothing beyond the "
+            + f"image's border enters a loss. Their loader resizes squares to {RENDERED} pixels; renders are resized back",
             "images and renders are PNG in place of JPEG; their renderer rounds down to 8 bits",
-            "the mask of the second stage is white: images lie on white already",
-            "training ends after a number of iterations, which the authors' does not",
+            "the mask of the second stage is white because images are already on white",
+            "training ends after a number of iterations, unlike the authors'",
             "renders show listed poses; the authors' smooths them over time",
         ]
         return {"leaks": [], "differences": differences}
@@ -299,7 +301,7 @@ def _networks(codes: int, *, mesh: bool) -> dict[str, Any]:
 
 
 def _recorder(name: str, work: Workplace, iterations: int) -> dict[str, Any]:
-    """Checkpoints after the first iteration and the last; pictures of the first alone."""
+    """Checkpoints after the first and last iteration; images only after the first."""
     return {
         "name": name,
         "logdir": str(work.model / "log" / name),
@@ -325,4 +327,4 @@ def _side(folder: Path) -> int:
 def _check_white(background: Sequence[float] | Any, where: str) -> None:
     levels = [float(value) for value in background]
     if levels != [1.0] * 3:
-        raise InputError(where, "background", "white; the code knows no other", str(tuple(levels)))
+        raise InputError(where, "background", "white, which the code supports", str(tuple(levels)))

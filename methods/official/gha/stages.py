@@ -1,8 +1,8 @@
-"""Runs scripts of Gaussian Head Avatar's authors, each for as long as it is told; copied to where they run.
+"""Runs scripts of Gaussian Head Avatar's authors for given numbers of iterations; copied to their working directory.
 
-Their training has no number of iterations, and their renderer writes JPEG beside the image it was given. A plan (JSON)
-lists scripts and configurations; each runs in a process of its own, by the interpreter that runs this file. Nothing but
-the standard library is needed here, and Python 3.8.
+Their training has no number of iterations, and their renderer writes JPEG beside its input image. A plan (JSON) lists
+scripts and configurations; each runs in a separate process of the same interpreter. This file requires only Python 3.8
+and the standard library.
 """
 
 import json
@@ -38,7 +38,7 @@ def main():
 
 
 def run(checkout, seed, part):
-    """One script with its configuration, until it ends or its iterations are done."""
+    """Run one script with its configuration until it ends or its iterations are done."""
     script = part["script"]
     sys.path.insert(0, checkout)
     sys.argv = [os.path.join(checkout, script), "--config", part["config"]]
@@ -53,7 +53,7 @@ def run(checkout, seed, part):
 
 
 def seeded(seed):
-    """Seed what draws numbers in their code."""
+    """Seed the random number generators of their code."""
     import torch
 
     random.seed(seed)
@@ -61,7 +61,7 @@ def seeded(seed):
 
 
 def bounded(script, part):
-    """End a training after its last iteration is recorded; their number of epochs sets no other end."""
+    """End a training after its last iteration is recorded, since their code has only a number of epochs."""
     import importlib
 
     recorder = getattr(importlib.import_module("lib.recorder.Recorder"), RECORDERS[script])
@@ -75,7 +75,7 @@ def bounded(script, part):
         loss = next(float(values[name]) for name in LOSSES if name in values)
         print(f"\nheadbench: iteration {part['before'] + done} loss {loss:.4f}", flush=True)
         if done == part["iterations"]:
-            # Not by an exception: the threads of their loader wait for somebody to take what they have read.
+            # An exception would not end the process: the threads of their loader wait for a consumer.
             sys.stdout.flush()
             os._exit(0)
 
@@ -84,7 +84,7 @@ def bounded(script, part):
 
 
 def numbered(part):
-    """Write renders as PNG, by the numbers that the plan gives to the frames of this camera."""
+    """Write renders as PNG, named by the numbers of the frames of this camera in the plan."""
     import cv2
 
     write = cv2.imwrite

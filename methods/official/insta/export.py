@@ -1,8 +1,8 @@
-"""Videos and lists of frames in the form that INSTA's program reads, which is that of Metrical Tracker with ``generate.sh``.
+"""Export of videos and lists of frames for INSTA's program, in the format of Metrical Tracker with ``generate.sh``.
 
 ``transforms_train.json`` (camera-to-world with OpenCV's axes, metres; intrinsics of each frame), ``images`` with straight
 alpha, ``meshes``, ``flame/exp``, ``depth`` (16 bits, millimetres), ``seg_mask`` (a class in the red channel),
-``canonical.obj``; and ``mesh_masks``, which the program opens by its working directory. The head stands still.
+``canonical.obj``; and ``mesh_masks``, which the program opens relative to its working directory. The head stands still.
 """
 
 from __future__ import annotations
@@ -50,24 +50,26 @@ MASKS: Mapping[str, tuple[str, ...]] = {
     "boundary": ("boundary",),
     "face": ("face",),
 }
-"""Their meshes that tell a region by red vertices, and our regions; a vertex of several belongs to the first."""
+"""Their meshes that mark a region by red vertices, and regions of the head; a vertex of several belongs to the
+first."""
 MASK_FOLDER = "mesh_masks"
 SKIN, MOUTH, HAIR = 250, 140, 80
-"""Classes of pixels: losses of the mouth weigh more, and up to 90 there is no loss of depth."""
+"""Classes of pixels: losses of the mouth have a larger weight, and classes up to 90 have no depth loss."""
 CONDITIONS = 16
-"""Expression coefficients that the network reads; their program takes for granted that a file has as many."""
+"""Expression coefficients that the network reads; their program assumes that a file has as many."""
 REACH = 0.45
-"""Metres from the head's origin: their scene is a cube of one metre, and there has to be room about the head."""
+"""Maximum distance of vertices from the head's origin, metres: their scene is a cube of one metre, with a margin
+around the head."""
 MILLIMETRES, FARTHEST = 1000, 65_535
 TRAIN, TEST, CANONICAL = "transforms_train.json", "transforms_test.json", "canonical.obj"
 PLACEHOLDER = "images/placeholder.png"
 PART = 1000
-"""Frames to render in one call: meshes of all lie in the GPU's memory."""
+"""Maximum number of frames in one call, since all their meshes are in GPU memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class VideoMesh:
-    """A head model and one identity as their program is given them: meshes without teeth, the static offset in them.
+    """A head model and one identity for their program: meshes without teeth, with the static offset.
 
     Attributes
     ----------
@@ -92,7 +94,7 @@ class VideoMesh:
 
     @classmethod
     def of(cls, subject: Subject, head: HeadAsset, checkout: Checkout) -> VideoMesh:
-        """Raises `InputError` for a head that is not where their scene is."""
+        """Raises `InputError` for a head outside their scene."""
         posed = PosedSubject(head, subject.shape, subject.static_offset)
         kept = np.setdiff1d(np.arange(len(head.template)), head.regions.get("teeth", []))
         farthest = float(np.abs(posed.neutral[kept]).max())
@@ -120,7 +122,7 @@ class VideoMesh:
             write_bytes(folder / MASK_FOLDER / f"{name}.obj", content)
 
     def write_canonical(self, folder: Path) -> None:
-        """Write the mesh that the field is about: no expression, the jaw open as the tracker leaves it."""
+        """Write the canonical mesh: no expression, with the jaw opened as by the tracker."""
         rest, still = np.zeros(3), np.zeros(self.head.expression_basis.shape[2])
         jaw = np.array([InstaConfig().jaw_opening, 0.0, 0.0])
         pose = HeadPose(self.head.version, still, rest, rest, jaw, np.zeros(6), rest)
@@ -131,7 +133,7 @@ class VideoMesh:
         write_text(path, _vertices(vertices[self.kept]) + _triangles(self.faces))
 
     def write_poses(self, folder: Path, poses: Mapping[str, HeadPose]) -> None:
-        """Write mesh and expression of each frame, by the frame's name; an equal pose is written once and linked to."""
+        """Write mesh and expression of each frame, by the frame's name; equal poses are written once and linked."""
         at_rest = {name: pose_in_head_frame(pose) for name, pose in poses.items()}
         first: dict[bytes, str] = {}
         for name, pose in at_rest.items():
@@ -176,17 +178,17 @@ def _masks(head: HeadAsset, kept: IntArray, faces: IntArray, neutral: FloatArray
 
 
 def mesh_name(name: str) -> str:
-    """Place of a frame's mesh; their program takes frames in the order of these."""
+    """Path of a frame's mesh; their program orders frames by these names."""
     return f"meshes/{name}.obj"
 
 
 def expression_name(name: str) -> str:
-    """Place of a frame's expression coefficients."""
+    """Path of a frame's expression coefficients."""
     return f"flame/exp/{name}.txt"
 
 
 def frame_name(number: int) -> str:
-    """Name of a frame in a folder; names are in the order of numbers."""
+    """Name of a frame in a folder; names sort by number."""
     return f"{number:06d}"
 
 
@@ -197,11 +199,11 @@ def check_camera(camera: Camera) -> None:
 
 
 def write_training(clip: Clip, head: VideoMesh, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
-    """Write the training frames, and as the split that their program renders in the end one that shows nothing.
+    """Write the training frames, and a placeholder as the split that their program renders at the end.
 
-    It has an image of one pixel, and pose and camera of the first training frame. Depths and classes of pixels are
-    those of the mesh, where theirs are of a tracker and of a network that parses faces. Returns the key of every other
-    image by its place.
+    The placeholder has an image of one pixel, and pose and camera of the first training frame. Depths and classes of
+    pixels are those of the mesh instead of those of a tracker and a face parsing network. Returns the key of every
+    other image by its path.
     """
     keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
     views = [(clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys]
@@ -230,7 +232,7 @@ def write_training(clip: Clip, head: VideoMesh, work: Workplace, progress: Progr
 
 
 class _Surfaces:
-    """Parts of the mesh that pixels of a clip's frames show."""
+    """Parts of the mesh visible in the pixels of a clip's frames."""
 
     def __init__(self, head: VideoMesh):
         self._posed = head.posed
@@ -240,9 +242,9 @@ class _Surfaces:
         self._last: tuple[bytes, PosedSurface] | None = None
 
     def seen(self, pose: HeadPose, camera: Camera, coverage: ByteArray) -> tuple[ByteArray, np.ndarray]:
-        """(H, W, 3) class in the red channel and (H, W) uint16 depth, millimetres along the axis; 0 where nothing is.
+        """(H, W, 3) class in the red channel and (H, W) uint16 depth, millimetres along the axis; 0 for background.
 
-        Hair where there is coverage beside the mesh.
+        Covered pixels beside the mesh are hair.
         """
         rows, columns = np.nonzero(coverage)
         rays = camera_rays(camera, columns, rows, 0.0)
@@ -266,7 +268,8 @@ class _Surfaces:
 def record(name: str, camera: Camera, image: str, *, height: int | None = None) -> dict[str, Any]:
     """A frame of their JSON, its camera in the head's frame.
 
-    ``height`` is that of the image where it is not the camera's: their program takes focal lengths in images' heights.
+    ``height`` is the height of the image if it differs from the camera's: their program takes focal lengths relative
+    to it.
     """
     return {
         "transform_matrix": np.linalg.inv(np.asarray(camera.world_to_camera, np.float64)).tolist(),
@@ -278,7 +281,7 @@ def record(name: str, camera: Camera, image: str, *, height: int | None = None) 
 
 
 def intrinsics(camera: Camera, scale: float = 1.0) -> dict[str, float]:
-    """Size, focal lengths times ``scale`` and principal point, pixels; the last is read as a share of the size."""
+    """Size, focal lengths times ``scale`` and principal point, pixels; the last is read as a fraction of the size."""
     K = np.asarray(camera.K, np.float64)
     return {
         "w": float(camera.width),
@@ -291,10 +294,11 @@ def intrinsics(camera: Camera, scale: float = 1.0) -> dict[str, float]:
 
 
 def write_list(frames: Sequence[Listed], head: VideoMesh, work: Workplace) -> list[dict[str, Any]]:
-    """Write frames to render, in folders of one image size and at most `PART` frames each; return what to render.
+    """Write frames to render, in folders of one image size and at most `PART` frames each; return a list of the
+    folders.
 
-    That is ``folder``, ``width``, ``height`` and the ``numbers`` of its frames in order. Images are one pixel: rendering
-    reads none, and their program would hold all of them in the GPU's memory.
+    Each entry has ``folder``, ``width``, ``height`` and the ``numbers`` of its frames in order. Images have one pixel:
+    rendering reads none, and their program would keep all of them in GPU memory.
     """
     by_size: dict[tuple[int, int], list[Listed]] = {}
     for frame in frames:

@@ -1,8 +1,7 @@
 """INSTA by its authors' code.
 
 Zielonka, Bolkart, Thies, "Instant Volumetric Head Avatars", CVPR 2023. Their program is C++ and CUDA, built on
-instant-ngp. It takes nothing but a scene and a configuration; it trains, records the frames of the scene's test split, and
-ends.
+instant-ngp. It takes a scene and a configuration, trains, records the frames of the scene's test split, and ends.
 """
 
 from __future__ import annotations
@@ -48,14 +47,14 @@ from .export import (
 
 CONFIGS, MAIN, OURS = Path("configs/nerf"), "main.json", "headbench.json"
 INPUT, EXPERIMENTS = "../input", "experiments"
-"""Places by the program's working directory. It finds its files by parts of their paths ("train", "test") and hands paths to a
-shell, so that none may be absolute: a run folder can have any name."""
+"""Paths relative to the program's working directory. It finds files by parts of their paths ("train", "test") and
+passes paths to a shell, so none may be absolute because a run folder can have any name."""
 RECORDED = Path("headbench/debug")
 """Folder of its output, named after its configuration."""
 SNAPSHOT, BACKGROUND_FILE, RENDERS = "snapshot.msgpack", "background.json", "renders"
 PLAN, LAUNCHER = "parts.json", Path(__file__).with_name("parts.py")
 LAST_SIZE = 16
-"""Side of the final render of a training, which is not used."""
+"""Side of the unused final render of a training."""
 MOST_CONFIG = 1 << 16
 _ITERATION = re.compile(r"iteration=(\d+) loss=([-+.\de]+|-?nan|inf)")
 _DRAWN = re.compile(r"^headbench: drawn (\d+)")
@@ -75,11 +74,11 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
     config_class, repository = INSTAOfficialConfig, INSTA_REPOSITORY
 
     def inspect_environment(self) -> Environment:
-        """Their program, and a GPU."""
+        """Check their program and the GPU."""
         return inspect_program(self.name, self.config, self.repository)
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
-        """Refuse a clip without masks, a skewed camera, and a head that is not where their scene is."""
+        """Refuse a clip without masks, a skewed camera, and a head outside their scene."""
         check_masks(clip)
         for name in sorted({key.camera for key in clip.splits["train"]}):
             check_camera(clip.cameras[name])
@@ -88,14 +87,14 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
     def export(
         self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
     ) -> dict[str, FrameKey]:
-        """The training frames as a tracked video, and the files that the program opens by its working directory."""
+        """Write the training frames as a tracked video, and the files that the program opens in its working directory."""
         head = VideoMesh.of(Subject.of(clip), clip.head, checkout)
         head.write_masks(work.program)
         _copy_main(checkout, work)
         return write_training(clip, head, work, progress)
 
     def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
-        """Their program without a window; ``input/experiments``, which it writes to, leads to ``model``."""
+        """Their program without a window; its output folder ``input/experiments`` is a link to ``model``."""
         _write_config(work, max_steps=fit.budget.iterations, max_images_gpu=self.config.images_on_gpu)
         link = work.input / EXPERIMENTS
         link.unlink(missing_ok=True)
@@ -103,7 +102,7 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
         return [*_program(checkout), "--scene", INPUT, *_size(LAST_SIZE, LAST_SIZE)]
 
     def done(self, line: str) -> tuple[int, str] | None:
-        """From the line that it writes after each iteration."""
+        """Parse the line that it writes after each iteration."""
         match = _ITERATION.search(line)
         return None if match is None else (int(match[1]), f"loss {match[2]}")
 
@@ -124,7 +123,7 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
         checkout: Checkout,
         work: Workplace,
     ) -> None:
-        """The frames as test splits of their own, each rendered in a call of its own by the launcher."""
+        """Write the frames as test splits, each rendered in a separate call by the launcher."""
         model = read_shared_head(folder)
         head = VideoMesh.of(read_subject(folder / SUBJECT_FILE, model), model, checkout)
         head.write_masks(work.program)
@@ -145,7 +144,7 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
         write_bytes(work.root / LAUNCHER.name, read_bytes(LAUNCHER, "the launcher", MOST_CONFIG))
 
     def render_command(self, folder: Path, checkout: Checkout, work: Workplace) -> list[str]:
-        """The launcher, with the plan that was written with the list; by our interpreter, since the program is none."""
+        """The launcher, with the plan that was written with the list, run by headbench's interpreter."""
         return [sys.executable, str(work.root / LAUNCHER.name), str(work.root / PLAN)]
 
     def drawn(self, line: str) -> int | None:
@@ -154,7 +153,7 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
         return None if match is None else int(match[1])
 
     def render_folder(self, folder: Path, work: Workplace) -> Path:
-        """Folder that the launcher writes them to."""
+        """Output folder of the launcher."""
         return work.model / RENDERS
 
     def render_name(self, number: int) -> str:
@@ -162,7 +161,7 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
         return f"{number:06d}.png"
 
     def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
-        """A render, put on the background asked for; its colours are on black, that is, times its coverage."""
+        """A render on black, composited on the background by its coverage."""
         pixels = read_pixels(path, size=(frame.camera.width, frame.camera.height))
         if pixels.ndim != 3 or pixels.shape[2] != 4:
             raise InputError(path, str(frame.key), "colours and coverage (RGBA)", f"shape {pixels.shape}")
@@ -172,14 +171,14 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
         return Frame(np.clip(rgb + (1 - alpha[..., None]) * ground, 0, 1), np.ascontiguousarray(alpha))
 
     def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """Notes for readers of results."""
+        """Leaks and differences, for readers of results."""
         differences = [
-            "frames are numbered anew; the test split that their program renders in the end is a placeholder of one pixel",
+            "frames are renumbered; the test split that their program renders at the end is a placeholder of one pixel",
             "depths and classes of pixels (mouth, skin, hair) are those of the head model's mesh, not of a depth map of the "
-            + "tracker and of a network that parses faces",
+            + "tracker and of a face parsing network",
             "meshes have no teeth; the static offset is part of them",
-            "the background is taken out of half-covered pixels",
-            "images are read again for each part of the training, in place of kept in memory",
+            "the background is removed from partly covered pixels",
+            "images are read again for each part of the training instead of kept in memory",
             "renders are rounded down to 8 bits by their program",
         ]
         if clip.head.expression_basis.shape[2] < CONDITIONS:
@@ -209,6 +208,6 @@ def _copy_main(checkout: Checkout, work: Workplace) -> None:
 
 
 def _write_config(work: Workplace, **changes: Any) -> None:
-    """Their published settings with the given changes, and no further videos."""
+    """Their published settings with the given changes, without further videos."""
     fixed = {"parent": MAIN, "use_dataset_cache": False, "render_novel_trajectory": False}
     write_json(work.program / CONFIGS / OURS, {"render_from_snapshot": False, **fixed, **changes})

@@ -1,8 +1,8 @@
-"""Renders lists of frames by INSTA's program, one after the other; a file that is run by itself.
+"""Renders lists of frames by INSTA's program, one after the other; run as a script.
 
-The program renders one list at one image size in a call, beside the list. A plan (JSON) names the lists. Each render is
-moved to the number that its frame has, once the cameras that the program writes beside its renders have shown that they
-are those of the list, in its order. Nothing but the standard library is needed here.
+The program renders one list at one image size in a call, beside the list. A plan (JSON) names the lists. Each render
+is named by the number of its frame, after the cameras that the program writes beside its renders are compared with the
+list. This file requires only the standard library.
 """
 
 import json
@@ -51,7 +51,7 @@ def render(plan, part, before):
 
 
 def check_cameras(listed, shown):
-    """End with an error where frames were rendered by other cameras, or in another order, than they are listed."""
+    """Exit with an error if frames were rendered by other cameras, or in another order, than listed."""
     if not os.path.exists(shown):
         sys.exit(f"the program wrote no {shown}")
     wanted, found = (cameras(path) for path in (listed, shown))
@@ -59,11 +59,11 @@ def check_cameras(listed, shown):
         sys.exit(f"{shown} has {len(found)} frames of {len(wanted)}")
     for index, (one, other) in enumerate(zip(wanted, found)):
         if not max(abs(a - b) for a, b in zip(one, other)) < TOLERANCE:
-            sys.exit(f"{shown}: frame {index} was rendered by the camera of another: the order was changed")
+            sys.exit(f"{shown}: frame {index} was rendered by the camera of another: the order has changed")
 
 
 def cameras(path):
-    """Rotation and place of each frame's camera, in the order of their names."""
+    """Rotation and position of each frame's camera, in the order of their names."""
     with open(path) as stream:
         frames = sorted(json.load(stream)["frames"], key=lambda frame: frame["mesh_path"])
     return [[float(value) for row in frame["transform_matrix"][:3] for value in row] for frame in frames]

@@ -1,4 +1,5 @@
-"""A native method against its authors' code: one capture, equal settings, the same image in each iteration."""
+"""Comparison of a native method with its authors' code: one capture, equal settings, the same image in each
+iteration."""
 
 from __future__ import annotations
 
@@ -42,21 +43,22 @@ _VERTICES = re.compile(rb"element vertex (\d+)")
 
 CAUSES = {
     "ga": (
-        "what is drawn at random besides the order: where the children of split splats land, first colours",
+        "random numbers besides the order: positions of the children of split splats, initial colours",
         "splats nearer than 0.2 m are left out by theirs, than 0.01 m by ours",
     ),
     "gbs": (
-        "what is drawn at random besides the order: where splats lie at the start, where the children of split splats land",
-        "weights of joints: theirs are looked up in a grid once splats have moved or split, ours are those of the surface point",
-        "their code has differences for every splat and expression, with mask 0 where ours stores none",
+        "random numbers besides the order: initial positions of splats, positions of the children of split splats",
+        "weights of joints: official from a grid once splats have moved or split, native those of the surface point",
+        "the official code has differences for every splat and expression, with mask 0 where the native one stores none",
         "splats nearer than 0.2 m are left out by theirs, than 0.01 m by ours",
     ),
     "ours": (
-        "what is drawn at random besides the order: first values of planes, lines and networks, split splats",
+        "random numbers besides the order: initial values of planes, lines and networks, children of split splats",
         "splats nearer than 0.2 m are left out by theirs, than 0.01 m by ours",
     ),
 }
-"""Why results differ at equal settings and order, by native method; the avatar's record adds what its adapter changed."""
+"""Reasons for differences at equal settings and order, by native method; the avatar's record adds the changes of its
+adapter."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class Difference:
     Attributes
     ----------
     orders : tuple[int, ...]
-        Orders for which both have complete results.
+        Orders for which both methods have complete results.
     native, official : tuple[float, ...]
         Mean over frames, then sequences, then subjects, for each order.
     half_width : float | None
@@ -83,7 +85,7 @@ class Difference:
 
 
 def compare(settings: ParitySettings, progress: Progress = no_progress) -> CommandResult:
-    """Train and score both, and write the table of their differences; see the command."""
+    """Train and score both methods, and write the table of their differences; see the command."""
     out = Path(settings.out)
     config = run_config(settings, out)
     methods = resolve_methods(config)
@@ -119,7 +121,7 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
 
 
 def run_config(settings: ParitySettings, out: Path) -> RunConfig:
-    """The comparison, with settings that make the two do the same."""
+    """The comparison, with settings that make both methods equivalent."""
     official = OFFICIAL[settings.method]
     of_theirs: dict[str, Any] = {
         "checkout": settings.checkout,
@@ -153,10 +155,11 @@ def run_config(settings: ParitySettings, out: Path) -> RunConfig:
 
 
 def as_theirs(native: str, iterations: int, samples: int) -> dict[str, Any]:
-    """Settings of a native method that make a run of any length do what the authors' program is told to do.
+    """Settings that make a native run of any length equivalent to the run of the authors' program.
 
-    ``samples`` are splats at the start, of gbs. Their program raises the harmonics' degree each 1,000 iterations whatever the length, removes large splats from the
-    first regular reset of opacities on, and here draws no image more often than another.
+    ``samples`` is the initial number of splats of gbs. The authors' program raises the harmonics' degree every 1,000
+    iterations regardless of the length, removes large splats from the first regular reset of opacities, and here uses
+    all images equally often.
     """
     if native == "gbs":
         errors = {"correctives_variant": "official", "lower_teeth_variant": "official"}
@@ -172,7 +175,7 @@ def as_theirs(native: str, iterations: int, samples: int) -> dict[str, Any]:
 
 
 def differences_of(rows: Rows, native: str, official: str, orders: Sequence[int]) -> list[Difference]:
-    """Differences by task and metric, of the orders that both have values of."""
+    """Differences by task and metric, over the orders for which both have values."""
     found = []
     for task in TASKS:
         for metric in METRICS:
@@ -237,7 +240,7 @@ def _cells(run_folder: RunFolder, rows: Rows, method: str, orders: Sequence[int]
 
 
 def _splats(folder: Path) -> int | None:
-    """Splats of an avatar in GaussianAvatars' file; None where it has none."""
+    """Number of splats in an avatar's GaussianAvatars file; None without such a file."""
     path = folder / "point_cloud.ply"
     if not path.is_file():
         return None
@@ -261,7 +264,7 @@ def _text(
         f"{'# ' if markdown else ''}{native} and {official}, {settings.iterations:,} iterations each",
         "",
         (
-            "Equal settings and the same image in each iteration; every order of the images is a training of both. Means over "
+            "Equal settings and the same image in each iteration; both methods are trained once for each order of the images. Means over "
             "frames, then sequences, then subjects; the difference is official minus native, with its 95 % interval over orders."
         ),
         "",

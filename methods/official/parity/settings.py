@@ -14,14 +14,15 @@ from ....bench.options import DependentOptions
 
 @dataclass(frozen=True)
 class ParitySettings(ExecutionOptions):
-    """Trains both on one capture with equal settings, the published ones at this length, both with the same image in each
-    iteration, and scores all renders by one implementation of the metrics. Repeated with other orders of the images, for
-    the order alone moves results by half a decibel. Writes parity.md, parity.json and the run. Started again after a kill
-    it continues. Exit code 1: PSNR differs by more than the tolerance in the mean over orders, or a training failed.
+    """Trains both on one capture with equal settings, the published ones for this length, with the same image in each
+    iteration, and scores all renders by one implementation of the metrics. This is repeated with other orders of the
+    images, since the order alone changes results by half a decibel. Writes parity.md, parity.json and the run. A
+    killed run is continued by the same command. Exit code 1: PSNR differs by more than the tolerance in the mean over
+    orders, or a training failed.
     """
 
     method: tyro.conf.Positional[Literal["ga", "gbs", "ours"]]
-    """The native method. The authors' code of ours is that of TensorialGaussianAvatar (`tga-official`)."""
+    """The native method. The authors' code of method ours is TensorialGaussianAvatar (`tga-official`)."""
 
     checkout: str
     """Folder of a checkout of the authors' repository; it is read, never written."""
@@ -39,17 +40,17 @@ class ParitySettings(ExecutionOptions):
     """Length of each training."""
 
     orders: int = 3
-    """Orders of the images, each a training of either method. One alone gives no interval."""
+    """Number of orders of the images, each with one training of either method. A single order gives no interval."""
 
     device: Literal["cuda", "cpu-shim"] = "cuda"
-    """What the authors' code computes with: CUDA, or our CPU renderer in place of its rasteriser (methods/official/README.md),
-    which shows what training and head model differ by, not the rasterisers."""
+    """Device of the authors' code: CUDA, or headbench's CPU renderer instead of its rasteriser
+    (methods/official/README.md), which shows differences of training and head model, not of the rasterisers."""
 
     python: str = ""
     """Interpreter for the authors' code, as settings.ga-official.python of `headbench run`. Default with cpu-shim: this one."""
 
     commit: str | None = None
-    """What is checked out; default: the commit that the adapter was written for, "" takes whatever is there."""
+    """Expected commit; default: the one that the adapter was written for; "" accepts any."""
 
     frames: int | None = None
     """Held-out frames scored for each task, evenly spread; default: all."""
@@ -58,13 +59,13 @@ class ParitySettings(ExecutionOptions):
     """Mean difference of PSNR, in decibels, up to which the two count as equal."""
 
     samples: int = 5_000
-    """Splats on the head at the start, for gbs; published: 50,000, whose differences for each expression take gigabytes."""
+    """Initial number of splats on the head, for gbs; published: 50,000, whose differences for each expression take gigabytes."""
 
     size: str = "96x136"
     """Width x height of the synthetic capture's images in pixels."""
 
     cameras: int = 8
-    """Views of the synthetic capture, the held-out one included."""
+    """Views of the synthetic capture, including the held-out one."""
 
     timesteps: int = 24
     """Timesteps of the synthetic capture."""
@@ -75,7 +76,7 @@ class ParitySettings(ExecutionOptions):
     )
 
     def __post_init__(self) -> None:
-        """Refuse what has no meaning."""
+        """Raise ValueError for invalid settings."""
         parse_size(self.size)
         if self.iterations < 1 or self.orders < 1 or self.samples < 10 or not self.tolerance > 0:
             raise ValueError("iterations and orders must be at least 1, samples 10, the tolerance above 0")

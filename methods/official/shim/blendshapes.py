@@ -1,7 +1,7 @@
-"""Stand-ins for what GaussianBlendshapes' code has of its own in CUDA and C++, and for the packages that it imports.
+"""Stand-ins for GaussianBlendshapes' own CUDA and C++ code, and for the packages that it imports.
 
-Values and gradients are those of their kernels; how they are computed is not. Their forks of the rasteriser and of
-``simple_knn`` have the names of the originals and more functions.
+Values and gradients equal those of their kernels. Their forks of the rasteriser and of ``simple_knn`` have the names
+of the originals and additional functions.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from ...gbs.points import poisson_disk
 from ...ops.harmonics import sh_basis
 
 FAR = 0.015
-"""Metres from the nearest vertex, from which on a point is given that vertex in place of the nearest triangle. No splat
-is so far from the surface at its start."""
+"""Distance from the nearest vertex, metres, from which a point gets that vertex instead of the nearest triangle. No
+splat is initially so far from the surface."""
 DIRECTIONS = 40
-"""Directions whose values fix the 16 harmonics up to degree 3."""
+"""Number of directions whose values determine the 16 harmonics up to degree 3."""
 
 
 # ---------------------------------------------------------------------- diff_gaussian_rasterization
 
 
 def rotate_harmonics(rotations: Tensor, coefficients: Tensor) -> Tensor:
-    """Harmonics (P, 16, 3) as seen when turned by (P, 3, 3) rotations: value at R d is what it was at d."""
+    """Harmonics (P, 16, 3) rotated by (P, 3, 3): the value at R d is the original one at d."""
     directions = _sphere(DIRECTIONS).to(coefficients)
     fitted = torch.linalg.pinv(sh_basis(_sphere(DIRECTIONS), 3)).to(coefficients)
     back = torch.einsum("pji,mj->pmi", rotations, directions).reshape(-1, 3)
@@ -46,7 +46,7 @@ def _sphere(count: int) -> Tensor:
 
 
 class _Composite(torch.autograd.Function):
-    """Its adjoint gives no gradient to coefficients, initial differences and mask, as theirs."""
+    """As in their code, coefficients, initial differences and mask have no gradient."""
 
     @staticmethod
     def forward(ctx: Any, mean: Tensor, basis: Tensor, shares: Tensor, added: Tensor) -> Tensor:
@@ -112,7 +112,7 @@ def adam_update(
     mean: Tensor,
     square: Tensor,
 ) -> None:
-    """One step of Adam in place; ``step`` is divided by the first correction already."""
+    """One step of Adam in place; ``step`` is already divided by the first bias correction."""
     if decay:
         gradient = gradient + decay * parameter
     mean.mul_(beta1).add_(gradient, alpha=1 - beta1)
@@ -124,7 +124,7 @@ def adam_update(
 
 
 class _Nearest(NamedTuple):
-    """(M,) triangles, (M, 3) barycentric coordinates, and what they were found for."""
+    """(M,) triangles, (M, 3) barycentric coordinates, and the query."""
 
     triangles: np.ndarray
     weights: np.ndarray
@@ -135,7 +135,7 @@ _last: list[_Nearest] = []
 
 
 def _nearest(vertices: Tensor, faces: Tensor, points: Tensor) -> _Nearest:
-    """Nearest triangles; the last answer is kept, for their code asks twice."""
+    """Nearest triangles; the last result is cached because their code asks twice."""
     asked = vertices, faces, points
     if _last and all(torch.equal(old, new) for old, new in zip(_last[0].asked, asked, strict=True)):
         return _last[0]
@@ -154,7 +154,7 @@ def _nearest(vertices: Tensor, faces: Tensor, points: Tensor) -> _Nearest:
 
 
 def nearest_triangles(vertices: Tensor, faces: Tensor, points: Tensor, candidates: int) -> Tensor:
-    """(M,) int32 triangle nearest to each of (M, 3) points; ``candidates`` bounds their search, and none here."""
+    """(M,) int32 triangle nearest to each of (M, 3) points; ``candidates`` is ignored."""
     return torch.from_numpy(_nearest(vertices, faces, points).triangles).int()
 
 
@@ -172,7 +172,7 @@ def nearest_features(
 
 
 def ids_and_weights(points: Tensor, grid: Tensor, align_corners: bool) -> tuple[Tensor, Tensor]:
-    """Values (P, 8) of an integer grid (D, H, W) at the nodes around (P, 3) points in [-1, 1] x, y, z, and their shares."""
+    """Values (P, 8) of an integer grid (D, H, W) at the nodes around (P, 3) points in [-1, 1] x, y, z, and their weights."""
     sizes = torch.tensor(grid.shape[::-1])
     scaled = (points * 0.5 + 0.5) * (sizes - 1 if align_corners else sizes) - (0 if align_corners else 0.5)
     low = scaled.floor()
@@ -215,21 +215,21 @@ def load_obj(path: str) -> tuple[Tensor, Faces, None]:
 
 
 class Attributes:
-    """Holds what it is made with: cameras and settings of a mesh renderer."""
+    """Holds its arguments: cameras and settings of a mesh renderer."""
 
     def __init__(self, **values: Any):
         self.__dict__.update(values)
 
 
 class MeshRasterizer(Attributes):
-    """Draws nothing: the picture of the mesh beside a render is white."""
+    """Draws nothing: the image of the mesh beside a render is white."""
 
     def __call__(self, meshes: Any, cameras: Any) -> None:
         return None
 
 
 class SoftPhongShader(Attributes):
-    """White pictures (1, H, W, 4) of the size of the camera's image."""
+    """White images (1, H, W, 4) of the camera's size."""
 
     def __call__(self, fragments: Any, meshes: Any, cameras: Any, **options: Any) -> Tensor:
         return torch.ones(1, *cameras.image_size[0], 4)
@@ -250,14 +250,14 @@ def sample_mesh_poisson_disk(
 ) -> tuple[np.ndarray, np.ndarray]:
     """About ``count`` points on a mesh, no two of them close: (P,) triangles and (P, 3) barycentric coordinates.
 
-    Coordinates are of the type of the vertices.
+    Coordinates have the dtype of the vertices.
     """
     found = poisson_disk(vertices, faces, np.arange(len(faces)), count, 0)
     return found.triangles, found.barycentric.astype(vertices.dtype)
 
 
 class SummaryWriter:
-    """Writes nothing, whatever it is told."""
+    """Ignores all calls."""
 
     def __init__(self, *arguments: Any, **options: Any):
         pass
@@ -303,4 +303,4 @@ PACKAGES: dict[str, dict[str, Any]] = {
     },
     "torch.utils.tensorboard": {"SummaryWriter": SummaryWriter},
 }
-"""Modules that stand in for packages which are not installed, by name."""
+"""Stand-in modules for packages that are not installed, by name."""

@@ -1,8 +1,7 @@
-"""Runs official CUDA code on a CPU: the renderer of this package replaces theirs, and stand-ins replace the
-rest.
+"""Runs official CUDA code on a CPU: headbench's renderer replaces theirs, and stand-ins replace the rest.
 
-Installed into the interpreter that runs their scripts, before them (`launch`). Their files are not touched. What they then
-compute is not their method on their rasteriser: results carry the label "(cpu-shim)".
+The shim is installed in the interpreter before their scripts are run (`launch`). Their files are not modified. Results
+have the label "(cpu-shim)", since they are not those of their rasteriser.
 """
 
 from __future__ import annotations
@@ -26,17 +25,17 @@ from . import blendshapes, rasterizer
 
 
 def install(threads: int, code: str) -> None:
-    """Put the shim before everything that is imported later.
+    """Install the shim for everything that is imported later.
 
-    ``code``: "bound splats" or "blendshapes", see `OfficialMethod.shimmed`. Code that tries a package and goes on without it
-    has to find none, so that stand-ins are for those alone that need them.
+    ``code``: "bound splats" or "blendshapes", see `OfficialMethod.shimmed`. Packages that code imports optionally must
+    stay missing, so stand-ins are limited to the required ones.
     """
     torch.set_num_threads(threads)
     _module("diff_gaussian_rasterization", rasterizer.PUBLIC | blendshapes.RASTERIZER)
     _module("diff_gaussian_rasterization._C", blendshapes.RASTERIZER_KERNELS)
     _module("simple_knn")
     _module("simple_knn._C", {"distCUDA2": mean_square_distances, **blendshapes.NEIGHBOURS})
-    # Imported by scripts that draw no mesh, read no OBJ file from elsewhere and measure no LPIPS here.
+    # Imported by scripts, but not used: no mesh is drawn, no external OBJ file read and no LPIPS measured.
     context = {"RasterizeCudaContext": _Nothing, "RasterizeGLContext": _Nothing}
     unused: dict[str, dict[str, Any]] = {
         "nvdiffrast": {},
@@ -62,9 +61,9 @@ def mean_square_distances(points: Tensor) -> Tensor:
 
 
 def _is_installed(name: str) -> bool:
-    """Whether a module is that of an installed package, or one of our own stands in for the package already."""
+    """Whether a module is that of an installed package, or already replaced by a stand-in."""
     package = name.partition(".")[0]
-    if package == "torch":  # brings a module that imports another package
+    if package == "torch":  # replaced by a module that imports another package
         package = name.rpartition(".")[2]
     known = sys.modules.get(package)
     if known is not None:
@@ -87,7 +86,7 @@ class LocalPaths:
 
 
 class _Nothing:
-    """Can be made, and nothing else."""
+    """A class that can only be constructed."""
 
 
 def _module(name: str, content: Mapping[str, Any] | None = None) -> None:
@@ -100,7 +99,7 @@ def _module(name: str, content: Mapping[str, Any] | None = None) -> None:
 
 
 class OnCPU(TorchFunctionMode):
-    """Takes every mention of a CUDA device for the CPU."""
+    """Replaces every CUDA device by the CPU."""
 
     def __torch_function__(
         self,
@@ -144,11 +143,11 @@ def _without_cuda() -> None:
     replaced.Event = _Event
     for of in (Tensor, torch.nn.Module):
         of.cuda = lambda self, *arguments, **options: self  # type: ignore[method-assign,union-attr,assignment]
-    OnCPU().__enter__()  # for the life of the process
+    OnCPU().__enter__()  # active until the process ends
     stock: Any = torch.utils.data.DataLoader
 
     def loader(*arguments: Any, **options: Any) -> Any:
-        # Workers are for decoding beside a GPU; here they would take the cores that training needs.
+        # Workers decode images for a GPU; on a CPU they would take the cores from training.
         options |= {"num_workers": 0, "pin_memory": False, "persistent_workers": False}
         return stock(*arguments, **options)
 

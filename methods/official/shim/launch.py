@@ -1,7 +1,7 @@
-"""Starts a script of an official repository as it stands, after what a plan asks for: ``launch.py PLAN SCRIPT ...``.
+"""Runs an unmodified script of an official repository after the changes of a plan: ``launch.py PLAN SCRIPT ...``.
 
-Run by the interpreter of the authors' code, where headbench need not be installed: nothing of it is imported, but for the
-CPU shim, which needs it. A copy of this file lies beside the plan.
+It is run by the interpreter of the authors' code and imports headbench only for the CPU shim. A copy of this file is
+written beside the plan.
 """
 
 import json
@@ -12,12 +12,12 @@ from typing import Any
 
 
 def main() -> None:
-    """Read the plan, do what it asks for, and run the script in this process."""
+    """Read the plan, apply its changes, and run the script in this process."""
     with open(sys.argv[1], encoding="utf-8") as stream:
         plan = json.load(stream)
     script = os.path.abspath(sys.argv[2])
     sys.argv = sys.argv[2:]
-    sys.path[0] = os.path.dirname(script)  # in place of this file's folder, as Python does for a script
+    sys.path[0] = os.path.dirname(script)  # instead of this file's folder, as Python does for a script
     if plan["shim"]:
         from headbench.methods.official.shim.cpu import install
 
@@ -34,7 +34,7 @@ def main() -> None:
 def patch_sources(patches: Any, root: str) -> None:
     """Replace texts in sources below ``root`` when they are compiled; files stay as they are.
 
-    ``patches`` are [file, old text, new text]; each old text has to stand in its file.
+    ``patches`` are [file, old text, new text]; each old text must occur in its file.
     """
     sys.pycache_prefix = os.path.join(root, "no-such-folder")  # code compiled before has no replacements
     by_path: dict = {}
@@ -47,7 +47,7 @@ def patch_sources(patches: Any, root: str) -> None:
         for old, new in by_path.get(os.path.realpath(path), ()):
             if old.encode() not in data:
                 sys.exit(
-                    f"{path}: expected {old!r}, found none; this commit is not the one the adapter knows"
+                    f"{path}: expected {old!r}, found none; this commit is not the one that the adapter supports"
                 )
             data = data.replace(old.encode(), new.encode())
         return compiled(self, data, path, **options)
@@ -56,9 +56,9 @@ def patch_sources(patches: Any, root: str) -> None:
 
 
 def feed_order(order: Any) -> None:
-    """Let loaders that draw at random give the images of these names, in this order.
+    """Make random loaders return the images of these names, in this order.
 
-    Code without such a loader finds the names as ``images_in_order``, by a patch.
+    Patched code without such a loader reads the names from ``images_in_order``.
     """
     import builtins
 

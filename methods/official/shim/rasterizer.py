@@ -1,4 +1,4 @@
-"""Our CPU renderer behind the interface of ``diff_gaussian_rasterization`` (Kerbl et al. 2023)."""
+"""headbench's CPU renderer with the interface of ``diff_gaussian_rasterization`` (Kerbl et al. 2023)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NEAR = 0.2
 
 
 class GaussianRasterizationSettings(NamedTuple):
-    """The published settings; matrices act on rows from the left. ``prefiltered`` and ``debug`` change nothing."""
+    """The published settings; matrices multiply row vectors from the right. ``prefiltered`` and ``debug`` have no effect."""
 
     image_height: int
     image_width: int
@@ -83,14 +83,14 @@ class GaussianRasterizer(nn.Module):
         if (shs is None) == (colors_precomp is None):
             raise ValueError("expected either shs or colors_precomp")
         if cov3D_precomp is not None or scales is None or rotations is None:
-            raise ValueError("expected scales and rotations; the shim takes no covariances")
+            raise ValueError("expected scales and rotations; the shim does not support covariances")
         if alpha_point_id not in (None, 0):
-            raise ValueError("expected alpha_point_id 0; the shim knows the coverage by all splats alone")
+            raise ValueError("expected alpha_point_id 0; the shim supports only the coverage by all splats")
         if shs is not None:
             colors_precomp = _colors(shs, means3D - to.campos, to.sh_degree)
         assert colors_precomp is not None
         width, height = int(to.image_width), int(to.image_height)
-        # The value of means2D is of no account: the difference is zero, its gradient is not.
+        # The value of means2D has no effect: the difference is zero, its gradient is not.
         half = means3D.new_tensor([0.5 * width, 0.5 * height])
         offset = (means2D - means2D.detach())[:, :2] * half
         rendering = rasterize(

@@ -47,8 +47,8 @@ _MODEL_SOURCE, _TRAIN_SOURCE = "scene/flame_gaussian_model.py", "train.py"
 class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
     """The method: see the module.
 
-    Their preprocessing draws the jaw bases from validation and test poses. It is not run: bases and expression clusters
-    are those of `datasets.steps`, from training frames alone, in the files that their training opens.
+    Their preprocessing draws the jaw bases from validation and test poses. It is not run: bases and expression
+    clusters are those of `datasets.steps`, from training frames only, in the files that their training opens.
     """
 
     name, version = TGA_OFFICIAL.name, TGA_OFFICIAL.version
@@ -63,7 +63,7 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
     )
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
-        """Refuse, besides, a mesh of another size than the one that their code fixes, and a head without a face."""
+        """Also refuse a mesh of another size than the fixed one of their code, and a head without a face."""
         super().check_clip(clip, checkout)
         where = f"head model {clip.head.version!r}"
         head = OfficialHead.of(clip.head, checkout.folder)
@@ -73,7 +73,7 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
             expected = (
                 f"{fixed[0]} vertices and {fixed[1]} triangles with teeth, as {_MODEL_SOURCE} fixes them"
             )
-            remedy = "Refit the capture to FLAME (headbench prepare refit), or compare with ours, the native method."
+            remedy = "Refit the capture to FLAME (headbench prepare refit), or compare with the native method ours."
             raise InputError(where, "template, faces", expected, f"{found[0]} and {found[1]}", remedy)
         if "face" not in clip.head.regions:
             raise InputError(where, "regions", "a region face", "none", "Load the head model with its masks.")
@@ -81,10 +81,10 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
     def export(
         self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
     ) -> dict[str, FrameKey]:
-        """Besides, jaw bases and expression clusters of the training timesteps."""
+        """Also write jaw bases and expression clusters of the training timesteps."""
         images = super().export(clip, checkout, work, progress)
         bases = jaw_bases(clip, DEFAULT_COUNT)
-        # Their lines are 16: a base that stands there twice shares the weight with its twin.
+        # Their code has 16 lines: a duplicate base shares the weight with its copy.
         filled = bases[np.arange(DEFAULT_COUNT) % len(bases)]
         save_npz(work.input / JAW_FILE, {"jaw_poses": filled.astype(np.float32)})
         clusters = cluster_expressions(clip)
@@ -94,14 +94,14 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
         return images
 
     def check_length(self, iterations: int, checkout: Checkout) -> None:
-        """Refuse a run too short for their feature lines to begin."""
+        """Refuse a run too short for their feature lines to start."""
         begin = _lines_begin(checkout)
         if iterations <= begin and self.config.device == "cuda":
             expected = f"more than {begin}, where {_TRAIN_SOURCE} begins to train its feature lines"
             raise InputError(f"settings.{self.name}", "budget.iterations", expected, f"{iterations}")
 
     def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
-        """Sizes of another head, and the beginning of their lines at its fraction of a shorter run."""
+        """Replace sizes for another head, and the start of their lines in a shorter run."""
         begin = _lines_begin(checkout)
         moved = Timeline(iterations, PAPER_ITERATIONS).at(begin)
         lines = (_TRAIN_SOURCE, f"offset_start_iter = {begin}", f"offset_start_iter = {moved}")
@@ -120,7 +120,7 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
         ]
 
     def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
-        """Besides, the jaw bases, which their renderer reads again."""
+        """Also keep the jaw bases, which their renderer reads."""
         kept = super().keep(fit, work)
         copy_file(work.input / JAW_FILE, fit.out / JAW_FILE)
         return kept
@@ -142,11 +142,11 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
         copy_file(folder / JAW_FILE, work.input / JAW_FILE)
 
     def excused(self, ended: ProgramEnd) -> bool:
-        """Their renderer appends its speed to a file of its author's, once all images of a split are written."""
+        """Their renderer appends its speed to a file of its author after all images of a split are written."""
         return any(re.search(r"FileNotFoundError.*fps\.txt", line) for line in ended.lines)
 
     def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """Besides, what takes the place of their preprocessing."""
+        """Also the replacement of their preprocessing."""
         remarks = super().remarks(clip, seed)
         remarks["differences"] += [
             "jaw bases from training poses, first the identity; published: validation and test poses, first a half turn",
@@ -162,12 +162,12 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
 
 
 def _sizes(head: OfficialHead) -> tuple[int, int]:
-    """Vertices and triangles of a head in their code, teeth included."""
+    """Number of vertices and triangles of a head in their code, including teeth."""
     return len(head.order) + TEETH_VERTICES, len(head.faces) + 12 * (RING_LENGTH - 1)
 
 
 def _fixed_sizes(checkout: Checkout) -> tuple[int, int]:
-    """Those that their code fixes."""
+    """The numbers fixed in their code."""
     vertices, triangles = (
         int(checkout.constant(_MODEL_SOURCE, rf"self\.{name} = torch\.zeros\(\[T, (\d+), 3\]", name))
         for name in ("mesh_lst", "face_center_lst")

@@ -10,7 +10,7 @@
 
 namespace headbench {
 
-constexpr int kGroupRows = 16;  // rows are allocated in groups of so many
+constexpr int kGroupRows = 16;  // rows per allocated group
 constexpr int kEncoding = 27;   // of a direction
 constexpr int kPlanes = 3;
 constexpr int kPlaneAxes[kPlanes][2] = {{0, 1}, {0, 2}, {1, 2}};  // PAIRS of methods/ops/planes.py
@@ -62,7 +62,7 @@ struct ColorTraining {
   // Backward.
   const float* by_colors;  // (N, 3)
   float* by_features;      // (N, features)
-  float* by_positions;     // (N, 3), or null where nobody asks for gradients by positions and directions
+  float* by_positions;     // (N, 3), or null if no gradients by positions and directions are needed
   float* by_directions;    // (N, 3), or null with it
   float* by_planes[kPlanes];
 };

@@ -156,7 +156,7 @@ struct ToWorld {
   float* world_scales;          // (N, 3)
 };
 
-// Coefficients lie in blocks of so many splats, those of one block and one coefficient side by side.
+// Number of splats per block of coefficients; values of one coefficient in a block are contiguous.
 constexpr int kHarmonicsBlock = 16;
 constexpr int kDegreeMax = 3;
 

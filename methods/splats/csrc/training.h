@@ -255,8 +255,6 @@ HEADBENCH_INLINE void harmonics_basis_backward(Real x, Real y, Real z, const Rea
   out[2] = by_z;
 }
 
-constexpr int kRest = (kDegreeMax + 1) * (kDegreeMax + 1) - 1;
-
 // Unit vectors of W vectors, and their lengths.
 HEADBENCH_INLINE Real direction_of(const Gathered<3>& vector, Real* direction) {
   for (int k = 0; k < 3; ++k) direction[k] = vector[k];

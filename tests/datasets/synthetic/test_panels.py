@@ -8,7 +8,14 @@ from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.native.loader import Kernel
 from headbench.datasets.synthetic.capture import synthesize
-from headbench.datasets.synthetic.panels import KERNEL, Panel, PanelTracer, panels, rig_middle, sample_count
+from headbench.datasets.synthetic.panels import (
+    KERNEL,
+    AreaLight,
+    PanelTracer,
+    panels,
+    rig_middle,
+    sample_count,
+)
 from headbench.datasets.synthetic.plan import FRONTAL
 from headbench.datasets.synthetic.renderer import develop
 from headbench.datasets.synthetic.subject import RenderedSubject
@@ -19,7 +26,7 @@ pytestmark = pytest.mark.skipif(not KERNEL.instruction_sets, reason="the compile
 
 
 def panel(center, half_width, half_height, normal, radiance=(1.0, 2.0, 3.0)):
-    return Panel(*(np.array(v, float) for v in (center, half_width, half_height, normal, radiance)))
+    return AreaLight(*(np.array(v, float) for v in (center, half_width, half_height, normal, radiance)))
 
 
 OVERHEAD = panel([0.1, 1.0, 0.2], [0.3, 0, 0], [0, 0, 0.4], [0, -1, 0])

@@ -84,7 +84,7 @@ def test_a_folder_without_git_needs_an_empty_commit(repository, tmp_path):
     folder.mkdir()
     for name in ("train.py", "render.py"):
         (folder / name).write_text("")
-    with pytest.raises(InputError, match="a folder that git does not know"):
+    with pytest.raises(InputError, match="not a git checkout"):
         inspect_checkout("ga-official", settings(folder, repository[1]), REPOSITORY)
     assert inspect_checkout("ga-official", settings(folder, ""), REPOSITORY).record["commit"] == ""
 

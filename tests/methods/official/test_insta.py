@@ -135,7 +135,7 @@ def test_renders_that_are_not_what_was_listed_are_found(avatar, faults_are_found
         ({"program": "build/none"}, "build/none.*program: expected a program that can be run.*cmake"),
         ({"program": "no-such-program build/rta"}, "no-such-program"),
         ({"program": "'unclosed"}, "the program that was built"),
-        ({"program": "/bin/true"}, "an answer to --version.*cmake"),
+        ({"program": "/bin/true"}, "to --version.*cmake"),
         ({"commit": "0" * 40}, "expected commit 000000000000"),
         ({"checkout": "/nowhere"}, "no such folder.*git clone.*built as its installation page says"),
         ({"device": "cpu-shim"}, "device: expected cuda"),

@@ -157,7 +157,7 @@ def test_a_list_is_on_disk_where_the_harness_groups_writes(avatar, official_clip
 
 def test_a_frame_on_its_own_cannot_be_had(avatar, official_clip):
     ((camera, pose), *_) = views(official_clip, "novel_view").values()
-    with pytest.raises(UnavailableError, match="never one frame"):
+    with pytest.raises(UnavailableError, match="not single frames"):
         avatar.render(camera, pose)
 
 

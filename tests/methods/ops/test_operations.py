@@ -64,8 +64,8 @@ def rotations(normal: Callable[..., Tensor], count: int) -> Tensor:
     return torch.linalg.qr(normal(count, 3, 3)).Q
 
 
-def frames(normal: Callable[..., Tensor]) -> mesh.Frames:
-    return mesh.Frames(
+def frames(normal: Callable[..., Tensor]) -> mesh.TriangleFrames:
+    return mesh.TriangleFrames(
         *(value.clone() for value in mesh.triangle_frames(normal(VERTICES, 3), faces_of(FACES)))
     )
 

@@ -23,7 +23,7 @@ from headbench.bench.rows import Row, Rows
 from headbench.bench.specs import MetricSpec
 from headbench.reports.pareto.command import COSTS, pareto_runs
 from headbench.reports.pareto.plot import label_points, write_plot
-from headbench.reports.pareto.points import Point, pareto_front
+from headbench.reports.pareto.points import ParetoPoint, pareto_front
 from headbench.reports.pareto.settings import ParetoSettings
 
 METRICS = [
@@ -172,7 +172,7 @@ def test_derived_avatars_are_told_from_trained_ones(make_run, tmp_path, change_m
 
 
 def point(variant="", quality=20.0, megabytes=1.0, milliseconds=None, method="ga"):
-    return Point("run", method, method, variant, quality, megabytes, milliseconds, "here")
+    return ParetoPoint("run", method, method, variant, quality, megabytes, milliseconds, "here")
 
 
 def test_labels_touch_neither_points_nor_each_other():

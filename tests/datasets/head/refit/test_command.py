@@ -77,7 +77,7 @@ def test_what_cannot_be_refitted_is_refused(finished):
     same = replace(settings, capture=findings.data["capture"], out=settings.out + "2")
     for changed, said in (
         (same, "another head model"),
-        (replace(settings, out=str(root / "capture")), "apart from the capture"),
+        (replace(settings, out=str(root / "capture")), "outside the capture"),
         (replace(settings, target="no-such-head"), "no-such-head"),
     ):
         with pytest.raises(InputError, match=said):

@@ -170,7 +170,7 @@ def test_an_array_of_a_later_method_is_kept_as_it_is(clip, tmp_path):
     before = OursAvatar.read(store(clip, tmp_path), "cpu")
     extra = torch.arange(6.0).view(2, 3)
     path, person = tmp_path / COMPACT_FILE, (before.subject, read_shared_head(tmp_path))
-    with pytest.raises(ValueError, match="order of their triangles"):
+    with pytest.raises(ValueError, match="sorted by triangle"):
         write_compact(path, before.field, *person, EXACT)
     tensors = simplify(before, [], EXACT).tensors
     field = before.field._replace(tensors={**tensors, "projection": extra})
