@@ -226,7 +226,7 @@ class Manifest:
                 if not method[name]:
                     del method[name]
         for metric in record["metrics"]:
-            del metric["default"], metric["needs"]
+            del metric["default"], metric["needs"], metric["suspect_above"]
         write_json(path, record)
 
     def check_done(self, path: Path) -> None:
