@@ -217,7 +217,7 @@ def another_order(model):
         (
             one_too_few,
             "ga-official",
-            "3 images, .*transforms_test.json, found 2.*Render the split again.*MAP",
+            "3 images, .*transforms_test.json, found 2.*Render the whole split again.*MAP",
         ),
         (a_gap, "ga-official", "found 3, 00000.png to 00003.png"),
         (another_order, "ga-official", "gt/00000.png: expected the ground truth of .* found .*another order"),
