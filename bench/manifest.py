@@ -21,7 +21,6 @@ from .protocol import Protocol
 from .specs import LABEL, MetricSpec, is_label
 from .upgrade import upgraded_manifest
 
-
 MAX_CELLS = 20_000
 """A record of few bytes can ask for any number; the largest suite has some hundred."""
 
