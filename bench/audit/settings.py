@@ -17,7 +17,7 @@ from ..specs import LABEL, is_label
 
 
 @dataclass(frozen=True)
-class VerifySettings(RunOptions):
+class VerifySettings(RunOptions, ExecutionOptions):
     """Recompute a run's hashes and metrics from the files it left.
 
     Of a bundle the listed digests are checked, and with renders in it all metrics of frames as well: against the capture

@@ -19,6 +19,7 @@ from ..engine.jobs import load, make_jobs
 from ..engine.steps import DIGESTS, Job, measure, recorded_frames
 from ..engine.store import Cell, RunFolder
 from ..errors import ExitCode, HeadbenchError, InputError
+from ..executors.remote import run_as_task
 from ..io.files import digest, digest_file
 from ..io.images import read_png
 from ..manifest import Manifest, ProtocolRecord
@@ -70,6 +71,10 @@ def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> Co
 
     A folder that is not a finished run, or a capture that cannot be opened, is a finding with exit code 3.
     """
+    if settings.execution.executor != "inline":
+        run = Path(settings.run)
+        place = run.with_name(f"{run.name}-verify-task")
+        return run_as_task(f"{__name__}:verify_run", settings, place, "cpu")
     try:
         with tempfile.TemporaryDirectory() as scratch:
             if Path(settings.run).is_file():

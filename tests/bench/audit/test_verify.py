@@ -10,6 +10,8 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.audit.settings import VerifySettings
+from headbench.bench.audit.verify import verify_run
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.captures import run_configuration
 from headbench.bench.engine.config import RunOptions
@@ -146,3 +148,15 @@ def test_an_unfinished_run_gives_no_verdict(run, tmp_path):
     started.write(RunFolder(run).manifest)
     assert verify(run) == 3
     assert verify(tmp_path) == 3
+
+
+def test_an_executor_gives_the_same_verdict(run):
+    given = {"run": str(run), "trust": True}
+    image = next(run.glob("*/*/*/renders/novel_view/*.png"))
+    for change in (0, 1):
+        if change:
+            write_png(image, read_png(image) + 1)
+        inline = verify_run(VerifySettings(**given))
+        assert inline.passed == (not change)
+        assert verify_run(VerifySettings(**given, executor="processes")).text == inline.text
+    assert [path.name for path in run.parent.glob("*task*")] == []
