@@ -49,7 +49,7 @@ def change_json(path, change):
 
 def test_an_untouched_run_verifies_with_the_counts_checked(run, capsys):
     assert verify(run, "--json") == 0
-    found = json.loads(capsys.readouterr().out)
+    (found,) = json.loads(capsys.readouterr().out)["runs"]
     # 3 + 2 frames, the avatar's file and its record; a PSNR of each frame and the number of files
     assert (found["files"], found["values"], found["mismatches"]) == (7, 6, [])
 
@@ -146,3 +146,20 @@ def test_an_unfinished_run_gives_no_verdict(run, tmp_path):
     started.write(RunFolder(run).manifest)
     assert verify(run) == 3
     assert verify(tmp_path) == 3
+
+
+def test_cells_are_verified_by_tasks_of_an_executor(run, frame, tmp_path, capsys):
+    write_png(frame, read_png(frame) + 3)
+    found = []
+    for more in ([], ["--executor", "processes", "--workers", "1", "--out", str(tmp_path / "out")]):
+        assert verify(run, "--json", *more) == 1
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[0] == found[1] == read_json(tmp_path / "out" / "verify.json")
+    assert len(found[0]["runs"][0]["mismatches"]) == 2
+
+
+def test_renders_that_were_cleaned_are_one_finding(run, found):
+    assert cli.main(["status", str(run), "--clean", "renders"]) == 0
+    out = found()
+    assert "1 mismatches" in out
+    assert "`headbench status --clean renders`" in out
