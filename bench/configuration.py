@@ -104,7 +104,7 @@ def setting_paths(cls: Any, prefix: str = "") -> list[str]:
 def deciding_settings(config: Any) -> Any:
     """The settings of a dataclass that decide results, as plain values, for digests; other values, None say, as they are.
 
-    Settings named in the class variable ``places`` are left out: they say where something lies on this machine.
+    Settings named in the class variable ``places`` are left out: paths on this machine, and limits of time.
     """
     if isinstance(config, tuple):
         return tuple(map(deciding_settings, config))

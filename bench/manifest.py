@@ -21,6 +21,9 @@ from .protocol import Protocol
 from .specs import LABEL, MetricSpec, is_label
 from .upgrade import upgraded_manifest
 
+MAX_CELLS = 20_000
+"""A record of few bytes can ask for any number; the largest suite has some hundred."""
+
 
 @dataclass(frozen=True)
 class MethodRecord:
@@ -179,6 +182,10 @@ class Manifest:
             raise InputError(path, "format", "1 or 2", shown(record.get("format")))
         hashes = checked(record.get(PROTOCOLS), dict[str, str], path, PROTOCOLS)
         manifest = checked({**record, PROTOCOLS: {}}, cls, path)
+        cells = len(manifest.methods) * len(manifest.clips) * len(manifest.configuration.seeds)
+        if cells > MAX_CELLS:
+            expected = f"at most {MAX_CELLS} cells (methods, captures and seeds)"
+            raise InputError(path, "configuration.seeds", expected, str(cells))
         named: dict[str, set[str]] = {
             "methods": {method.label for method in manifest.methods},
             "metrics, tables": {table for metric in manifest.metrics for table in metric.tables},

@@ -6,7 +6,6 @@ resolved when it is used. The behaviours are defined in `contracts`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
@@ -212,7 +211,7 @@ class MetricSpec:
         Whether a run that names no metrics includes it. Not recorded in runs.
     needs : str
         As for a method, called with None for the config. Not recorded in runs.
-    suspect_above : float
+    suspect_above : float | None
         Values of whole frames above it are marked as suspect in rows, tables and reports: no method that was measured
         reaches it without the test image. Not recorded in runs.
     """
@@ -231,7 +230,7 @@ class MetricSpec:
     profile: str = "canonical"
     default: bool = field(default=False, compare=False)
     needs: str = field(default="", compare=False)
-    suspect_above: float = field(default=math.inf, compare=False)
+    suspect_above: float | None = field(default=None, compare=False)
 
     @property
     def per_frame(self) -> bool:

@@ -294,7 +294,7 @@ CASES = {
     "export html": [
         case(
             f"export html {cell(name)} --out {name}.html --capture {{capture}}",
-            "dB; the least",
+            "dB; minimum",
             f"{name}.html",
         )
         for name in ("ours",)

@@ -17,6 +17,7 @@ from ..engine.steps import DIGESTS, Job, measure, render
 from ..engine.store import Cell, RunFolder
 from ..engine.stored import avatar_digest, open_avatar
 from ..errors import HeadbenchError, InputError
+from ..executors.remote import run_as_task
 from ..io.files import (
     atomic_path,
     check_kind,
@@ -61,6 +62,10 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
 
     Raises `InputError` for invalid settings, captures or images, before anything is written.
     """
+    if settings.execution.executor != "inline":
+        out = Path(settings.out)
+        place = out.with_name(f"{out.name}-task")
+        return run_as_task(f"{__name__}:evaluate_folder", settings, place, settings.device)
     source = Path(settings.folder)
     stored = open_avatar(source, settings.method) if settings.avatar else None
     config, clips = _open(settings, {} if stored is None else stored.heads)

@@ -88,7 +88,7 @@ def check_shown(submission: Any, source: str) -> None:
 
 
 @dataclass(frozen=True)
-class EvaluateSettings:
+class EvaluateSettings(ExecutionOptions):
     """Score a folder of images named by key, so that a method needs no plug-in to be compared, or a stored avatar.
 
     An image is SEQUENCE_TIMESTEP_CAMERA.png (timestep of five digits), as `headbench run` names its renders: 8-bit RGB

@@ -700,7 +700,7 @@ def _score(job: Job, specs: Sequence[MetricSpec], protocol: Protocol) -> dict[st
 
 def _suspicion(spec: MetricSpec, score: Score) -> str:
     """Reason of a row whose value is too good to be true, "" for any other."""
-    if score.region != FULL or not score.value > spec.suspect_above:
+    if spec.suspect_above is None or score.region != FULL or not score.value > spec.suspect_above:
         return ""
     return f"{SUSPECT}above {spec.suspect_above:g} {spec.unit}"
 

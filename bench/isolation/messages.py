@@ -41,10 +41,7 @@ def receive(connection: Connection) -> tuple[Message, dict[str, NDArray[Any]]]:
 
     Raises `HeadbenchError` for anything else than a message, and `EOFError` where the other side has ended.
     """
-    try:
-        line = connection.recv_bytes(LARGEST_LINE)
-    except OSError as error:
-        raise HeadbenchError(f"the process of the method sent no message: {error}") from error
+    line = _bytes(connection, LARGEST_LINE)
     try:
         message, listed = json.loads(line)
         announced = {str(name): _announced(*entry) for name, entry in listed.items()}
@@ -54,13 +51,22 @@ def receive(connection: Connection) -> tuple[Message, dict[str, NDArray[Any]]]:
         raise HeadbenchError(f"the process of the method sent no valid message: {error}") from error
     arrays = {}
     for name, (kind, shape, size) in announced.items():
-        data = connection.recv_bytes(size) if size else b""
+        data = _bytes(connection, size) if size else b""
         if len(data) != size:
             raise HeadbenchError(
                 f"the process of the method sent {len(data)} bytes of {name} instead of {size}"
             )
         arrays[name] = np.frombuffer(data, kind).reshape(shape)
     return message, arrays
+
+
+def _bytes(connection: Connection, largest: int) -> bytes:
+    try:
+        return connection.recv_bytes(largest)
+    except ConnectionError:
+        raise
+    except OSError as error:  # longer than that
+        raise HeadbenchError(f"the process of the method sent no valid message: {error}") from error
 
 
 def _announced(kind: str, shape: Sequence[int]) -> tuple[str, tuple[int, ...], int]:

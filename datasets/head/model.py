@@ -52,9 +52,8 @@ class HeadModel(torch.nn.Module):
 
         def buffer(name: str, values: Any) -> None:
             array = np.ascontiguousarray(values, dtype=np.float64)
-            self.register_buffer(
-                name, torch.from_numpy(array).to(device=device, dtype=dtype), persistent=False
-            )
+            # A copy: the arrays of a head model are read-only and shared by all methods.
+            self.register_buffer(name, torch.tensor(array, device=device, dtype=dtype), persistent=False)
 
         def basis(name: str, values: Any) -> None:
             # (V, 3, K) to (K, 3V), so that the product with coefficients is one matrix multiplication.
@@ -72,7 +71,7 @@ class HeadModel(torch.nn.Module):
             basis("eyelid_matrix", asset.eyelid_basis)
         regressor = np.asarray(asset.joint_regressor, np.float64)
         basis("joint_matrix", np.tensordot(regressor, np.asarray(asset.expression_basis, np.float64), 1))
-        faces = torch.from_numpy(np.asarray(asset.faces, dtype=np.int64)).to(device)
+        faces = torch.tensor(np.asarray(asset.faces, dtype=np.int64), device=device)
         self.register_buffer("faces", faces, persistent=False)
 
     @property

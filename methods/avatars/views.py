@@ -25,9 +25,7 @@ def contribution(splats: Splats, camera: Camera) -> Tensor:
     """
     view = view_of(camera, "cpu")
     geometry = splats.means, splats.quats, splats.scales, splats.opacities
-    means, quats, scales, opacities = (
-        torch.from_numpy(np.asarray(values, np.float32)) for values in geometry
-    )
+    means, quats, scales, opacities = (torch.tensor(np.asarray(values, np.float32)) for values in geometry)
     colors = torch.ones(len(means), 1, requires_grad=True)
     where = view.world_to_camera, view.K, camera.width, camera.height
     image = rasterize(means, quats, scales, opacities, colors, *where).image

@@ -97,12 +97,12 @@ class Driver:
     ):
         self.model = HeadModel(head, device=device)
         self._identity = {
-            "shape": torch.as_tensor(np.asarray(shape)).to(self.model.template),
-            "static_offset": torch.as_tensor(np.asarray(static_offset)).to(self.model.template),
+            "shape": torch.tensor(np.asarray(shape)).to(self.model.template),
+            "static_offset": torch.tensor(np.asarray(static_offset)).to(self.model.template),
         }
         self.neutral = self.model.canonical(**self._identity)[0]
         check_size("subject", "shape, static_offset", self.neutral.cpu().numpy(), np.asarray(head.faces))
-        self.origin = torch.as_tensor(np.asarray(origin)).to(self.neutral)
+        self.origin = torch.tensor(np.asarray(origin)).to(self.neutral)
         self.center = torch.as_tensor(np.zeros(3) if center is None else np.asarray(center)).to(self.neutral)
         self._code_shift = torch.cat([torch.zeros_like(self.center), self.center])
         self.unit = unit
@@ -303,7 +303,7 @@ def training_scene(clip: Clip, config: GHAConfig, device: str, seed: int) -> Tra
         views={
             name: view_of(clip.cameras[name], device) for name in {k.camera for k in clip.splits["train"]}
         },
-        background=torch.as_tensor(np.asarray(clip.background), dtype=torch.float32, device=device),
+        background=torch.tensor(np.asarray(clip.background), dtype=torch.float32, device=device),
         rest=driver.unposed(driver.rest_arguments(opened))[0],
         landmark_rows=rows,
         expression_scale=scale,

@@ -175,7 +175,7 @@ def first_points(
         points, features = points[rows], features[rows]
     lips = scene.clip.head.regions.get("lips")
     if lips is not None and config.mouth_points:
-        center, half = mouth_box(scene.rest[torch.as_tensor(np.asarray(lips))].cpu().double().numpy())
+        center, half = mouth_box(scene.rest[torch.tensor(np.asarray(lips))].cpu().double().numpy())
         draws = torch.rand(config.mouth_points, 3, generator=torch_generator(scene.seed, "gha-mouth"))
         inside = torch.as_tensor(center + half * (2 * draws.double().numpy() - 1)).to(points)
         points = torch.cat([points, inside])

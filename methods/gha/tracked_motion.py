@@ -97,7 +97,7 @@ def _rows(scene: TrainingScene, config: GHAConfig) -> Tensor:
     ruled[near.rows[near.weights == 1]] = True
     for name in TURNING:
         if name in scene.clip.head.regions:
-            ruled[torch.as_tensor(scene.clip.head.regions[name], device=ruled.device)] = False
+            ruled[torch.tensor(scene.clip.head.regions[name], device=ruled.device)] = False
     return ruled.nonzero().squeeze(1)
 
 

@@ -88,7 +88,7 @@ class InstaAvatar:
         if reach < 0:
             return Frame(rgb, alpha)
         corners = box_corners(surface.vertices.numpy(), reach)
-        condition = torch.as_tensor(np.asarray(pose.expression), dtype=torch.float32)
+        condition = torch.tensor(np.asarray(pose.expression), dtype=torch.float32)
         for rows, columns in pixels_by_blocks(pixels_of_hull(camera, corners), RAYS_AT_ONCE):
             scene = PosedRays(surface, condition, camera_rays(camera, columns, rows, MIDDLE))
             seen = self._inference.render(scene)

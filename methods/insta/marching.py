@@ -85,7 +85,7 @@ class CanonicalSurface:
         self, head: HeadAsset, canonical: Tensor, variant: Variant = "paper", backend: Backend = "auto"
     ):
         self.canonical = canonical.detach().cpu()
-        self.faces = torch.from_numpy(np.asarray(head.faces, dtype=np.int64))
+        self.faces = torch.tensor(np.asarray(head.faces, dtype=np.int64))
         self.blend = Blend.of(head, variant)
         self.module: Any = None if backend == "reference" else kernel.load()
         if backend == "kernel" and self.module is None:
@@ -212,12 +212,12 @@ class PosedSurface:
         self, points: np.ndarray, triangles: np.ndarray, direction: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Canonical positions of (N, 3) points by their nearest triangles, and of one direction at each of them."""
-        own = torch.from_numpy(np.asarray(points)).to(self.matrices)
+        own = torch.tensor(np.asarray(points)).to(self.matrices)
         matrices = blended(
             own, torch.from_numpy(triangles).long(), self.matrices, self.centroids, self.surface.blend
         )
         positions = (matrices[:, :, :3] @ own[:, :, None])[:, :, 0] + matrices[:, :, 3]
-        turned = matrices[:, :, :3] @ torch.from_numpy(np.asarray(direction)).to(own)
+        turned = matrices[:, :, :3] @ torch.tensor(np.asarray(direction)).to(own)
         return positions.numpy(), torch.nn.functional.normalize(turned, dim=1).numpy()
 
 

@@ -65,7 +65,7 @@ class InstaTraining:
         self._rays = max(config.first_rays, RAYS_MIN)
         self.mouth = mouth_triangles(clip.head)
         self._bare = bare_triangles(clip.head)
-        self._ground = torch.as_tensor(np.asarray(clip.background), dtype=torch.float32)
+        self._ground = torch.tensor(np.asarray(clip.background), dtype=torch.float32)
         self._marching = Marching(config.step, config.round_samples, config.stop_transmittance)
         self._masked = clip.mask(self.keys[0]) is not None
         cameras = [clip.cameras[key.camera] for key in self.keys]
@@ -170,9 +170,7 @@ class InstaTraining:
 
     def _refresh(self, iteration: int) -> None:
         key = self.keys[int(numpy_generator(self._seed, "expression", iteration).integers(len(self.keys)))]
-        condition = torch.as_tensor(
-            np.asarray(self._clip.poses[key.timestep].expression), dtype=torch.float32
-        )
+        condition = torch.tensor(np.asarray(self._clip.poses[key.timestep].expression), dtype=torch.float32)
         parameters = {name: self._optimiser[name].detach() for name in self._names}
         whole = iteration <= self._config.occupancy_whole
         self.occupancy.refresh(
@@ -208,7 +206,7 @@ class InstaTraining:
         hit, triangles = found.triangles >= 0, found.triangles.clamp_min(0)
         bare = hit & self._bare[triangles] & (coverage[:, 0] > 0.001)
         depth = torch.where(bare, found.values, torch.inf)
-        expression = torch.as_tensor(np.asarray(pose.expression), dtype=torch.float32)
+        expression = torch.tensor(np.asarray(pose.expression), dtype=torch.float32)
         return PosedRays(surface, expression, rays), colors, coverage, hit & self.mouth[triangles], depth
 
     @torch.no_grad()

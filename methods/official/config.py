@@ -29,6 +29,8 @@ class OfficialConfig:
     order : Literal['published', 'native']
         Order of the training images: as their code draws them, or as the native method does with the
         same seed, so that both use the same image in each iteration.
+    time_limit_hours : float | None
+        Time after which one of their programs is ended and its cell fails; None for no limit.
     """
 
     checkout: str = ""
@@ -37,8 +39,13 @@ class OfficialConfig:
     arguments: tuple[str, ...] = ()
     device: Literal["cuda", "cpu-shim"] = "cuda"
     order: Literal["published", "native"] = "published"
+    time_limit_hours: float | None = None
 
-    places: ClassVar[tuple[str, ...]] = ("checkout", "python")
+    places: ClassVar[tuple[str, ...]] = ("checkout", "python", "time_limit_hours")
+
+    def __post_init__(self) -> None:
+        if self.time_limit_hours is not None and self.time_limit_hours <= 0:
+            raise ValueError(f"time_limit_hours is above 0, or none; found {self.time_limit_hours}")
 
     @property
     def label(self) -> str:
@@ -83,6 +90,7 @@ class GHAOfficialConfig(OfficialConfig):
     mesh_fraction: float = 0.05
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 < self.mesh_fraction < 1:
             raise ValueError(f"mesh_fraction must lie between 0 and 1, found {self.mesh_fraction}")
         if self.arguments:

@@ -362,14 +362,26 @@ class OfficialMethod(ABC, Generic[Config]):
             order=self._order(fit, work),
         )
         ended = run_program(
-            command, work.program, fit.out / TRAINING_LOG, on_line, variables=self.variables, held=held
+            command,
+            work.program,
+            fit.out / TRAINING_LOG,
+            on_line,
+            variables=self.variables,
+            held=held,
+            hours=self.config.time_limit_hours,
         )
         if ended.code:
             raise ended.error(f"The training command of {checkout.folder} {described(ended.code)}")
         shrinking = self.shrink_command(fit, checkout, work)
         if shrinking is not None:
             shrunk = run_program(
-                shrinking, work.program, fit.out / TRAINING_LOG, on_line, variables=self.variables, held=held
+                shrinking,
+                work.program,
+                fit.out / TRAINING_LOG,
+                on_line,
+                variables=self.variables,
+                held=held,
+                hours=self.config.time_limit_hours,
             )
             if shrunk.code:
                 raise shrunk.error(f"Leaving the optimiser out of its output {described(shrunk.code)}")
@@ -463,7 +475,13 @@ class OfficialAvatar:
                 patches=method.patches_to_render(folder, checkout) if method.config.device != "cuda" else [],
             )
             ended = run_program(
-                command, work.program, folder / RENDERING_LOG, on_line, variables=method.variables, held=held
+                command,
+                work.program,
+                folder / RENDERING_LOG,
+                on_line,
+                variables=method.variables,
+                held=held,
+                hours=method.config.time_limit_hours,
             )
             if ended.code and not method.excused(ended):
                 raise ended.error(f"The render command of {checkout.folder} {described(ended.code)}")

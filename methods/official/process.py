@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
+import select
 import signal
 import subprocess
 import time
+import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
+
+import psutil
 
 from ...bench.errors import HeadbenchError, shortened
 from ...bench.io.files import flush_renames
@@ -27,11 +33,17 @@ GIVEN = {"PYTHONUNBUFFERED": "1", "PYTHONDONTWRITEBYTECODE": "1", "TQDM_MININTER
 """Additional variables: output is not buffered, and no caches are written to its folder."""
 
 LAST_LINES, LONGEST_LINE = 12, 2_000
-LONGEST_LOG = 64 * 2**20
+LONGEST_LOG = 4 * 2**20
+"""Bytes of a program's output that are logged, from the beginning; of the rest the last lines."""
+LEFT_IN_PIPE = 2**20
+"""Bytes read at most after the program has ended; what it wrote itself is within the pipe's 64 KiB."""
 REDRAWN_EVERY_S = 30.0
 """Seconds between logged lines of a progress bar that redraws its line."""
 PATIENCE_S = 10.0
 """Seconds between the request to terminate and the kill of a program."""
+
+MARK = "HEADBENCH_PROGRAM"
+"""Environment variable by which processes that a program started are recognised, in whatever session they are."""
 
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
@@ -76,11 +88,12 @@ def run_program(
     *,
     variables: Mapping[str, str] | None = None,
     held: IO[str] | None = None,
+    hours: float | None = None,
 ) -> ProgramEnd:
     """Run a command in ``folder`` until it ends; its output, both streams, is appended to ``log``.
 
-    The program and its children are one process group, which is terminated when the program ends or this call is
-    interrupted. Files written for it are flushed to disk before, even inside a group of writes.
+    All processes that it started are terminated when it ends or this call is interrupted: its process group, and those
+    that left the group but kept its environment. A process that keeps the output open is not waited for. Files written for it are flushed to disk before, even inside a group of writes.
 
     Parameters
     ----------
@@ -90,20 +103,24 @@ def run_program(
         Environment variables in addition to `environment`.
     held : IO[str] | None
         An open file that the program inherits, so that a lock on it lasts as long as the program.
+    hours : float | None
+        Time limit; None for none.
 
     Raises
     ------
     ProgramError
-        The command cannot be started.
+        The command cannot be started, or takes longer than ``hours``.
     """
     flush_renames()
+    mark = uuid.uuid4().hex
+    until = math.inf if hours is None else time.monotonic() + 3600 * hours
     with log.open("ab") as stream:
         stream.write(f"$ {' '.join(command)}\n".encode())
         try:
             process = subprocess.Popen(
                 command,
                 cwd=folder,
-                env=environment(variables),
+                env=environment(variables) | {MARK: mark},
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
@@ -114,17 +131,28 @@ def run_program(
             raise ProgramError(f"{command[0]} could not be started: {error.strerror or error}.") from error
         last: deque[str] = deque(maxlen=LAST_LINES)
         try:
-            assert process.stdout is not None
-            _follow(process.stdout, stream, last, on_line)
-            code = process.wait()
+            in_time = _follow(process, stream, last, on_line, until)
         finally:
             _end_group(process)
-    return ProgramEnd(code, tuple(last), log)
+            _end_marked(mark)
+    ended = ProgramEnd(process.wait(), tuple(last), log)
+    if not in_time:
+        raise ended.error(
+            f"{command[0]} was ended after {hours:g} hours, the limit of the setting time_limit_hours"
+        )
+    return ended
 
 
-def _follow(output: IO[bytes], log: IO[bytes], last: deque[str], on_line: Callable[[str], None]) -> None:
-    drawn = -REDRAWN_EVERY_S
-    for line, redrawn in _lines(output):
+def _follow(
+    process: subprocess.Popen[bytes],
+    log: IO[bytes],
+    last: deque[str],
+    on_line: Callable[[str], None],
+    until: float,
+) -> bool:
+    """Log the output of a program until it ends; False if it runs longer than ``until``."""
+    drawn, left_out, limit = -REDRAWN_EVERY_S, 0, log.tell() + LONGEST_LOG
+    for line, redrawn in _lines(_output(process, until)):
         on_line(line)
         if last and redrawn and last[-1].split(":")[0] == line.split(":")[0]:
             last[-1] = line
@@ -134,15 +162,38 @@ def _follow(output: IO[bytes], log: IO[bytes], last: deque[str], on_line: Callab
         if redrawn and now - drawn < REDRAWN_EVERY_S:
             continue
         drawn = now if redrawn else drawn
-        if log.tell() < LONGEST_LOG:
+        if log.tell() < limit:
             log.write(line.encode() + b"\n")
             log.flush()
+        else:
+            left_out += 1
+    if left_out:
+        log.write("\n".join([f"[... {left_out} more lines; the last of them:]", *last, ""]).encode())
+    return process.poll() is not None
 
 
-def _lines(output: IO[bytes]) -> Iterator[tuple[str, bool]]:
+def _output(process: subprocess.Popen[bytes], until: float) -> Iterator[bytes]:
+    """Output of a program until it ends or ``until``; another process may keep the pipe open for longer."""
+    assert process.stdout is not None
+    descriptor, left, is_open = process.stdout.fileno(), LEFT_IN_PIPE, True
+    while left > 0 and time.monotonic() < until:
+        ended = process.poll() is not None  # before the pipe is looked at, so that the last output is read
+        if not is_open and not ended:
+            time.sleep(0.05)
+        ready = is_open and select.select([descriptor], [], [], 0.0 if ended else 0.2)[0]
+        if ready:
+            chunk = os.read(descriptor, 1 << 16)
+            is_open = bool(chunk)
+            left -= len(chunk) if ended else 0
+            yield chunk
+        elif ended:
+            return
+
+
+def _lines(chunks: Iterator[bytes]) -> Iterator[tuple[str, bool]]:
     """Lines, and whether each is overwritten by the next; memory is bounded."""
     rest = b""
-    while chunk := os.read(output.fileno(), 1 << 16):
+    for chunk in chunks:
         *whole, rest = re.split(rb"(\r\n|\n|\r)", rest + chunk)
         for text, end in zip(whole[::2], whole[1::2]):
             yield _readable(text), end == b"\r"
@@ -168,6 +219,14 @@ def _end_group(process: subprocess.Popen[bytes]) -> None:
     process.wait()
     if process.stdout is not None:
         process.stdout.close()
+
+
+def _end_marked(mark: str) -> None:
+    """Kill processes that a program left outside of its process group."""
+    for process in psutil.process_iter():
+        with suppress(psutil.Error, OSError):
+            if process.environ().get(MARK) == mark:
+                process.kill()
 
 
 def _signal_group(leader: int, number: int) -> bool:

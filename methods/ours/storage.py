@@ -60,7 +60,7 @@ def write_field(
         "splats": table,
         "plane_box": torch.stack(list(plane_box)),
         "line_box": torch.stack(list(line_box)),
-        "jaw_bases": torch.from_numpy(np.asarray(jaw_bases, dtype=np.float32)),
+        "jaw_bases": torch.tensor(np.asarray(jaw_bases, dtype=np.float32)),
     }
     save_field(path, StoredField(tensors, tuple(dynamic)))
 

@@ -40,7 +40,7 @@ class SplatTrainer:
         self._images = TrainingImages(clip, self.keys, sampler, device, masks=masks)
         self.cameras = {key.camera: clip.cameras[key.camera] for key in self.keys}
         self._views = {name: view_of(camera, device) for name, camera in self.cameras.items()}
-        self._background = torch.as_tensor(np.asarray(clip.background), dtype=torch.float32, device=device)
+        self._background = torch.tensor(np.asarray(clip.background), dtype=torch.float32, device=device)
 
     def _start(
         self,

@@ -38,9 +38,9 @@ class SubjectMesh:
         self.model = HeadModel(head, device=device)
         self.faces = self.model.faces
         like = self.model.template
-        self._canonical = self.model.canonical(
-            torch.as_tensor(np.asarray(shape)).to(like), torch.as_tensor(np.asarray(static_offset)).to(like)
-        )
+        # Copies: what a clip gives is read-only and shared by all methods.
+        identity, offset = (torch.tensor(np.asarray(each)).to(like) for each in (shape, static_offset))
+        self._canonical = self.model.canonical(identity, offset)
         check_size(
             "subject", "shape, static_offset", self._canonical[0].cpu().numpy(), np.asarray(head.faces)
         )

@@ -53,7 +53,7 @@ class ControlPanel:
             )
             self._timestep = self._add(gui.add_slider("Frame", min=0, max=1, step=1, initial_value=0))
             self._playing = self._add(gui.add_checkbox("Play", initial_value=False))
-            self.fps = gui.add_slider("Frames per second", min=1, max=MOST_FPS, step=1, initial_value=25)
+            self._fps = gui.add_slider("Frames per second", min=1, max=MOST_FPS, step=1, initial_value=25)
             cameras = sorted(scene.first.clip.cameras)
             self._camera = gui.add_dropdown(
                 *("Camera", (FREE, *cameras)),
@@ -82,17 +82,22 @@ class ControlPanel:
     @property
     def state(self) -> State:
         """State of the controls."""
-        values = {name: tuple(s.value for s in sliders) for name, sliders in self._joints.items()}
-        leading = {name: tuple(s.value for s in sliders) for name, sliders in self._expressions.items()}
-        red, green, blue = (channel / 255 for channel in self._background.value)
+        values = {name: tuple(map(_within, sliders)) for name, sliders in self._joints.items()}
+        leading = {name: tuple(map(_within, sliders)) for name, sliders in self._expressions.items()}
+        red, green, blue = (min(max(channel / 255, 0.0), 1.0) for channel in self._background.value)
         return State(
             Sliders(leading, **values),
             self._recording.value,
-            self._steps[min(self._timestep.value, len(self._steps) - 1)],
+            self._steps[min(int(_within(self._timestep)), len(self._steps) - 1)],
             "" if self._camera.value == FREE else self._camera.value,
             (red, green, blue),
             self._mode.value == SPLATS,
         )
+
+    @property
+    def fps(self) -> float:
+        """Frames per second of a sequence that runs."""
+        return _within(self._fps)
 
     @property
     def playing(self) -> bool:
@@ -134,3 +139,8 @@ class ControlPanel:
             for slider in sliders:
                 slider.value = 0.0
         self._changed()
+
+
+def _within(slider: Any) -> float:
+    """The value of a slider, in its range whatever the browser sent."""
+    return min(max(slider.value, slider.min), slider.max)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import io
-import ipaddress
 import logging
 import socket
 import tempfile
@@ -33,7 +32,7 @@ def view_avatars(settings: ViewSettings, progress: Progress = no_progress) -> Co
     with tempfile.TemporaryDirectory(prefix="headbench-view-") as kept:
         scene = open_scene(settings, Path(kept))
         with serving(scene, settings) as server:
-            address = f"http://{settings.host}:{server.get_port()}"
+            address = server.address
             names = ", ".join(shown.label for shown in scene.shown)
             log.warning("%s: %s (Ctrl-C ends it)", address, names)
             ends = None if settings.seconds is None else time.monotonic() + settings.seconds
@@ -47,14 +46,20 @@ def view_avatars(settings: ViewSettings, progress: Progress = no_progress) -> Co
 
 @contextmanager
 def serving(scene: Scene, settings: ViewSettings) -> Iterator[Any]:
-    """A running server, which stops in the end; its ``sessions`` by client."""
-    if not _is_loopback(settings.host):
+    """A running server, which stops in the end; its ``address`` for browsers, and its ``sessions`` by client."""
+    library = viser()
+    from .guard import Guard  # needs packages that come with viser
+
+    guard = Guard.of(settings)
+    if guard.token:
         log.warning(
-            "Everybody who reaches %s can look at these avatars and use this machine to draw them.",
+            "Everybody who reaches %s and has this address can look at these avatars and use this machine to draw them. "
+            "The connection is not encrypted.",
             settings.host,
         )
-    with redirect_stdout(io.StringIO()):  # it prints a banner
-        server = viser().ViserServer(host=settings.host, port=settings.port, label="headbench", verbose=False)
+    with redirect_stdout(io.StringIO()), guard.installed():  # it prints a banner
+        server = library.ViserServer(host=settings.host, port=settings.port, label="headbench", verbose=False)
+    server.address = guard.address(server.get_port())
     # It can open a tunnel to a public address on a browser's wish; no picture of anybody leaves this way.
     server.request_share_url = lambda verbose=True: None
     server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -67,6 +72,8 @@ def serving(scene: Scene, settings: ViewSettings) -> Iterator[Any]:
     @server.on_client_connect
     def begin(client: Any) -> None:
         server.sessions[client.client_id] = Session(client, scene, settings.expressions, lock)
+        if client.client_id not in server.get_clients():  # it has gone meanwhile
+            end(client)
 
     @server.on_client_disconnect
     def end(client: Any) -> None:
@@ -105,10 +112,3 @@ def check_port(host: str, port: int) -> None:
         raise InputError(
             "command line", "--port", expected, f"{host}:{port}: {error}", "Choose another --port."
         ) from None
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

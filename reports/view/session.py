@@ -37,7 +37,10 @@ STILL = 1e-4
 DRAFT_QUALITY = 85
 APART_M = 0.35
 """Between avatars side by side, where the browser draws splats."""
-MOST_HEIGHT = 1080
+MOST_WIDTH, MOST_HEIGHT = 3840, 1080
+LEAST_FOV, MOST_FOV = 0.01, 3.0
+MOST_TASKS = 3
+"""Files that wait to be saved; further clicks are ignored."""
 VIDEO_HEIGHT = 512
 TURNTABLE_VIEWS, BEYOND_DEGREES = 90, 30.0
 
@@ -86,9 +89,9 @@ class Session:
                     self._tasks.pop(0)()
                 self._changed.wait(timeout=None if not self._panel.playing else 0.0)
                 if self._panel.playing:
-                    frames = int((time.perf_counter() - last) * self._panel.fps.value)
+                    frames = int((time.perf_counter() - last) * self._panel.fps)
                     if frames:
-                        last += frames / self._panel.fps.value
+                        last += frames / self._panel.fps
                         self._panel.advance(frames)
                     else:
                         time.sleep(0.005)
@@ -173,11 +176,11 @@ class Session:
     # -------------------------------------------------------------- the camera
 
     def _size(self) -> tuple[int, int]:
-        """Width and height of the browser's canvas, pixels, at most `MOST_HEIGHT` high."""
+        """Width and height of the browser's canvas, pixels, at most `MOST_WIDTH` by `MOST_HEIGHT`."""
         camera = self._client.camera
         width, height = max(1, camera.image_width), max(1, camera.image_height)
-        factor = min(1.0, MOST_HEIGHT / height)
-        return round(width * factor), round(height * factor)
+        factor = min(1.0, MOST_WIDTH / width, MOST_HEIGHT / height)
+        return max(1, round(width * factor)), max(1, round(height * factor))
 
     def _camera_moved(self) -> None:
         """Record a visible change; a browser that smooths a motion also reports smaller ones."""
@@ -192,7 +195,7 @@ class Session:
         to_world = np.eye(4)
         to_world[:3, :3] = rotations(np.array([camera.wxyz]))[0]
         to_world[:3, 3] = np.asarray(camera.position) / SCALE
-        return FreeView(np.linalg.inv(to_world), float(camera.fov))
+        return FreeView(np.linalg.inv(to_world), float(np.clip(camera.fov, LEAST_FOV, MOST_FOV)))
 
     def _look_at_head(self) -> None:
         """Start from the front, so near that the head fills the view as in a camera of the capture."""
@@ -223,7 +226,8 @@ class Session:
     # -------------------------------------------------------------- saved files
 
     def _do(self, task: Callable[[], None]) -> None:
-        self._tasks.append(task)
+        if len(self._tasks) < MOST_TASKS:
+            self._tasks.append(task)
         self._changed.set()
 
     def _say(self, text: str, title: str = "Not done") -> None:
@@ -251,7 +255,7 @@ class Session:
     def _save(self, name: str, moments: Iterator[tuple[State, FreeView]], count: int) -> None:
         width, height = self._size()
         factor = min(1.0, VIDEO_HEIGHT / height)
-        size = 2 * round(width * factor / 2), 2 * round(height * factor / 2)
+        size = 2 * max(1, round(width * factor / 2)), 2 * max(1, round(height * factor / 2))
         bar = self._client.gui.add_progress_bar(0.0)
 
         def images() -> Iterator[ByteArray]:
@@ -265,7 +269,7 @@ class Session:
         try:
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / f"{name}.webm"
-                write_webm(path, images(), float(self._panel.fps.value), COMPOSITE)
+                write_webm(path, images(), float(self._panel.fps), COMPOSITE)
                 self._client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
         finally:
             bar.remove()

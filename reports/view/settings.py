@@ -38,7 +38,11 @@ class ViewSettings(RunOptions):
     """Rendering device; by default that of the training."""
 
     host: str = "127.0.0.1"
-    """Address to listen at. Any other than the machine's own lets everybody who reaches it look and draw."""
+    """Address to listen at. Any other than the machine's own lets everybody look and draw who reaches it and has the
+    printed address, which then holds a random token."""
+
+    allowed_hosts: tuple[str, ...] = ()
+    """Names of this machine in browsers, such as that of a proxy, besides localhost and ``host``; others are refused."""
 
     port: int = 8080
     """Port to listen at; 0 takes a free one."""

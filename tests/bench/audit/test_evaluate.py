@@ -16,7 +16,7 @@ from headbench.bench.audit.naming import Render, check_truth, composited
 from headbench.bench.audit.settings import EvaluateSettings
 from headbench.bench.contracts import FrameKey
 from headbench.bench.engine.store import RunFolder
-from headbench.bench.errors import InputError
+from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.images import read_png, write_png
 from headbench.bench.rows import ALL, COLUMNS
 
@@ -57,6 +57,27 @@ def test_every_layout_gives_the_same_rows(run, renders, images, tmp_path, layout
     """Among them that of a run's cell."""
     shutil.copytree(renders, tmp_path / "other" / layout, dirs_exist_ok=True)
     assert scored(tmp_path / "other", run, tmp_path / "a").equals(scored(images, run, tmp_path / "b"))
+
+
+def test_an_executor_gives_the_same_result(run, images, tmp_path):
+    results = {}
+    for name in ("inline", "processes"):
+        given = {"like": str(run), "label": "theirs", "trust": True, "executor": name}
+        results[name] = evaluate_folder(
+            EvaluateSettings(str(images), out=str(tmp_path / name / "out"), **given)
+        )
+        assert [path.name for path in (tmp_path / name).iterdir()] == ["out"]
+    rows = [pd.read_parquet(RunFolder(tmp_path / name / "out").rows) for name in results]
+    assert rows[0].equals(rows[1])
+    first, second = (result.text.replace(name, "") for name, result in results.items())
+    assert first == second
+    assert results["processes"].data["rows"] == results["inline"].data["rows"]
+
+
+def test_a_failure_in_an_executor_names_its_reason_and_log(run, tmp_path):
+    given = {"out": str(tmp_path / "out"), "like": str(run), "label": "theirs", "trust": True}
+    with pytest.raises(HeadbenchError, match=r"expected a folder of images.*Its log is .*job\.log"):
+        evaluate_folder(EvaluateSettings(str(tmp_path / "none"), **given, executor="processes"))
 
 
 def test_the_table_shown_holds_the_run_and_the_images(run, images, tmp_path):
@@ -217,7 +238,7 @@ def another_order(model):
         (
             one_too_few,
             "ga-official",
-            "3 images, .*transforms_test.json, found 2.*Render the split again.*MAP",
+            "3 images, .*transforms_test.json, found 2.*Render the whole split again.*MAP",
         ),
         (a_gap, "ga-official", "found 3, 00000.png to 00003.png"),
         (another_order, "ga-official", "gt/00000.png: expected the ground truth of .* found .*another order"),

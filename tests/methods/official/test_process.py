@@ -1,0 +1,77 @@
+"""Programs that leave processes, never end, or write without end."""
+
+import signal
+import sys
+import time
+
+import psutil
+import pytest
+
+from headbench.methods.official.process import LONGEST_LOG, ProgramError, run_program
+
+LEAVES = """
+import subprocess, sys
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(300)"], start_new_session={session})
+open("child", "w").write(str(child.pid))
+print("the last line")
+"""
+
+
+def run(tmp_path, code, **options):
+    lines = []
+    ended = run_program([sys.executable, "-c", code], tmp_path, tmp_path / "log", lines.append, **options)
+    return ended, lines
+
+
+def is_running(process):
+    """Whether a process that was left still runs; it may be nobody's child yet."""
+    try:
+        return psutil.Process(process).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+@pytest.mark.parametrize("session", [False, True], ids=["in its group", "in a session of its own"])
+def test_a_child_that_holds_the_output_is_ended(tmp_path, session):
+    began = time.monotonic()
+    ended, lines = run(tmp_path, LEAVES.format(session=session))
+    assert time.monotonic() - began < 60  # it sleeps for 300
+    assert (ended.code, lines) == (0, ["the last line"])
+    child = int((tmp_path / "child").read_text())
+    until = time.monotonic() + 10
+    while is_running(child) and time.monotonic() < until:
+        time.sleep(0.02)
+    assert not is_running(child)
+
+
+def test_a_child_that_writes_without_end_is_not_followed(tmp_path):
+    code = "import os, subprocess; subprocess.Popen(['yes'], start_new_session=True)"
+    ended, _ = run(tmp_path, code)
+    assert ended.code == 0
+
+
+def test_a_program_over_its_time_limit_is_ended(tmp_path):
+    with pytest.raises(ProgramError, match=r"ended after 0.0003 hours.*time_limit_hours.*begun"):
+        run(tmp_path, "import time; print('begun', flush=True); time.sleep(300)", hours=0.0003)
+
+
+def test_the_log_keeps_the_beginning_and_the_end(tmp_path):
+    code = "print('first'); print(('x' * 99 + '\\n') * 80_000, end=''); print('last')"
+    ended, lines = run(tmp_path, code)
+    assert len(lines) == 80_002
+    text = (tmp_path / "log").read_text()
+    assert len(text) < LONGEST_LOG + 10_000 < 80_000 * 100
+    assert "first\nxxx" in text
+    assert text.endswith("xxx\nlast\n")
+    assert " more lines; the last of them:]" in text
+    assert ended.lines[-1] == "last"
+
+
+def test_a_program_that_closes_its_output_is_waited_for(tmp_path):
+    ended, _ = run(tmp_path, "import os, time; os.close(1); os.close(2); time.sleep(0.5); os._exit(5)")
+    assert ended.code == 5
+
+
+def test_a_signal_is_the_end_of_a_program(tmp_path):
+    ended, _ = run(tmp_path, "import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
+    assert ended.code == -signal.SIGKILL
