@@ -57,6 +57,7 @@ VERIFY = CommandSpec(
     summary="Recompute a run's digests and metrics from its frames and report differences.",
     settings="headbench.bench.audit.settings:VerifySettings",
     function="headbench.bench.audit.verify:verify_run",
+    writes="out",
 )
 
 BUNDLE = CommandSpec(

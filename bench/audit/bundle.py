@@ -21,6 +21,7 @@ from ..io.documents import MAX_JSON_BYTES, checked, parse_json
 from ..io.files import atomic_path, check_writable, digest_file, write_json
 from ..io.provenance import RENDER, source_type
 from ..manifest import PROTOCOLS, Manifest, protocol_path
+from ..rows import Rows
 from ..specs import CommandResult
 from .settings import BundleSettings, check_shown
 
@@ -166,6 +167,19 @@ def _cell_files(
             paths += [cell.folder / name for name in recorded]
         files |= {path.relative_to(folder.root).as_posix(): path for path in paths}
     return files
+
+
+def check_results(folder: RunFolder, manifest: Manifest) -> Rows:
+    """The rows of a finished run, checked: each frame once, by the protocols of the record, whose hashes are those of their content.
+
+    Raises `InputError` for rows or protocols that are not.
+    """
+    for record in manifest.protocols.values():
+        record.protocol(folder.manifest)
+    folder.read_rows(manifest)
+    rows = folder.rows_by_condition(manifest)
+    rows.check_protocols(folder.rows, {task: record.hash for task, record in manifest.protocols.items()})
+    return rows
 
 
 def read_bundle(path: Path, into: Path) -> Bundle:

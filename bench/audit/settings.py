@@ -18,15 +18,28 @@ from ..specs import LABEL, is_label
 
 @dataclass(frozen=True)
 class VerifySettings(RunOptions, ExecutionOptions):
-    """Recompute a run's hashes and metrics from the files it left.
+    """Recompute hashes and metrics of runs from the files they left; state what was not verified.
 
     Of a bundle the listed digests are checked, and with renders in it all metrics of frames as well: against the capture
-    that --data names, or for a synthetic one against a capture made again from the recorded seed.
-    Exit code 0: as recorded; 1: something differs; 2: wrong usage; 3: the run or its capture is missing or invalid.
+    that --data names, or for a synthetic one against a capture made again from the recorded seed. Definitions of metrics and
+    methods are compared with those registered here. Of several runs or bundles, equal renders are listed.
+    Exit code 0: everything that was verified is as recorded; 1: something differs; 2: wrong usage; 3: a run or its capture is
+    missing or invalid.
     """
 
-    run: tyro.conf.Positional[str]
-    """Folder of a finished run or of `headbench evaluate`, or a file of `headbench bundle`."""
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of finished runs or of `headbench evaluate`, and files of `headbench bundle`."""
+
+    out: str | None = None
+    """Folder for verify.json and for temporary files; with --executor slurm one that all machines share. Default: temporary
+    files only, deleted at the end."""
+
+    def __post_init__(self) -> None:
+        """Refuse to verify nothing, and jobs of a cluster without a folder that they share."""
+        if not self.runs:
+            raise InputError("command line", "RUNS", "a run or a bundle", "none")
+        if self.executor == "slurm" and self.out is None:
+            raise InputError("command line", "--out", "a folder that all machines share", "none")
 
 
 @dataclass(frozen=True)

@@ -5,29 +5,35 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import lru_cache
+from itertools import combinations, product
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pandas as pd
 
 from ..condition import Condition
 from ..contracts import Avatar, Clip, FrameKey, Progress, no_progress
 from ..engine.captures import Plugins, open_run_clips, synthesis_arguments
-from ..engine.config import resolve_cells, resolve_metrics
+from ..engine.config import RunOptions, resolve_cells
 from ..engine.jobs import load, make_jobs
 from ..engine.steps import DIGESTS, Job, measure, recorded_frames
 from ..engine.store import Cell, RunFolder
 from ..errors import ExitCode, HeadbenchError, InputError
-from ..executors.remote import run_as_task
-from ..io.files import digest, digest_file
+from ..executors.schedule import Schedule
+from ..executors.settings import Execution, check_executor
+from ..executors.task import TASK_LOG, Task
+from ..io.documents import checked, read_json
+from ..io.files import digest, digest_file, write_json
 from ..io.images import read_png
 from ..manifest import Manifest, ProtocolRecord
 from ..protocol import Protocol, make_protocols
 from ..registry import get, resolve
 from ..rows import ALL, FRAME, Rows
 from ..specs import CommandResult, MetricSpec
-from .bundle import read_bundle
+from .bundle import check_results, read_bundle
+from .definitions import Mismatch, contradictions, known_methods, known_metrics, method_of
 from .evaluate import NoAvatar, images_method
 from .settings import VerifySettings
 
@@ -36,80 +42,218 @@ SHOWN = 20
 PIXELS_PER_BYTE = 100
 """Of the captures that are made again for a bundle; its renders have about one of a byte, a run scores a tenth of them at
 least."""
-
-
-@dataclass(frozen=True)
-class Mismatch:
-    """A file or value that differs from its record."""
-
-    file: Path
-    key: str
-    expected: str
-    found: str
-
-    def __str__(self) -> str:
-        where = f"{self.file}, {self.key}" if self.key else str(self.file)
-        return f"{where}: expected {self.expected}, found {self.found}"
+TRAINING = "settings, budget, seeds, versions, processor time and memory of the training"
+"""Claims that only another training can confirm."""
+FINDINGS = "findings.json"
 
 
 @dataclass
-class _Report:
-    """Checks and findings."""
+class Findings:
+    """Results of a verification.
 
-    mismatches: list[Mismatch]
+    Attributes
+    ----------
+    mismatches : list[Mismatch]
+        Differences from the record or from the registry.
+    files, values : int
+        Number of digests and values that were computed again.
+    recomputed : list[str]
+        Metrics of frames whose values were computed again.
+    unverified : dict[str, str]
+        Why something could not be checked, by its name.
+    """
+
+    mismatches: list[Mismatch] = field(default_factory=list)
     files: int = 0
     values: int = 0
-    unverified: int = 0
+    recomputed: list[str] = field(default_factory=list)
+    unverified: dict[str, str] = field(default_factory=dict)
+
+    def add(self, other: Findings) -> None:
+        """Add the findings of a part."""
+        self.mismatches += other.mismatches
+        self.files += other.files
+        self.values += other.values
+        self.recomputed += [name for name in other.recomputed if name not in self.recomputed]
+        self.unverified |= other.unverified
+
+    @property
+    def not_verified(self) -> str:
+        """A sentence that names everything that was not verified, by reason; "" for nothing."""
+        reasons: dict[str, list[str]] = {}
+        for name, reason in self.unverified.items():
+            reasons.setdefault(reason, []).append(name)
+        parts = [f"{', '.join(names)} ({reason})" for reason, names in reasons.items()]
+        return f"Not verified: {'; '.join(parts)}." if parts else ""
+
+    def text(self, name: str) -> str:
+        """The findings in words."""
+        checked = f"{self.files} files and {self.values} values"
+        verdict = f"{checked} as recorded." if checked and not self.mismatches else ""
+        if self.mismatches:
+            verdict = f"{len(self.mismatches)} mismatches: {checked} computed again."
+        elif not self.values:
+            verdict = f"{self.files} files as listed. No value was recomputed."
+        lines = [f"  {mismatch}" for mismatch in self.mismatches[:SHOWN]]
+        if len(self.mismatches) > SHOWN:
+            lines.append(f"  and {len(self.mismatches) - SHOWN} more")
+        return "\n".join(filter(None, [f"{name}: {verdict}", *lines, self.not_verified]))
+
+
+Renders = Mapping[str, Mapping[str, str]]
+"""Digests of rendered frames by subject and path, by the name of what rendered them."""
 
 
 def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> CommandResult:
-    """Verify a run; not passed if anything differs.
+    """Verify runs and bundles; not passed if anything differs.
 
     Recomputed: fingerprints of the captures, hashes of the protocols, fingerprint of each avatar's inputs,
     digests of frames and avatar files, every metric of frames and those of avatars that are not bound to a machine.
+    Definitions of registered metrics and methods are compared with the registry.
     A value may differ by a tenth of the last digit that tables show, for networks that round otherwise elsewhere.
 
     A folder that is not a finished run, or a capture that cannot be opened, is a finding with exit code 3.
     """
-    if settings.execution.executor != "inline":
-        run = Path(settings.run)
-        place = run.with_name(f"{run.name}-verify-task")
-        return run_as_task(f"{__name__}:verify_run", settings, place, "cpu")
-    try:
-        with tempfile.TemporaryDirectory() as scratch:
-            if Path(settings.run).is_file():
-                return _verify_bundle(settings, Path(scratch), progress)
-            return _verify(settings, Path(scratch), progress)
-    except InputError as error:
-        text = f"Verify: missing or invalid: {error}"
-        return CommandResult(text, {"error": str(error)}, False, ExitCode.NO_VERDICT)
+    check_executor(settings.execution, "cpu")
+    texts, data, codes = [], [], []
+    renders: dict[str, Mapping[str, str]] = {}
+    with tempfile.TemporaryDirectory(dir=settings.out) as scratch:
+        for index, name in enumerate(settings.runs):
+            folder = Path(scratch) / str(index)
+            folder.mkdir()
+            try:
+                verified = verify(Path(name), settings, folder, settings.execution, progress)
+            except InputError as error:
+                texts.append(f"{name}: Verify: missing or invalid: {error}")
+                data.append({"run": name, "error": str(error)})
+                codes.append(ExitCode.NO_VERDICT)
+                continue
+            texts.append(verified.findings.text(name))
+            data.append({"run": name, **asdict(verified.findings)})
+            codes.append(ExitCode.NEGATIVE if verified.findings.mismatches else ExitCode.OK)
+            renders |= {f"{name}: {label}": digests for label, digests in verified.renders.items()}
+    equal = equal_renders(renders)
+    code = max(codes, key=(ExitCode.OK, ExitCode.NO_VERDICT, ExitCode.NEGATIVE).index)
+    found = {"runs": data, "equal_renders": equal}
+    if settings.out is not None:
+        write_json(Path(settings.out) / "verify.json", found)
+    return CommandResult("\n".join([*texts, *equal]), found, code == ExitCode.OK, code)
 
 
-def _verify_bundle(settings: VerifySettings, scratch: Path, progress: Progress) -> CommandResult:
-    """Check a bundle's digests and records; recompute the metrics of its renders if it has them."""
-    file, folder = Path(settings.run), RunFolder(scratch / "run")
-    bundle = read_bundle(file, folder.root)
+@dataclass(frozen=True)
+class Verified:
+    """A run or an unpacked bundle with its findings and the digests of its renders."""
+
+    folder: RunFolder
+    manifest: Manifest
+    findings: Findings
+    renders: Renders
+
+
+def verify(
+    path: Path,
+    options: RunOptions,
+    scratch: Path,
+    execution: Execution | None = None,
+    progress: Progress = no_progress,
+) -> Verified:
+    """Verify the folder of a run, or a bundle, which is unpacked into ``scratch``.
+
+    Raises `InputError` if it is not a finished run or bundle, or its capture cannot be opened.
+    """
+    findings, folder = Findings(), RunFolder(path)
+    bundle = None
+    if path.is_file():
+        folder = RunFolder(scratch / "run")
+        bundle = read_bundle(path, folder.root)
+        findings.unverified |= dict.fromkeys(("author", "link", "comment"), "the author's own words")
     manifest = folder.read_manifest()
     manifest.check_done(folder.manifest)
-    rows = folder.read_rows(manifest)
-    rows.check()
-    rows.check_protocols(file, {task: protocol.hash for task, protocol in manifest.protocols.items()})
-    if not bundle.renders:
-        report = _Report([], len(bundle.files), unverified=len(rows))
-        text = (
-            f"{file}: {report.files} files as listed, rows of one protocol for each task. No value was recomputed: the "
-            "bundle has no renders (`headbench bundle --renders`)."
-        )
-        return CommandResult(text, asdict(report))
-    if settings.data is None:
-        limit = PIXELS_PER_BYTE * file.stat().st_size
-        settings = replace(
-            settings, data=str(_captured_again(manifest, scratch / "capture", limit, progress))
-        )
-    return _verify(replace(settings, run=str(folder.root)), scratch, progress, shown=file)
+    known = known_metrics()
+    findings.mismatches += contradictions(manifest, folder.manifest, known, known_methods())
+    if bundle is not None and not bundle.renders:
+        findings.files = len(bundle.files)
+        lacking = lacking_frames(check_results(folder, manifest), manifest)
+        findings.mismatches += [Mismatch(str(folder.rows), *lack) for lack in lacking]
+        reason = "the bundle has no renders, see `headbench bundle --renders`"
+        findings.unverified |= dict.fromkeys((metric.name for metric in manifest.metrics), reason)
+    else:
+        if bundle is not None and options.data is None:
+            limit = PIXELS_PER_BYTE * path.stat().st_size
+            capture = captured_again(manifest, scratch / "capture", limit, progress)
+            options = replace(options, data=str(capture))
+        findings.add(_verified(folder, options, scratch, bundle is not None, execution, progress))
+    nothing = "nothing was trained again"
+    findings.unverified |= {TRAINING: nothing, "machine": "as it was recorded"}
+    for record in manifest.methods:
+        spec = method_of(record.name, known_methods())
+        if spec is None:
+            findings.unverified[f"method {record.label}"] = "not registered here"
+        elif record.version != spec.version:
+            findings.unverified[f"version {record.version} of {record.label}"] = (
+                f"version {spec.version} is here"
+            )
+    return Verified(folder, manifest, findings, _renders(folder, manifest))
 
 
-def _captured_again(manifest: Manifest, out: Path, limit: int, progress: Progress) -> Path:
+def _renders(folder: RunFolder, manifest: Manifest) -> Renders:
+    """Recorded digests of the frames of every method and seed."""
+    found: dict[str, dict[str, str]] = {}
+    known, seeds = known_methods(), manifest.configuration.seeds
+    for method, seed, clip in product(manifest.methods, seeds, manifest.clips):
+        spec = method_of(method.name, known)
+        if spec is not None and spec.trivial and seed != seeds[0]:
+            continue  # baselines have the same frames with every seed
+        state = folder.cell(clip.subject, method.label, seed).step(DIGESTS)
+        files = {} if state is None else state.get("files", {})
+        own = found.setdefault(f"{method.label} seed {seed}", {})
+        own |= {f"{clip.subject}/{name}": value for name, value in files.items()}
+    return found
+
+
+def equal_renders(renders: Renders) -> list[str]:
+    """A sentence for each pair that has frames with equal files."""
+    texts = []
+    for (first, own), (second, others) in combinations(renders.items(), 2):
+        count = sum(others.get(name) == value for name, value in own.items())
+        if count:
+            texts.append(f"{count} of {len(own)} frames of {first} equal those of {second}.")
+    return texts
+
+
+def lacking_frames(rows: Rows, manifest: Manifest) -> list[tuple[str, str, str]]:
+    """Values that rows lack of the frames of their protocols: where, number expected and number found.
+
+    Every method has a value, or the reason why it has none, for each frame, seed and metric; one row without a frame stands
+    for all frames of a method that failed.
+    """
+    lacking = []
+    per_frame = [metric.name for metric in manifest.metrics if metric.per_frame]
+    for method, metric in product(manifest.methods, per_frame):
+        for task, record in manifest.protocols.items():
+            own = rows.select(
+                method=method.name,
+                condition=method.condition,
+                metric=metric,
+                task=task,
+                region="full",
+                seeds=ALL,
+            )
+            whole = own[(own["timestep"] < 0) & (own["status"] == "failed")]
+            places = set(own[["seed", *FRAME]].itertuples(index=False, name=None))
+            failed = set(whole[["seed", "subject"]].itertuples(index=False, name=None))
+            wanted = {
+                (seed, *key)
+                for seed, key in product(manifest.configuration.seeds, record.keys)
+                if (seed, key.subject) not in failed
+            }
+            if missing := wanted - places:
+                where = f"{metric} of {method.label}, {task}"
+                lacking.append((where, f"{len(wanted)} frames", f"{len(wanted) - len(missing)}"))
+    return lacking
+
+
+def captured_again(manifest: Manifest, out: Path, limit: int, progress: Progress) -> Path:
     """Regenerate the synthetic captures of a run from their clips; ``limit`` bounds their pixels.
 
     Raises `InputError` for a capture that is not synthetic, not of the procedural head, or larger.
@@ -132,67 +276,158 @@ def _captured_again(manifest: Manifest, out: Path, limit: int, progress: Progres
     return out
 
 
-def _verify(
-    settings: VerifySettings, scratch: Path, progress: Progress, shown: Path | None = None
-) -> CommandResult:
-    """Verify a run folder; ``shown``: the bundle that it was unpacked from, which holds no avatars."""
-    folder = RunFolder(Path(settings.run))
-    manifest = folder.read_manifest()
-    manifest.check_done(folder.manifest)
-    # Otherwise there are images alone, of a bundle or scored by `evaluate`.
-    avatars = shown is None and any(method.implementation for method in manifest.methods)
-    used: tuple[Plugins, ...] = ("methods", "metrics") if avatars else ("metrics",)
-    config, clips = open_run_clips(
-        folder.root, settings, out=scratch, altered=True, use_cache=False, used=used
-    )
-    folder.read_rows(manifest)
-    rows = folder.rows_by_condition(manifest)
-    images = [(images_method(m.name, m.version), Condition(m.condition)) for m in manifest.methods]
-    cells = resolve_cells(config) if avatars else images
-    metrics = [metric for metric in resolve_metrics(config) if metric.per_frame or avatars]
-    protocols = make_protocols(config.tasks, clips, config.frames_per_task)
-    report = _Report([*_clips(folder, manifest, clips), *_protocols(folder, manifest, protocols)])
-    if not report.mismatches:
-        rows.check_protocols(folder.rows, {task: protocol.hash for task, protocol in protocols.items()})
+@dataclass(frozen=True)
+class _Opened:
+    """A run with the cells of some of its captures, ready to be verified."""
+
+    folder: RunFolder
+    manifest: Manifest
+    rows: Rows
+    clips: Sequence[Clip]
+    protocols: Mapping[str, Protocol]
+    jobs: Sequence[Job]
+    metrics: Sequence[MetricSpec]
+
+    @classmethod
+    def read(
+        cls, run: Path, options: RunOptions, scratch: Path, *, images: bool, only: int | None = None
+    ) -> Self:
+        """Open the captures of a run; ``images``: it is a bundle, which holds no avatars."""
+        folder = RunFolder(run)
+        manifest = folder.read_manifest()
+        # Otherwise there are images alone, of a bundle or scored by `evaluate`.
+        avatars = not images and any(method.implementation for method in manifest.methods)
+        used: tuple[Plugins, ...] = ("methods", "metrics") if avatars else ("metrics",)
+        config, clips = open_run_clips(
+            run, options, out=scratch, altered=True, use_cache=False, only=only, used=used
+        )
+        of_images = [(images_method(m.name, m.version), Condition(m.condition)) for m in manifest.methods]
+        known = known_metrics(config)
+        named = [known[metric.name] for metric in manifest.metrics if metric.name in known]
+        if only is None:
+            protocols = make_protocols(config.tasks, clips, config.frames_per_task)
+        else:  # compared by the process that opened all captures
+            protocols = {
+                task: record.protocol(folder.manifest) for task, record in manifest.protocols.items()
+            }
+        cells = resolve_cells(config) if avatars else of_images
         jobs = make_jobs(config, cells, clips, protocols, folder, scratch)
-        for index, job in enumerate(jobs):
-            _verify_cell(job, metrics, rows, folder.rows, report)
-            progress(index + 1, len(jobs), job.name)
-    lines = [f"  {mismatch}" for mismatch in report.mismatches[:SHOWN]]
-    if len(report.mismatches) > SHOWN:
-        lines.append(f"  and {len(report.mismatches) - SHOWN} more")
-    verdict = f"{len(report.mismatches)} mismatches" if report.mismatches else "as recorded"
-    looked = f"{report.files} files and {report.values} values recomputed"
-    left = f"; {report.unverified} values bound to a machine or absent are not recomputed"
-    left = left if report.unverified else ""
-    text = "\n".join([f"{shown or folder.root}: {verdict}: {looked}{left}.", *lines])
-    return CommandResult(text, asdict(report), not report.mismatches)
+        metrics = [metric for metric in named if metric.per_frame or avatars]
+        rows = folder.rows_by_condition(manifest)
+        return cls(folder, manifest, rows, clips, protocols, jobs, metrics)
 
 
-def _clips(folder: RunFolder, manifest: Manifest, clips: Sequence[Clip]) -> Iterator[Mismatch]:
-    found = {clip.subject: clip.fingerprint for clip in clips}
-    for entry in manifest.clips:
+def _verified(
+    folder: RunFolder,
+    options: RunOptions,
+    scratch: Path,
+    images: bool,
+    execution: Execution | None,
+    progress: Progress,
+) -> Findings:
+    """Findings in the captures, the protocols and the cells of a run."""
+    opened = _Opened.read(folder.root, options, scratch, images=images)
+    found = Findings([*_clips(opened), *_protocols(opened)])
+    if found.mismatches:
+        return found
+    folder.read_rows(opened.manifest)
+    hashes = {task: protocol.hash for task, protocol in opened.protocols.items()}
+    opened.rows.check_protocols(folder.rows, hashes)
+    named = {metric.name for metric in opened.metrics}
+    known = known_metrics()
+    for metric in opened.manifest.metrics:
+        if metric.name not in named:
+            reason = "a bundle holds no avatars" if metric.name in known else "not registered here"
+            found.unverified[metric.name] = reason
+    if execution is None or execution.executor == "inline":
+        for index, job in enumerate(opened.jobs):
+            found.add(_verify_cell(job, opened))
+            progress(index + 1, len(opened.jobs), job.name)
+    else:
+        for each in _by_executor(opened, options, scratch, images, execution):
+            found.add(each)
+    return found
+
+
+def _by_executor(
+    opened: _Opened, options: RunOptions, scratch: Path, images: bool, execution: Execution
+) -> Iterator[Findings]:
+    """Findings of every cell, each verified by a task. Raises `HeadbenchError` if one failed."""
+    root = scratch / "cells"
+    root.mkdir()
+    subjects = list(dict.fromkeys(job.clip.subject for job in opened.jobs))
+    tasks = [
+        Task.of(
+            root,
+            job.cell.folder.relative_to(opened.folder.root).as_posix(),
+            f"{__name__}:verify_cell",
+            run=str(opened.folder.root.resolve()),
+            options={name: _absolute(getattr(options, name)) for name in ("data", "head", "trust")},
+            images=images,
+            capture=subjects.index(job.clip.subject),
+            label=job.label,
+            seed=job.seed,
+        )
+        for job in opened.jobs
+    ]
+    schedule = Schedule("cells", lambda task: (task.folder / FINDINGS).is_file(), execution)
+    for place, reason in schedule.run_all(tasks).items():
+        log = (root / place / TASK_LOG).read_text(encoding="utf-8", errors="replace")
+        raise HeadbenchError(f"Cell {place} was not verified: {reason} Its log ends with: {log[-1000:]}")
+    for task in tasks:
+        path = task.folder / FINDINGS
+        yield checked(read_json(path), Findings, path)
+
+
+def _absolute(value: Any) -> Any:
+    return str(Path(value).absolute()) if isinstance(value, str) else value
+
+
+def verify_cell(task: Task, report: Any) -> None:
+    """Verify a cell as a task of an executor, and write its findings as JSON into the folder of the task."""
+    given = task.arguments
+    opened = _open_capture(
+        given["run"], tuple(given["options"].items()), given["images"], given["capture"], task.root
+    )
+    (job,) = (job for job in opened.jobs if (job.label, job.seed) == (given["label"], given["seed"]))
+    write_json(task.folder / FINDINGS, asdict(_verify_cell(job, opened)))
+
+
+@lru_cache(maxsize=1)
+def _open_capture(
+    run: str, options: tuple[tuple[str, Any], ...], images: bool, capture: int, root: str
+) -> _Opened:
+    """One capture of a run; cells of a capture follow each other in a process."""
+    scratch = Path(tempfile.mkdtemp(prefix="adapted-", dir=root))
+    return _Opened.read(Path(run), RunOptions(**dict(options)), scratch, images=images, only=capture)
+
+
+def _clips(opened: _Opened) -> Iterator[Mismatch]:
+    found = {clip.subject: clip.fingerprint for clip in opened.clips}
+    for entry in opened.manifest.clips:
         subject, expected = entry.subject, entry.fingerprint
         if found.get(subject) != expected:
             there = found.get(subject, "no such capture")
-            yield Mismatch(folder.manifest, f"clips, fingerprint of {subject}", expected[:12], there[:12])
+            file = str(opened.folder.manifest)
+            yield Mismatch(file, f"clips, fingerprint of {subject}", expected[:12], there[:12])
 
 
-def _protocols(
-    folder: RunFolder, manifest: Manifest, protocols: Mapping[str, Protocol]
-) -> Iterator[Mismatch]:
+def _protocols(opened: _Opened) -> Iterator[Mismatch]:
     """Compare the recorded protocols, field by field, with those from captures and settings."""
-    for task, protocol in protocols.items():
-        wanted, recorded = ProtocolRecord.of(protocol), manifest.protocols.get(task)
-        for name in (field.name for field in fields(wanted)):
-            value, found = getattr(wanted, name), getattr(recorded, name, None)
+    file, recorded = str(opened.folder.manifest), opened.manifest.protocols
+    for task, protocol in opened.protocols.items():
+        wanted, own = ProtocolRecord.of(protocol), recorded.get(task)
+        for name in (each.name for each in fields(wanted)):
+            value, found = getattr(wanted, name), getattr(own, name, None)
             if found != value:
-                yield Mismatch(folder.manifest, f"protocols.{task}.{name}", _short(value), _short(found))
+                yield Mismatch(file, f"protocols.{task}.{name}", _short(value), _short(found))
+    for task in recorded.keys() - opened.protocols.keys():
+        yield Mismatch(file, f"protocols.{task}", "none: the settings do not ask for it", recorded[task].hash)
 
 
-def _verify_cell(job: Job, metrics: Sequence[MetricSpec], rows: Rows, file: Path, report: _Report) -> None:
-    method = job.method.spec
-    own = rows.select(
+def _verify_cell(job: Job, opened: _Opened) -> Findings:
+    method, found = job.method.spec, Findings()
+    own = opened.rows.select(
         method=method.name,
         condition=job.condition.name,
         metric=ALL,
@@ -202,49 +437,54 @@ def _verify_cell(job: Job, metrics: Sequence[MetricSpec], rows: Rows, file: Path
         subject=job.clip.subject,
     )
     if len(own) and (own["status"] == "failed").all():
-        report.unverified += len(own)
-        return  # recorded as failed: no results to check
+        found.unverified[f"the failure of {job.name}"] = "as it was recorded"
+        return found
     state = job.cell.step("fit")
     trained = state is not None and method.implementation
     digests = {**(state.get("files", {}) if state and trained else {}), **recorded_frames(job)}
-    found = list(_files(job, digests, report))
-    report.mismatches += found
+    changed = list(_files(job, digests, found))
+    found.mismatches += changed
     if not method.implementation or job.condition.derive:
         avatar: Avatar = NoAvatar()
     else:
         made_of = "none" if state is None else state["fingerprint"]
+        record = str(job.cell.folder / "fit.json")
         if made_of != job.fit_fingerprint:
-            record = job.cell.folder / "fit.json"
-            report.mismatches.append(Mismatch(record, "fingerprint", job.fit_fingerprint[:12], made_of[:12]))
+            found.mismatches.append(Mismatch(record, "fingerprint", job.fit_fingerprint[:12], made_of[:12]))
         avatar = load(job)
         names = [job.cell.name(path) for path in avatar.files() if path.is_relative_to(job.cell.folder)]
         unknown = [name for name in names if name not in digests]
-        report.mismatches += [
-            Mismatch(job.cell.folder / "fit.json", f"files, {name}", "a digest", "none") for name in unknown
-        ]
-    changed = {mismatch.file for mismatch in found}
+        found.mismatches += [Mismatch(record, f"files, {name}", "a digest", "none") for name in unknown]
+    files = {mismatch.file for mismatch in changed}
     for path, (_, key) in job.frame_paths.items():
-        suspect = path in changed or job.cell.name(path) not in digests
+        suspect = str(path) in files or not path.is_file() or job.cell.name(path) not in digests
         if suspect and not _can_be_scored(job, path, key):
-            return  # reported above
-    report.mismatches += _values(_measure_again(job, avatar, metrics), own, metrics, file, report)
+            return found  # reported above
+    found.mismatches += _values(job, _measure_again(job, avatar, opened.metrics), own, opened, found)
+    return found
 
 
-def _files(job: Job, digests: Mapping[str, str], report: _Report) -> Iterator[Mismatch]:
+def _files(job: Job, digests: Mapping[str, str], found: Findings) -> Iterator[Mismatch]:
     """Digests of frames and avatar files; every scored frame has to have one."""
-    record = job.cell.folder / f"{DIGESTS}.json"
+    record = str(job.cell.folder / f"{DIGESTS}.json")
     for path in job.frame_paths:
         if job.cell.name(path) not in digests:
             yield Mismatch(record, f"files, {job.cell.name(path)}", "a digest", "none")
+    frames = recorded_frames(job)
+    cleaned = frames and not any((job.cell.folder / name).exists() for name in frames)
+    if cleaned:
+        there = "none: they were deleted, as `headbench status --clean renders` does. Start the run again to render them"
+        yield Mismatch(str(job.cell.folder / "renders"), "", f"the {len(frames)} frames of {record}", there)
     for name, expected in digests.items():
         path = job.cell.folder / name
         if not path.is_file():
-            yield Mismatch(path, "", f"a file of digest {expected[:12]}", "no such file")
+            if not (cleaned and name in frames):
+                yield Mismatch(str(path), "", f"a file of digest {expected[:12]}", "no such file")
             continue
-        report.files += 1
-        found = digest_file(path)
-        if found != expected:
-            yield Mismatch(path, "digest", expected[:12], found[:12])
+        found.files += 1
+        now = digest_file(path)
+        if now != expected:
+            yield Mismatch(str(path), "digest", expected[:12], now[:12])
 
 
 def _can_be_scored(job: Job, path: Path, key: FrameKey) -> bool:
@@ -266,30 +506,46 @@ def _measure_again(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> p
 
 
 def _values(
-    again: pd.DataFrame, own: pd.DataFrame, metrics: Sequence[MetricSpec], file: Path, report: _Report
+    job: Job, again: pd.DataFrame, own: pd.DataFrame, opened: _Opened, found: Findings
 ) -> Iterator[Mismatch]:
-    recorded, found = _by_place(own), _by_place(again)
+    """Compare the rows of a cell with rows that were measured again."""
+    file = str(opened.folder.rows)
+    recorded, new_rows = _by_place(own), _by_place(again)
     if len(recorded) != len(own):
         twice = own[own.duplicated(KEY)][KEY].iloc[0].tolist()
         yield Mismatch(file, _place(twice), "one row", "several")
         return
-    tolerances = {metric.name: 10.0 ** -(metric.digits + 1) for metric in metrics}
-    bound = {metric.name for metric in metrics if metric.machine_bound}
+    for version in sorted(set(map(str, own["version"])) - {job.method.spec.version}):
+        yield Mismatch(file, f"version of {job.label}", job.method.spec.version, version)
+    stable = {metric.name: metric for metric in opened.metrics if not metric.machine_bound}
+    for metric in opened.metrics:
+        if metric.machine_bound:
+            found.unverified[metric.name] = "depends on the machine"
+    for name, table in again.groupby("metric"):
+        if (table["status"] == "ok").any():
+            found.recomputed.append(str(name))
+        else:  # nowhere here; a value that single frames cannot have is a mismatch
+            reason = str(table["reason"].iloc[0]).rstrip(".") or "not measured here"
+            found.unverified[str(name)] = reason
+            stable.pop(str(name))
     for place, (status, value, _) in recorded.items():
-        metric = str(place[-1])
-        new = found.pop(place, None)
-        if metric in bound or metric not in tolerances or status == "missing":
-            report.unverified += 1
-        elif new is None:
-            yield Mismatch(file, _place(place), "no row: nothing asks for it", f"{value:.9g}")
-        elif new[0] != "ok":
-            raise HeadbenchError(f"{_place(place)} was measured, and cannot be now: {new[2]}")
-        else:
-            report.values += 1
-            if not abs(new[1] - value) <= tolerances[metric]:
-                yield Mismatch(file, _place(place), f"{new[1]:.9g}", f"{value:.9g}")
-    for place, (status, value, _) in found.items():
-        if status == "ok":
+        metric_name = str(place[-1])
+        new = new_rows.pop(place, None)
+        if metric_name not in stable:
+            continue
+        shown = f"{value:.9g}" if status == "ok" else status
+        if new is None:
+            yield Mismatch(file, _place(place), "no row: nothing asks for it", shown)
+        elif (new[0], status) == ("ok", "ok"):
+            found.values += 1
+            if not abs(new[1] - value) <= 10.0 ** -(stable[metric_name].digits + 1):
+                yield Mismatch(file, _place(place), f"{new[1]:.9g}", shown)
+        elif new[0] == "ok":
+            yield Mismatch(file, _place(place), f"a value, {new[1]:.9g}", shown)
+        elif status == "ok":
+            yield Mismatch(file, _place(place), f"no value: {new[2]}", shown)
+    for place, (status, value, _) in new_rows.items():
+        if status == "ok" and place[-1] in stable:
             yield Mismatch(file, _place(place), f"a row with {value:.9g}", "none")
 
 

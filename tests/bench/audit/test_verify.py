@@ -10,8 +10,6 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
-from headbench.bench.audit.settings import VerifySettings
-from headbench.bench.audit.verify import verify_run
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.captures import run_configuration
 from headbench.bench.engine.config import RunOptions
@@ -51,7 +49,7 @@ def change_json(path, change):
 
 def test_an_untouched_run_verifies_with_the_counts_checked(run, capsys):
     assert verify(run, "--json") == 0
-    found = json.loads(capsys.readouterr().out)
+    (found,) = json.loads(capsys.readouterr().out)["runs"]
     # 3 + 2 frames, the avatar's file and its record; a PSNR of each frame and the number of files
     assert (found["files"], found["values"], found["mismatches"]) == (7, 6, [])
 
@@ -150,13 +148,18 @@ def test_an_unfinished_run_gives_no_verdict(run, tmp_path):
     assert verify(tmp_path) == 3
 
 
-def test_an_executor_gives_the_same_verdict(run):
-    given = {"run": str(run), "trust": True}
-    image = next(run.glob("*/*/*/renders/novel_view/*.png"))
-    for change in (0, 1):
-        if change:
-            write_png(image, read_png(image) + 1)
-        inline = verify_run(VerifySettings(**given))
-        assert inline.passed == (not change)
-        assert verify_run(VerifySettings(**given, executor="processes")).text == inline.text
-    assert [path.name for path in run.parent.glob("*task*")] == []
+def test_cells_are_verified_by_tasks_of_an_executor(run, frame, tmp_path, capsys):
+    write_png(frame, read_png(frame) + 3)
+    found = []
+    for more in ([], ["--executor", "processes", "--workers", "1", "--out", str(tmp_path / "out")]):
+        assert verify(run, "--json", *more) == 1
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[0] == found[1] == read_json(tmp_path / "out" / "verify.json")
+    assert len(found[0]["runs"][0]["mismatches"]) == 2
+
+
+def test_renders_that_were_cleaned_are_one_finding(run, found):
+    assert cli.main(["status", str(run), "--clean", "renders"]) == 0
+    out = found()
+    assert "1 mismatches" in out
+    assert "`headbench status --clean renders`" in out

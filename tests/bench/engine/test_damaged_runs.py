@@ -181,8 +181,8 @@ def test_verify_names_frames_that_cannot_be_scored(run, capsys):
     other = cell / "renders/self_reenactment/FREE_00003_a.png"
     other.write_bytes(cv2.imencode(".png", read_png(other)[:3])[1].tobytes())
     assert cli.main(["verify", str(root), "--trust", "--json"]) == 1
-    found = json.loads(capsys.readouterr().out)["mismatches"]
-    assert [entry["file"] for entry in found] == [str(cell / FRAME), str(other)]
+    (found,) = json.loads(capsys.readouterr().out)["runs"]
+    assert [entry["file"] for entry in found["mismatches"]] == [str(cell / FRAME), str(other)]
 
 
 def test_verify_wants_a_digest_of_each_file_of_an_avatar(run, capsys):
