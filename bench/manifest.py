@@ -177,7 +177,11 @@ class Manifest:
 
         Names that folders and files are found by are checked as `check_name` does.
         """
-        record = upgraded_manifest(read_json(path))
+        record = read_json(path)
+        methods = record.get("methods")
+        if isinstance(methods, list) and len(methods) > MAX_CELLS:  # before copies are made of them
+            raise InputError(path, "methods", f"at most {MAX_CELLS} methods", str(len(methods)))
+        record = upgraded_manifest(record)
         if record.get("format") != 2:
             raise InputError(path, "format", "1 or 2", shown(record.get("format")))
         hashes = checked(record.get(PROTOCOLS), dict[str, str], path, PROTOCOLS)

@@ -278,6 +278,18 @@ class Rows:
         }
         return Rows(table.assign(**columns))
 
+    def with_suspects(self, limits: Mapping[str, float], region: str) -> Rows:
+        """The same rows; measured values of whole images, in ``region``, are marked as suspect above the limit of their metric alone."""
+        table = self._table
+        above = table["value"] > table["metric"].map(dict(limits)).astype(float)
+        above &= (table["status"] == "ok") & (table["region"] == region) & (table["task"] != "")
+        marked = table["reason"].str.startswith(SUSPECT)
+        reasons = table["reason"].mask(marked, "").astype("str")
+        texts = (
+            SUSPECT + "above " + table["metric"].map({m: f"{v:g}" for m, v in limits.items()}).astype("str")
+        )
+        return Rows(table.assign(reason=reasons.mask(above, texts)))
+
     def in_single_precision(self) -> Rows:
         """The same rows, values to the 24 bits of float32 (7 digits, more than tables show): half the bytes of a file."""
         return Rows(self._table.assign(value=self._table["value"].astype(np.float32).astype(np.float64)))

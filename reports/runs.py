@@ -196,7 +196,11 @@ class RunSet:
             raise InputError("runs", "", "at least one folder", "none")
         runs = tuple(RunData.read(folder) for folder in folders)
         _check_protocols(runs)
-        labels = _labels(runs)
+        return cls.of_runs(runs, _labels(runs)).of(part)
+
+    @classmethod
+    def of_runs(cls, runs: tuple[RunData, ...], labels: Sequence[Mapping[str, str]]) -> RunSet:
+        """Runs that were read, with the label of each run's methods by name. Raises `InputError` as `read` does."""
         rows = Rows.joined([run.rows.renamed(own) for run, own in zip(runs, labels)])
         rows.check()
         records = {
@@ -209,7 +213,7 @@ class RunSet:
         for run, own in zip(runs, labels):
             for method in run.methods:
                 shown.setdefault(own[method], (run, method))
-        return cls(runs, rows, _metrics(runs), tasks, records, trivial, keys, shown).of(part)
+        return cls(runs, rows, _metrics(runs), tasks, records, trivial, keys, shown)
 
     def of(self, part: FrameSelection) -> RunSet:
         """A part of the frames of runs that were read whole.

@@ -107,8 +107,8 @@ LEADERBOARD_BUILD = CommandSpec(
     name="report leaderboard",
     group="inspect",
     summary="Build a leaderboard page from the result bundles in a folder.",
-    settings="headbench.reports.leaderboard.command:LeaderboardSettings",
-    function="headbench.reports.leaderboard.command:leaderboard_build",
+    settings="headbench.reports.leaderboard.settings:LeaderboardSettings",
+    function="headbench.reports.leaderboard.page:build",
     writes="out",
 )
 

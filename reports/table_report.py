@@ -7,7 +7,7 @@ The paper is "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Co
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -23,7 +23,7 @@ from ..bench.registry import unknown
 from ..bench.specs import MetricSpec
 from ..bench.streams import on_terminal
 from .runs import WHOLE, FrameSelection, RunSet
-from .tables import AVATAR_TITLE, Table, TableCell, TableRow, build_table
+from .tables import AVATAR_TITLE, RowGroup, Table, TableCell, TableRow, build_table
 from .writers import WRITERS, column_name, to_text
 
 NAMES = {
@@ -290,9 +290,14 @@ def layouts(runs: RunSet) -> tuple[str, ...]:
 
 
 def table_of(
-    runs: RunSet, layout: str = COMPARISON, published: bool = False, columns: Columns = ALL_COLUMNS
+    runs: RunSet,
+    layout: str = COMPARISON,
+    published: bool = False,
+    columns: Columns = ALL_COLUMNS,
+    apart: Sequence[RowGroup] = (),
+    claimed: Collection[tuple[str, str]] = (),
 ) -> Table:
-    """Build a table of runs that were read."""
+    """Build a table of runs that were read; ``apart`` and ``claimed`` are those of `build_table`."""
     names = {label: label for label in runs.methods}
     if layout in PAPER:
         columns.check(PAPER[layout].digits, TASKS)
@@ -323,6 +328,8 @@ def table_of(
         keys=runs.keys,
         avatar_title=TITLES.get(layout, AVATAR_TITLE),
         name=layout,
+        apart=apart,
+        claimed=claimed,
     )
     if published:
         table = with_published(table, layout, runs.records)

@@ -46,13 +46,14 @@ class Column:
 class TableCell:
     """A value, or the reason why it is missing.
 
-    ``status`` is "ok", "missing" (could not or was not measured), "failed" (the method ended in an error), "published"
-    (a paper's figure, not measured) or "none" (no paper's figure). ``rank`` is 1 for all that may be the best, then 2,
+    ``status`` is "ok", "claimed" (a value that was not verified, in a leaderboard), "missing" (could not or was not
+    measured), "failed" (the method ended in an error), "published" (a paper's figure, not measured) or "none" (no paper's
+    figure). ``rank`` is 1 for all that may be the best, then 2,
     3, ... for the next displayed values; None where nothing is ranked.
     """
 
-    status: Literal["ok", "missing", "failed", "published", "none"]
-    value: float | None  # full precision; None unless ok or published
+    status: Literal["ok", "claimed", "missing", "failed", "published", "none"]
+    value: float | None  # full precision; None unless ok, claimed or published
     text: str  # as displayed
     spread: str = ""  # standard deviation over seeds, as displayed; "" with one seed
     rank: int | None = None
@@ -106,6 +107,12 @@ class Table:
     missing: tuple[str, ...] = ()
     name: str = ""
     tested: bool = False
+
+    @property
+    def titled(self) -> bool:
+        """Whether the groups need their titles."""
+        common = (METHODS_TITLE, TRIVIAL_TITLE, CONDITIONS_TITLE)
+        return len(self.groups) > 1 or any(title not in common for title, _ in self.groups)
 
     @property
     def rows(self) -> tuple[TableRow, ...]:
@@ -184,6 +191,16 @@ METHODS_TITLE = "Methods"
 TRIVIAL_TITLE = "Trivial baselines (not ranked)"
 SUSPECT_TITLE = "Suspect: better than any method that has not seen the frames (not ranked)"
 CONDITIONS_TITLE = "Under other conditions (not ranked)"
+CLAIMED = "Claimed by its author, not verified (not ranked)."
+
+
+@dataclass(frozen=True)
+class RowGroup:
+    """A separate group of a table's rows; those that are not ``ranked`` come last."""
+
+    title: str
+    methods: frozenset[str]
+    ranked: bool = True
 
 
 def build_table(
@@ -202,6 +219,8 @@ def build_table(
     keys: Mapping[str, Collection[FrameKey]] | None = None,
     avatar_title: str = AVATAR_TITLE,
     name: str = "",
+    apart: Sequence[RowGroup] = (),
+    claimed: Collection[tuple[str, str]] = (),
 ) -> Table:
     """Build the comparison table of whole images.
 
@@ -229,6 +248,10 @@ def build_table(
         Heading of the columns that belong to no task.
     name : str
         Name of the layout.
+    apart : Sequence[RowGroup]
+        Groups of some methods, by what is known of their values.
+    claimed : Collection[tuple[str, str]]
+        Methods and metrics whose values were not verified: they are shown as such and not ranked.
 
     Raises
     ------
@@ -246,33 +269,42 @@ def build_table(
         for m, task, title in places
     )
     found = conditions(rows, metrics, methods)
-    marked = marks(found, trivial)
+    unsupported = {method for group in apart if not group.ranked for method in group.methods}
+    marked = marks(found, [*trivial, *unsupported])
     suspect = suspects(rows, methods)
-    unranked = {*trivial, *changed, *(method for _, method, _ in suspect)}
+    too_good = {method for _, method, _ in suspect}
+    titles = dict.fromkeys(methods, METHODS_TITLE)
+    for group in (
+        *(group for group in apart if group.ranked),
+        RowGroup(SUSPECT_TITLE, frozenset(too_good), ranked=False),
+        RowGroup(TRIVIAL_TITLE, frozenset(trivial), ranked=False),
+        RowGroup(CONDITIONS_TITLE, frozenset(changed), ranked=False),
+        *(group for group in apart if not group.ranked),
+    ):
+        titles |= {method: group.title for method in methods if method in group.methods}
+    ranked_titles = [*(group.title for group in apart if group.ranked), METHODS_TITLE]
+    unranked = {method for method, title in titles.items() if title not in ranked_titles}
     notes: list[str] = []
     lines: list[TableRow] = []
     for method in methods:
-        cells = tuple(
-            _cell(
-                summarise(rows, method, c.metric, c.task),
-                c.digits,
-                notes,
-                suspect.get((c.metric, method, c.task)) or marked.get((c.metric, method), ""),
-            )
-            for c in columns
-        )
-        lines.append(TableRow(method, ", ".join(rows.versions(method)), method in unranked, cells))
+        cells = []
+        for c in columns:
+            cell = summarise(rows, method, c.metric, c.task)
+            mark = suspect.get((c.metric, method, c.task)) or marked.get((c.metric, method), "")
+            known = (method, c.metric) not in claimed
+            if not known and method not in unranked:
+                mark = f"{mark} {CLAIMED}".lstrip()
+            shown = _cell(cell, c.digits, notes, mark)
+            cells.append(shown if known or shown.status != "ok" else replace(shown, status="claimed"))
+        lines.append(TableRow(method, ", ".join(rows.versions(method)), method in unranked, tuple(cells)))
     bests = [_best(rows, lines, index, column) for index, column in enumerate(columns)]
     lines = _ranked(lines, columns, bests)
-    groups = (
-        (METHODS_TITLE, tuple(line for line in lines if not line.trivial)),
-        (SUSPECT_TITLE, tuple(line for line in lines if line.method in unranked - {*trivial, *changed})),
-        (CONDITIONS_TITLE, tuple(line for line in lines if line.method in changed)),
-        (
-            TRIVIAL_TITLE,
-            tuple(line for line in lines if line.method in trivial and line.method not in changed),
-        ),
-    )
+    order = [*ranked_titles, SUSPECT_TITLE, CONDITIONS_TITLE, TRIVIAL_TITLE]
+    order += [group.title for group in apart if not group.ranked]
+    groups = [
+        (title, tuple(line for line in lines if titles[line.method] == title))
+        for title in dict.fromkeys(order)
+    ]
     return Table(
         columns=columns,
         groups=tuple((title, members) for title, members in groups if members),
@@ -281,10 +313,12 @@ def build_table(
             _task_summary(rows, task, protocol_ids.get(task, ""), (keys or {}).get(task, ()))
             for task in tasks
         ),
-        seeds=max(1, len(rows.seeds(ALL))),
+        seeds=max([1, *(len(rows.seeds(method)) for method in methods if method not in unsupported)])
+        if unsupported
+        else max(1, len(rows.seeds(ALL))),
         marking=_marking(columns, lines, bests),
         image_size=image_size,
-        machine=measured_on(found.get("fps", {}), trivial, machine),
+        machine=measured_on(found.get("fps", {}), [*trivial, *unsupported], machine),
         part=part,
         missing=tuple(missing),
         name=name,

@@ -32,7 +32,7 @@ def to_markdown(table: Table) -> str:
         names.append("*published*" if column.published else measured)
     lines = [tasks, names]
     for title, rows in table.groups:
-        if len(table.groups) > 1:
+        if table.titled:
             lines.append([f"*{escape_markdown(title)}*", *[""] * len(table.columns)])
         lines += [[escape_markdown(row.method), *map(_markdown_cell, row.cells)] for row in rows]
     widths = [max(3, *(len(line[i]) for line in lines)) for i in range(len(names))]
@@ -70,7 +70,7 @@ def to_text(table: Table, *, styled: bool = False) -> str:
     lines: list[list[str]] = []
     marks: dict[tuple[int, int], int] = {}
     for title, rows in table.groups:
-        if len(table.groups) > 1:
+        if table.titled:
             lines.append([title])
         for row in rows:
             marks |= {
@@ -177,7 +177,7 @@ def to_latex(table: Table) -> str:
     body: list[str] = []
     for index, (title, rows) in enumerate(table.groups):
         body += [r"\midrule"] if index else []
-        if len(table.groups) > 1:
+        if table.titled:
             body.append(rf"\multicolumn{{{len(names)}}}{{l}}{{\emph{{{escape_latex(title)}}}}} \\")
         lines = ([escape_latex(row.method), *map(_latex_cell, row.cells)] for row in rows)
         body += [" & ".join(line) + r" \\" for line in lines]

@@ -12,7 +12,11 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.audit.bundle import INDEX
+from headbench.bench.audit.settings import VerifySettings
+from headbench.bench.audit.verify import verify_run
 from headbench.bench.registry import get, resolve
+from headbench.reports.leaderboard.page import build
+from headbench.reports.leaderboard.settings import LeaderboardSettings
 
 from .small_run import run_on
 
@@ -148,7 +152,8 @@ def renamed(name, old="nearest-camera"):
 
     def forge(files):
         files = rows(lambda t: t.assign(method=t["method"].replace(old, name)))(files)
-        files = record(lambda r: next(m for m in r["methods"] if m["name"] == old).update(name=name))(files)
+        changes = {"name": name, "trivial": False}
+        files = record(lambda r: next(m for m in r["methods"] if m["name"] == old).update(changes))(files)
         return {path.replace(f"/{old}/", f"/{name}/"): content for path, content in files.items()}
 
     return forge
@@ -213,17 +218,6 @@ CONTRADICTED = {
 """Changes that the renders or the registry contradict, and what is said of them."""
 
 
-def verify(path, *others, capture=None):
-    return cli.main(["verify", str(path), *map(str, others), *(["--data", str(capture)] if capture else [])])
-
-
-@pytest.mark.parametrize("forgery", CONTRADICTED)
-def test_a_contradicted_bundle_does_not_verify(honest, capture, tmp_path, capsys, forgery):
-    forge, words = CONTRADICTED[forgery]
-    assert verify(write(tmp_path / "b.zip", forge(honest)), capture=capture) in (1, 3)
-    assert re.search(words, capsys.readouterr().out)
-
-
 UNVERIFIED = {
     "storage": (setting("value", 0.001, of("storage")), r"storage(, \w+)* \(a bundle holds no avatars"),
     "speed": (setting("value", 9e9, of("fps")), r"fps(, \w+)* \(a bundle holds no avatars"),
@@ -257,27 +251,240 @@ UNVERIFIED = {
 """Changes that nothing contradicts, and where the result names them."""
 
 
+ALIKE = {
+    "a copied seed": (together(renamed("mine"), copied_seed), ("mine seed 0", "mine seed 1")),
+    "copied under another name": (copied_under_another_name, ("mean-image seed 0", "nearest-camera seed 0")),
+}
+"""Copies of renders, and what is said to be equal."""
+
+
+@pytest.fixture(scope="module")
+def verdicts(honest, capture, tmp_path_factory):
+    """What `verify` says of all forged bundles at once: the text of each and the lines on equal renders."""
+    folder = tmp_path_factory.mktemp("verdicts")
+    forged = {name: forge for name, (forge, _) in {**CONTRADICTED, **UNVERIFIED, **ALIKE}.items()}
+    paths = {
+        name: write(folder / f"{index}.zip", forge(honest))
+        for index, (name, forge) in enumerate(forged.items())
+    }
+    options = VerifySettings(tuple(map(str, paths.values())), data=str(capture))
+    result = verify_run(options)
+    texts = dict(
+        zip(forged, re.split(r"^(?=\S*/\d+\.zip: )", result.text, flags=re.MULTILINE)[1:], strict=False)
+    )
+    return texts, dict(zip(forged, result.data["runs"], strict=True)), result.data["equal_renders"], paths
+
+
+@pytest.mark.parametrize("forgery", CONTRADICTED)
+def test_a_contradicted_bundle_does_not_verify(verdicts, forgery):
+    texts, runs, _, _ = verdicts
+    assert "error" in runs[forgery] or runs[forgery]["mismatches"]
+    assert re.search(CONTRADICTED[forgery][1], texts[forgery])
+
+
 @pytest.mark.parametrize("forgery", UNVERIFIED)
-def test_what_cannot_be_verified_is_named(honest, capture, tmp_path, capsys, forgery):
-    forge, words = UNVERIFIED[forgery]
-    assert verify(write(tmp_path / "b.zip", forge(honest)), capture=capture) == 0
-    assert re.search(words, capsys.readouterr().out)
+def test_what_cannot_be_verified_is_named(verdicts, forgery):
+    texts, runs, _, _ = verdicts
+    assert runs[forgery]["mismatches"] == []
+    assert re.search(UNVERIFIED[forgery][1], texts[forgery])
+
+
+@pytest.mark.parametrize("forgery", ALIKE)
+def test_equal_renders_are_pointed_out(verdicts, forgery):
+    _, _, equal, paths = verdicts
+    names = [f"{paths[forgery]}: {name}" for name in ALIKE[forgery][1]]
+    assert any(all(name in text for name in names) for text in equal)
+
+
+def test_equal_renders_of_two_bundles_are_pointed_out(verdicts):
+    _, _, equal, paths = verdicts
+    names = [f"{paths[name]}: mean-image seed 0" for name in ("storage", "speed")]
+    assert any(all(name in text for name in names) for text in equal)
+
+
+def only(name):
+    """One method of a bundle alone."""
+
+    def forge(files):
+        files = record(lambda r: r.update(methods=[m for m in r["methods"] if m["name"] == name]))(files)
+        files = record(lambda r: r["configuration"].update(methods=[name]))(files)
+        files = rows(lambda t: t[t["method"] == name])(files)
+        return {path: c for path, c in files.items() if path.count("/") < 2 or f"/{name}/" in path}
+
+    return forge
+
+
+def another_seed(table):
+    return table[table["seed"] == 0].assign(seed=7, value=1.0)
+
+
+def a_frame_more(table):
+    """A frame that no other bundle has, so that theirs look incomplete."""
+    return pd.concat([table, table[table["task"] != ""].iloc[:1].assign(timestep=999)])
+
+
+def a_subject_more(table):
+    return pd.concat([table, table[table["task"] == ""].iloc[:1].assign(subject="nobody")])
+
+
+OURS = together(only("nearest-camera"), renamed("mine"))
+SEED_7 = together(without_renders, rows(another_seed), record(lambda r: r["configuration"].update(seeds=[7])))
+NOT_RANKED = {
+    "values of 99 dB": (together(without_renders, setting("value", 99.0)), "Claimed, not verified"),
+    "another seed of a method": (SEED_7, "Claimed, not verified"),
+    "a name like that of a variant": (together(SEED_7, renamed("mine (a)", "mine")), "Claimed, not verified"),
+    "the best frame alone": (together(without_renders, rows(best_frame)), "Incomplete"),
+    "another direction": (together(metric("psnr", higher_is_better=False), without_renders), "Contradicted"),
+    "values raised": (setting("value", lambda v: v + 1), "Contradicted"),
+}
+"""Changes to the only method of a second bundle, and the group of the table that shows it."""
+REFUSED = {
+    "fewer frames under the same hash": (together(without_renders, fewer_frames), "protocols"),
+    "a frame more": (
+        together(without_renders, rows(a_frame_more)),
+        "frames of .*: expected those of its protocol",
+    ),
+    "a subject more": (together(without_renders, rows(a_subject_more)), "subject: expected those of the run"),
+    "a seed more": (together(without_renders, rows(another_seed)), "seed: expected those of the run"),
+}
+"""Changes that keep a second bundle out of every table, and the reason."""
+
+
+@pytest.fixture(scope="module")
+def make_board(honest, capture, tmp_path_factory):
+    """A function that makes a page of the honest bundle and others by name; it returns tables, bundles by file and page."""
+
+    def make(words=(), **others):
+        folder = tmp_path_factory.mktemp("board")
+        (folder / "bundles").mkdir()
+        write(folder / "bundles" / "lab.zip", OURS(honest))
+        for name, files in others.items():
+            write(folder / "bundles" / f"{name}.zip", files, by="Stranger")
+        (folder / "page").mkdir()
+        settings = LeaderboardSettings(
+            str(folder / "bundles"), str(folder / "page"), data=str(capture), recompute=tuple(words)
+        )
+        found = build(settings).data
+        page = (folder / "page" / "leaderboard.md").read_text()
+        return found["tables"], {each["file"]: each for each in found["bundles"]}, page
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def alone(make_board):
+    """The table of the honest bundle on a page of its own."""
+    ((table,), _, _) = make_board()
+    return table
+
+
+@pytest.fixture(scope="module")
+def board(honest, make_board):
+    """A page of the honest bundle and all forgeries."""
+    forged = {name: forge(OURS(honest)) for name, (forge, _) in {**NOT_RANKED, **REFUSED}.items()}
+    return make_board(**forged)
+
+
+def cells(table, label):
+    """The group of a method in a table, and its cells by metric in the first task."""
+    for title, members in table["groups"]:
+        for row in members:
+            if row["method"] == label:
+                columns = [column["metric"] for column in table["columns"]]
+                return title, dict(reversed(list(zip(columns, row["cells"], strict=True))))
+    raise AssertionError(f"no row {label}")
+
+
+HONEST = "mine [Honest lab/lab]"
+
+
+@pytest.mark.parametrize("forgery", NOT_RANKED)
+def test_a_forged_bundle_is_not_ranked(board, forgery):
+    (table,), _, _ = board
+    name = "mine (a)" if "name" in forgery else "mine"
+    title, forged = cells(table, f"{name} [Stranger/{forgery}]")
+    assert title.startswith(NOT_RANKED[forgery][1])
+    assert all(cell["rank"] is None for cell in forged.values())
+
+
+def test_forged_bundles_change_no_other_row(board, alone):
+    (table,), _, _ = board
+    (title, found), (_, expected) = cells(table, HONEST), cells(alone, HONEST)
+    assert title == "Verified from renders"
+    assert found["psnr"]["status"] == "ok"
+    assert [cell["text"] for cell in found.values()] == [cell["text"] for cell in expected.values()]
+
+
+@pytest.mark.parametrize("forgery", REFUSED)
+def test_a_bundle_that_would_change_other_rows_is_refused(board, forgery):
+    (table,), bundles, page = board
+    assert f"{forgery}.zip" not in bundles
+    assert re.search(rf"In no table\n(.|\n)*{forgery}.zip: .*{REFUSED[forgery][1]}", page)
+    assert not [row for _, members in table["groups"] for row in members if forgery in row["method"]]
+
+
+def test_suspect_values_are_found_without_their_mark(board):
+    (table,), _, _ = board
+    _, forged = cells(table, "mine [Stranger/values of 99 dB]")
+    assert "are above 50" in table["notes"][forged["psnr"]["note"]]
+
+
+def test_unverified_values_of_a_verified_bundle_are_not_ranked(honest, make_board):
+    (table,), bundles, page = make_board(small=setting("value", 1e-9, of("storage"))(OURS(honest)))
+    for label in (HONEST, "mine [Stranger/small]"):
+        title, own = cells(table, label)
+        assert title == "Verified from renders"
+        found = {name: (cell["status"], cell["rank"]) for name, cell in own.items()}
+        assert found == {
+            "psnr": ("ok", 1),
+            "ssim": ("ok", 1),
+            "storage": ("claimed", None),
+            "fps": ("claimed", None),
+        }
+    assert "frames are equal in lab.zip: mine seed 0, lab.zip: mine seed 1, small.zip: mine seed 0" in page
+    for name in ("storage", "fps", "processor time", "budget", "settings", "versions"):
+        assert all(name in " ".join(bundle["remarks"]) for bundle in bundles.values())
+
+
+def test_a_training_is_repeated_and_compared(honest, make_board):
+    baseline = together(only("nearest-camera"), without_renders)(honest)
+    others = {
+        "same": baseline,
+        "raised": setting("value", 24.0)(baseline),
+        "slower": setting("value", 9e9, of("fps"))(baseline),
+    }
+    _, bundles, _ = make_board(words=[f"{name}.zip" for name in others], **others)
+    states = {name: bundles[f"{name}.zip"]["state"] for name in others}
+    assert states == {"same": "recomputed", "raised": "contradicted", "slower": "recomputed"}
+    remarks = {name: " ".join(bundles[f"{name}.zip"]["remarks"]) for name in others}
+    assert "psnr: a single value differs by at most 0, a mean by 0 (tolerance 0.25)" in remarks["same"]
+    assert "which is more" in remarks["raised"]
+    assert "fps" in remarks["slower"].partition("Not verified")[2]
+
+
+STRANGER = record(lambda r: r["configuration"].update(methods=["stranger:METHOD"]))
+PROGRAM = together(
+    renamed("ga-official"),
+    record(lambda r: r["configuration"].update(methods=["ga-official"])),
+    record(
+        lambda r: r["configuration"].update(
+            settings={"ga-official": {"checkout": "/", "python": "/bin/true"}}
+        )
+    ),
+)
 
 
 @pytest.mark.parametrize(
     ("forge", "words"),
     [
-        (together(renamed("mine"), copied_seed), "b.zip: mine seed 0 equal those of .*b.zip: mine seed 1"),
-        (copied_under_another_name, "b.zip: mean-image seed 0 equal those of .*b.zip: nearest-camera seed 0"),
+        (STRANGER, "'stranger:METHOD'.*--trust"),
+        (PROGRAM, "methods that run no program which the bundle names"),
     ],
 )
-def test_equal_renders_are_pointed_out(honest, capture, tmp_path, capsys, forge, words):
-    verify(write(tmp_path / "b.zip", forge(honest)), capture=capture)
-    assert re.search(rf"frames of .*{words}", capsys.readouterr().out)
-
-
-def test_equal_renders_of_two_bundles_are_pointed_out(honest, capture, tmp_path, capsys):
-    paths = [write(tmp_path / name, honest, by=name) for name in ("a.zip", "b.zip")]
-    assert verify(*paths, capture=capture) == 0
-    out = capsys.readouterr().out
-    assert re.search(r"frames of .*a.zip: mean-image seed 0 equal those of .*b.zip: mean-image seed 0", out)
+def test_a_bundle_has_nothing_imported_or_run(honest, make_board, tmp_path, monkeypatch, forge, words):
+    (tmp_path / "stranger.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    files = together(only("nearest-camera"), forge)(honest)
+    _, bundles, _ = make_board(words=["s.zip"], s=files)
+    assert re.search(f"Not trained again: .*{words}", " ".join(bundles["s.zip"]["remarks"]))
+    assert bundles["s.zip"]["state"] != "recomputed"

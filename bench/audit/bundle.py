@@ -21,7 +21,7 @@ from ..io.documents import MAX_JSON_BYTES, checked, parse_json
 from ..io.files import atomic_path, check_writable, digest_file, write_json
 from ..io.provenance import RENDER, source_type
 from ..manifest import PROTOCOLS, Manifest, protocol_path
-from ..rows import Rows
+from ..rows import ALL, Rows
 from ..specs import CommandResult
 from .settings import BundleSettings, check_shown
 
@@ -170,15 +170,34 @@ def _cell_files(
 
 
 def check_results(folder: RunFolder, manifest: Manifest) -> Rows:
-    """The rows of a finished run, checked: each frame once, by the protocols of the record, whose hashes are those of their content.
+    """The rows of a finished run, checked: only frames of its protocols, each once, whose hashes are those of their content.
 
     Raises `InputError` for rows or protocols that are not.
     """
+    manifest.check_done(folder.manifest)
     for record in manifest.protocols.values():
         record.protocol(folder.manifest)
     folder.read_rows(manifest)
     rows = folder.rows_by_condition(manifest)
+    rows.check()
     rows.check_protocols(folder.rows, {task: record.hash for task, record in manifest.protocols.items()})
+    for task, record in manifest.protocols.items():
+        wanted = {tuple(key) for key in record.keys}
+        for region in rows.regions:
+            if strange := rows.frames(task, region) - wanted:
+                raise InputError(folder.rows, f"frames of {task}", "those of its protocol", str(min(strange)))
+    known = {
+        "subject": (
+            {subject for record in manifest.protocols.values() for subject, _ in record.clips},
+            rows.subjects,
+        ),
+        "seed": ({*map(str, manifest.configuration.seeds)}, {*map(str, rows.seeds(ALL))}),
+    }
+    for key, (own, found) in known.items():
+        if found - own:
+            raise InputError(
+                folder.rows, key, f"those of the run: {', '.join(sorted(own))}", min(found - own)
+            )
     return rows
 
 

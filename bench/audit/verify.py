@@ -32,7 +32,7 @@ from ..protocol import Protocol, make_protocols
 from ..registry import get, resolve
 from ..rows import ALL, FRAME, Rows
 from ..specs import CommandResult, MetricSpec
-from .bundle import check_results, read_bundle
+from .bundle import Bundle, check_results, read_bundle
 from .definitions import Mismatch, contradictions, known_methods, known_metrics, method_of
 from .evaluate import NoAvatar, images_method
 from .settings import VerifySettings
@@ -122,9 +122,11 @@ def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> Co
             folder = Path(scratch) / str(index)
             folder.mkdir()
             try:
-                verified = verify(Path(name), settings, folder, settings.execution, progress)
+                bundle = read_bundle(Path(name), folder / "run") if Path(name).is_file() else None
+                run = Path(name) if bundle is None else folder / "run"
+                verified = verify(run, bundle, settings, folder, settings.execution, progress)
             except InputError as error:
-                texts.append(f"{name}: Verify: missing or invalid: {error}")
+                texts.append(f"{name}: Verify: missing or invalid: {error}".replace(f"{folder / 'run'}/", ""))
                 data.append({"run": name, "error": str(error)})
                 codes.append(ExitCode.NO_VERDICT)
                 continue
@@ -132,7 +134,7 @@ def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> Co
             data.append({"run": name, **asdict(verified.findings)})
             codes.append(ExitCode.NEGATIVE if verified.findings.mismatches else ExitCode.OK)
             renders |= {f"{name}: {label}": digests for label, digests in verified.renders.items()}
-    equal = equal_renders(renders)
+    equal = list(equal_renders(renders))
     code = max(codes, key=(ExitCode.OK, ExitCode.NO_VERDICT, ExitCode.NEGATIVE).index)
     found = {"runs": data, "equal_renders": equal}
     if settings.out is not None:
@@ -151,26 +153,24 @@ class Verified:
 
 
 def verify(
-    path: Path,
+    run: Path,
+    bundle: Bundle | None,
     options: RunOptions,
     scratch: Path,
     execution: Execution | None = None,
     progress: Progress = no_progress,
 ) -> Verified:
-    """Verify the folder of a run, or a bundle, which is unpacked into ``scratch``.
+    """Verify the folder of a run, or of an unpacked ``bundle``; temporary files are written into and beside ``scratch``.
 
     Raises `InputError` if it is not a finished run or bundle, or its capture cannot be opened.
     """
-    findings, folder = Findings(), RunFolder(path)
-    bundle = None
-    if path.is_file():
-        folder = RunFolder(scratch / "run")
-        bundle = read_bundle(path, folder.root)
-        findings.unverified |= dict.fromkeys(("author", "link", "comment"), "the author's own words")
+    findings, folder = Findings(), RunFolder(run)
     manifest = folder.read_manifest()
     manifest.check_done(folder.manifest)
-    known = known_metrics()
-    findings.mismatches += contradictions(manifest, folder.manifest, known, known_methods())
+    known, methods = known_metrics(), known_methods()
+    findings.mismatches += contradictions(manifest, folder.manifest, known, methods)
+    if bundle is not None:
+        findings.unverified |= dict.fromkeys(("author", "link", "comment"), "the author's own words")
     if bundle is not None and not bundle.renders:
         findings.files = len(bundle.files)
         lacking = lacking_frames(check_results(folder, manifest), manifest)
@@ -179,20 +179,23 @@ def verify(
         findings.unverified |= dict.fromkeys((metric.name for metric in manifest.metrics), reason)
     else:
         if bundle is not None and options.data is None:
-            limit = PIXELS_PER_BYTE * path.stat().st_size
-            capture = captured_again(manifest, scratch / "capture", limit, progress)
+            limit = PIXELS_PER_BYTE * sum(path.stat().st_size for path in folder.root.rglob("*.png"))
+            capture = captured_again(manifest, scratch.parent / "captures", limit, progress)
             options = replace(options, data=str(capture))
         findings.add(_verified(folder, options, scratch, bundle is not None, execution, progress))
     nothing = "nothing was trained again"
     findings.unverified |= {TRAINING: nothing, "machine": "as it was recorded"}
     for record in manifest.methods:
-        spec = method_of(record.name, known_methods())
+        spec = method_of(record.name, methods)
         if spec is None:
             findings.unverified[f"method {record.label}"] = "not registered here"
         elif record.version != spec.version:
             findings.unverified[f"version {record.version} of {record.label}"] = (
                 f"version {spec.version} is here"
             )
+    if bundle is not None:  # its temporary place says nothing
+        root = f"{folder.root}/"
+        findings.mismatches = [replace(m, file=m.file.removeprefix(root)) for m in findings.mismatches]
     return Verified(folder, manifest, findings, _renders(folder, manifest))
 
 
@@ -211,14 +214,21 @@ def _renders(folder: RunFolder, manifest: Manifest) -> Renders:
     return found
 
 
-def equal_renders(renders: Renders) -> list[str]:
-    """A sentence for each pair that has frames with equal files."""
-    texts = []
-    for (first, own), (second, others) in combinations(renders.items(), 2):
-        count = sum(others.get(name) == value for name, value in own.items())
-        if count:
-            texts.append(f"{count} of {len(own)} frames of {first} equal those of {second}.")
-    return texts
+def equal_renders(renders: Renders) -> dict[str, tuple[str, ...]]:
+    """Sentences on frames with equal files, each with the names of what has them."""
+    same: dict[frozenset[tuple[str, str]], list[str]] = {}
+    for name, digests in renders.items():
+        if digests:
+            same.setdefault(frozenset(digests.items()), []).append(name)
+    found = {
+        f"All {len(digests)} frames are equal in {', '.join(names[:-1])} and {names[-1]}.": tuple(names)
+        for digests, names in same.items()
+        if len(names) > 1
+    }
+    for (own, (first, *_)), (others, (second, *_)) in combinations(same.items(), 2):
+        if count := len(own & others):
+            found[f"{count} of {len(own)} frames of {first} equal those of {second}."] = (first, second)
+    return found
 
 
 def lacking_frames(rows: Rows, manifest: Manifest) -> list[tuple[str, str, str]]:
@@ -254,7 +264,7 @@ def lacking_frames(rows: Rows, manifest: Manifest) -> list[tuple[str, str, str]]
 
 
 def captured_again(manifest: Manifest, out: Path, limit: int, progress: Progress) -> Path:
-    """Regenerate the synthetic captures of a run from their clips; ``limit`` bounds their pixels.
+    """Regenerate the synthetic captures of a run from their clips, in a folder below ``out``, once; ``limit`` bounds their pixels.
 
     Raises `InputError` for a capture that is not synthetic, not of the procedural head, or larger.
     """
@@ -271,9 +281,13 @@ def captured_again(manifest: Manifest, out: Path, limit: int, progress: Progress
             expected = f"at most {limit} pixels in all for a bundle of this size"
             found = " x ".join(map(str, factors))
             raise InputError(where, "", expected, found, "Name the folder of the capture with --data.")
-    for _, arguments in captures.values():
-        make(out, **arguments, progress=progress)
-    return out
+    folder = out / digest(sorted(captures))[:12]
+    done = folder.with_suffix(".done")
+    if not done.exists():
+        for _, arguments in captures.values():
+            make(folder, **arguments, progress=progress)
+        done.touch()
+    return folder
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import re
@@ -9,10 +10,9 @@ import select
 import signal
 import subprocess
 import time
-import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -42,8 +42,8 @@ REDRAWN_EVERY_S = 30.0
 PATIENCE_S = 10.0
 """Seconds between the request to terminate and the kill of a program."""
 
-MARK = "HEADBENCH_PROGRAM"
-"""Environment variable by which processes that a program started are recognised, in whatever session they are."""
+PR_SET_CHILD_SUBREAPER = 36
+"""From linux/prctl.h."""
 
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
@@ -93,7 +93,8 @@ def run_program(
     """Run a command in ``folder`` until it ends; its output, both streams, is appended to ``log``.
 
     All processes that it started are terminated when it ends or this call is interrupted: its process group, and those
-    that left the group but kept its environment. A process that keeps the output open is not waited for. Files written for it are flushed to disk before, even inside a group of writes.
+    that left the group (on Linux). A process that keeps the output open is not waited for. Files written for it are
+    flushed to disk before, even inside a group of writes.
 
     Parameters
     ----------
@@ -112,15 +113,14 @@ def run_program(
         The command cannot be started, or takes longer than ``hours``.
     """
     flush_renames()
-    mark = uuid.uuid4().hex
     until = math.inf if hours is None else time.monotonic() + 3600 * hours
-    with log.open("ab") as stream:
+    with log.open("ab") as stream, _orphans_ended():
         stream.write(f"$ {' '.join(command)}\n".encode())
         try:
             process = subprocess.Popen(
                 command,
                 cwd=folder,
-                env=environment(variables) | {MARK: mark},
+                env=environment(variables),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
@@ -134,7 +134,6 @@ def run_program(
             in_time = _follow(process, stream, last, on_line, until)
         finally:
             _end_group(process)
-            _end_marked(mark)
     ended = ProgramEnd(process.wait(), tuple(last), log)
     if not in_time:
         raise ended.error(
@@ -214,19 +213,53 @@ def _end_group(process: subprocess.Popen[bytes]) -> None:
             break
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until and _signal_group(process.pid, 0):
-            process.poll()  # a dead leader stays in its group until its exit code is read
+            # Processes stay in their group until their exit code is read.
+            if process.poll() is not None:
+                with suppress(ChildProcessError):
+                    os.waitpid(-process.pid, os.WNOHANG)
             time.sleep(0.02)
     process.wait()
     if process.stdout is not None:
         process.stdout.close()
 
 
-def _end_marked(mark: str) -> None:
-    """Kill processes that a program left outside of its process group."""
-    for process in psutil.process_iter():
-        with suppress(psutil.Error, OSError):
-            if process.environ().get(MARK) == mark:
-                process.kill()
+@contextmanager
+def _orphans_ended() -> Iterator[None]:
+    """Kill, at the end, processes that programs started here left behind in whatever session.
+
+    As a subreaper (Linux), this process becomes the parent of every descendant whose own parent has ended. Those of a program
+    have another session than this process, whatever they do to their environment. Without subreapers, none are found.
+    """
+    libc = ctypes.CDLL(None)
+    before = {child.pid for child in _orphans()}
+    becomes = hasattr(libc, "prctl") and libc.prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0) == 0
+    try:
+        yield
+    finally:
+        until = time.monotonic() + PATIENCE_S
+        while (
+            becomes and time.monotonic() < until
+        ):  # the children of a killed process are found in the next round
+            left = [child for child in _orphans() if child.pid not in before]
+            if not left:
+                break
+            for child in left:
+                with suppress(psutil.Error, OSError):
+                    child.kill()
+                    os.waitpid(child.pid, os.WNOHANG)
+            time.sleep(0.02)
+        if becomes:
+            libc.prctl(PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)
+
+
+def _orphans() -> list[psutil.Process]:
+    """Children of this process in other sessions."""
+    found, own = [], os.getsid(0)
+    for child in psutil.Process().children():
+        with suppress(ProcessLookupError):
+            if os.getsid(child.pid) != own:
+                found.append(child)
+    return found
 
 
 def _signal_group(leader: int, number: int) -> bool:

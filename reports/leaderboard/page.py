@@ -7,49 +7,22 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from ...bench.audit.bundle import Bundle, read_bundle
-from ...bench.contracts import Progress
-from ...bench.engine.store import RunFolder
+from ...bench.audit.verify import equal_renders
+from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.io.files import digest_file, entries, write_text
-from ...bench.manifest import Manifest
+from ...bench.executors.settings import check_executor
+from ...bench.io.files import entries, write_text
 from ...bench.specs import CommandResult
 from ..runs import RunSet
 from ..table_report import table_of
-from ..tables import Table
+from ..tables import RowGroup, Table
 from ..writers import escape_markdown, render_page, to_markdown
+from .settings import LeaderboardSettings
+from .submissions import RANKED, STATES, Submission, placeless, qualified, read_submission, verified
 
-HEADS = ("Bundle", "By", "Methods", "Comment", "headbench", "Machine", "Renders", "SHA-256")
-
-
-@dataclass(frozen=True)
-class Submission:
-    """A bundle, unpacked, and the SHA-256 of its file."""
-
-    file: Path
-    bundle: Bundle
-    folder: RunFolder
-    manifest: Manifest
-    digest: str
-
-    @property
-    def measured(self) -> tuple[tuple[str, str], ...]:
-        """The protocol's hash of each task; results in one table have equal hashes."""
-        return tuple(sorted((task, record.hash) for task, record in self.manifest.protocols.items()))
-
-    @property
-    def line(self) -> tuple[str, ...]:
-        """Fields of the list of submissions, in the order of `HEADS`."""
-        return (
-            self.file.name,
-            self.bundle.by,
-            ", ".join(method.label for method in self.manifest.methods),
-            self.bundle.comment,
-            self.bundle.headbench,
-            str(self.manifest.machine.get("processor", "")),
-            "yes" if self.bundle.renders else "no",
-            self.digest[:12],
-        )
+HEADS = ("Bundle", "By", "State", "Methods", "Comment", "headbench", "Machine", "SHA-256")
+RECOMPUTED = "recomputed"
+"""Folder of trainings, below that of the page."""
 
 
 @dataclass(frozen=True)
@@ -60,33 +33,91 @@ class Board:
     table: Table
     submissions: tuple[Submission, ...]
 
+    @property
+    def equal(self) -> dict[str, tuple[str, ...]]:
+        """Sentences on equal renders, each with the names of what has them, which begin with that of a bundle."""
+        return equal_renders(
+            {
+                f"{each.file.name}: {label}": digests
+                for each in self.submissions
+                for label, digests in each.renders.items()
+            }
+        )
 
-def build(folder: Path, out: Path, title: str, progress: Progress) -> CommandResult:
+    @property
+    def lines(self) -> list[tuple[str, ...]]:
+        """Fields of the submissions, in the order of `HEADS`."""
+        alike = {name.rpartition(": ")[0] for names in self.equal.values() for name in names}
+        return [
+            (
+                each.file.name,
+                each.bundle.by,
+                each.state + (", equal renders" if each.file.name in alike else ""),
+                ", ".join(each.run.methods),
+                each.bundle.comment,
+                each.bundle.headbench,
+                str(each.manifest.machine.get("processor", "")),
+                each.digest[:12],
+            )
+            for each in self.submissions
+        ]
+
+    @property
+    def remarks(self) -> list[str]:
+        """Sentences on equal renders, on what was found and on what was not verified."""
+        files: dict[str, list[str]] = {}
+        for each in self.submissions:
+            for remark in each.remarks:
+                files.setdefault(remark, []).append(each.file.name)
+        return [*self.equal, *(f"{', '.join(names)}: {remark}" for remark, names in files.items())]
+
+
+def build(settings: LeaderboardSettings, progress: Progress = no_progress) -> CommandResult:
     """Write ``leaderboard.md`` and ``leaderboard.html``.
 
-    Raises `InputError` for a folder without bundles, and for a bundle that is not as it lists itself.
+    A bundle that is not as it lists itself is in no table, and the page says why. Raises `InputError` for a folder without
+    sound bundles, and for names of --recompute that it does not have.
     """
+    folder, out, execution = Path(settings.folder), Path(settings.out), settings.execution
+    check_executor(execution, "cpu")
     files = entries(folder, "*.zip")
     if not files:
         raise InputError(folder, "", "bundles (*.zip) of `headbench bundle`", "none")
-    with tempfile.TemporaryDirectory() as scratch:
-        submissions = []
+    for name in settings.recompute:
+        if name not in [file.name for file in files]:
+            raise InputError("command line", "--recompute", ", ".join(file.name for file in files), name)
+    submissions: list[Submission] = []
+    errors: list[InputError] = []
+    refused: list[str] = []
+    with tempfile.TemporaryDirectory(dir=out) as scratch:
         for number, file in enumerate(files):
-            submissions.append(_read(file, Path(scratch) / file.stem))
+            own = Path(scratch) / str(number)
+            try:
+                read = read_submission(file, own / "run")
+            except InputError as error:
+                errors.append(error)
+                refused.append(f"{file.name}: {placeless(error, own / 'run')}")
+                continue
+            again = file.name in settings.recompute
+            kept = out / RECOMPUTED
+            submissions.append(verified(read, settings, own, kept, again, execution, progress))
             progress(number + 1, len(files), file.name)
+        if not submissions:
+            raise errors[0]
         boards = _boards(submissions)
-    write_text(out / "leaderboard.md", _markdown(boards, title))
-    page = render_page("leaderboard.html", title=title, boards=boards, heads=HEADS)
-    write_text(out / "leaderboard.html", page)
+        content = {"title": settings.title, "boards": boards, "heads": HEADS, "refused": refused}
+        write_text(out / "leaderboard.md", _markdown(boards, settings.title, refused))
+        write_text(out / "leaderboard.html", render_page("leaderboard.html", **content))
     text = f"{len(files)} bundles, {len(boards)} tables: {out / 'leaderboard.md'}, {out / 'leaderboard.html'}"
-    return CommandResult(text, {"out": out, "tables": [asdict(board.table) for board in boards]})
-
-
-def _read(file: Path, into: Path) -> Submission:
-    bundle, folder = read_bundle(file, into), RunFolder(into)
-    manifest = folder.read_manifest()
-    manifest.check_done(folder.manifest)
-    return Submission(file, bundle, folder, manifest, digest_file(file))
+    data = {
+        "out": out,
+        "tables": [asdict(board.table) for board in boards],
+        "bundles": [
+            {"file": each.file.name, "state": each.state, "remarks": each.remarks} for each in submissions
+        ],
+        "refused": refused,
+    }
+    return CommandResult(text, data)
 
 
 def _boards(submissions: Sequence[Submission]) -> list[Board]:
@@ -96,19 +127,39 @@ def _boards(submissions: Sequence[Submission]) -> list[Board]:
         groups.setdefault(submission.measured, []).append(submission)
     boards = []
     for group in sorted(groups.values(), key=len, reverse=True):
-        runs = RunSet.read([submission.folder.root for submission in group])
+        labels = qualified(group)
+        runs = RunSet.of_runs(tuple(each.run for each in group), labels)
+        apart = [
+            RowGroup(
+                title,
+                frozenset(n for e, own in zip(group, labels) if e.state == state for n in own.values()),
+                state in RANKED,
+            )
+            for state, title in STATES.items()
+        ]
+        claimed = {
+            (label, metric.name)
+            for each, own in zip(group, labels)
+            for label in own.values()
+            for metric in runs.metrics
+            if metric.name not in each.supported
+        }
         subjects = sorted({clip.subject for submission in group for clip in submission.manifest.clips})
-        boards.append(Board(f"Subjects {', '.join(subjects)}", table_of(runs), tuple(group)))
+        table = table_of(runs, apart=apart, claimed=claimed)
+        boards.append(Board(f"Subjects {', '.join(subjects)}", table, tuple(group)))
     return boards
 
 
-def _markdown(boards: Sequence[Board], title: str) -> str:
+def _markdown(boards: Sequence[Board], title: str, refused: Sequence[str]) -> str:
     parts = [f"# {escape_markdown(title)}"]
     for board in boards:
         rows = [f"| {' | '.join(HEADS)} |", "|" + " --- |" * len(HEADS)]
-        for submission in board.submissions:
-            file, by, *others = map(escape_markdown, submission.line)
+        for submission, line in zip(board.submissions, board.lines):
+            file, by, *others = map(escape_markdown, line)
             link = submission.bundle.link
             rows.append(f"| {' | '.join([file, f'[{by}]({link})' if link else by, *others])} |")
         parts += [f"## {escape_markdown(board.title)}", to_markdown(board.table).strip(), "\n".join(rows)]
+        parts.append("\n".join(f"- {escape_markdown(remark)}" for remark in board.remarks))
+    if refused:
+        parts += ["## In no table", "\n".join(f"- {escape_markdown(text)}" for text in refused)]
     return "\n\n".join(parts) + "\n"

@@ -15,6 +15,8 @@ from headbench.bench.io import documents
 from headbench.bench.io.documents import checked, parse_json, parse_setting, read_json, read_yaml
 from headbench.bench.io.files import write_json
 
+from ...memory import memory_below
+
 DEEP = 200_000
 ALIASES = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{new}: &{new} [{','.join([f'*{old}'] * 9)}]\n" for old, new in zip("abcdefgh", "bcdefghi")
@@ -24,6 +26,11 @@ PLAIN = st.recursive(
     lambda below: st.lists(below, max_size=3) | st.dictionaries(st.text(), below, max_size=3),
     max_leaves=10,
 )
+
+
+@dataclass(frozen=True)
+class Named:
+    name: str
 
 
 @pytest.mark.parametrize(
@@ -249,3 +256,18 @@ def test_text_of_windows_editors_is_read_or_refused_by_name(tmp_path, read, enco
     else:
         with pytest.raises(InputError, match=r"in UTF-8, found UTF-16 or UTF-32\. Save it as UTF-8"):
             read(path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "key"),
+    [
+        (tuple[int, ...], [""] * 50_000, "[0]"),
+        (list[Named], [{}] * 50_000, "[0].name"),
+        (dict[str, int], {str(number): "" for number in range(50_000)}, ".0"),
+    ],
+    ids=["tuple", "objects", "mapping"],
+)
+def test_many_faults_take_the_memory_of_one(kind, value, key):
+    with memory_below(12e6), pytest.raises(InputError) as caught:
+        checked(value, kind, "file", "items")
+    assert caught.value.key == f"items{key}"

@@ -1,6 +1,7 @@
 """Programs that leave processes, never end, or write without end."""
 
 import signal
+import subprocess
 import sys
 import time
 
@@ -42,6 +43,32 @@ def test_a_child_that_holds_the_output_is_ended(tmp_path, session):
     while is_running(child) and time.monotonic() < until:
         time.sleep(0.02)
     assert not is_running(child)
+
+
+def test_a_daemon_without_its_environment_is_ended(tmp_path):
+    """Its parent has ended, and it is in another session with an empty environment; so is the child that it starts."""
+    forked = (
+        "import os, time; open('pid-%d' % os.getpid(), 'w').close(); os.fork() and os._exit(0); os.setsid()"
+    )
+    daemon = f"{forked}; open('pid-%d' % os.getpid(), 'w').close(); time.sleep(300)"
+    code = (
+        "import os, sys, time\n"
+        "if os.fork() == 0:\n"
+        f"  os.setsid(); os.execve(sys.executable, ['python', '-c', {daemon!r}], {{}})\n"
+        "while len([name for name in os.listdir() if name.startswith('pid-')]) < 2: time.sleep(0.02)\n"
+    )
+    run(tmp_path, code)
+    left = [int(path.name[4:]) for path in tmp_path.glob("pid-*")]
+    assert len(left) == 2
+    assert not any(map(is_running, left))
+
+
+def test_other_children_are_left_alone(tmp_path):
+    other = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, start_new_session=True)
+    run(tmp_path, "")
+    assert other.poll() is None
+    other.communicate(b"\n")
+    assert other.returncode == 0
 
 
 def test_a_child_that_writes_without_end_is_not_followed(tmp_path):

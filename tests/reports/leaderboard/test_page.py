@@ -3,11 +3,20 @@
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
 
+import pandas as pd
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.audit.definitions import known_metrics
+from headbench.bench.contracts import FrameKey
 from headbench.bench.engine.store import RunFolder
+from headbench.bench.manifest import ProtocolRecord
+from headbench.bench.protocol import Protocol
+from headbench.bench.rows import FRAME
+from headbench.reports.leaderboard.submissions import qualified
 
 
 class Text(HTMLParser):
@@ -49,56 +58,83 @@ def build(folder, tmp_path):
     return build
 
 
+def sound(run, resolution="48x64"):
+    """Give a run that was written by hand registered metrics, and protocols of its frames."""
+    manifest, rows = RunFolder(run).read_manifest(), pd.read_parquet(run / "rows.parquet")
+    frames = rows[rows["task"] != ""]
+    keys = tuple(FrameKey(*key) for key in sorted(set(frames[FRAME].itertuples(index=False, name=None))))
+    clips = tuple((subject, "f") for subject in sorted({key.subject for key in keys}))
+    made = {task: Protocol(task, keys, (), clips, resolution) for task in manifest.protocols}
+    rows["protocol"] = [made[task].hash if task else "" for task in rows["task"]]
+    rows.to_parquet(run / "rows.parquet", index=False)
+    records = {task: ProtocolRecord.of(protocol) for task, protocol in made.items()}
+    metrics = tuple(known_metrics()[metric.name] for metric in manifest.metrics)
+    replace(manifest, protocols=records, metrics=metrics).write(RunFolder(run).manifest)
+    return run
+
+
 def test_runs_on_the_same_frames_share_a_table(write_run, submit, build):
-    submit(write_run("one", {"ga": 30.0, "mean-image": 10.0}), "first")
-    submit(write_run("two", {"ours": 31.25}), "second", "--link", "https://example.org/ours", by="B <b>")
+    submit(sound(write_run("one", {"mine": 30.0, "slow": 10.0})), "first")
+    submit(sound(write_run("two", {"mine": 31.25})), "second", "--link", "https://example.org/m", by="B <b>")
     markdown, page = build()
     assert len(re.findall("^## ", markdown, flags=re.MULTILINE)) == 1
     html = Text(page)
-    for text in ("31.2500", "30.0000"):
-        assert text in markdown
+    for text in ("31.25", "30.00", "mine [A. Person/first]", "mine [B <b>/second]"):
+        assert text in markdown.replace("\\", "")
         assert text in html.texts
-    assert "[B \\<b\\>](https://example.org/ours)" in markdown
-    assert html.links == ["https://example.org/ours"]
+    assert "[B \\<b\\>](https://example.org/m)" in markdown
+    assert html.links == ["https://example.org/m"]
     assert "<b>" not in page
 
 
 def test_other_frames_make_another_table(write_run, submit, build):
-    submit(write_run("one", {"ga": 30.0}), "first")
-    other = write_run("two", {"ga": 31.0})
-    measured_by(other, "other")
-    submit(other, "second")
+    submit(sound(write_run("one", {"mine": 30.0})), "first")
+    submit(sound(write_run("two", {"mine": 31.0}), "96x128"), "second")
     markdown, page = build()
     assert len(re.findall("^## ", markdown, flags=re.MULTILINE)) == 2
     assert page.count("<h2>") == 2
 
 
-def measured_by(run, protocol):
-    """Give a run and its rows other protocols."""
-    import pandas as pd
-
-    rows = pd.read_parquet(run / "rows.parquet")
-    rows["protocol"] = rows["task"].where(rows["task"] == "", f"{protocol}-" + rows["task"])
-    rows.to_parquet(run / "rows.parquet", index=False)
-    manifest = RunFolder(run).read_manifest()
-    others = {task: replace(each, hash=f"{protocol}-{task}") for task, each in manifest.protocols.items()}
-    replace(manifest, protocols=others).write(RunFolder(run).manifest)
-
-
 def test_notes_of_two_tables_have_names_of_their_own(write_run, submit, build):
-    for name, protocol in (("one", "first"), ("two", "other")):
-        run = write_run(name, {"ga": 30.0, "ours": 31.0})
-        import pandas as pd
-
+    for name, size in (("one", "48x64"), ("two", "96x128")):
+        run = write_run(name, {"mine": 30.0, "theirs": 31.0})
         rows = pd.read_parquet(run / "rows.parquet")
-        rows.loc[rows["method"] == "ours", ["status", "reason"]] = ["missing", "not measured here"]
+        rows.loc[rows["method"] == "theirs", ["status", "reason"]] = ["missing", "not measured here"]
         rows.to_parquet(run / "rows.parquet", index=False)
-        measured_by(run, protocol)
-        submit(run, name)
+        submit(sound(run, size), name)
     _, page = build()
     names = re.findall(r'id="([^"]+)"', page)
     assert len(names) == len(set(names)) == 2
     assert set(re.findall(r'href="#([^"]+)"', page)) == set(names)
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("a", "b"), ["m [A/a]", "m [A/b]"]),
+        (("a", "A"), ["m [A/a] 00000000", "m [A/A] 11111111"]),
+        (("a", "\uff41"), ["m [A/a] 00000000", "m [A/\uff41] 11111111"]),  # a wide letter a
+    ],
+)
+def test_names_that_look_alike_have_a_digest(names, expected):
+    made = [
+        SimpleNamespace(
+            bundle=SimpleNamespace(by="A"),
+            file=Path(f"{name}.zip"),
+            run=SimpleNamespace(methods=("m",)),
+            digest=str(i) * 64,
+        )
+        for i, name in enumerate(names)
+    ]
+    assert [own["m"] for own in qualified(made)] == expected
+
+
+def test_an_unsound_bundle_is_listed_in_no_table(write_run, submit, build, folder):
+    submit(sound(write_run("one", {"mine": 30.0})), "first")
+    (folder / "b.zip").write_bytes(b"text")
+    markdown, page = build()
+    for text in (markdown, page):
+        assert re.search("In no table(.|\n)*b.zip: .*File is not a zip file", text)
 
 
 @pytest.mark.parametrize(
