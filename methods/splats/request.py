@@ -243,7 +243,8 @@ def _check_like(name: str, value: Tensor, shape: tuple[int, ...], means: Tensor)
 
 def _as_like(name: str, value: ArrayLike, shape: tuple[int, ...], means: Tensor) -> Tensor:
     """Turn a small array, or a stack of them, into a tensor of ``means``' dtype and device; gradients pass through."""
-    tensor = torch.as_tensor(value)
+    # A copy: cameras' arrays are read-only, which torch.as_tensor warns of.
+    tensor = value if isinstance(value, Tensor) else torch.tensor(value)
     if tuple(tensor.shape[-len(shape) :]) != shape or tensor.ndim > len(shape) + 1:
         stacked = ", ".join(["V", *map(str, shape)])
         raise _error(name, f"shape {shape} or ({stacked})", f"shape {tuple(tensor.shape)}")

@@ -101,7 +101,7 @@ def definition(clip, key, tensors, splats, boxes, jaw_bases, spread=0.0):
     means, colors, opacities = [], [], []
     own = splats.get(RESIDUAL, torch.zeros(len(splats["means"]), 3))
     for mean, logit, triangle, residual in zip(*(splats[n] for n in ("means", "opacities", "binding")), own):
-        corners = torch.from_numpy(np.asarray(clip.head.faces, np.int64)[int(triangle)])
+        corners = torch.tensor(np.asarray(clip.head.faces, np.int64)[int(triangle)])
         rotation, size, center = frame(vertices, corners)
         own_rotation, own_size, own_center = frame(canonical[0], corners)
         means.append(size * rotation @ mean + center)
