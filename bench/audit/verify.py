@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
 from itertools import combinations, product
@@ -45,6 +47,7 @@ least."""
 TRAINING = "settings, budget, seeds, versions, processor time and memory of the training"
 """Claims that only another training can confirm."""
 FINDINGS = "findings.json"
+TEMPORARY_FILES = "temporary"
 
 
 @dataclass
@@ -117,9 +120,9 @@ def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> Co
     check_executor(settings.execution, "cpu")
     texts, data, codes = [], [], []
     renders: dict[str, Mapping[str, str]] = {}
-    with tempfile.TemporaryDirectory(dir=settings.out) as scratch:
+    with _scratch_folder(settings.out) as scratch:
         for index, name in enumerate(settings.runs):
-            folder = Path(scratch) / str(index)
+            folder = scratch / str(index)
             folder.mkdir()
             try:
                 bundle = read_bundle(Path(name), folder / "run") if Path(name).is_file() else None
@@ -140,6 +143,22 @@ def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> Co
     if settings.out is not None:
         write_json(Path(settings.out) / "verify.json", found)
     return CommandResult("\n".join([*texts, *equal]), found, code == ExitCode.OK, code)
+
+
+@contextmanager
+def _scratch_folder(out: str | None) -> Iterator[Path]:
+    """An empty folder for temporary files, in ``out``, which its command locks, if it is given; what a killed process left is removed."""
+    if out is None:
+        with tempfile.TemporaryDirectory() as name:
+            yield Path(name)
+        return
+    folder = Path(out) / TEMPORARY_FILES
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder)
 
 
 @dataclass(frozen=True)

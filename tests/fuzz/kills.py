@@ -80,6 +80,7 @@ WRITERS = [
     *(Writer(name, "capture", f"{name} capture --out out") for name in ("inspect", "inspect steps")),
     Writer("lint", "capture", "lint capture"),
     Writer("verify", "run", "verify run"),
+    Writer("verify out", "run", "verify run --out out"),
     Writer("processes", "unfinished", PROCESSES, (PAGE, "outcome.json")),
 ]
 
