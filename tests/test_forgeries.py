@@ -17,23 +17,20 @@ from headbench.bench.audit.bundle import INDEX
 from headbench.bench.audit.settings import VerifySettings
 from headbench.bench.audit.verify import verify_run
 from headbench.bench.errors import ExitCode
-from headbench.bench.registry import get, resolve
 from headbench.reports.leaderboard import submissions
 from headbench.reports.leaderboard.page import build
 from headbench.reports.leaderboard.settings import LeaderboardSettings
 
+from .datasets.head.toy import toy_head
+from .datasets.tiny_capture import make_plan, write_tiny_capture
 from .small_run import run_on
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    """A synthetic capture, which `verify` can make again."""
-    folder = tmp_path_factory.mktemp("capture")
-    size = {"size": (24, 32), "cameras": 3, "timesteps": 6}
-    resolve(get("datasets", "synthetic").implementation)(
-        folder, subjects=1, head="procedural", seed=5, **size
-    )
-    return folder
+    """A capture; a synthetic one would take longer than all that is done with it."""
+    head = toy_head(16, version="procedural2020")
+    return write_tiny_capture(tmp_path_factory.mktemp("capture"), make_plan(head=head)).union
 
 
 @pytest.fixture(scope="module")
@@ -139,14 +136,13 @@ def listed_again(files):
 
 
 def synthetic(**changes):
-    """Other settings of the synthetic capture; None leaves one out."""
+    """A record that names a synthetic capture, with these settings; None leaves one out."""
+    made = {"head": "procedural", "size": [24, 32], "cameras": 3, "timesteps": 6, "subjects": 1, "seed": 5, **changes}
+    settings = {name: value for name, value in made.items() if value is not None}
 
     def change(values):
         for clip in values["clips"]:
-            made = clip["steps"][0]["parameters"]["synthetic"]
-            made |= changes
-            for name in [name for name, value in changes.items() if value is None]:
-                del made[name]
+            clip["steps"] = [{"name": "synthesize", "parameters": {"synthetic": settings}, "fingerprint": "0"}]
 
     return record(change)
 
