@@ -5,6 +5,8 @@ import re
 import resource
 import signal
 import socket
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from headbench.bench.contracts import Frame, FrameKey
+from headbench.bench.contracts import Budget, Frame, FrameKey, SharingAvatar
 from headbench.bench.engine import run as runner
-from headbench.bench.engine.config import RunConfig
+from headbench.bench.engine.config import ResolvedMethod, RunConfig
 from headbench.bench.engine.guard import ChangedInputError, check_frame
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.isolation.landlock import landlock_version, without
+from headbench.bench.isolation.parent import IsolatedMethod
 from headbench.bench.rows import ALL
 from headbench.reports.tables import METHODS_TITLE, SUSPECT_TITLE, build_table
 
@@ -218,6 +221,28 @@ def test_isolated_results_are_the_same(config):
     )
     assert len(inside) > 5
     assert isolated == inside
+
+
+@pytest.mark.parametrize("name", ["TOOBRIGHT", "SHARES"])
+def test_an_isolated_avatar_offers_what_it_does_itself(place, tmp_path, name):
+    import attacks
+
+    (tmp_path / "level.txt").write_text("0.5")
+    resolved = ResolvedMethod(getattr(attacks, name), attacks.ToyConfig(), Budget())
+    avatar = IsolatedMethod(resolved, tmp_path).load(tmp_path, device="cpu")
+    try:
+        assert isinstance(avatar, SharingAvatar) == (name == "SHARES")
+        assert not isinstance(avatar, SharingAvatar) or avatar.shared_files() == (Path(np.__file__),)
+    finally:
+        avatar.close()
+
+
+def test_a_single_file_can_be_named_as_writable(tmp_path):
+    file = tmp_path / "x"
+    file.touch()
+    code = f"from headbench.bench.isolation.landlock import restrict; restrict(['/'], ['{file}']); open('{file}', 'w').write('1')"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert file.read_text() == "1"
 
 
 @pytest.mark.parametrize(
