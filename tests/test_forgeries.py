@@ -117,7 +117,9 @@ def worst(table):
 def recompressed(files):
     """The same pixels in files of other bytes, for seed 1 of the method "mine"."""
     return {
-        name: cv2.imencode(".png", cv2.imdecode(np.frombuffer(c, np.uint8), -1), [cv2.IMWRITE_PNG_COMPRESSION, 0])[1].tobytes()
+        name: cv2.imencode(
+            ".png", cv2.imdecode(np.frombuffer(c, np.uint8), -1), [cv2.IMWRITE_PNG_COMPRESSION, 0]
+        )[1].tobytes()
         if "/seed-1/renders/" in name
         else c
         for name, c in files.items()
@@ -137,12 +139,22 @@ def listed_again(files):
 
 def synthetic(**changes):
     """A record that names a synthetic capture, with these settings; None leaves one out."""
-    made = {"head": "procedural", "size": [24, 32], "cameras": 3, "timesteps": 6, "subjects": 1, "seed": 5, **changes}
+    made = {
+        "head": "procedural",
+        "size": [24, 32],
+        "cameras": 3,
+        "timesteps": 6,
+        "subjects": 1,
+        "seed": 5,
+        **changes,
+    }
     settings = {name: value for name, value in made.items() if value is not None}
 
     def change(values):
         for clip in values["clips"]:
-            clip["steps"] = [{"name": "synthesize", "parameters": {"synthetic": settings}, "fingerprint": "0"}]
+            clip["steps"] = [
+                {"name": "synthesize", "parameters": {"synthetic": settings}, "fingerprint": "0"}
+            ]
 
     return record(change)
 
@@ -229,9 +241,18 @@ CONTRADICTED = {
         together(metric("psnr", digits=0), setting("value", lambda v: v + 0.04)),
         "psnr, digits: expected 2, found 0",
     ),
-    "another unit": (together(without_renders, metric("psnr", unit="bit")), "psnr, unit: expected dB, found bit"),
-    "another label": (together(without_renders, metric("psnr", label="SSIM")), "psnr, label: expected PSNR, found SSIM"),
-    "another kind": (together(without_renders, metric("psnr", kind="avatar")), "psnr, kind: expected .*, found avatar"),
+    "another unit": (
+        together(without_renders, metric("psnr", unit="bit")),
+        "psnr, unit: expected dB, found bit",
+    ),
+    "another label": (
+        together(without_renders, metric("psnr", label="SSIM")),
+        "psnr, label: expected PSNR, found SSIM",
+    ),
+    "another kind": (
+        together(without_renders, metric("psnr", kind="avatar")),
+        "psnr, kind: expected .*, found avatar",
+    ),
     "bound to a machine": (
         metric("psnr", machine_bound=True),
         "psnr, machine_bound: expected False, found True",
@@ -243,7 +264,10 @@ CONTRADICTED = {
         ),
         "psnr .*expected",
     ),
-    "a baseline called a method": (together(without_renders, method(trivial=False)), "mean-image, trivial: expected True, found False"),
+    "a baseline called a method": (
+        together(without_renders, method(trivial=False)),
+        "mean-image, trivial: expected True, found False",
+    ),
     "another program under a known name": (
         together(without_renders, method(implementation="m:M")),
         "mean-image, implementation: expected .*, found m:M",
@@ -538,7 +562,12 @@ def test_a_training_is_repeated_and_compared(honest, make_board):
     }
     (table,), bundles, _ = make_board(words=[f"{name}.zip" for name in others], **others)
     states = {name: bundles[f"{name}.zip"]["state"] for name in others}
-    assert states == {"same": "recomputed", "raised": "contradicted", "slower": "recomputed", "nearly": "recomputed"}
+    assert states == {
+        "same": "recomputed",
+        "raised": "contradicted",
+        "slower": "recomputed",
+        "nearly": "recomputed",
+    }
     same, forged = (cells(table, f"nearest-camera [Stranger/{name}]")[1] for name in ("same", "nearly"))
     assert forged["psnr"]["text"] == same["psnr"]["text"]  # what was trained here, not what is claimed
     remarks = {name: " ".join(bundles[f"{name}.zip"]["remarks"]) for name in others}

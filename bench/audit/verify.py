@@ -212,7 +212,9 @@ def _renders(folder: RunFolder, manifest: Manifest) -> Renders:
         state = cell.step(DIGESTS)
         files = {} if state is None else state.get("files", {})
         own = found.setdefault(f"{method.label} seed {seed}", {})
-        own |= {f"{clip.subject}/{name}": _pixels(cell.folder / name) or value for name, value in files.items()}
+        own |= {
+            f"{clip.subject}/{name}": _pixels(cell.folder / name) or value for name, value in files.items()
+        }
     return found
 
 

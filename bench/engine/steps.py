@@ -33,7 +33,6 @@ from ..errors import HeadbenchError, InputError, UnavailableError, is_damage, te
 from ..io.documents import read_json
 from ..io.files import digest, digest_file, grouped_writes, refuse_links, write_text
 from ..io.images import quantise, read_png, write_png
-from ..isolation.landlock import landlock_version
 from ..isolation.parent import IsolatedAvatar, IsolatedMethod
 from ..machine import PeakMemory, ProcessorLoad, machine_name, processor_seconds, use_device
 from ..progress import RunProgress, duration, progress
@@ -240,7 +239,7 @@ def fit(job: Job) -> Avatar:
             seconds=round(seconds, 3),
             processor_seconds=round(processor_seconds() - processor, 3),
             interruptions=interruptions,
-            **({} if job.hidden is None else {"landlock": landlock_version()}),
+            **({} if job.hidden is None else {"landlock": method.landlock}),
             peak_memory_bytes=memory.peak,
             memory_before_bytes=memory.before,
             **memory.device_record,

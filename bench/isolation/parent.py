@@ -43,8 +43,6 @@ from .child import StoredHead
 from .landlock import SYSTEM, devices, without
 from .messages import Arrays, receive, send
 
-log = logging.getLogger(__name__)
-HEAD = tuple(field.name for field in fields(StoredHead))
 GRACE_S = 10.0
 """Seconds that a process has for ending after its connection is closed."""
 
@@ -65,6 +63,8 @@ class IsolatedMethod:
     def __init__(self, resolved: Any, out: Path, hidden: Sequence[Path] = ()):
         self._resolved, self._out, self._hidden = resolved, out, hidden
         self._prepared: _Process | None = None
+        self.landlock = 0
+        """Version of Landlock that restricted the process of the last training."""
 
     def check(self, clip: Clip | None, budget: Budget) -> None:
         """Let the method check its settings and the clip, if it can."""
@@ -92,6 +92,7 @@ class IsolatedMethod:
             self.prepare(device)
         assert self._prepared is not None
         process, self._prepared = self._prepared, None
+        self.landlock = process.landlock
         with process:
             values: dict[str, Any] = {
                 "clip": described(clip),
@@ -207,7 +208,10 @@ class _Process:
         self.running.add(self._started.pid)
         self._connection = Connection(own.detach())
         # Settings have defaults, so that a plug-in itself names files here.
-        named = [*_texts(self._resolved.config), *(os.environ[n] for n in os.environ if n.startswith("HEADBENCH_"))]
+        named = [
+            *_texts(self._resolved.config),
+            *(os.environ[n] for n in os.environ if n.startswith("HEADBENCH_")),
+        ]
         known = [*SYSTEM, sys.prefix, sys.base_prefix, *_search_path(), *filter(os.path.isabs, named)]
         read = [*without(map(Path, known), self._hidden), *self._read]
         write = [*devices(), Path(self._scratch.name), *self._write]
@@ -307,7 +311,9 @@ class _Process:
 
 def described(clip: Clip) -> dict[str, Any]:
     """Everything of a clip except its images, as plain values."""
-    head = StoredHead(**{name: _plain(getattr(clip.head, name, None)) for name in HEAD})
+    head = StoredHead(
+        **{each.name: _plain(getattr(clip.head, each.name, None)) for each in fields(StoredHead)}
+    )
     names = (
         "subject",
         "shape",
@@ -345,7 +351,9 @@ def _raised(kind: str, parts: Sequence[Any]) -> Exception:
 
 def _priorities() -> tuple[Any, ...]:
     """What any process of the same user can change of this one, and other processes inherit."""
-    limits = [resource.getrlimit(getattr(resource, name)) for name in dir(resource) if name.startswith("RLIMIT_")]
+    limits = [
+        resource.getrlimit(getattr(resource, name)) for name in dir(resource) if name.startswith("RLIMIT_")
+    ]
     processors = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
     return limits, processors, os.getpriority(os.PRIO_PROCESS, 0)
 

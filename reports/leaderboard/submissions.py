@@ -161,8 +161,12 @@ def verified(
             metrics = {metric.name: metric for metric in submission.run.metrics}
             own = folder.rows_by_condition(folder.read_manifest())
             submission = replace(submission, agreed=tuple(agreements(own, rows, metrics)))
-            if submission.state == "recomputed":  # what is ranked is what was trained here, not what comes close to it
-                values = submission.run.rows.with_values(rows.labelled().of_metrics(sorted(submission.supported)))
+            if (
+                submission.state == "recomputed"
+            ):  # what is ranked is what was trained here, not what comes close to it
+                values = submission.run.rows.with_values(
+                    rows.labelled().of_metrics(sorted(submission.supported))
+                )
                 run = replace(submission.run, rows=_with_suspects(values, submission.run.metrics))
                 submission = replace(submission, run=run)
     except Exception as error:  # noqa: BLE001

@@ -133,9 +133,7 @@ def test_a_method_cannot_change_what_others_get(inside, name):
     assert IN_PROCESS[name] in reason
 
 
-@pytest.mark.parametrize(
-    "name", [*ISOLATED, *(pytest.param(name, marks=restricted) for name in RESTRICTED)]
-)
+@pytest.mark.parametrize("name", [*ISOLATED, *(pytest.param(name, marks=restricted) for name in RESTRICTED)])
 def test_an_isolated_method_reaches_nothing_else(isolated, name):
     status, reason, found = isolated[name]
     assert (status, found) == ({"failed"}, None)
