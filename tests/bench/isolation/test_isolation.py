@@ -95,10 +95,10 @@ def config(place, tmp_path):
 
 
 def attacked(config, *names, **changes):
-    """By attack: status and reasons of its rows and what it found; under "toy" the values of the toy method after them."""
-    methods = (*(f"attacks:{name.upper()}" for name in names), "toy_plugin:METHOD")
+    """By attack: status and reasons of its rows and what it found; under "mirror" the values of a method that shows poses, after them."""
+    methods = (*(f"attacks:{name.upper()}" for name in names), "toy_plugin:MIRROR")
     rows = runner.run(replace(config, methods=methods, **changes))
-    results = {"toy": rows.select(method="toy", **EVERY)["value"].tolist()}
+    results = {"mirror": rows.select(method="mirror", **EVERY)["value"].tolist()}
     for name in names:
         own = rows.select(method=name.lower(), **EVERY)
         file = Path(config.out, "subject1", name.lower(), "seed-0", "avatar", "found.txt")
@@ -109,8 +109,8 @@ def attacked(config, *names, **changes):
 
 @pytest.fixture(scope="module")
 def alone(place):
-    """The values of the toy method without attacks."""
-    return attacked(replace(place, out=f"{place.out}-alone"))["toy"]
+    """The values of that method without attacks."""
+    return attacked(replace(place, out=f"{place.out}-alone"))["mirror"]
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_an_isolated_method_reaches_nothing_else(isolated, name):
 
 
 def test_attacks_leave_everything_as_it_was(inside, isolated, alone):
-    assert inside["toy"] == isolated["toy"] == alone
+    assert inside["mirror"] == isolated["mirror"] == alone
     assert Path(os.environ["ATTACKED"], "secret.txt").read_text() == "test picture"
     assert RECEIVED == []
 
@@ -153,7 +153,7 @@ def test_arrays_changed_by_force_end_the_run(config, alone):
     assert not (cell / "rows.parquet").exists()  # nothing of it is kept
     results = attacked(config, "ScalesCameraByForce", isolation="plugins")
     assert results["ScalesCameraByForce"][0] == {"ok"}  # it changed its own copy
-    assert results["toy"] == alone
+    assert results["mirror"] == alone
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="these calls are those of Linux")
