@@ -45,6 +45,10 @@ class HeadbenchError(Exception):
     """Base of all errors the command line reports as one paragraph, without a traceback (exit code 2)."""
 
 
+class ChangedInputError(HeadbenchError):
+    """A method changed what other methods are given, so that no result of this process can be trusted from here on."""
+
+
 LONGEST_PLACE, LONGEST_WORDS, LONGEST_FOUND = 400, 1200, 300
 """Maximum characters of an error's parts; longer text is cut in the middle."""
 
@@ -75,6 +79,14 @@ class InputError(HeadbenchError):
         where = f"{self.file}, {self.key}" if key else self.file
         message = f"{where}: expected {self.expected}, found {self.found}."
         super().__init__(f"{message} {self.remedy}" if remedy else message)
+
+
+def text_of(error: BaseException) -> str:
+    """The message of an error; its type where that cannot be had, as the class may be anybody's."""
+    try:
+        return str(error)
+    except Exception:  # noqa: BLE001
+        return f"{type(error).__name__} without a readable message"
 
 
 def is_damage(error: BaseException) -> bool:

@@ -88,6 +88,8 @@ SPARE_ROWS = 100_000
 """Rows that a file may have beyond one a byte: repeated rows, such as those of a metric that is missing, pack well."""
 JOINED_AT_ONCE = 64
 """Tables that are joined at a time: small ones take many times the memory of their content."""
+MAX_VALUE = 1e15
+"""Of a measured value; sums and their text stay of bounded size."""
 MAX_REASON = 4_000
 """Characters of a reason that are read; longer ones are cut in their middle."""
 
@@ -326,6 +328,13 @@ class Rows:
         chosen[places] = len(own) + np.arange(len(others))
         return Rows(pd.concat([self._table, new._table]).take(chosen).reset_index(drop=True))
 
+    def with_values(self, other: Rows) -> Rows:
+        """The same rows; measured values that ``other`` has, too, are those of ``other``."""
+        identity = ["method", "condition", "seed", "task", *FRAME, "region", "metric"]
+        theirs = other._table[other._table["status"] == "ok"].set_index(identity)["value"]
+        found = theirs.reindex(pd.MultiIndex.from_frame(self._table[identity])).to_numpy()
+        return Rows(self._table.assign(value=self._table["value"].where(np.isnan(found), found)))
+
     @property
     def regions(self) -> set[str]:
         """Regions of the rows of frames."""
@@ -481,11 +490,11 @@ def _checked(table: pa.Table, path: Path) -> pd.DataFrame:
     strange = sorted(set(frame["status"]) - set(STATUSES))
     if strange:
         raise InputError(path, "status", f"one of {', '.join(STATUSES)}", ", ".join(map(repr, strange)))
-    undefined = frame[(frame["status"] == "ok") & ~np.isfinite(frame["value"])]
+    undefined = frame[(frame["status"] == "ok") & ~(frame["value"].abs() <= MAX_VALUE)]
     if len(undefined):
         first = undefined.iloc[0]
         where = f"{first['metric']} of {first['method']}, {first['subject']} {first['timestep']}"
-        raise InputError(path, where, "a finite value", str(first["value"]))
+        raise InputError(path, where, f"a finite value of at most {MAX_VALUE:g}", str(first["value"]))
     for name in ("threads", "other_cores"):
         wrong = frame.loc[(frame[name] < 0) | np.isinf(frame[name]), name]
         if len(wrong):

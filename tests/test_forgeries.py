@@ -7,6 +7,8 @@ import math
 import re
 import zipfile
 
+import cv2
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -14,22 +16,21 @@ from headbench.bench import cli
 from headbench.bench.audit.bundle import INDEX
 from headbench.bench.audit.settings import VerifySettings
 from headbench.bench.audit.verify import verify_run
-from headbench.bench.registry import get, resolve
+from headbench.bench.errors import ExitCode
+from headbench.reports.leaderboard import submissions
 from headbench.reports.leaderboard.page import build
 from headbench.reports.leaderboard.settings import LeaderboardSettings
 
+from .datasets.head.toy import toy_head
+from .datasets.tiny_capture import make_plan, write_tiny_capture
 from .small_run import run_on
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    """A synthetic capture, which `verify` can make again."""
-    folder = tmp_path_factory.mktemp("capture")
-    size = {"size": (24, 32), "cameras": 3, "timesteps": 6}
-    resolve(get("datasets", "synthetic").implementation)(
-        folder, subjects=1, head="procedural", seed=5, **size
-    )
-    return folder
+    """A capture; a synthetic one would take longer than all that is done with it."""
+    head = toy_head(16, version="procedural2020")
+    return write_tiny_capture(tmp_path_factory.mktemp("capture"), make_plan(head=head)).union
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +114,51 @@ def worst(table):
     return table.index.isin(own.groupby("method")["value"].idxmin())
 
 
+def recompressed(files):
+    """The same pixels in files of other bytes, for seed 1 of the method "mine"."""
+    return {
+        name: cv2.imencode(
+            ".png", cv2.imdecode(np.frombuffer(c, np.uint8), -1), [cv2.IMWRITE_PNG_COMPRESSION, 0]
+        )[1].tobytes()
+        if "/seed-1/renders/" in name
+        else c
+        for name, c in files.items()
+    }
+
+
+def listed_again(files):
+    """Records whose digests are those of the renders."""
+    changed = dict(files)
+    for path, content in files.items():
+        if path.endswith("digests.json"):
+            state, folder = json.loads(content), path.rpartition("/")[0]
+            state["files"] = {n: hashlib.sha256(files[f"{folder}/{n}"]).hexdigest() for n in state["files"]}
+            changed[path] = json.dumps(state).encode()
+    return changed
+
+
+def synthetic(**changes):
+    """A record that names a synthetic capture, with these settings; None leaves one out."""
+    made = {
+        "head": "procedural",
+        "size": [24, 32],
+        "cameras": 3,
+        "timesteps": 6,
+        "subjects": 1,
+        "seed": 5,
+        **changes,
+    }
+    settings = {name: value for name, value in made.items() if value is not None}
+
+    def change(values):
+        for clip in values["clips"]:
+            clip["steps"] = [
+                {"name": "synthesize", "parameters": {"synthetic": settings}, "fingerprint": "0"}
+            ]
+
+    return record(change)
+
+
 def called_missing(table):
     """Bad frames called missing."""
     table.loc[worst(table), ["status", "value", "reason"]] = ["missing", math.nan, "not available"]
@@ -127,6 +173,12 @@ def best_frame(table):
 
 def without_renders(files):
     return {name: content for name, content in files.items() if not name.endswith(".png")}
+
+
+def one_seed(files):
+    """Seed 0 alone."""
+    files = rows(lambda t: t[t["seed"] == 0])(record(lambda r: r["configuration"].update(seeds=[0]))(files))
+    return {name: content for name, content in files.items() if "/seed-1/" not in name}
 
 
 def together(*forgeries):
@@ -189,9 +241,18 @@ CONTRADICTED = {
         together(metric("psnr", digits=0), setting("value", lambda v: v + 0.04)),
         "psnr, digits: expected 2, found 0",
     ),
-    "another unit": (metric("psnr", unit="bit"), "psnr, unit: expected dB, found bit"),
-    "another label": (metric("psnr", label="SSIM"), "psnr, label: expected PSNR, found SSIM"),
-    "another kind": (metric("psnr", kind="avatar"), "psnr, kind: expected .*, found avatar"),
+    "another unit": (
+        together(without_renders, metric("psnr", unit="bit")),
+        "psnr, unit: expected dB, found bit",
+    ),
+    "another label": (
+        together(without_renders, metric("psnr", label="SSIM")),
+        "psnr, label: expected PSNR, found SSIM",
+    ),
+    "another kind": (
+        together(without_renders, metric("psnr", kind="avatar")),
+        "psnr, kind: expected .*, found avatar",
+    ),
     "bound to a machine": (
         metric("psnr", machine_bound=True),
         "psnr, machine_bound: expected False, found True",
@@ -203,9 +264,12 @@ CONTRADICTED = {
         ),
         "psnr .*expected",
     ),
-    "a baseline called a method": (method(trivial=False), "mean-image, trivial: expected True, found False"),
+    "a baseline called a method": (
+        together(without_renders, method(trivial=False)),
+        "mean-image, trivial: expected True, found False",
+    ),
     "another program under a known name": (
-        method(implementation="m:M"),
+        together(without_renders, method(implementation="m:M")),
         "mean-image, implementation: expected .*, found m:M",
     ),
     "rows of another version": (
@@ -253,18 +317,27 @@ UNVERIFIED = {
 
 ALIKE = {
     "a copied seed": (together(renamed("mine"), copied_seed), ("mine seed 0", "mine seed 1")),
+    "a copied seed, compressed again": (
+        together(renamed("mine"), copied_seed, recompressed, listed_again),
+        ("mine seed 0", "mine seed 1"),
+    ),
     "copied under another name": (copied_under_another_name, ("mean-image seed 0", "nearest-camera seed 0")),
 }
 """Copies of renders, and what is said to be equal."""
+
+
+SEEDED = {"a failure", *ALIKE}
+"""Forgeries that take two seeds."""
 
 
 @pytest.fixture(scope="module")
 def verdicts(honest, capture, tmp_path_factory):
     """What `verify` says of all forged bundles at once: the text of each and the lines on equal renders."""
     folder = tmp_path_factory.mktemp("verdicts")
+    single = one_seed(honest)
     forged = {name: forge for name, (forge, _) in {**CONTRADICTED, **UNVERIFIED, **ALIKE}.items()}
     paths = {
-        name: write(folder / f"{index}.zip", forge(honest))
+        name: write(folder / f"{index}.zip", forge(honest if name in SEEDED else single))
         for index, (name, forge) in enumerate(forged.items())
     }
     options = VerifySettings(tuple(map(str, paths.values())), data=str(capture))
@@ -300,6 +373,35 @@ def test_equal_renders_of_two_bundles_are_pointed_out(verdicts):
     _, _, equal, paths = verdicts
     names = [f"{paths[name]}: mean-image seed 0" for name in ("storage", "speed")]
     assert any(all(name in text for name in names) for text in equal)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"size": None, "timesteps": 10**9}, "at most .* pixels in all"),
+        ({"timesteps": 10**9}, "at most .* pixels in all"),
+        ({"seed": -1}, "--seed: expected a whole number from 0"),
+        ({"samples_per_pixel": 10**9}, "--samples: expected"),
+        ({"head": "procedural/../../x"}, "--head"),
+    ],
+)
+def test_a_capture_is_made_again_within_limits(honest, tmp_path, changes, expected):
+    path = write(tmp_path / "b.zip", synthetic(**changes)(honest))
+    result = verify_run(VerifySettings((str(path),)))
+    assert result.code == ExitCode.NO_VERDICT
+    assert re.search(expected, result.text)
+
+
+def test_an_unexpected_error_of_one_bundle_is_its_own(honest, make_board, monkeypatch):
+    own = submissions.verify
+
+    def verify(folder, bundle, *others):
+        return 1 / 0 if bundle.by == "Stranger" else own(folder, bundle, *others)
+
+    monkeypatch.setattr(submissions, "verify", verify)
+    _, bundles, _ = make_board(x=OURS(honest))
+    assert [bundles[f"{name}.zip"]["state"] for name in ("lab", "x")] == ["verified", "claimed"]
+    assert "Not verified: ZeroDivisionError" in bundles["x.zip"]["remarks"][0]
 
 
 def only(name):
@@ -345,6 +447,10 @@ REFUSED = {
         "frames of .*: expected those of its protocol",
     ),
     "a subject more": (together(without_renders, rows(a_subject_more)), "subject: expected those of the run"),
+    "values whose sum is infinite": (
+        together(without_renders, setting("value", 1e308)),
+        "a finite value of at most",
+    ),
     "a seed more": (together(without_renders, rows(another_seed)), "seed: expected those of the run"),
 }
 """Changes that keep a second bundle out of every table, and the reason."""
@@ -447,15 +553,23 @@ def test_unverified_values_of_a_verified_bundle_are_not_ranked(honest, make_boar
 
 
 def test_a_training_is_repeated_and_compared(honest, make_board):
-    baseline = together(only("nearest-camera"), without_renders)(honest)
+    baseline = together(only("nearest-camera"), one_seed, without_renders)(honest)
     others = {
         "same": baseline,
         "raised": setting("value", 24.0)(baseline),
         "slower": setting("value", 9e9, of("fps"))(baseline),
+        "nearly": setting("value", lambda v: v + 0.2)(baseline),
     }
-    _, bundles, _ = make_board(words=[f"{name}.zip" for name in others], **others)
+    (table,), bundles, _ = make_board(words=[f"{name}.zip" for name in others], **others)
     states = {name: bundles[f"{name}.zip"]["state"] for name in others}
-    assert states == {"same": "recomputed", "raised": "contradicted", "slower": "recomputed"}
+    assert states == {
+        "same": "recomputed",
+        "raised": "contradicted",
+        "slower": "recomputed",
+        "nearly": "recomputed",
+    }
+    same, forged = (cells(table, f"nearest-camera [Stranger/{name}]")[1] for name in ("same", "nearly"))
+    assert forged["psnr"]["text"] == same["psnr"]["text"]  # what was trained here, not what is claimed
     remarks = {name: " ".join(bundles[f"{name}.zip"]["remarks"]) for name in others}
     assert "psnr: a single value differs by at most 0, a mean by 0 (tolerance 0.25)" in remarks["same"]
     assert "which is more" in remarks["raised"]

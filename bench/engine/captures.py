@@ -133,7 +133,7 @@ def capture_configuration(
 
 
 def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dict[str, Any]:
-    """Settings that reproduce a subject's synthetic capture, from the steps recorded in its clip.
+    """Settings that reproduce a subject's synthetic capture, all of them, from the steps recorded in its clip.
 
     Raises `InputError` for a capture that is not synthetic, not of the procedural head, or made by settings that are not
     known here.
@@ -145,7 +145,9 @@ def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dic
     if not isinstance(recorded, Mapping) or not str(recorded.get("head")).startswith("procedural"):
         expected = "a folder, as only synthetic captures of the procedural head can be made again"
         raise InputError("--data", where, expected, "none", "Name the folder of the capture with --data.")
-    return build_arguments(
+    defaults = {name: each.default for name, each in inspect.signature(make).parameters.items()}
+    arguments = {name: default for name, default in defaults.items() if name not in given}
+    return arguments | build_arguments(
         make,
         {key: value for key, value in recorded.items() if key not in ("style", "edition")},
         where,

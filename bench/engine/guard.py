@@ -14,17 +14,13 @@ from typing import Any
 import numpy as np
 
 from ..contracts import ByteArray, Clip, Frame, FrameKey, HeadAsset
-from ..errors import HeadbenchError, InputError
+from ..errors import ChangedInputError, HeadbenchError, InputError
 
 HEAD = tuple(name for name in vars(HeadAsset) if not name.startswith("_"))
 SHARED = ("shape", "static_offset", "background", "cameras", "poses")
 """Attributes of a clip that all methods are given."""
 SLACK = 1e-3
 """How far colours and coverage may exceed [0, 1]: rounding in float32, below a quarter of an 8-bit step."""
-
-
-class ChangedInputError(HeadbenchError):
-    """A method changed what other methods are given, so that no result of this process can be trusted from here on."""
 
 
 class TrainingView:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..condition import Condition, label_of
 from ..contracts import CheckedMethod, Clip
-from ..errors import HeadbenchError, InputError, UnavailableError, is_damage
+from ..errors import ChangedInputError, HeadbenchError, InputError, UnavailableError, is_damage
 from ..executors.outcome import outcome_path
 from ..executors.settings import Execution, check_executor
 from ..io.files import check_kind, check_output_folder
@@ -30,7 +30,6 @@ from ..specs import ConditionSpec, DatasetSpec, MetricSpec
 from . import adaptation
 from .captures import open_clips, relative_paths
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
-from .guard import ChangedInputError
 from .jobs import make_jobs, run_cell
 from .scoring import make_metric
 from .steps import Job, failed_rows, reason_of, steps_ahead

@@ -29,11 +29,10 @@ from ..contracts import (
     PreparedMethod,
     Progress,
 )
-from ..errors import HeadbenchError, InputError, UnavailableError, is_damage
+from ..errors import HeadbenchError, InputError, UnavailableError, is_damage, text_of
 from ..io.documents import read_json
 from ..io.files import digest, digest_file, grouped_writes, refuse_links, write_text
 from ..io.images import quantise, read_png, write_png
-from ..isolation.landlock import landlock_version
 from ..isolation.parent import IsolatedAvatar, IsolatedMethod
 from ..machine import PeakMemory, ProcessorLoad, machine_name, processor_seconds, use_device
 from ..progress import RunProgress, duration, progress
@@ -240,7 +239,7 @@ def fit(job: Job) -> Avatar:
             seconds=round(seconds, 3),
             processor_seconds=round(processor_seconds() - processor, 3),
             interruptions=interruptions,
-            **({} if job.hidden is None else {"landlock": landlock_version()}),
+            **({} if job.hidden is None else {"landlock": method.landlock}),
             peak_memory_bytes=memory.peak,
             memory_before_bytes=memory.before,
             **memory.device_record,
@@ -637,7 +636,7 @@ def _measure_fingerprint(job: Job, spec: MetricSpec, rendered: Mapping[str, str]
 
 def reason_of(error: Exception) -> str:
     """Reason of a failed cell for its rows; running out of memory is always "out of memory"."""
-    name, text = type(error).__name__, str(error)
+    name, text = type(error).__name__, text_of(error)
     wanted = ("out of memory", "can't allocate memory", "cannot allocate memory")
     if isinstance(error, MemoryError) or name == "OutOfMemoryError" or any(w in text.lower() for w in wanted):
         return f"out of memory: {text or name}"

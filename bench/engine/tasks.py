@@ -15,7 +15,7 @@ from typing import Any
 
 from ..condition import Condition, label_of
 from ..contracts import Clip
-from ..errors import InputError, shortened
+from ..errors import ChangedInputError, InputError, shortened
 from ..executors.outcome import read_outcome
 from ..executors.schedule import DAMAGED, Failures, Schedule
 from ..executors.settings import Execution, is_speed
@@ -29,7 +29,6 @@ from ..rows import Rows
 from ..specs import MAX_LABEL, MetricSpec
 from .captures import open_clips
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
-from .guard import ChangedInputError
 from .jobs import make_jobs, run_cell
 from .steps import Job, failed_rows, log_kept, steps_ahead, stored_rows, trained_files
 from .store import RunFolder

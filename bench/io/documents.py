@@ -33,6 +33,8 @@ Source = str | PathLike[str]
 MAX_JSON_BYTES = 64 * 2**20
 """The JSON of the largest known capture, with 50,000 frames, has 35 MB. Objects take up to 25 times their
 text."""
+MAX_RECORD_BYTES = 8 * 2**20
+"""Of what a run writes about itself, which may come from a stranger; the record of the largest known run has 78 KB."""
 MAX_YAML_BYTES = 4 * 2**20
 """YAML is written by people, or lists frames to leave out; its parser is slower than JSON's."""
 MAX_DEPTH = 64
@@ -42,13 +44,13 @@ _DECIMAL = re.compile(r"-?(0|[1-9][0-9]*)")
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, limit: int | None = None) -> dict[str, Any]:
     """Read a JSON file whose top level is an object.
 
-    Raises `InputError` for a file that is missing, cannot be read, is larger than `MAX_JSON_BYTES`, does not parse,
+    Raises `InputError` for a file that is missing, cannot be read, is larger than ``limit`` bytes (default: `MAX_JSON_BYTES`), does not parse,
     nests deeper than `MAX_DEPTH`, repeats a key, holds a number that is not finite, or something else than an object.
     """
-    return parse_json(read_text(path, "JSON", MAX_JSON_BYTES), path)
+    return parse_json(read_text(path, "JSON", MAX_JSON_BYTES if limit is None else limit), path)
 
 
 def parse_json(text: str | bytes, source: Source, key: str = "") -> dict[str, Any]:

@@ -22,12 +22,11 @@ from ..contracts import (
     FloatArray,
     FrameKey,
     IntArray,
-    ListedFrames,
     PreparedMethod,
     SharingAvatar,
     SplatAvatar,
 )
-from ..errors import HeadbenchError, InputError, UnavailableError
+from ..errors import HeadbenchError, InputError, UnavailableError, text_of
 from .landlock import restrict
 from .messages import receive, send
 
@@ -130,10 +129,9 @@ class _Method:
 
     def load(self, path: str, device: str) -> Any:
         self._avatar = avatar = self._method.load(Path(path), device=device)
-        kinds = {"sharing": SharingAvatar, "splats": SplatAvatar, "listed": ListedFrames}
-        offers = [name for name, kind in kinds.items() if isinstance(avatar, kind)]
-        shared = [str(file) for file in avatar.shared_files()] if isinstance(avatar, SharingAvatar) else []
-        return {"offers": offers, "files": [str(file) for file in avatar.files()], "shared": shared}, {}
+        shared = [str(file) for file in avatar.shared_files()] if isinstance(avatar, SharingAvatar) else None
+        files = [str(file) for file in avatar.files()]
+        return {"splats": isinstance(avatar, SplatAvatar), "files": files, "shared": shared}, {}
 
     def render(self, camera: Any, pose: Any, background: Any) -> Any:
         assert self._avatar is not None
@@ -180,7 +178,7 @@ def _described(error: Exception) -> dict[str, Any]:
     elif isinstance(error, UnavailableError):
         parts = [error.what, error.remedy, error.note]
     else:
-        parts = [str(error)]
+        parts = [text_of(error)]
     kinds = {
         InputError: "input",
         UnavailableError: "unavailable",

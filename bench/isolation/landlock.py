@@ -7,14 +7,15 @@ import os
 import struct
 import sys
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 _CREATE, _ADD, _RESTRICT = 444, 445, 446  # numbers of the system calls, the same on every architecture
 _PATH_BENEATH, _NO_NEW_PRIVILEGES = 1, 38
 _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR = 1, 2, 4, 8
-_FILE_RIGHTS = (
-    0b1_0000_0000_0111 | 1 << 14
-)  # those that a rule for a single file may have, with truncation and ioctl
+_TRUNCATE, _IOCTL = 1 << 14, 1 << 15
+_FILE_RIGHTS = _EXECUTE | _WRITE_FILE | _READ_FILE | _TRUNCATE | _IOCTL
+"""Those that a rule for a single file may have."""
 _READ = _EXECUTE | _READ_FILE | _READ_DIR
 _RIGHTS = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 5: (1 << 16) - 1}
 """All rights to files that a version knows; versions between have those of the one before."""
@@ -35,7 +36,13 @@ SYSTEM = (
     "/run/nvidia",
 )
 """Folders that programs and libraries are read from."""
-DEVICES = ("/dev",)
+DEVICES = ("null", "zero", "full", "random", "urandom", "tty", "shm", "nvidia*", "dri", "kfd")
+"""Devices of programs, shared memory of their own processes, and GPUs; disks are none of them."""
+
+
+def devices() -> list[Path]:
+    """The `DEVICES` of this machine."""
+    return sorted(path for pattern in DEVICES for path in Path("/dev").glob(pattern))
 
 
 def landlock_version() -> int:
@@ -94,7 +101,8 @@ def without(roots: Iterable[Path], hidden: Iterable[Path]) -> Iterator[Path]:
         if any(root.is_relative_to(path) for path in hidden):
             continue
         if any(path.is_relative_to(root) for path in hidden):
-            yield from without((entry for entry in root.iterdir() if not entry.is_symlink()), hidden)
+            with suppress(PermissionError):  # what cannot be listed is left out
+                yield from without([entry for entry in root.iterdir() if not entry.is_symlink()], hidden)
         else:
             yield root
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -22,7 +23,7 @@ from pathlib import Path
 from pickle import PicklingError
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from ..contracts import (
     Budget,
@@ -35,14 +36,13 @@ from ..contracts import (
     Progress,
     no_progress,
 )
-from ..errors import HeadbenchError, InputError, UnavailableError, shortened
+from ..errors import ChangedInputError, HeadbenchError, InputError, UnavailableError, shortened
+from ..orphans import become_subreaper, end_orphans
 from ..start import starting_workers
 from .child import StoredHead
-from .landlock import DEVICES, SYSTEM, without
+from .landlock import SYSTEM, devices, without
 from .messages import Arrays, receive, send
 
-log = logging.getLogger(__name__)
-HEAD = tuple(field.name for field in fields(StoredHead))
 GRACE_S = 10.0
 """Seconds that a process has for ending after its connection is closed."""
 
@@ -63,6 +63,8 @@ class IsolatedMethod:
     def __init__(self, resolved: Any, out: Path, hidden: Sequence[Path] = ()):
         self._resolved, self._out, self._hidden = resolved, out, hidden
         self._prepared: _Process | None = None
+        self.landlock = 0
+        """Version of Landlock that restricted the process of the last training."""
 
     def check(self, clip: Clip | None, budget: Budget) -> None:
         """Let the method check its settings and the clip, if it can."""
@@ -90,6 +92,7 @@ class IsolatedMethod:
             self.prepare(device)
         assert self._prepared is not None
         process, self._prepared = self._prepared, None
+        self.landlock = process.landlock
         with process:
             values: dict[str, Any] = {
                 "clip": described(clip),
@@ -105,26 +108,24 @@ class IsolatedMethod:
         process = self._process(read=(path,)).__enter__()
         try:
             found, _ = process.call("load", path=str(path), device=device)
-            kind = IsolatedSplats if "splats" in found["offers"] else IsolatedAvatar
-            return kind(process, path, tuple(map(Path, found["files"])), tuple(map(Path, found["shared"])))
+            kind = IsolatedSplats if found["splats"] else IsolatedAvatar
+            return kind(process, path, found["files"], found["shared"])
         except BaseException:
             process.__exit__()
             raise
 
     def _process(self, read: Sequence[Path] = (), write: Sequence[Path] = ()) -> _Process:
-        named = [
-            value for name, value in os.environ.items() if name.startswith("HEADBENCH_")
-        ]  # such as weights
-        own = [Path(text) for text in (*_texts(self._resolved.config), *named) if os.path.isabs(text)]
-        return _Process(self._resolved, [*read, *own], write, self._hidden)
+        return _Process(self._resolved, read, write, self._hidden)
 
 
 class IsolatedAvatar:
     """An `Avatar` in a process of its own, which ends with it."""
 
-    def __init__(self, process: _Process, folder: Path, files: Sequence[Path], shared: Sequence[Path]):
-        self.process, self._files, self._shared = process, files, shared
-        for path in files:
+    def __init__(self, process: _Process, folder: Path, files: Sequence[str], shared: Sequence[str] | None):
+        self.process, self._files = process, tuple(map(Path, files))
+        if shared is not None:  # then it is a `SharingAvatar`
+            self.shared_files = lambda: tuple(map(Path, shared))
+        for path in self._files:
             if not path.resolve().is_relative_to(folder.resolve()):
                 raise InputError(folder, "files()", "files in the folder of the avatar", str(path))
 
@@ -171,17 +172,22 @@ class IsolatedSplats(IsolatedAvatar):
 
 
 class _Process:
-    """A process of a method, started by `__enter__`; ``hidden`` paths are left out of what it can read."""
+    """A process of a method, started by `__enter__`; ``hidden`` paths can be read only where ``read`` and ``write`` name them."""
+
+    running: ClassVar[set[int]] = set()
+    """Ids of all such processes."""
 
     def __init__(self, resolved: Any, read: Sequence[Path], write: Sequence[Path], hidden: Sequence[Path]):
         self._resolved, self._read, self._write, self._hidden = resolved, read, write, hidden
         self._started: subprocess.Popen[bytes] | None = None
         self._sent_method = False
         self.landlock = 0
+        self._before = _priorities()
 
     def __enter__(self) -> Self:
         if self._started is not None:
             return self
+        become_subreaper()
         own, other = socket.socketpair()
         self._scratch = TemporaryDirectory(ignore_cleanup_errors=True)
         code = f"from {__package__}.child import main; main({other.fileno()})"
@@ -199,10 +205,16 @@ class _Process:
                 start_new_session=True,
             )
         other.close()
+        self.running.add(self._started.pid)
         self._connection = Connection(own.detach())
-        roots = [Path(text) for text in (*SYSTEM, sys.prefix, sys.base_prefix, *_search_path())]
-        read = [*without(roots, self._hidden), *self._read]
-        write = [*map(Path, DEVICES), Path(self._scratch.name), *self._write]
+        # Settings have defaults, so that a plug-in itself names files here.
+        named = [
+            *_texts(self._resolved.config),
+            *(os.environ[n] for n in os.environ if n.startswith("HEADBENCH_")),
+        ]
+        known = [*SYSTEM, sys.prefix, sys.base_prefix, *_search_path(), *filter(os.path.isabs, named)]
+        read = [*without(map(Path, known), self._hidden), *self._read]
+        write = [*devices(), Path(self._scratch.name), *self._write]
         limits = {"path": _search_path(), "read": list(map(str, read)), "write": list(map(str, write))}
         try:
             send(self._connection, limits)
@@ -224,6 +236,8 @@ class _Process:
             with suppress(ProcessLookupError, PermissionError):
                 os.killpg(started.pid, signal.SIGKILL)  # with all that it started in its session
             started.wait()
+            end_orphans(self.running)
+            self.running.discard(started.pid)
             self._scratch.cleanup()
 
     def call(
@@ -233,6 +247,8 @@ class _Process:
 
         Raises
         ------
+        ChangedInputError
+            The method changed limits, priority or processors of this process.
         HeadbenchError
             The method raised an error, sent something else than the messages agreed on, or its process ended.
         """
@@ -247,6 +263,11 @@ class _Process:
         while True:
             message, arrays = self._next()
             if "done" in message:
+                if _priorities() != self._before:
+                    raise ChangedInputError(
+                        f"{self._resolved.spec.name} changed limits, priority or processors of the process of the run, which "
+                        "later methods inherit. Its results are not recorded. Leave the method out."
+                    )
                 return message["done"], arrays
             if "failed" in message:
                 raise _raised(message["failed"], message["parts"])
@@ -290,7 +311,9 @@ class _Process:
 
 def described(clip: Clip) -> dict[str, Any]:
     """Everything of a clip except its images, as plain values."""
-    head = StoredHead(**{name: _plain(getattr(clip.head, name, None)) for name in HEAD})
+    head = StoredHead(
+        **{each.name: _plain(getattr(clip.head, each.name, None)) for each in fields(StoredHead)}
+    )
     names = (
         "subject",
         "shape",
@@ -324,6 +347,15 @@ def _raised(kind: str, parts: Sequence[Any]) -> Exception:
     if kind == "memory":
         return MemoryError(*texts)
     return HeadbenchError(texts[0] if kind == "headbench" else f"{kind}: {texts[0] if texts else ''}")
+
+
+def _priorities() -> tuple[Any, ...]:
+    """What any process of the same user can change of this one, and other processes inherit."""
+    limits = [
+        resource.getrlimit(getattr(resource, name)) for name in dir(resource) if name.startswith("RLIMIT_")
+    ]
+    processors = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
+    return limits, processors, os.getpriority(os.PRIO_PROCESS, 0)
 
 
 def _search_path() -> list[str]:

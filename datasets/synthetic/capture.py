@@ -270,6 +270,7 @@ def _check(settings: SyntheticSettings) -> None:
     checks = (
         ("--subjects", settings.subjects >= 1, "at least 1", settings.subjects),
         ("--cameras", 2 <= count <= most, f"2 to {most}, as the frontal one is held out", count),
+        ("--seed", settings.seed >= 0, "a whole number from 0", settings.seed),
         ("--performance", settings.performance in KINDS, f"one of {kinds}", repr(settings.performance)),
         ("--dynamics", 0.0 <= settings.dynamics <= 3.0, "0 to 3", settings.dynamics),
         ("--size", min(size) >= 16, "at least 16 pixels each way", "x".join(map(str, size))),

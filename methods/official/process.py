@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 import os
 import re
@@ -12,15 +11,14 @@ import subprocess
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-import psutil
-
 from ...bench.errors import HeadbenchError, shortened
 from ...bench.io.files import flush_renames
+from ...bench.orphans import orphans_ended
 
 KEPT = (
     *("PATH", "HOME", "USER", "LANG", "LC_ALL", "TMPDIR", "XDG_CACHE_HOME", "XDG_RUNTIME_DIR"),
@@ -41,9 +39,6 @@ REDRAWN_EVERY_S = 30.0
 """Seconds between logged lines of a progress bar that redraws its line."""
 PATIENCE_S = 10.0
 """Seconds between the request to terminate and the kill of a program."""
-
-PR_SET_CHILD_SUBREAPER = 36
-"""From linux/prctl.h."""
 
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
@@ -114,7 +109,7 @@ def run_program(
     """
     flush_renames()
     until = math.inf if hours is None else time.monotonic() + 3600 * hours
-    with log.open("ab") as stream, _orphans_ended():
+    with log.open("ab") as stream, orphans_ended():
         stream.write(f"$ {' '.join(command)}\n".encode())
         try:
             process = subprocess.Popen(
@@ -221,45 +216,6 @@ def _end_group(process: subprocess.Popen[bytes]) -> None:
     process.wait()
     if process.stdout is not None:
         process.stdout.close()
-
-
-@contextmanager
-def _orphans_ended() -> Iterator[None]:
-    """Kill, at the end, processes that programs started here left behind in whatever session.
-
-    As a subreaper (Linux), this process becomes the parent of every descendant whose own parent has ended. Those of a program
-    have another session than this process, whatever they do to their environment. Without subreapers, none are found.
-    """
-    libc = ctypes.CDLL(None)
-    before = {child.pid for child in _orphans()}
-    becomes = hasattr(libc, "prctl") and libc.prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0) == 0
-    try:
-        yield
-    finally:
-        until = time.monotonic() + PATIENCE_S
-        while (
-            becomes and time.monotonic() < until
-        ):  # the children of a killed process are found in the next round
-            left = [child for child in _orphans() if child.pid not in before]
-            if not left:
-                break
-            for child in left:
-                with suppress(psutil.Error, OSError):
-                    child.kill()
-                    os.waitpid(child.pid, os.WNOHANG)
-            time.sleep(0.02)
-        if becomes:
-            libc.prctl(PR_SET_CHILD_SUBREAPER, 0, 0, 0, 0)
-
-
-def _orphans() -> list[psutil.Process]:
-    """Children of this process in other sessions."""
-    found, own = [], os.getsid(0)
-    for child in psutil.Process().children():
-        with suppress(ProcessLookupError):
-            if os.getsid(child.pid) != own:
-                found.append(child)
-    return found
 
 
 def _signal_group(leader: int, number: int) -> bool:

@@ -16,11 +16,14 @@ from ...bench.audit.verify import SHOWN, TRAINING, Findings, Renders, lacking_fr
 from ...bench.contracts import Progress
 from ...bench.engine.config import RunOptions
 from ...bench.engine.scoring import FULL
+from ...bench.engine.steps import reason_of
 from ...bench.engine.store import RunFolder
-from ...bench.errors import HeadbenchError
+from ...bench.errors import HeadbenchError, text_of
 from ...bench.executors.settings import Execution
 from ...bench.io.files import digest_file
 from ...bench.manifest import Manifest
+from ...bench.rows import Rows
+from ...bench.specs import MetricSpec
 from ..runs import RunData
 
 State = Literal["recomputed", "verified", "claimed", "incomplete", "contradicted"]
@@ -111,10 +114,15 @@ def read_submission(file: Path, into: Path) -> Submission:
     for record in manifest.methods:
         spec = method_of(record.name, methods)
         records.append(record if spec is None else replace(record, trivial=spec.trivial))
-    limits = {metric.name: metric.suspect_above for metric in metrics if metric.suspect_above is not None}
-    rows = rows.labelled().of_metrics([metric.name for metric in metrics]).with_suspects(limits, FULL)
+    rows = _with_suspects(rows.labelled().of_metrics([metric.name for metric in metrics]), metrics)
     shown = replace(manifest, metrics=metrics, methods=tuple(records))
     return Submission(file, bundle, RunData(folder, shown, rows), digest_file(file), lacking=lacking)
+
+
+def _with_suspects(rows: Rows, metrics: Sequence[MetricSpec]) -> Rows:
+    """The rows, marked by the limits of the registered metrics alone."""
+    limits = {metric.name: metric.suspect_above for metric in metrics if metric.suspect_above is not None}
+    return rows.with_suspects(limits, FULL)
 
 
 def verified(
@@ -140,7 +148,7 @@ def verified(
     try:
         found = verify(folder.root, submission.bundle, options, scratch, execution, progress)
         submission = replace(submission, findings=found.findings, renders=found.renders)
-    except HeadbenchError as error:
+    except Exception as error:  # noqa: BLE001 - whatever a bundle causes, the others are shown
         trouble.append(f"Not verified: {placeless(error, folder.root)}")
         submission = replace(
             submission, findings=Findings(unverified={TRAINING: "nothing was trained again"})
@@ -153,7 +161,15 @@ def verified(
             metrics = {metric.name: metric for metric in submission.run.metrics}
             own = folder.rows_by_condition(folder.read_manifest())
             submission = replace(submission, agreed=tuple(agreements(own, rows, metrics)))
-    except HeadbenchError as error:
+            if (
+                submission.state == "recomputed"
+            ):  # what is ranked is what was trained here, not what comes close to it
+                values = submission.run.rows.with_values(
+                    rows.labelled().of_metrics(sorted(submission.supported))
+                )
+                run = replace(submission.run, rows=_with_suspects(values, submission.run.metrics))
+                submission = replace(submission, run=run)
+    except Exception as error:  # noqa: BLE001
         trouble.append(f"Not trained again: {placeless(error, folder.root)}")
     return replace(submission, trouble=tuple(trouble))
 
@@ -179,5 +195,6 @@ def _folded(text: str) -> str:
 
 
 def placeless(error: Exception, folder: Path) -> str:
-    """An error without the temporary folder that a bundle was unpacked into."""
-    return str(error).replace(f"{folder}/", "")
+    """An error without the temporary folder that a bundle was unpacked into; with its type if it is unexpected."""
+    text = text_of(error) if isinstance(error, HeadbenchError) else reason_of(error)
+    return text.replace(f"{folder}/", "")

@@ -84,6 +84,16 @@ def test_single_precision_keeps_seven_digits(rows, tmp_path):
     assert sizes[2] - sizes[0] < 0.65 * (sizes[1] - sizes[0])
 
 
+def test_values_are_taken_from_other_rows_alone(rows):
+    table = rows.select(**NAMED)
+    other = table[[7 <= i < 9 for i in range(len(table))]][::-1].assign(value=-1.0, version="2")
+    missing = table[:1].assign(status="missing", value=float("nan"))
+    found = rows.with_values(Rows(pd.concat([other, missing]))).select(**NAMED)
+    expected = [-1.0 if 7 <= i < 9 else value for i, value in enumerate(table["value"])]
+    assert found["value"].tolist() == expected
+    assert found.drop(columns="value").equals(table.drop(columns="value"))
+
+
 def test_rows_are_updated_in_their_places(rows):
     table = rows.select(**NAMED)
     new = Rows(

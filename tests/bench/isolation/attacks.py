@@ -1,14 +1,16 @@
 """Methods that change or read what they must not; each is a subclass of the toy method."""
 
 import os
+import resource
 import signal
 import socket
 import sys
 import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from toy_plugin import METHOD, ToyAvatar, ToyMethod
+from toy_plugin import METHOD, ToyAvatar, ToyConfig, ToyMethod
 
 from headbench.bench.contracts import Frame
 
@@ -119,6 +121,21 @@ class ReadsCapture(Attack):
         found(out, Path(os.environ["ATTACKED"], "secret.txt").read_text())
 
 
+class ReadsByDefault(ReadsCapture):
+    """Names everything in a default of its settings."""
+
+
+@dataclass(frozen=True)
+class Everything(ToyConfig):
+    weights: str = "/"
+
+
+class ReadsDisk(Attack):
+    def attack(self, clip, out):
+        with open(os.environ["ATTACKED_DISK"], "rb") as disk:
+            found(out, disk.read(16))
+
+
 class ReadsParentMemory(Attack):
     def attack(self, clip, out):
         with open(f"/proc/{os.getppid()}/mem", "rb", 0) as memory:
@@ -145,6 +162,41 @@ class KillsParent(Attack):
     def attack(self, clip, out):
         os.kill(os.getppid(), signal.SIGUSR1)
         found(out, "sent")
+
+
+class TakesProcessors(Attack):
+    def attack(self, clip, out):
+        os.sched_setaffinity(os.getppid(), {min(os.sched_getaffinity(0))})
+
+
+class TakesFiles(Attack):
+    def attack(self, clip, out):
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.prlimit(os.getppid(), resource.RLIMIT_NOFILE, (soft - 1, hard))
+
+
+class NamesOutside(Attack):
+    def load(self, path, *, device):
+        avatar = super().load(path, device=device)
+        avatar.files = lambda: [Path(os.environ["ATTACKED"], "secret.txt")]
+        return avatar
+
+
+class Shares(Attack):
+    def load(self, path, *, device):
+        avatar = super().load(path, device=device)
+        avatar.shared_files = lambda: [Path(np.__file__)]
+        return avatar
+
+
+class Wordless(Exception):
+    def __str__(self):
+        raise RuntimeError("no words")
+
+
+class RaisesWordless(Attack):
+    def attack(self, clip, out):
+        raise Wordless
 
 
 class LinksCapture(Attack):
@@ -192,13 +244,29 @@ class LeavesChild(Attack):
         found(out, child)
 
 
+class LeavesDaemon(Attack):
+    """Leaves a process in another session, whose parent has ended."""
+
+    def attack(self, clip, out):
+        reader, writer = os.pipe()
+        if os.fork() == 0:
+            os.setsid()
+            daemon = os.fork()
+            if daemon == 0:
+                time.sleep(600)
+            os.write(writer, str(daemon).encode())
+            os._exit(0)
+        os.wait()
+        found(out, os.read(reader, 20).decode())
+
+
 def spec(name):
     """The registry entry of an attack."""
-    from dataclasses import replace
-
     return replace(METHOD, name=name.lower(), implementation=f"attacks:{name}")
 
 
 for _name, _kind in list(vars(sys.modules[__name__]).items()):
     if isinstance(_kind, type) and issubclass(_kind, Attack):
         globals()[_name.upper()] = spec(_name)
+
+READSBYDEFAULT = replace(READSBYDEFAULT, config="attacks:Everything")  # noqa: F821

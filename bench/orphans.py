@@ -1,0 +1,65 @@
+"""Ends processes that a program left behind, in whatever session."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import psutil
+
+PATIENCE_S = 10.0
+"""Seconds during which processes are sought that others started meanwhile."""
+_SET_SUBREAPER = 36
+"""From linux/prctl.h."""
+
+
+def become_subreaper() -> bool:
+    """Let this process become the parent of every descendant whose own parent has ended, for good; False without Linux."""
+    libc = ctypes.CDLL(None)
+    return hasattr(libc, "prctl") and libc.prctl(_SET_SUBREAPER, 1, 0, 0, 0) == 0
+
+
+def end_orphans(kept: Collection[int]) -> None:
+    """Kill children of this process that are in other sessions, except those whose ids are in ``kept``.
+
+    Descendants of a program that started in a session of its own have another session than this process, whatever they do to
+    their environment. The children of a killed process are found in the next round.
+    """
+    import psutil
+
+    until = time.monotonic() + PATIENCE_S
+    while (left := [child for child in _orphans() if child.pid not in kept]) and time.monotonic() < until:
+        for child in left:
+            with suppress(psutil.Error, OSError):
+                child.kill()
+                os.waitpid(child.pid, os.WNOHANG)
+        time.sleep(0.02)
+
+
+@contextmanager
+def orphans_ended() -> Iterator[None]:
+    """Kill, at the end, processes that programs started in the block left behind. Without subreapers, none are found."""
+    before = {child.pid for child in _orphans()}
+    becomes = become_subreaper()
+    try:
+        yield
+    finally:
+        if becomes:
+            end_orphans(before)
+
+
+def _orphans() -> list[psutil.Process]:
+    """Children of this process in other sessions."""
+    import psutil
+
+    found, own = [], os.getsid(0)
+    for child in psutil.Process().children():
+        with suppress(ProcessLookupError):
+            if os.getsid(child.pid) != own:
+                found.append(child)
+    return found
