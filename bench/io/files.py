@@ -432,6 +432,10 @@ def _check_target(path: Path) -> None:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
         return
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        return  # a link to itself, which is replaced as other links are
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(mode):
