@@ -43,9 +43,11 @@ class SynthSettings(ExecutionOptions):
     """Decides subjects and performances."""
     tracking_noise: float = 0.0
     """Noise on the tracked parameters, as a fraction of their standard deviation."""
-    performance: Literal["full", "parts", "expressions", "still"] = "full"
+    performance: Literal["full", "parts", "natural", "expressions", "still"] = "full"
     """`parts` plays every sequence and holds out three parts of FREE, each scored as a sequence: seen, recombined and
-    beyond the range of training. `expressions` has no jaw and tongue motion, `still` moves only head, neck and eyes."""
+    beyond the range of training. `natural` has these and speech, with the speeds, blinks, gaze and correlations of tracked
+    recordings, at every n-th frame of a video. `expressions` has no jaw and tongue motion, `still` moves only head, neck and
+    eyes."""
     dynamics: float = 1.0
     """Scale of wrinkles and blush, 0 to 3."""
     tracking_error: float = 0.0
