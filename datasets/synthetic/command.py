@@ -53,6 +53,9 @@ class SynthSettings(ExecutionOptions):
     tracking_error: float = 0.0
     """Level of simulated tracking errors: shrunk and mixed expressions, drift; 1 is 0.5 to 1 mm on the face, 2 to 3 mm
     on lips and lids. 0 to 4."""
+    tracker: Literal["per-frame", "video"] = "per-frame"
+    """Kind of tracker that errs so: drift from frame to frame; or an error that lasts for a sequence, slow drift, jitter and
+    1.2 mm on lips and lids, as trackers of videos have."""
 
 
 def synth(settings: SynthSettings, progress: Progress) -> CommandResult:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -123,7 +124,7 @@ def _strokes(opening: FloatArray, rate: float) -> FloatArray:
     turning = np.flatnonzero(np.diff(np.sign(np.diff(opening))) != 0) + 1
     edges = [0, *turning.tolist(), len(opening) - 1]
     found = []
-    for begin, end in zip(edges, edges[1:]):
+    for begin, end in pairwise(edges):
         change = opening[end] - opening[begin]
         if abs(change) < OPEN_DEGREES:
             continue
