@@ -36,6 +36,7 @@ from .panels import KERNEL, default_samples, sample_count
 from .performance import KINDS, Kind, share_out
 from .plan import SERIALS, SubjectPlan, SyntheticSettings, load_geometry, plan_subject
 from .renderer import CaptureRenderer
+from .tracking import TRACKERS, Tracker
 
 MANIFEST, MARK = "synthesis.json", "provenance.xmp"
 TASKS = ".tasks"
@@ -64,6 +65,7 @@ def synthesize(
     performance: Kind = "full",
     dynamics: float = 1.0,
     tracking_error: float = 0.0,
+    tracker: Tracker = "per-frame",
     pictures: str | Path | None = None,
     workers: int | None = None,
     execution: Execution | None = None,
@@ -90,6 +92,8 @@ def synthesize(
         of a frame.
     tracking_error : float
         Level of simulated tracking errors, see `tracking.with_tracking_error`; 0 to 4.
+    tracker : Tracker
+        Whether these errors are those of a tracker of single frames or of videos, see `tracking`.
     performance : Kind
         See `performance.Kind`; other kinds than the full performance are easier to model.
     dynamics : float
@@ -127,6 +131,7 @@ def synthesize(
         performance,
         dynamics,
         tracking_error,
+        tracker,
     )
     _check(settings)
     KERNEL.load()
@@ -275,6 +280,7 @@ def _check(settings: SyntheticSettings) -> None:
         ("--dynamics", 0.0 <= settings.dynamics <= 3.0, "0 to 3", settings.dynamics),
         ("--size", min(size) >= 16, "at least 16 pixels each way", "x".join(map(str, size))),
         ("--tracking-error", np.isfinite(error) and 0.0 <= error <= 4.0, "0 to 4", error),
+        ("--tracker", settings.tracker in TRACKERS, f"one of {', '.join(TRACKERS)}", repr(settings.tracker)),
         ("--tracking-noise", np.isfinite(noise) and noise >= 0.0, "a number from 0 up", noise),
     )
     for option, fits, expected, found in checks:
@@ -298,7 +304,7 @@ def _check_pictures(pictures: Path, wanted: Mapping[str, Any]) -> None:
     """Refuse images whose settings differ in more than tracking."""
     manifest = pictures / MANIFEST
     found = read_json(manifest)
-    tracking = {"tracking_error", "tracking_noise"}
+    tracking = {"tracking_error", "tracking_noise", "tracker"}
     for key in {**wanted, **found}.keys() - tracking - {"head"}:  # the name of the head does not matter
         if found.get(key) != wanted.get(key):
             raise InputError(manifest, key, f"{wanted.get(key)!r}, as asked for", f"{found.get(key)!r}")

@@ -18,7 +18,9 @@ from ...bench.errors import InputError
 from ..head.procedural.expressions import SEMANTIC_NAMES
 from ..head.procedural.model import semantic_to_coefficients
 from ..rounding import COEFFICIENT_BITS, on_grid
+from . import natural
 from .anatomy import SIDES
+from .natural import SPEECH, Curves
 
 Activations = Mapping[str, float]
 
@@ -35,7 +37,7 @@ EXPRESSION_CONTROLS = (
 """Shapes of the skin; each is 0 at rest and 1 at its natural extreme."""
 
 POSE_CONTROLS = (
-    *("jaw_open", "jaw_side", "gaze_left", "gaze_up", "head_turn", "head_nod", "head_tilt"),
+    *("jaw_open", "jaw_side", "jaw_roll", "gaze_left", "gaze_up", "head_turn", "head_nod", "head_tilt"),
     *("neck_turn", "neck_nod", "sway_x", "sway_y", "sway_z", "tongue_out"),
 )
 """Jaw and tongue in [0, 1] (sideways and gaze in [-1, 1]); head, neck in radians; sway in metres."""
@@ -43,7 +45,7 @@ POSE_CONTROLS = (
 CONTROLS = (*EXPRESSION_CONTROLS, *POSE_CONTROLS)
 
 _JAW_OPEN = 0.36  # radians at jaw_open = 1
-_JAW_SIDE = 0.09
+_JAW_SIDE, _JAW_ROLL = 0.09, 0.11
 _GAZE_SIDE, _GAZE_UP = 0.45, 0.32
 
 
@@ -67,7 +69,9 @@ class Translation:
             "expression": values @ self.expression,
             "rotation": np.array([a["head_nod"], a["head_turn"], a["head_tilt"]]),
             "neck": np.array([a["neck_nod"], a["neck_turn"], 0.0]),
-            "jaw": np.array([_JAW_OPEN * a["jaw_open"], _JAW_SIDE * a["jaw_side"], 0.0]),
+            "jaw": np.array(
+                [_JAW_OPEN * a["jaw_open"], _JAW_SIDE * a["jaw_side"], _JAW_ROLL * a["jaw_roll"]]
+            ),
             "eyes": np.array(gaze + gaze),
             "translation": np.array([a["sway_x"], a["sway_y"], a["sway_z"]]),
         }
@@ -80,14 +84,15 @@ class Translation:
 
 Face = Mapping[str, float]
 
-Kind = Literal["full", "parts", "expressions", "still"]
-"""Kind of performance: full; full with FREE in the parts of `FREE_PARTS`, each a sequence; without jaw and tongue;
-only head, neck and gaze."""
+Kind = Literal["full", "parts", "natural", "expressions", "still"]
+"""Kind of performance: full; full with FREE in the parts of `FREE_PARTS`, each a sequence; these parts and speech with the
+motion of tracked recordings (see `natural`); without jaw and tongue; only head, neck and gaze."""
 
-_JAW = ("jaw_open", "jaw_side", "tongue_out")
+_JAW = ("jaw_open", "jaw_side", "jaw_roll", "tongue_out")
 _MUTED: Mapping[Kind, frozenset[str]] = {
     "full": frozenset(),
     "parts": frozenset(),
+    "natural": frozenset(),
     "expressions": frozenset(_JAW),
     "still": frozenset((*_JAW, *EXPRESSION_CONTROLS)),
 }
@@ -283,13 +288,14 @@ class Performed:
 def share_out(timesteps: int, kind: Kind = "full") -> dict[str, int]:
     """Timesteps of each sequence, in NeRSemble's order; they sum to ``timesteps``.
 
-    FREE gets a double share. Few timesteps make few sequences, two at least. A performance in parts has all sequences,
-    each with as many timesteps as it has phrases to show, and a quarter of them for FREE.
+    FREE gets a double share. Few timesteps make few sequences, two at least. A performance in parts or a natural one has all
+    sequences, each with as many timesteps as it has phrases to show, and a quarter of them for FREE.
     """
-    if kind == "parts":
+    if kind in ("parts", "natural"):
         train = {name: len(phrases) for name, phrases in SEQUENCES.items() if name != HELD_OUT}
         shares = {name: count / sum(train.values()) * (1 - _HELD_OUT_SHARE) for name, count in train.items()}
-        shares |= dict.fromkeys(FREE_PARTS, _HELD_OUT_SHARE / len(FREE_PARTS))
+        held_out = (*FREE_PARTS, SPEECH) if kind == "natural" else tuple(FREE_PARTS)
+        shares |= dict.fromkeys(held_out, _HELD_OUT_SHARE / len(held_out))
         least = int(np.ceil(2.5 / min(shares.values())))
         if timesteps < least:
             raise InputError(
@@ -306,18 +312,78 @@ def share_out(timesteps: int, kind: Kind = "full") -> dict[str, int]:
     return {name: int(n) for name, n in zip(chosen, np.diff(ends, prepend=0))}
 
 
-def perform(
-    name: str, timesteps: int, seed: int, tongue_shows: float = TONGUE_SHOWS, kind: Kind = "full"
-) -> Performed:
-    """Play a sequence, sampled evenly at ``timesteps`` moments. The same seed gives the same performance.
+def frames_kept(timesteps: int) -> int:
+    """n, where a natural performance of ``timesteps`` keeps every n-th frame, so that it has time for its phrases."""
+    phrases = sum(map(len, (*SEQUENCES.values(), *FREE_PARTS.values())))
+    return max(1, round(natural.PHRASE_SECONDS * phrases * natural.FRAME_RATE / timesteps))
 
-    ``tongue_shows`` is the share in [0, 1] by which the tongue has to be out for a timestep to be labelled. What
-    ``kind`` leaves out stays at rest; everything else moves as in the full performance.
+
+def perform(
+    name: str,
+    timesteps: int,
+    seed: int,
+    tongue_shows: float = TONGUE_SHOWS,
+    kind: Kind = "full",
+    every: int = 1,
+) -> Performed:
+    """Play a sequence, sampled at ``timesteps`` moments. The same seed gives the same performance.
+
+    ``tongue_shows`` is the share in [0, 1] by which the tongue has to be out for a timestep to be labelled. A natural
+    performance keeps every ``every``-th frame of a video of `natural.FRAME_RATE`; others distribute the moments evenly over
+    their phrases. What ``kind`` leaves out stays at rest; everything else moves as in the full performance.
     """
-    every = {**SEQUENCES, **FREE_PARTS}
-    rng = np.random.default_rng([seed, list(every).index(name)])
-    phrases = every[name]
-    seconds = _PHRASE_SECONDS * (len(phrases) + 1)
+    names = [*SEQUENCES, *FREE_PARTS, SPEECH]
+    rng = np.random.default_rng([seed, names.index(name)])
+    if kind == "natural":
+        seconds = timesteps * every / natural.FRAME_RATE
+        values = _natural_curves(
+            name, (np.arange(timesteps) + 0.5) * every / natural.FRAME_RATE, seconds, rng
+        )
+    else:
+        seconds = _PHRASE_SECONDS * (len({**SEQUENCES, **FREE_PARTS}[name]) + 1)
+        values = _smooth_curves(name, timesteps, seconds, rng)
+    values |= {control: np.zeros(timesteps) for control in CONTROLS if control not in values}
+    # Lids follow the eyes down.
+    for side in SIDES:
+        values[f"blink_{side}"] = np.clip(
+            values[f"blink_{side}"] + 0.35 * np.maximum(-values["gaze_up"], 0), 0, 1
+        )
+    values |= {control: np.zeros(timesteps) for control in _MUTED[kind]}
+    values = {control: on_grid(curve, COEFFICIENT_BITS) for control, curve in values.items()}
+    activations = [{control: float(values[control][t]) for control in CONTROLS} for t in range(timesteps)]
+    excluded = {t: TONGUE for t, a in enumerate(activations) if a["tongue_out"] >= tongue_shows}
+    return Performed(name, activations, excluded, seconds / timesteps)
+
+
+_NEW = {"FREE": 1, "FREE-1-seen": 1, "FREE-2-recombined": 1, "FREE-3-beyond": 2}
+"""Synergies of each phrase that training does not show, by sequence."""
+
+
+def _natural_curves(name: str, time: FloatArray, seconds: float, rng: np.random.Generator) -> Curves:
+    """Controls of a natural performance at the moments ``time``."""
+    if name == SPEECH:
+        values = natural.speech_curves(time, seconds, rng)
+    else:
+        values = natural.face_curves({**SEQUENCES, **FREE_PARTS}[name], time, seconds, rng, _NEW.get(name, 0))
+    gap = natural.BLINK_GAP["speech" if name == SPEECH else "posed"]
+    closed = natural.blinks(time, seconds, gap, rng)
+    for side in SIDES:
+        values[f"blink_{side}"] = np.maximum(values.get(f"blink_{side}", 0.0), closed)
+    yaw, pitch = natural.gaze(time, seconds, rng).T
+    values["gaze_left"] = values.get("gaze_left", 0.0) + yaw / _GAZE_SIDE
+    values["gaze_up"] = values.get("gaze_up", 0.0) + pitch / _GAZE_UP
+    values["head_nod"], values["head_turn"], values["head_tilt"] = natural.head(time, seconds, rng).T
+    values["jaw_roll"] = values.get("jaw_side", 0.0) + natural.JAW_ROLL * natural.wander(
+        time, natural.IDLE_SECONDS, rng
+    )
+    for control, amplitude in natural.SWAY.items():
+        values[control] = amplitude * natural.wander(time, natural.IDLE_SECONDS, rng)
+    return values
+
+
+def _smooth_curves(name: str, timesteps: int, seconds: float, rng: np.random.Generator) -> Curves:
+    """Controls of the other kinds: phrases as monotone cubics, with blinks and idle motion."""
+    phrases = {**SEQUENCES, **FREE_PARTS}[name]
     time = (np.arange(timesteps) + 0.5) / timesteps * seconds
     middles = _PHRASE_SECONDS * np.arange(1, len(phrases) + 1) + rng.uniform(-0.08, 0.08, len(phrases))
     for middle, phrase in zip(middles, phrases):
@@ -332,16 +398,7 @@ def perform(
         values[f"blink_{side}"] = np.maximum(values[f"blink_{side}"], blinks)
     for control, amplitude, period in _IDLE:
         values[control] = values[control] + amplitude * _drift(time, period, rng)
-    # Lids follow the eyes down.
-    for side in SIDES:
-        values[f"blink_{side}"] = np.clip(
-            values[f"blink_{side}"] + 0.35 * np.maximum(-values["gaze_up"], 0), 0, 1
-        )
-    values |= {control: np.zeros(timesteps) for control in _MUTED[kind]}
-    values = {control: on_grid(curve, COEFFICIENT_BITS) for control, curve in values.items()}
-    activations = [{control: float(values[control][t]) for control in CONTROLS} for t in range(timesteps)]
-    excluded = {t: TONGUE for t, a in enumerate(activations) if a["tongue_out"] >= tongue_shows}
-    return Performed(name, activations, excluded, seconds / timesteps)
+    return values
 
 
 _IDLE = (

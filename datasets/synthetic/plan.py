@@ -30,12 +30,13 @@ from .performance import (
     Kind,
     Performed,
     Translation,
+    frames_kept,
     named_translation,
     perform,
     procedural_translation,
     share_out,
 )
-from .tracking import with_tracking_error, with_tracking_noise
+from .tracking import Tracker, with_tracking_error, with_tracking_noise
 from .volume import tracked_volume
 
 FIRST_SUBJECT = 900
@@ -64,11 +65,12 @@ class SyntheticSettings:
     performance: Kind = "full"
     dynamics: float = 1.0
     tracking_error: float = 0.0
+    tracker: Tracker = "per-frame"
 
     def described(self) -> dict[str, Any]:
         """The settings for records; those that came later are left out where they have their default."""
         described = {**asdict(self), "edition": EDITION}
-        usual = {"performance": "full", "dynamics": 1.0, "tracking_error": 0.0}
+        usual = {"performance": "full", "dynamics": 1.0, "tracking_error": 0.0, "tracker": "per-frame"}
         for name, value in usual.items():
             if described[name] == value:
                 del described[name]
@@ -115,9 +117,10 @@ def plan_subject(out: Path, index: int, geometry: Geometry, settings: SyntheticS
     tongue_shows = share_that_shows(geometry.mouth(who, anatomy, shape), anatomy, neutral)
     views = cameras(settings.cameras, width, height, target, seed=settings.seed + 101 * index)
     performed, poses = {}, {}
+    every = frames_kept(settings.timesteps)
     for sequence, count in share_out(settings.timesteps, settings.performance).items():
         performed[sequence] = perform(
-            sequence, count, settings.seed + 101 * index, tongue_shows, settings.performance
+            sequence, count, settings.seed + 101 * index, tongue_shows, settings.performance, every
         )
         poses[sequence] = tuple(
             geometry.translation.pose(activations, name, timestep)
@@ -131,6 +134,8 @@ def plan_subject(out: Path, index: int, geometry: Geometry, settings: SyntheticS
         shape,
         settings.tracking_error,
         settings.seed + 101 * index,
+        settings.tracker,
+        {sequence: played.step for sequence, played in performed.items()},
     )
     every = [pose for sequence in tracked_by_name.values() for pose in sequence]
     tracked = iter(with_tracking_noise(every, settings.tracking_noise, settings.seed + 101 * index))

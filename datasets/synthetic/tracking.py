@@ -1,16 +1,20 @@
 """Simulated errors of the stored tracking at a chosen level.
 
 Trackers fit a regularised model to images: coefficients are biased towards zero, a basis that does not match the face
-represents an expression by a mix of others, and the remaining error drifts from frame to frame. Lips and lids suffer
-most: they move fastest and have the fewest vertices. Images always show the exact poses.
+represents an expression by a mix of others, and the remaining error drifts. Lips and lids suffer most: they move fastest and
+have the fewest vertices. Images always show the exact poses.
+
+Two kinds of trackers differ in the drift. One works frame by frame: its error changes from timestep to timestep, however far
+apart these are. One of videos has an error for each sequence that lasts, and drift and jitter with time constants in seconds; its
+amounts are those of tracked recordings of NeRSemble.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -39,6 +43,19 @@ _MOMENTS = 48  # poses that amplitudes are measured on
 _PROBE = 1e-2  # part of an error at which its displacement is measured: there it is linear
 DRIFT = 0.2
 """Amplitude of the drift, in spreads of a parameter or relative to the range of a control."""
+LASTING, LASTING_DRIFT, JITTER = 0.35, 0.2, 0.1
+"""Amplitudes of a tracker of videos, in spreads: an error that lasts for a sequence, drift, jitter."""
+DRIFT_SECONDS, JITTER_SECONDS = 2.0, 0.1
+VIDEO_DETAIL_MM = 1.2
+"""Of lips and lids at level 1 by a tracker of videos, which regularises over time."""
+STARTING, START_SECONDS, START_SHARE = 0.5, 0.12, 1.0 / 3.0
+"""Error with which a sequence begins, in spreads, the time in which it decays to 1/e, and the share of coefficients that have it."""
+GAZE_JITTER, SIDE_JITTER, DEPTH_JITTER = np.radians(0.3), np.radians(0.13), 3.5e-4
+"""Deviation of jitter at level 1 of a tracker of videos: eyes and jaw sideways in radians, distance from the cameras in metres.
+
+Third differences at a video's rate, by which jitter of recordings was measured, show about half."""
+Tracker = Literal["per-frame", "video"]
+TRACKERS: tuple[Tracker, ...] = get_args(Tracker)
 LID_CONTROLS = tuple(f"{name}_{side}" for name in ("blink", "squint", "eye_wide") for side in SIDES)
 LIP_CONTROLS = (
     *(f"{name}_{side}" for name in ("upper_lip_up", "lower_lip_down") for side in SIDES),
@@ -69,6 +86,8 @@ def with_tracking_error(
     shape: FloatArray,
     level: float,
     seed: int,
+    tracker: Tracker = "per-frame",
+    steps: Mapping[str, float] | None = None,
 ) -> dict[str, list[HeadPose]]:
     """Poses with simulated tracking errors; drift is independent in each sequence.
 
@@ -78,25 +97,36 @@ def with_tracking_error(
         Exact poses, the controls that made them, and the conversion between them.
     level : float
         0 returns the poses unchanged; 1 displaces the face by 0.5 to 1 mm, lips and lids by about
-        `DETAIL_MM`, and so on in proportion.
+        `DETAIL_MM` or `VIDEO_DETAIL_MM`, and so on in proportion.
+    tracker : Tracker
+        Whether errors drift from timestep to timestep or in time.
+    steps : Mapping[str, float] | None
+        Seconds between timesteps of each sequence, for a tracker of videos.
     """
     if level == 0.0:
         return {name: list(each) for name, each in sequences.items()}
     poses = [pose for each in sequences.values() for pose in each]
     rng = np.random.default_rng([seed, 6])
     begins = {0, *itertools.accumulate(map(len, sequences.values()))}
+    if tracker == "video":
+        assert steps is not None
+        apart = np.concatenate([np.full(len(each), steps[name]) for name, each in sequences.items()])
+        drift: Callable[[tuple[int, ...]], FloatArray] = lambda shape: _lasting(shape, begins, apart, rng)
+        detail = VIDEO_DETAIL_MM
+    else:
+        drift, detail = (lambda shape: DRIFT * _drift(shape, begins, PERSISTENCE, rng)), DETAIL_MM
     values = _values(poses)
     overall: dict[str, FloatArray] = {}
     for name, exact in values.items():
         # A part of the spread of all, so that what hardly moves is not tracked exactly.
         spread = np.maximum(exact.std(axis=0), 0.1 * exact.std() + 1e-4)
-        overall[name] = DRIFT * spread * _drift(exact.shape, begins, rng)
+        overall[name] = spread * drift(exact.shape)
     overall["expression"] += _systematic(values["expression"], rng)
     errors = [overall]
     for names in (LIP_CONTROLS, LID_CONTROLS):
         rows = [EXPRESSION_CONTROLS.index(name) for name in names]
         played = np.array([[a[name] for name in names] for each in activations.values() for a in each])
-        wrong = DRIFT * _drift(played.shape, begins, rng) - rng.uniform(*SHRINKAGE, len(names)) * played
+        wrong = drift(played.shape) - rng.uniform(*SHRINKAGE, len(names)) * played
         matrices = {"expression": translation.expression, "eyelids": translation.eyelids}
         errors.append(
             {
@@ -109,13 +139,17 @@ def with_tracking_error(
     everywhere, *local = map(measure, errors)
     # Squares of displacements add up, but for what errors have in common.
     first = (FACE_MM**2) / everywhere[0]
-    wanted = DETAIL_MM**2 - first * everywhere[1:]
+    wanted = detail**2 - first * everywhere[1:]
     others, _ = nnls(np.stack([squares[1:] for squares in local], axis=1), np.maximum(wanted, 0.0))
     amplitudes = on_grid(level * np.sqrt([first, *others]), COEFFICIENT_BITS)
     total = {
         name: sum(amplitude * error[name] for amplitude, error in zip(amplitudes, errors) if name in error)
         for name in overall
     }
+    if tracker == "video":
+        for name, column, amount in _OWN_JITTER:
+            kept = _kept(apart, JITTER_SECONDS)
+            total[name][:, column] += level * amount * _drift((len(poses), 1), begins, kept, rng)
     moved = iter(_moved(poses, total))
     return {name: [next(moved) for _ in each] for name, each in sequences.items()}
 
@@ -132,14 +166,44 @@ def _systematic(expression: FloatArray, rng: np.random.Generator) -> FloatArray:
     return np.stack([(row[:, None] * mixing).sum(axis=0) for row in units]) * spread
 
 
-def _drift(shape: tuple[int, ...], begins: Collection[int], rng: np.random.Generator) -> FloatArray:
-    """(T, n) unit noise, each row correlated with the one before unless a sequence begins there."""
+def _drift(
+    shape: tuple[int, ...], begins: Collection[int], persistence: float | FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """(T, n) unit noise, each row correlated by ``persistence`` with the one before unless a sequence begins there."""
     fresh = rng.standard_normal(shape)
+    kept = np.broadcast_to(persistence, shape[0])
     drift = fresh.copy()
     for row in range(1, shape[0]):
         if row not in begins:
-            drift[row] = PERSISTENCE * drift[row - 1] + np.sqrt(1 - PERSISTENCE**2) * fresh[row]
+            drift[row] = kept[row] * drift[row - 1] + np.sqrt(1 - kept[row] ** 2) * fresh[row]
     return drift
+
+
+def _lasting(
+    shape: tuple[int, ...], begins: Collection[int], apart: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """(T, n) error of a tracker of videos in spreads; ``apart`` (T,) are the seconds between rows."""
+    error = LASTING * _drift(shape, begins, 1.0, rng)
+    error += LASTING_DRIFT * _drift(shape, begins, _kept(apart, DRIFT_SECONDS), rng)
+    error += JITTER * _drift(shape, begins, _kept(apart, JITTER_SECONDS), rng)
+    starting = STARTING * rng.standard_normal(shape[1]) * (rng.random(shape[1]) < START_SHARE)
+    decay, left = _kept(apart, START_SECONDS), np.ones(shape[0])
+    for row in range(1, shape[0]):
+        left[row] = 1.0 if row in begins else decay[row] * left[row - 1]
+    return error + left[:, None] * starting
+
+
+def _kept(apart: FloatArray, seconds: float) -> FloatArray:
+    """Correlation over ``apart`` seconds of noise with a time constant; rounded, so that processors agree."""
+    return on_grid(np.exp(-apart / seconds), COEFFICIENT_BITS)
+
+
+_OWN_JITTER = (
+    *(("eyes", column, GAZE_JITTER) for column in ([0, 3], [1, 4])),
+    ("jaw", [1], SIDE_JITTER),
+    ("translation", [2], DEPTH_JITTER),
+)
+"""Field, columns that move together, and amplitude."""
 
 
 class _Displacement:
