@@ -219,6 +219,13 @@ class Budget:
 
     Schedules are fractions of the budget, so that a short run follows the course of a long one. With only a
     limit in seconds, the method estimates its iterations from the first steps and reports the estimate.
+
+    Attributes
+    ----------
+    iterations : int | None
+        Number of iterations of the training; None for no limit.
+    seconds : float | None
+        Time of the training; None for no limit.
     """
 
     iterations: int | None = None

@@ -67,6 +67,11 @@ def field_texts(cls: type) -> dict[str, str]:
             is_text = isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and is_text:
                 texts[field.target.id] = " ".join(str(text.value.value).split())
+    families = {re.escape(name).replace(re.escape("..."), ".+"): name for name in texts if "..." in name}
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        family = next((name for pattern, name in families.items() if re.fullmatch(pattern, field.name)), "")
+        if family:
+            texts.setdefault(field.name, texts[family])
     return texts
 
 
@@ -84,6 +89,11 @@ def section_texts(docstring: str, section: str) -> dict[str, str]:
         for name in names if line[:1].isspace() else ():
             texts[name] = f"{texts[name]} {line.strip()}".strip()
     return texts
+
+
+def without_sections(docstring: str) -> str:
+    """The summary and the description of a numpy docstring."""
+    return re.split(r"^\w+\n-{3,}$", docstring, maxsplit=1, flags=re.M)[0]
 
 
 def type_text(hint: Any) -> str:
@@ -184,7 +194,8 @@ def options_of(cls: type) -> Iterator[Option]:
         positional = tyro.conf.Positional in marks
         name = given.upper() if positional else "--" + given.replace("_", "-")
         default = "" if value is dataclasses.MISSING or value in ((), False, None) else value_text(value)
-        yield Option(name, "" if positional else metavar, texts.get(field.name, ""), default)
+        text = texts.get(field.name) or next((m.help for m in marks if getattr(m, "help", None)), "")
+        yield Option(name, "" if positional else metavar, text, default)
 
 
 def metavar_text(hint: Any) -> str:
@@ -218,7 +229,7 @@ def command_pages() -> dict[str, str]:
         parts = [f"# headbench {name}\n", escaped(spec.summary), f"\n```text\n{words}\n```\n"]
         notes = inspect.getdoc(cls) or ""
         if not notes.startswith(f"{cls.__name__}("):  # the docstring that dataclasses write themselves
-            parts.append(paragraphs(notes.partition("\nAttributes\n")[0]))
+            parts.append(paragraphs(without_sections(notes)))
         if hasattr(cls, "notes"):
             parts.append("\n" + escaped(cls.notes()) + "\n")
         seconds = [other for other in plugins if other.startswith(f"{name} ")]
@@ -226,7 +237,7 @@ def command_pages() -> dict[str, str]:
             links = ", ".join(link(f"{page_name(other)}.md", f"`headbench {other}`") for other in seconds)
             parts.append(f"\nRelated commands: {links}.\n")
         parts.append(f"\n## Options\n\n```{{program}} headbench {name}\n```\n")
-        for option in options_of(cls):
+        for option in sorted(options_of(cls), key=lambda option: option.name.startswith("--")):
             text = escaped(option.text) + (f"\n\nDefault: `{option.default}`" if option.default else "")
             parts.append(directive("option", f"{option.name} {option.metavar}".strip(), text))
         parts.append(directive("option", "--json", "Print the result as JSON."))
@@ -433,7 +444,7 @@ def metric_entry(name: str, spec: Any) -> str:
     """A metric as an object of the reference."""
     better = "higher" if spec.higher_is_better else "lower"
     function = resolve(spec.implementation)
-    definition = paragraphs((inspect.getdoc(function) or "").partition("\nParameters\n")[0])
+    definition = paragraphs(without_sections(inspect.getdoc(function) or ""))
     facts = [
         f"{better} is better",
         f"unit {spec.unit}" if spec.unit else "no unit",
@@ -444,7 +455,8 @@ def metric_entry(name: str, spec: Any) -> str:
     if spec.suspect_above is not None:
         facts.append(f"values above {spec.suspect_above:g} {spec.unit} are marked as suspect")
     text = f"**{escaped(spec.label)}.** {escaped(spec.summary)}\n\n{definition}\n"
-    text += f"\n{'; '.join(facts).capitalize()}. Implementation: `{spec.implementation}`."
+    facts[0] = facts[0].capitalize()
+    text += f"\n{'; '.join(facts)}. Implementation: `{spec.implementation}`."
     return directive("metric", name, text)
 
 
@@ -464,7 +476,7 @@ def conditions_page() -> str:
     for name, plugin in own("conditions").items():
         spec = plugin.spec
         function = resolve(spec.implementation)
-        about = paragraphs((inspect.getdoc(function) or "").partition("\nParameters\n")[0])
+        about = paragraphs(without_sections(inspect.getdoc(function) or ""))
         kind = {
             "clip": "changes the clip",
             "derive": "changes a trained avatar",

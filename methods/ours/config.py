@@ -147,6 +147,8 @@ class OuterLayers:
         Number of layers; 0 as published.
     gap : float
         Distance of two layers, metres.
+    opacity : float
+        Opacity of these splats at the start, between 0 and 1.
     """
 
     count: int = 0
@@ -212,6 +214,8 @@ class OursConfig:
 
     Attributes
     ----------
+    hidden : int
+        Width of the hidden layers of the colour and opacity networks.
     direction_jitter : float
         Standard deviation, radians, of a random rotation of all view directions in each iteration. No
         image shows the colours between the training cameras; jitter of the order of the cameras'

@@ -1,0 +1,27 @@
+"""The documentation, built once for all tests of it, without running its notebooks."""
+
+import io
+import os
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory):
+    """The application of Sphinx after it has read and resolved every page, and its warnings."""
+    application = pytest.importorskip("sphinx.application")
+    before = os.environ.get("HEADBENCH_DOCS_NOTEBOOKS")
+    os.environ["HEADBENCH_DOCS_NOTEBOOKS"] = "no"
+    out, warnings = tmp_path_factory.mktemp("site"), io.StringIO()
+    try:
+        app = application.Sphinx(DOCS, DOCS, out, out / "trees", "dummy", status=None, warning=warnings)
+        app.build()
+    finally:
+        if before is None:
+            del os.environ["HEADBENCH_DOCS_NOTEBOOKS"]
+        else:
+            os.environ["HEADBENCH_DOCS_NOTEBOOKS"] = before
+    return app, warnings.getvalue()

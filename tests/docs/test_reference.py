@@ -1,0 +1,134 @@
+"""The built reference has an entry for everything that the registries offer, and no page has a broken link."""
+
+import re
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+import headbench
+from headbench.bench import cli
+from headbench.bench.configuration import setting_paths
+from headbench.bench.engine.config import RunConfig
+from headbench.bench.errors import ExitCode
+from headbench.bench.executors.settings import Execution
+from headbench.bench.registry import discover, resolve
+from headbench.datasets.lint.catalogue import RULES
+
+ROOT = Path(__file__).parents[2]
+EMPTY = re.compile(r":::\{(?:option|confval)\} (.+)\n(?::\w+: .+\n)*\n*:::")
+
+
+def installed(group):
+    """Names of the entry points of headbench's own distribution."""
+    return {
+        entry.name for entry in entry_points(group=f"headbench.{group}") if entry.dist.name == "headbench"
+    }
+
+
+@pytest.fixture(scope="module")
+def entries(site):
+    """Names of the objects of the reference by their type."""
+    found = {}
+    for domain in ("std", "py"):
+        for name, _, kind, *_ in site[0].env.domains[domain].get_objects():
+            found.setdefault(kind, set()).add(name)
+    return found
+
+
+def test_pages_have_no_broken_link_and_no_warning(site):
+    assert site[1] == ""
+
+
+def test_every_command_has_a_page(site):
+    pages = {
+        page.rpartition("/")[2]
+        for page in site[0].env.found_docs
+        if page.startswith("reference/generated/commands/")
+    }
+    assert pages - {"index"} == {name.replace(" ", "-") for name in installed("commands")}
+
+
+def test_every_option_of_the_help_has_an_entry(entries, capsys):
+    assert installed("commands")
+    for command in sorted(installed("commands")):
+        with pytest.raises(SystemExit):
+            cli.main([*command.split(), "--help"])
+        shown = re.findall(r"^[│|]? {1,2}(--[a-z-]+)", capsys.readouterr().out, re.MULTILINE)
+        program = command.replace(" ", "-")
+        listed = {
+            name.partition(".")[2]
+            for name in entries["cmdoption"]
+            if name.startswith(f"headbench-{program}.")
+        }
+        assert set(shown) - {"--help"} == {name for name in listed if name.startswith("--")}, command
+
+
+def test_every_setting_has_an_entry(entries):
+    names = set()
+    for cls, prefix in [(RunConfig, ""), (Execution, "execution.")]:
+        names |= {f"{prefix}{path}" for path in leaves(cls)}
+    for method, plugin in discover("methods").items():
+        if plugin.spec.config and plugin.origin.startswith("headbench "):
+            cls = resolve(plugin.spec.config)
+            names |= {f"settings.{method}.{path}" for path in leaves(cls)}
+            for values in plugin.spec.presets.values():
+                names |= {f"settings.{method}.{path}" for path in flattened(values)}
+    assert len(names) > 300
+    assert sorted(names - entries["confval"]) == []
+
+
+def leaves(cls):
+    """Settings that hold a value, not a group of settings."""
+    paths = setting_paths(cls)
+    return [path for path in paths if not any(other.startswith(f"{path}.") for other in paths)]
+
+
+def flattened(values, prefix=""):
+    for key, value in values.items():
+        yield from flattened(value, f"{prefix}{key}.") if isinstance(value, dict) else [f"{prefix}{key}"]
+
+
+def test_every_option_and_setting_is_explained(site):
+    folder = ROOT / "docs" / "reference" / "generated"
+    assert [
+        name for path in sorted(folder.rglob("*.md")) for name in EMPTY.findall(path.read_text("utf-8"))
+    ] == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        ("lint", {rule.code for rule in RULES}),
+        ("metric", installed("metrics")),
+        ("profile", installed("profiles")),
+        ("condition", installed("conditions")),
+        ("exitcode", {str(code.value) for code in ExitCode}),
+    ],
+)
+def test_every_registered_name_has_an_entry(entries, kind, names):
+    assert names
+    assert names <= entries[kind]
+
+
+def test_every_metric_of_a_profile_has_an_entry(entries):
+    metrics = [metric.name for plugin in discover("profiles").values() for metric in plugin.spec.metrics]
+    assert set(metrics) <= entries["metric"]
+
+
+def test_every_public_name_has_an_entry(entries):
+    documented = set().union(*(entries.get(kind, set()) for kind in ("class", "function", "exception", "data")))
+    assert {f"headbench.{name}" for name in headbench.__all__} <= documented
+
+
+def test_every_environment_variable_is_listed():
+    page = (ROOT / "docs" / "reference" / "environment.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^\| `(\w+)`", page, re.MULTILINE))
+    sources = [
+        path.read_text(encoding="utf-8")
+        for package in ("bench", "datasets", "methods", "metrics", "reports")
+        for path in (ROOT / package).rglob("*.py")
+    ]
+    own = {name for text in sources for name in re.findall(r"""["'](HEADBENCH_[A-Z_]+[A-Z])["']""", text)}
+    assert own
+    assert own <= listed
