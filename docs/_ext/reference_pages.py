@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
+import itertools
 import os
 import re
 import shutil
@@ -63,7 +64,7 @@ def field_texts(cls: type) -> dict[str, str]:
             continue
         texts.update(section_texts(inspect.getdoc(base) or "", "Attributes"))
         body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body  # type: ignore[attr-defined]
-        for field, text in zip(body, body[1:]):
+        for field, text in itertools.pairwise(body):
             is_text = isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and is_text:
                 texts[field.target.id] = " ".join(str(text.value.value).split())
@@ -78,7 +79,7 @@ def field_texts(cls: type) -> dict[str, str]:
 def section_texts(docstring: str, section: str) -> dict[str, str]:
     """Descriptions of the names in a section of a numpy docstring; names that share an entry share its text."""
     match = re.search(
-        rf"^{section}\n-+\n(.*?)(?=^\S[^\n]*\n-+\n|\Z)", inspect.cleandoc(docstring), re.S | re.M
+        rf"^{section}\n-+\n(.*?)(?=^\S[^\n]*\n-+\n|\Z)", inspect.cleandoc(docstring), re.DOTALL | re.MULTILINE
     )
     texts: dict[str, str] = {}
     names: list[str] = []
@@ -93,7 +94,7 @@ def section_texts(docstring: str, section: str) -> dict[str, str]:
 
 def without_sections(docstring: str) -> str:
     """The summary and the description of a numpy docstring."""
-    return re.split(r"^\w+\n-{3,}$", docstring, maxsplit=1, flags=re.M)[0]
+    return re.split(r"^\w+\n-{3,}$", docstring, maxsplit=1, flags=re.MULTILINE)[0]
 
 
 def type_text(hint: Any) -> str:
@@ -448,7 +449,9 @@ def metric_entry(name: str, spec: Any) -> str:
     facts = [
         f"{better} is better",
         f"unit {spec.unit}" if spec.unit else "no unit",
-        f"measured for each {spec.kind}" if spec.kind in ("avatar", "training", "frame") else KINDS[spec.kind],
+        f"measured for each {spec.kind}"
+        if spec.kind in ("avatar", "training", "frame")
+        else KINDS[spec.kind],
     ]
     if spec.machine_bound:
         facts.append("depends on the machine and its load")

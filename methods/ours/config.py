@@ -193,7 +193,7 @@ class PlannedCapacity:
         Pixels; smaller motion of the surface is ignored.
     detail : float
         Samples of the planes per pixel, along the longest side of their box. 1 keeps PSNR and LPIPS;
-        0.5 keeps only PSNR, in half the bytes (README.md).
+        0.5 keeps only PSNR, in half the bytes.
     keep : tuple[Planned, ...]
         Sizes that "auto" does not change.
     """

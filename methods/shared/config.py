@@ -173,7 +173,7 @@ SHORT_SPLATS: Mapping[str, Any] = {
     "rotation_lr": 0.01,
 }
 """Settings of runs much shorter than published: splats start half opaque, with high learning rates of position, size
-and rotation (`ga/README.md`)."""
+and rotation (`docs/explanation/methods/ga.md`)."""
 
 
 def splat_presets(short: Mapping[str, Any], paper: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

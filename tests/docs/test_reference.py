@@ -117,7 +117,9 @@ def test_every_metric_of_a_profile_has_an_entry(entries):
 
 
 def test_every_public_name_has_an_entry(entries):
-    documented = set().union(*(entries.get(kind, set()) for kind in ("class", "function", "exception", "data")))
+    documented = set().union(
+        *(entries.get(kind, set()) for kind in ("class", "function", "exception", "data"))
+    )
     assert {f"headbench.{name}" for name in headbench.__all__} <= documented
 
 
