@@ -30,7 +30,10 @@ nb_merge_streams = True
 
 myst_enable_extensions = ["colon_fence", "deflist", "attrs_inline"]
 myst_heading_anchors = 4
-suppress_warnings = ["mystnb.unknown_mime_type"]
+suppress_warnings = [
+    "mystnb.unknown_mime_type",
+    "toc.empty_glob",
+]  # globs take what is not listed in an order
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"

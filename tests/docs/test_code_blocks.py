@@ -19,6 +19,8 @@ PAGES = re.search(r"(?s):maxdepth: 1\n\n(.*)\n\*\n", (TUTORIALS / "index.md").re
 SMALLER = {
     "--cameras 6 --timesteps 24 --size 96x136": "--cameras 4 --timesteps 6 --size 48x64",
     "--preset demo": "--preset smoke",
+    "--methods mean-image,ga --preset smoke": "--methods mean-image --preset smoke",
+    "--methods ga --preset smoke --seeds 0,1": "--methods mean-image --preset smoke --seeds 0,1",
 }
 BLOCK = re.compile(r"^```(bash|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
