@@ -19,7 +19,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "reference_pages",
 ]
-exclude_patterns = ["_ext", "_static"]
+exclude_patterns = ["_ext", "_static", "notebooks/work-*"]
 if os.environ.get("HEADBENCH_DOCS_NOTEBOOKS") == "no":  # a build that checks the pages alone
     nb_execution_mode = "off"
 else:
@@ -30,10 +30,7 @@ nb_merge_streams = True
 
 myst_enable_extensions = ["colon_fence", "deflist", "attrs_inline"]
 myst_heading_anchors = 4
-suppress_warnings = [
-    "mystnb.unknown_mime_type",
-    "toc.empty_glob",
-]  # globs take what is not listed in an order
+suppress_warnings = ["mystnb.unknown_mime_type"]
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"

@@ -183,6 +183,9 @@ def options_of(cls: type) -> Iterator[Option]:
     hints, texts = get_type_hints(cls, include_extras=True), field_texts(cls)
     for field in dataclasses.fields(cls):
         hint, marks = hints[field.name], ()
+        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+            yield from options_of(hint)  # the parser leaves out the name of the group
+            continue
         if get_origin(hint) is typing.Annotated:
             marks = hint.__metadata__
             hint = get_args(hint)[0]
@@ -620,6 +623,16 @@ def write_pages(app: Any) -> None:
             path.write_text(text, encoding="utf-8")
 
 
+def complete_index(app: Any, page: str, source: list[str]) -> None:
+    """Replace the line ``*`` of an index by the pages of its folder that it does not list, if there are any."""
+    folder, _, name = page.rpartition("/")
+    if name == "index" and "\n*\n" in source[0]:
+        listed = set(source[0].splitlines())
+        others = (path.stem for path in sorted(Path(app.srcdir, folder).glob("*.md")) if path.stem != "index")
+        more = "".join(f"{stem}\n" for stem in others if stem not in listed)
+        source[0] = source[0].replace("\n*\n", f"\n{more}")
+
+
 def copy_notebooks(app: Any, error: Exception | None) -> None:
     """Put the notebooks beside their pages, to download."""
     if error is None and app.builder.format == "html":
@@ -636,6 +649,7 @@ def setup(app: Any) -> dict[str, bool]:
     for name, title in OBJECT_TYPES.items():
         app.add_object_type(name, name, objname=title, indextemplate=f"pair: %s; {title}")
     app.connect("builder-inited", write_pages)
+    app.connect("source-read", complete_index)
     app.connect("build-finished", copy_notebooks)
     app.add_role("public", public_name_role)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
