@@ -38,6 +38,7 @@ autodoc_preserve_defaults = True
 napoleon_google_docstring = False
 napoleon_use_ivar = True
 default_role = "public"
+smartquotes = False  # two hyphens begin an option
 add_module_names = False
 python_display_short_literal_types = True
 maximum_signature_line_length = 90
@@ -47,6 +48,7 @@ html_title = "headbench"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_copy_source = False
+html_show_search_summary = False  # summaries would be fetched, which pages from a disk cannot do
 html_show_sphinx = False
 FONTS = {
     "font-stack": "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif",
@@ -62,6 +64,8 @@ html_theme_options = {
         "color-brand-primary": "#3b3fb6",
         "color-brand-content": "#3b3fb6",
         "color-brand-visited": "#3b3fb6",
+        "color-api-name": "#3b3fb6",
+        "color-api-pre-name": "#595c62",
     },
     "dark_css_variables": {
         **FONTS,
@@ -72,6 +76,8 @@ html_theme_options = {
         "color-brand-primary": "#aeb2ff",
         "color-brand-content": "#aeb2ff",
         "color-brand-visited": "#aeb2ff",
+        "color-api-name": "#aeb2ff",
+        "color-api-pre-name": "#a6a9af",
     },
     "top_of_page_buttons": [],
 }

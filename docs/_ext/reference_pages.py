@@ -149,6 +149,8 @@ def default_of(field: Any) -> Any:
 def directive(name: str, argument: str, text: str = "", **options: str) -> str:
     """A directive in MyST."""
     lines = [f":{key}: {value}" for key, value in options.items() if value]
+    if name in ("option", "confval"):  # hundreds on a page
+        lines.append(":no-contents-entry:")
     return "\n".join([f":::{{{name}}} {argument}", *lines, *([""] if lines else []), text, ":::", ""])
 
 

@@ -16,7 +16,7 @@ from headbench.bench.registry import discover, resolve
 from headbench.datasets.lint.catalogue import RULES
 
 ROOT = Path(__file__).parents[2]
-EMPTY = re.compile(r":::\{(?:option|confval)\} (.+)\n(?::\w+: .+\n)*\n*:::")
+EMPTY = re.compile(r":::\{(?:option|confval)\} (.+)\n(?::[\w-]+:.*\n)*\n*:::")
 
 
 def installed(group):
