@@ -351,7 +351,13 @@ def method_pages() -> dict[str, str]:
             ("implementation", "of this package" if spec.native else "adapter to the authors' program"),
             ("in a run that names no methods", "yes" if spec.default else "no"),
         ]
-        parts = [f"# {name}\n", escaped(spec.summary), "", table(("", ""), facts)]
+        parts = [
+            f"# {name}\n",
+            escaped(spec.summary),
+            "",
+            *(f"- {name}: {value}" for name, value in facts),
+            "",
+        ]
         parts += ["## Presets\n", "Settings that a preset changes; the others have the defaults below.\n"]
         parts += [table(*preset_rows(spec)), "## Settings\n"]
         parts.append(f"In `--set settings.{name}.KEY=VALUE`, or under `settings: {name}:` in a YAML file.\n")
