@@ -3,6 +3,7 @@
 import io
 import os
 from pathlib import Path
+from warnings import catch_warnings, simplefilter
 
 import pytest
 
@@ -18,7 +19,9 @@ def site(tmp_path_factory):
     out, warnings = tmp_path_factory.mktemp("site"), io.StringIO()
     try:
         app = application.Sphinx(DOCS, DOCS, out, out / "trees", "dummy", status=None, warning=warnings)
-        app.build()
+        with catch_warnings():
+            simplefilter("ignore")  # of extensions, about coming versions of Sphinx
+            app.build()
     finally:
         if before is None:
             del os.environ["HEADBENCH_DOCS_NOTEBOOKS"]

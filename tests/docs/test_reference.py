@@ -26,6 +26,14 @@ def installed(group):
     }
 
 
+def command_lines(text):
+    """Command lines of headbench in blocks of code and in inline code, without comments."""
+    fenced = re.findall(r"^```(?:bash|yaml)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    lines = [line for block in fenced for line in block.replace("\\\n", " ").splitlines()]
+    lines += re.findall(r"`(headbench [^`]+)`", text.replace("\n", " "))
+    return [found[1] for line in lines if (found := re.search(r"\b(headbench [a-z][^#|;]*)", line))]
+
+
 @pytest.fixture(scope="module")
 def entries(site):
     """Names of the objects of the reference by their type."""
@@ -62,6 +70,29 @@ def test_every_option_of_the_help_has_an_entry(entries, capsys):
             if name.startswith(f"headbench-{program}.")
         }
         assert set(shown) - {"--help"} == {name for name in listed if name.startswith("--")}, command
+
+
+PAGES = [
+    path
+    for path in [*ROOT.glob("docs/**/*.md"), *ROOT.glob("**/README.md")]
+    if not {".venv", "build", "generated"} & set(path.relative_to(ROOT).parts)
+    and not any(part.startswith((".", "work-")) for part in path.relative_to(ROOT).parts)
+]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_on_pages_exist_with_their_options(page, entries):
+    wrong = []
+    for line in command_lines(page.read_text(encoding="utf-8")):
+        words = line.split()[1:]
+        known = installed("commands")
+        name = next((name for name in (" ".join(words[:2]), words[0]) if name in known), None)
+        group = any(other.startswith(f"{words[0]} ") for other in known)
+        options = {word.partition("=")[0] for word in words if re.match(r"--[a-z]", word)}
+        listed = {f"headbench-{(name or '').replace(' ', '-')}.{option}" for option in options - {"--help"}}
+        if (name is None and not group) or not listed <= entries["cmdoption"]:
+            wrong.append(line)
+    assert wrong == []
 
 
 def test_every_setting_has_an_entry(entries):
@@ -134,3 +165,11 @@ def test_every_environment_variable_is_listed():
     own = {name for text in sources for name in re.findall(r"""["'](HEADBENCH_[A-Z_]+[A-Z])["']""", text)}
     assert own
     assert own <= listed
+
+
+def test_command_lines_are_found_on_pages():
+    text = (
+        "```bash\nPYTHONPATH=. headbench run --data a \\\n  --out b  # why\n```\nor `headbench\nlist methods`"
+    )
+    assert command_lines(text) == ["headbench run --data a    --out b  ", "headbench list methods"]
+    assert sum(len(command_lines(page.read_text(encoding="utf-8"))) for page in PAGES) > 100
