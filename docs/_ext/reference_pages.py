@@ -14,6 +14,7 @@ import itertools
 import os
 import re
 import shutil
+import sys
 import textwrap
 import types
 import typing
@@ -133,9 +134,14 @@ def value_text(value: Any) -> str:
 
 def escaped(text: str) -> str:
     """Text of a docstring as Markdown: characters with a meaning are escaped outside of code."""
-    parts = re.split(r"(``[^`]+``|`[^`]+`)", " ".join(text.split()))
+    parts = re.split(r"(``[^`]+``|`[^`]+`|(?<![\w-])--[a-z][\w-]*)", " ".join(text.split()))
     return "".join(
-        part if part.startswith("`") else re.sub(r"([*<>\[\]#|\\])", r"\\\1", part) for part in parts
+        part
+        if part.startswith("`")
+        else f"`{part}`"
+        if part.startswith("--")
+        else re.sub(r"([*<>\[\]#|\\])", r"\\\1", part)
+        for part in parts
     )
 
 
@@ -323,8 +329,16 @@ def preset_rows(spec: Any) -> tuple[list[str], list[list[str]]]:
     """Settings that the presets of a method change, as a table: a row for each setting, a column for each preset."""
     flat = {preset: dict(flattened(values)) for preset, values in spec.presets.items()}
     keys = dict.fromkeys(key for values in flat.values() for key in values)
-    rows = [[f"`{key}`", *(value_text(flat[p][key]) if key in flat[p] else "" for p in flat)] for key in keys]
+    rows = [
+        [f"`{key}`", *(shown_value(flat[p][key]) if key in flat[p] else "" for p in flat)] for key in keys
+    ]
     return ["setting", *(f"`{preset}`" for preset in flat)], rows
+
+
+def shown_value(value: Any) -> str:
+    """A value in a table."""
+    text = value_text(value)
+    return f"`{text}`" if "--" in text else text
 
 
 def flattened(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -568,11 +582,19 @@ def api_pages() -> dict[str, str]:
     for page, (title, about) in API_PAGES.items():
         parts = [f"# {title}\n", about + "\n"]
         parts.append(", ".join(f"{{py:obj}}`~headbench.{name}`" for name in grouped[page]) + "\n")
+        if page == "contracts":
+            parts.append(f"```{{eval-rst}}\n.. automodule:: {contracts.__name__}\n   :no-index:\n```\n")
         for name in grouped[page]:
             value = getattr(headbench, name)
+            if not isinstance(value, type) and not inspect.isfunction(value):
+                parts.append(directive("py:data", f"headbench.{name}", escaped(constant_text(name))))
+                continue
             lines = [f"```{{eval-rst}}\n.. {api_directive(value)}:: headbench.{name}"]
             if isinstance(value, type) and not issubclass(value, Exception):
-                lines.append("   :members:\n   :undoc-members:")
+                lines.append("   :members:")
+                if getattr(value, "_is_protocol", False):  # what a plug-in has to provide
+                    lines.append("   :undoc-members:")
+                    lines += ["   :special-members: __call__"] * ("__call__" in vars(value))
             parts += [*lines, "```\n"]
         pages[f"api/{page}"] = "\n".join(parts)
     rows = [
@@ -590,13 +612,28 @@ def api_pages() -> dict[str, str]:
     return pages
 
 
+def constant_text(name: str) -> str:
+    """The string below a public constant in its module."""
+    source = inspect.getsource(sys.modules[next(m for m in HOMES if hasattr(sys.modules[m], name))])
+    body = ast.parse(source).body
+    for statement, text in itertools.pairwise(body):
+        target = (
+            statement.targets[0] if isinstance(statement, ast.Assign) else getattr(statement, "target", None)
+        )
+        if isinstance(target, ast.Name) and target.id == name and isinstance(text, ast.Expr):
+            return str(ast.literal_eval(text.value))
+    raise ValueError(f"{name} has no string below it")
+
+
+HOMES = ("headbench.bench.contracts", "headbench.bench.condition", "headbench.bench.rows")
+"""Modules with public constants, in which their text is looked for."""
+
+
 def api_directive(value: Any) -> str:
     """The directive of autodoc for a value."""
     if inspect.isfunction(value):
         return "autofunction"
-    if isinstance(value, type):
-        return "autoexception" if issubclass(value, Exception) else "autoclass"
-    return "autodata"
+    return "autoexception" if issubclass(value, Exception) else "autoclass"
 
 
 # Sphinx ----------------------------------------------------------------------------------------------------------------
@@ -631,6 +668,17 @@ def write_pages(app: Any) -> None:
             path.write_text(text, encoding="utf-8")
 
 
+def parseable_signature(
+    app: Any, what: str, name: str, value: Any, options: Any, signature: str | None, returns: str | None
+) -> tuple[str, str | None] | None:
+    """Show defaults that are no Python as dots, without which types are not linked; protocols are not called."""
+    if isinstance(value, type) and getattr(value, "_is_protocol", False):
+        return "", returns
+    if signature is None:
+        return None
+    return re.sub(r"<factory>|<function [\w.]+(?:<lambda>)?>", "...", signature), returns
+
+
 def complete_index(app: Any, page: str, source: list[str]) -> None:
     """Replace the line ``*`` of an index by the pages of its folder that it does not list, if there are any."""
     folder, _, name = page.rpartition("/")
@@ -639,6 +687,11 @@ def complete_index(app: Any, page: str, source: list[str]) -> None:
         others = (path.stem for path in sorted(Path(app.srcdir, folder).glob("*.md")) if path.stem != "index")
         more = "".join(f"{stem}\n" for stem in others if stem not in listed)
         source[0] = source[0].replace("\n*\n", f"\n{more}")
+
+
+def indexes(app: Any, env: Any, added: set[str], changed: set[str], removed: set[str]) -> list[str]:
+    """Pages to read again if pages were added or removed: the indexes, see `complete_index`."""
+    return [page for page in env.found_docs if page.endswith("/index")] if added or removed else []
 
 
 def copy_notebooks(app: Any, error: Exception | None) -> None:
@@ -657,6 +710,8 @@ def setup(app: Any) -> dict[str, bool]:
     for name, title in OBJECT_TYPES.items():
         app.add_object_type(name, name, objname=title, indextemplate=f"pair: %s; {title}")
     app.connect("builder-inited", write_pages)
+    app.connect("autodoc-process-signature", parseable_signature)
+    app.connect("env-get-outdated", indexes)
     app.connect("source-read", complete_index)
     app.connect("build-finished", copy_notebooks)
     app.add_role("public", public_name_role)
