@@ -583,11 +583,11 @@ def api_pages() -> dict[str, str]:
         parts = [f"# {title}\n", about + "\n"]
         parts.append(", ".join(f"{{py:obj}}`~headbench.{name}`" for name in grouped[page]) + "\n")
         if page == "contracts":
-            parts.append(f"```{{eval-rst}}\n.. automodule:: {contracts.__name__}\n   :no-index:\n```\n")
+            parts.append(f"{inspect.getdoc(contracts)}\n")  # its headings and lists are Markdown, too
         for name in grouped[page]:
             value = getattr(headbench, name)
             if not isinstance(value, type) and not inspect.isfunction(value):
-                parts.append(directive("py:data", f"headbench.{name}", escaped(constant_text(name))))
+                parts.append(directive("py:data", name, escaped(constant_text(name)), module="headbench"))
                 continue
             lines = [f"```{{eval-rst}}\n.. {api_directive(value)}:: headbench.{name}"]
             if isinstance(value, type) and not issubclass(value, Exception):
