@@ -12,13 +12,13 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 @pytest.fixture(scope="session")
 def site(tmp_path_factory):
-    """The application of Sphinx after it has read and resolved every page, and its warnings."""
+    """The application of Sphinx after it has written every page, and its warnings."""
     application = pytest.importorskip("sphinx.application")
     before = os.environ.get("HEADBENCH_DOCS_NOTEBOOKS")
     os.environ["HEADBENCH_DOCS_NOTEBOOKS"] = "no"
     out, warnings = tmp_path_factory.mktemp("site"), io.StringIO()
     try:
-        app = application.Sphinx(DOCS, DOCS, out, out / "trees", "dummy", status=None, warning=warnings)
+        app = application.Sphinx(DOCS, DOCS, out, out / "trees", "html", status=None, warning=warnings)
         with catch_warnings():
             simplefilter("ignore")  # of extensions, about coming versions of Sphinx
             app.build()

@@ -1,4 +1,4 @@
-"""The built reference has an entry for everything that the registries offer, and no page has a broken link."""
+"""The built site: the reference has an entry for everything that is registered, links lead somewhere, no request leaves it."""
 
 import re
 from importlib.metadata import entry_points
@@ -173,3 +173,30 @@ def test_command_lines_are_found_on_pages():
     )
     assert command_lines(text) == ["headbench run --data a    --out b  ", "headbench list methods"]
     assert sum(len(command_lines(page.read_text(encoding="utf-8"))) for page in PAGES) > 100
+
+
+SEEN = ("index", "howto/own-data", "reference/generated/methods/ours", "search")
+
+
+def test_pages_name_no_file_elsewhere(site):
+    loaded = re.compile(r"""<(?:script|link|img|iframe|source)[^>]+(?:src|href)=["'](?:https?:)?//""")
+    pages = list(Path(site[0].outdir).rglob("*.html"))
+    assert len(pages) > 100
+    assert [page.name for page in pages if loaded.search(page.read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1440, 390])
+def test_pages_fit_and_are_silent(site, browser, scheme, width):
+    context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    page, heard = context.new_page(), []
+    page.on("request", lambda request: heard.append(request.url) if "//" in request.url[:8] else None)
+    page.on("console", lambda message: heard.append(message.text))
+    page.on("pageerror", lambda error: heard.append(str(error)))
+    for name in SEEN:
+        address = (Path(site[0].outdir) / f"{name}.html").as_uri()
+        page.goto(f"{address}?q=max_splats" if name == "search" else address)
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), name
+    page.wait_for_selector("#search-results li a")
+    assert [text for text in heard if not text.startswith("file:")] == []
+    context.close()
