@@ -240,7 +240,8 @@ def command_pages() -> dict[str, str]:
         words = " ".join([f"headbench {name}", *(option.name for option in positional), "[OPTIONS]"])
         parts = [f"# headbench {name}\n", escaped(spec.summary), f"\n```text\n{words}\n```\n"]
         notes = inspect.getdoc(cls) or ""
-        if not notes.startswith(f"{cls.__name__}("):  # the docstring that dataclasses write themselves
+        # Neither the docstring that dataclasses write themselves, nor one that says what the heading says.
+        if not notes.startswith((f"{cls.__name__}(", "Settings of ``headbench")):
             parts.append(paragraphs(without_sections(notes)))
         if hasattr(cls, "notes"):
             parts.append("\n" + escaped(cls.notes()) + "\n")

@@ -13,6 +13,7 @@ from headbench.bench.engine.config import RunConfig
 from headbench.bench.errors import ExitCode
 from headbench.bench.executors.settings import Execution
 from headbench.bench.registry import discover, resolve
+from headbench.bench.rows import COLUMNS
 from headbench.datasets.lint.catalogue import RULES
 
 ROOT = Path(__file__).parents[2]
@@ -200,3 +201,9 @@ def test_pages_fit_and_are_silent(site, browser, scheme, width):
     page.wait_for_selector("#search-results li a")
     assert [text for text in heard if not text.startswith("file:")] == []
     context.close()
+
+
+def test_every_column_of_rows_is_explained():
+    page = (ROOT / "docs" / "reference" / "run-folder.md").read_text(encoding="utf-8")
+    table = page.split("## Columns of rows.parquet")[1].split("##")[0]
+    assert set(COLUMNS) <= set(re.findall(r"`(\w+)`", table))
