@@ -13,7 +13,6 @@ import inspect
 import itertools
 import os
 import re
-import shutil
 import sys
 import textwrap
 import types
@@ -695,16 +694,6 @@ def indexes(app: Any, env: Any, added: set[str], changed: set[str], removed: set
     return [page for page in env.found_docs if page.endswith("/index")] if added or removed else []
 
 
-def copy_notebooks(app: Any, error: Exception | None) -> None:
-    """Put the notebooks beside their pages, to download."""
-    if error is None and app.builder.format == "html":
-        source = Path(app.srcdir, "notebooks")
-        for path in sorted(source.glob("*.ipynb")) if source.is_dir() else ():
-            target = Path(app.outdir, "notebooks", path.name)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, target)
-
-
 def setup(app: Any) -> dict[str, bool]:
     """Register pages, object types and the role."""
     os.environ.setdefault("COLUMNS", "100")
@@ -714,7 +703,6 @@ def setup(app: Any) -> dict[str, bool]:
     app.connect("autodoc-process-signature", parseable_signature)
     app.connect("env-get-outdated", indexes)
     app.connect("source-read", complete_index)
-    app.connect("build-finished", copy_notebooks)
     app.add_role("public", public_name_role)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
