@@ -10,13 +10,14 @@ SECONDS ?= 600
 # Build of PyTorch: cpu, cuda, or what pip's indexes offer of the two, the smaller first.
 TORCH  ?=
 
-.PHONY: help setup lock demo test test-slow test-latest check fuzz kills nightly gpu gpu-checks gate baseline bench readme \
+.PHONY: help setup lock demo docs test test-slow test-latest check fuzz kills nightly gpu gpu-checks gate baseline bench readme \
   release-source dist wheels clean
 
 help:
 	@echo "make setup   make $(VENV) with headbench in it, from the lock (TORCH=cpu or cuda chooses PyTorch's build)"
 	@echo "make lock    write the lock again, requirements*.txt, with the newest versions that pyproject.toml admits"
 	@echo "make demo    compare avatar methods on a capture made on the spot (OUT=$(OUT))"
+	@echo "make docs    build the documentation, in build/docs (NOTEBOOKS=no leaves them unexecuted)"
 	@echo "make test    run the tests (in JOBS=$(JOBS) processes)"
 	@echo "make test-latest  run the tests with the newest versions instead of the lock, in $(VENV)-latest"
 	@echo "make test-slow    run the tests marked slow"
@@ -61,6 +62,11 @@ lock:
 demo: setup
 	$(BIN)/headbench demo --out $(OUT)
 
+# Warnings, broken links among them, are errors. Notebooks are executed and their output is shown on their pages.
+docs: setup
+	HEADBENCH_DOCS_NOTEBOOKS=$(NOTEBOOKS) $(BIN)/python -m sphinx -W --keep-going --quiet -j $(JOBS) -d build/docs-cache docs build/docs
+	@echo "The documentation is in build/docs/index.html."
+
 # Where writing bytecode is switched off, every process compiles all tests again, two thirds of the time of collecting.
 test: setup
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
@@ -74,7 +80,7 @@ nightly:
 # A break by a new release of a package is seen here first. PyTorch too is the newest that pip's indexes offer.
 test-latest:
 	test -x $(VENV)-latest/bin/python || $(PYTHON) -m venv $(VENV)-latest
-	$(VENV)-latest/bin/python -m pip install --quiet --disable-pip-version-check --upgrade --upgrade-strategy eager -e '.[dev]'
+	$(VENV)-latest/bin/python -m pip install --quiet --disable-pip-version-check --upgrade --upgrade-strategy eager -e '.[dev,docs]'
 	$(VENV)-latest/bin/python -m pip list
 	$(VENV)-latest/bin/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 

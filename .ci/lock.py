@@ -3,7 +3,7 @@
 Four requirements files are written beside ``pyproject.toml``, whose open ranges they pin:
 
 - ``requirements.txt``: what headbench needs, without PyTorch;
-- ``requirements-dev.txt``: the extra ``dev`` and the tools that build the kernels;
+- ``requirements-dev.txt``: the extras ``dev`` and ``docs`` and the tools that build the kernels;
 - ``requirements-torch-cuda.txt``: PyTorch as the package index has it, CUDA's libraries, and the extra ``cuda``;
 - ``requirements-torch-cpu.txt``: PyTorch's CPU build. Hashes of builds that no index configured for pip offers are kept
   from the file as it is.
@@ -99,8 +99,8 @@ def main() -> None:
     """Resolve and write all four files; the smaller sets decide the versions of the larger ones."""
     build = tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["requires"]
     plain = resolve((), [], {})
-    developer = resolve(("dev",), [*build, *BUILDERS], plain)
-    everything = resolve(("dev", "cuda"), [*build, *BUILDERS], developer)
+    developer = resolve(("dev", "docs"), [*build, *BUILDERS], plain)
+    everything = resolve(("dev", "docs", "cuda"), [*build, *BUILDERS], developer)
     cuda = re.compile(r"torch==|triton==|nvidia-|cuda-")
     main = {pin: text for pin, text in plain.items() if not cuda.match(pin)}
     write("requirements.txt", main)

@@ -2,7 +2,7 @@
 
 Their registry entries are defined in `specs`.
 
-Only NumPy and the standard library are imported. Behaviours are `Protocol`s, so a plug-in inherits nothing:
+Only NumPy and the standard library are imported. Behaviours are protocols, so a plug-in inherits nothing:
 it provides these attributes and passes the conformance kit. Values are frozen dataclasses.
 
 Conventions
@@ -38,7 +38,7 @@ class FrameKey(NamedTuple):
 
     subject: str
     sequence: str
-    timestep: int  # unique within the clip, across its sequences
+    timestep: int  #: unique within the clip, across its sequences
     camera: str
 
     def __str__(self) -> str:
@@ -98,13 +98,13 @@ class HeadPose:
     """
 
     head_model: str
-    expression: FloatArray  # (E,)
-    rotation: FloatArray  # (3,) about joint 0
-    neck: FloatArray  # (3,)
-    jaw: FloatArray  # (3,)
-    eyes: FloatArray  # (6,) left, then right
-    translation: FloatArray  # (3,) metres
-    eyelids: FloatArray | None = None  # (2,) left, right; models that have the bases
+    expression: FloatArray  #: (E,)
+    rotation: FloatArray  #: (3,) about joint 0
+    neck: FloatArray  #: (3,)
+    jaw: FloatArray  #: (3,)
+    eyes: FloatArray  #: (6,) left, then right
+    translation: FloatArray  #: (3,) metres
+    eyelids: FloatArray | None = None  #: (2,) left, right; models that have the bases
     subject: str = ""
     timestep: int | None = None
 
@@ -219,6 +219,13 @@ class Budget:
 
     Schedules are fractions of the budget, so that a short run follows the course of a long one. With only a
     limit in seconds, the method estimates its iterations from the first steps and reports the estimate.
+
+    Attributes
+    ----------
+    iterations : int | None
+        Number of iterations of the training; None for no limit.
+    seconds : float | None
+        Time of the training; None for no limit.
     """
 
     iterations: int | None = None
@@ -228,8 +235,8 @@ class Budget:
 class Frame(NamedTuple):
     """The output of an avatar for one frame."""
 
-    rgb: FloatArray  # (H, W, 3) float32 in [0, 1], composited on the background asked for
-    alpha: FloatArray  # (H, W) float32 in [0, 1]
+    rgb: FloatArray  #: (H, W, 3) float32 in [0, 1], composited on the background asked for
+    alpha: FloatArray  #: (H, W) float32 in [0, 1]
 
 
 # ------------------------------------------------------------------ behaviours

@@ -101,6 +101,7 @@ class All(Enum):
 
 
 ALL: Final = All.ALL
+"""Selects every value of an argument of `Rows.select`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,7 +40,7 @@ QUALITY = {"psnr": 2, "ssim": 3, "lpips": 3}
 
 
 class ComparedRuns(RunSet):
-    """Finished runs on the same frames, as `read_runs` gives them; ``rows.table`` has every number."""
+    """Finished runs on the same frames, as `read_runs` gives them; ``rows.select`` gives every number."""
 
     def table(self) -> pd.DataFrame:
         """The comparison table: a row for each method, a column for each (task, metric); metrics of no task are of "avatar".

@@ -32,7 +32,7 @@ def test_the_commands_are_those_of_the_command_line():
 
 
 def test_the_ci_example_installs_from_checkouts():
-    page = (ROOT / "bench" / "README.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "howto" / "ci.md").read_text(encoding="utf-8")
     block = re.search(r"```yaml\n(# \.github/workflows.*?)```", page, re.DOTALL)
     steps = yaml.safe_load(block[1])["jobs"]["quality"]["steps"]
     checked_out = {

@@ -12,7 +12,7 @@ from ..executors.options import ExecutionOptions
 from ..listing import presets_of_methods
 
 SEED = 26_000
-"""Of the suite's captures. Settings of methods are chosen on captures of seeds below 10,000 (`README.md`)."""
+"""Of the suite's captures. Settings of methods are chosen on captures of seeds below 10,000 (`docs/explanation/statistics.md`)."""
 
 ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "no-lines": {"lines": {"enabled": False}},

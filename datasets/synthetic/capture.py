@@ -75,6 +75,8 @@ def synthesize(
 
     Parameters
     ----------
+    subjects : int
+        Number of heads, each with its own capture.
     cameras : int
         2 to 16; the frontal one is always included and held out as the novel view.
     timesteps : int
@@ -84,6 +86,8 @@ def synthesize(
         (width, height) of the images, pixels.
     head : str
         See `plan.load_geometry`.
+    seed : int
+        Decides the heads and their performances.
     tracking_noise : float
         Standard deviation of the error of each stored parameter, as a fraction of that parameter's
         own standard deviation over the subject's timesteps. Images show the exact poses.

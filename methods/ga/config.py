@@ -16,8 +16,12 @@ class GAConfig:
     sh_degree, sh_every, min_sh_every : int
         Final degree of the spherical harmonics; it is raised by one every ``sh_every`` iterations
         (published scale), but at least ``min_sh_every`` of the actual run.
+    sh_dc_lr, sh_rest_lr : float
+        Learning rates of the constant term and of the higher degrees of the spherical harmonics.
     refine_tracking : bool
         Whether to optimise expression, poses and translation of the training timesteps.
+    expression_lr, pose_lr, translation_lr : float
+        Learning rates of the refined expression coefficients, joint rotations and translation.
     """
 
     splats: SplatTraining = field(default_factory=SplatTraining)

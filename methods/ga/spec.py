@@ -8,7 +8,7 @@ from ...bench.specs import MethodSpec
 from ..shared.config import splat_presets
 
 SHORT: dict[str, Any] = {"sh_dc_lr": 0.02, "sh_rest_lr": 1e-3}
-"""Settings of runs much shorter than published (README.md, "Presets")."""
+"""Settings of runs much shorter than published (docs/explanation/methods/ga.md, "Presets")."""
 
 GA = MethodSpec(
     name="ga",

@@ -49,6 +49,8 @@ class GBSConfig:
     sh_degree, sh_every, min_sh_every : int
         Final degree of the neutral spherical harmonics; it is raised by one every ``sh_every``
         iterations (published scale), but at least ``min_sh_every`` of the actual run.
+    sh_dc_lr, sh_rest_lr : float
+        Learning rates of the constant term and of the higher degrees of the spherical harmonics.
     difference_sh_degree : int
         Degree up to which the differences change the harmonics.
     difference_..._lr : float

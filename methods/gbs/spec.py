@@ -17,7 +17,7 @@ SHORT: dict[str, Any] = {
     "difference_rotation_lr": 1e-3,
     "difference_opacity_lr": 5e-3,
 }
-"""Learning rates of runs much shorter than published (README.md, "Presets")."""
+"""Learning rates of runs much shorter than published (docs/explanation/methods/gbs.md, "Presets")."""
 SHORT_SPLATS: dict[str, Any] = {
     "initial_opacity": 0.5,
     "final_rate": 0.1,

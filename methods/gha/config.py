@@ -14,6 +14,8 @@ class GHAConfig:
 
     Attributes
     ----------
+    schedule_length : int
+        Iterations of the published run; settings in iterations are on its scale.
     mesh_fraction : float
         Fraction of the budget for the mesh phase.
     unit : float
@@ -74,6 +76,10 @@ class GHAConfig:
         noise regularises the networks there. 0 as published.
     displacement_scale, attribute_scale : float
         Factors of the networks' outputs.
+    initial_opacity : float
+        Opacity of every Gaussian at the start, between 0 and 1.
+    checkpoint_every_s : float
+        Seconds between checkpoints of the training.
     mesh_views, mesh_size : int
         Views of a timestep in one iteration of the mesh phase, and the longer side of their images in
         pixels; smaller images are not resized.

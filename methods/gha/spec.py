@@ -47,7 +47,7 @@ SHORT: dict[str, Any] = {
     "final_rate": 0.1,
     "augment": False,
 }
-"""Settings of the short presets, which scale with the capture, for CPUs (README.md)."""
+"""Settings of the short presets, which scale with the capture, for CPUs (docs/explanation/methods/gha.md)."""
 
 SHORT_PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {

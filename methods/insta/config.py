@@ -41,6 +41,10 @@ class InstaConfig:
 
     Attributes
     ----------
+    schedule_length : int
+        Iterations of the published run; settings in iterations are on its scale.
+    checkpoint_every_s : float
+        Seconds between checkpoints of the training.
     levels, level_features, log2_table, base_resolution, finest_resolution : int
         Multi-resolution hash encoding (Mueller et al., SIGGRAPH 2022): levels, features each (1, 2, 4
         or 8), largest rows per level, samples per side of the unit cube on the first and the last

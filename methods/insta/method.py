@@ -26,7 +26,7 @@ class Insta(TrainedMethod[InstaConfig, InstaAvatar]):
     draws_splats = False
 
     def prepare(self, device: str) -> None:
-        """Raise `InputError` for any device but the CPU; README.md says why."""
+        """Raise `InputError` for any device but the CPU; docs/explanation/methods/insta.md says why."""
         if not SPEC.computes_on(device):
             remedy = "Train and render it with device=cpu."
             raise InputError(f"method {self.name}", "device", " or ".join(SPEC.devices), repr(device), remedy)

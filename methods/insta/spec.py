@@ -33,7 +33,7 @@ SHORT: dict[str, Any] = {
     "learning_rate": 1e-2,
     "final_rate": 0.05,
 }
-"""Settings for a few minutes on two cores (README.md, "Presets")."""
+"""Settings for a few minutes on two cores (docs/explanation/methods/insta.md, "Presets")."""
 
 INSTA = MethodSpec(
     name="insta",

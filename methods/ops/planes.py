@@ -272,7 +272,7 @@ def _shader(from_position: Tensor, of_direction: Tensor, last: Tensor, samples: 
 
     Each coordinate of a direction contributes to the hidden layer through its own waves. The table is interpolated
     linearly: the error of a wave of the highest frequency, 8, is at most 8^2 / (2 SAMPLES^2) = 1e-4 of its amplitude,
-    and more samples would not fit into the first cache level. The README of "ours" has the effect of both on images.
+    and more samples would not fit into the first cache level. The page of "ours" has the effect of both on images.
     """
     of_direction, last = pad_units(of_direction, 1), pad_units(last, 1)
     network = *in_steps(pad_units(from_position, 1)), direction_table(of_direction, samples), last

@@ -1,7 +1,7 @@
 """A plan of the sizes of an avatar of "ours", each with its evidence.
 
 The configured sizes are upper limits; the plan reduces them to what the training data require: no lines without
-changes of expression, no jaw bases without jaw motion, no planes finer than the images. README.md has measurements.
+changes of expression, no jaw bases without jaw motion, no planes finer than the images. docs/explanation/methods/ours.md has measurements.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .field import PLANE_MARGIN, line_box, plane_box
 
 LINE_SAMPLES_PER_PIXEL = 0.5
 SPLATS_PER_PIXEL = 1.0
-"""Splats per pixel of the unrolled surface at the median pixel size; half as many lose 0.2 to 0.5 dB (README.md)."""
+"""Splats per pixel of the unrolled surface at the median pixel size; half as many lose 0.2 to 0.5 dB (docs/explanation/methods/ours.md)."""
 MINIMUM_PLANE, MINIMUM_LINE = 8, 4
 """Minimum number of samples."""
 

@@ -147,6 +147,8 @@ class OuterLayers:
         Number of layers; 0 as published.
     gap : float
         Distance of two layers, metres.
+    opacity : float
+        Opacity of these splats at the start, between 0 and 1.
     """
 
     count: int = 0
@@ -191,7 +193,7 @@ class PlannedCapacity:
         Pixels; smaller motion of the surface is ignored.
     detail : float
         Samples of the planes per pixel, along the longest side of their box. 1 keeps PSNR and LPIPS;
-        0.5 keeps only PSNR, in half the bytes (README.md).
+        0.5 keeps only PSNR, in half the bytes.
     keep : tuple[Planned, ...]
         Sizes that "auto" does not change.
     """
@@ -212,6 +214,8 @@ class OursConfig:
 
     Attributes
     ----------
+    hidden : int
+        Width of the hidden layers of the colour and opacity networks.
     direction_jitter : float
         Standard deviation, radians, of a random rotation of all view directions in each iteration. No
         image shows the colours between the training cameras; jitter of the order of the cameras'

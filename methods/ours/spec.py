@@ -22,7 +22,7 @@ SHORT: dict[str, Any] = {
     "sh_rest_lr": 1e-3,
     "storage": "compact",
 }
-"""Settings of runs much shorter than published (README.md, "Presets")."""
+"""Settings of runs much shorter than published (docs/explanation/methods/ours.md, "Presets")."""
 
 OURS = MethodSpec(
     name="ours",

@@ -24,6 +24,10 @@ class DensifiedTraining:
         Iterations of the published run; every ``..._from`` and ``..._every`` below is on its scale.
     position_lr, position_lr_final : float
         Initial and final rate, log-linear over the run, times the scene extent.
+    opacity_lr, scale_lr, rotation_lr : float
+        Initial learning rates of opacities, scales and rotations of the splats.
+    initial_opacity : float
+        Opacity of every splat at the start, between 0 and 1.
     final_rate : float
         Final learning rate of all other tensors relative to the initial one, log-linear over the last
         half of the run; 1 keeps it constant, as published. A short run lacks the steps to average
@@ -57,6 +61,8 @@ class DensifiedTraining:
         Number of last iterations of the actual run without densification and reset.
     mesh_cache_mb : int
         Memory for the posed meshes of known timesteps.
+    checkpoint_every_s : float
+        Seconds between checkpoints of the training.
     """
 
     schedule_length: int = 600_000
@@ -167,7 +173,7 @@ SHORT_SPLATS: Mapping[str, Any] = {
     "rotation_lr": 0.01,
 }
 """Settings of runs much shorter than published: splats start half opaque, with high learning rates of position, size
-and rotation (`ga/README.md`)."""
+and rotation (`docs/explanation/methods/ga.md`)."""
 
 
 def splat_presets(short: Mapping[str, Any], paper: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

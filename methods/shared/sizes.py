@@ -29,7 +29,7 @@ FRAMES = 48
 HELD_OUT_SHARE = 8
 """Number of parts of each training sequence, of which the last is held out. A whole sequence does not represent the
 others: with one held out, half the expressions seemed enough for `gbs`, and lost 0.7 dB in self-reenactment
-(`gbs/README.md`)."""
+(`docs/explanation/methods/gbs.md`)."""
 LEAST_ITERATIONS = 500
 """Minimum iterations of a trial, if the training has as many, since shorter ones do not show what is learned later."""
 FOLDER = "trials"

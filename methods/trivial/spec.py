@@ -9,7 +9,13 @@ from ...bench.specs import MethodSpec
 
 @dataclass(frozen=True)
 class NearestCameraConfig:
-    """Nearest training image. ``max_timesteps`` limits the number of timesteps, evenly spaced, and the storage."""
+    """Nearest training image.
+
+    Attributes
+    ----------
+    max_timesteps : int | None
+        Maximum number of stored timesteps, evenly spaced, which bounds the storage; None keeps all.
+    """
 
     max_timesteps: int | None = None
 

@@ -44,7 +44,7 @@ class ParitySettings(ExecutionOptions):
 
     device: Literal["cuda", "cpu-shim"] = "cuda"
     """Device of the authors' code: CUDA, or headbench's CPU renderer instead of its rasteriser
-    (methods/official/README.md), which shows differences of training and head model, not of the rasterisers."""
+    (docs/explanation/methods/official.md), which shows differences of training and head model, not of the rasterisers."""
 
     python: str = ""
     """Interpreter for the authors' code, as settings.ga-official.python of `headbench run`. Default with cpu-shim: this one."""
