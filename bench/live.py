@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Self
 
 BLOCKS, ASCII_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 BAR, ASCII_BAR = "█░", "#."
@@ -64,6 +65,11 @@ class Curve:
             self._columns = [a + b for a, b in zip(self._columns[::2], self._columns[1::2], strict=True)]
         self._columns.append([value])
 
+    @property
+    def last(self) -> float:
+        """The value that was added last."""
+        return self._columns[-1][-1]
+
     def text(self, blocks: str = BLOCKS) -> str:
         """The curve, a character for each column. The scale is logarithmic where all values are positive."""
         means = [sum(column) / len(column) for column in self._columns]
@@ -102,7 +108,7 @@ class Display:
         self._curves: dict[str, Curve] = {}
         self._last: dict[str, str] = {}
 
-    def __enter__(self) -> Display:
+    def __enter__(self) -> Self:
         self._live.start()
         return self
 
@@ -126,16 +132,18 @@ class Display:
         done = round(BAR_WIDTH * min(max(position.share, 0.0), 1.0))
         lines = [f"{bar[0] * done}{bar[1] * (BAR_WIDTH - done)} {position.label}"]
         self._curves = {name: curve for name, curve in self._curves.items() if name in position.cells}
-        for name, doing in position.cells.items():
+        for name, doing in list(position.cells.items())[:MOST_CELLS]:
             loss = LOSS.search(doing)
             curve = self._curves.setdefault(name, Curve())
             if loss and self._last.get(name) != doing:
                 curve.add(float(loss[1]))
             self._last[name] = doing
-            shown = curve.text(ASCII_BLOCKS if ascii_only else BLOCKS)
-            lines.append(f"{shown:<{CURVE_WIDTH}} {name}: {doing}")
-        more = len(lines) - 1 - MOST_CELLS
-        return [*lines[: 1 + MOST_CELLS], *([f"{'':{CURVE_WIDTH}} and {more} more"] if more > 0 else [])]
+            blocks = ASCII_BLOCKS if ascii_only else BLOCKS
+            lines.append(f"  {name}: {doing}")
+            if drawn := curve.text(blocks):
+                lines.append(f"  loss {drawn:<{CURVE_WIDTH}} {curve.last:.3g}")
+        more = len(position.cells) - MOST_CELLS
+        return [*lines, f"  and {more} more"] if more > 0 else lines
 
 
 _displays: list[Display] = []

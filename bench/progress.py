@@ -197,7 +197,9 @@ class RunProgress:
         share = at[0] / at[1] if at is not None and at[1] else 0.0
         before = steps.index(step) if step in steps else 0
         share = (index + (before + share) / max(len(steps), 1)) / len(self._names)
-        return Position(text, _text(place, total, "", bound), share, {cell: _text(f"{step}{count}", left, note)})
+        return Position(
+            text, _text(place, total, "", bound), share, {cell: _text(f"{step}{count}", left, note)}
+        )
 
     def _mean(self, step: str, kind: str) -> float | None:
         took = self._took.get((step, kind))
