@@ -75,6 +75,57 @@ def test_the_citation_has_the_version_of_the_package():
     assert (citation["version"], citation["license"]) == (project["version"], project["license"])
 
 
+def test_the_title_of_the_citation_is_that_of_the_package():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    name, _, what = citation["title"].partition(": ")
+    assert name == project["name"]
+    assert project["description"].lower().startswith(what.lower())
+    assert f"## [{project['version']}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+ELSEWHERE = {"docs"}
+"""Targets that are not in the Makefile yet."""
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
+def test_workflows_call_what_exists_and_hold_no_rights(path):
+    workflow = yaml.load(path.read_text(encoding="utf-8"), yaml.BaseLoader)  # noqa: S506 - "on" is no boolean
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    assert workflow["permissions"] == {"contents": "read"}
+    assert "pull_request_target" not in workflow["on"]
+    assert "secrets." not in path.read_text(encoding="utf-8")
+    for job in workflow["jobs"].values():
+        assert int(job["timeout-minutes"]) > 0
+        for step in job["steps"]:
+            assert re.fullmatch(r"[\w-]+/[\w-]+@v\d+", step.get("uses", "a/b@v1"))
+            script = step.get("run", "")
+            assert {*re.findall(r"\bmake ([\w-]+)", script)} <= targets | ELSEWHERE
+            named = re.findall(r"bin/headbench ([a-z]+(?: [a-z]+)?)", script)
+            assert all({name, name.split()[0]} & set(discover("commands")) for name in named)
+            assert (
+                "${{" not in script or "github.repository" in script
+            )  # what others write is no part of a script
+
+
+@pytest.mark.parametrize("name", ["bug.yml", "proposal.yml"])
+def test_issue_forms_have_what_forms_need(name):
+    form = yaml.safe_load((ROOT / ".github" / "ISSUE_TEMPLATE" / name).read_text(encoding="utf-8"))
+    assert {"name", "description", "body"} <= set(form)
+    assert all(field["attributes"]["label"] for field in form["body"])
+
+
+def test_the_hook_checks_what_make_check_does():
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))["repos"]
+    (mypy,) = (hook for repo in hooks for hook in repo["hooks"] if hook["id"] == "mypy")
+    assert mypy["entry"].removeprefix(".venv/bin/") in (ROOT / "Makefile").read_text(encoding="utf-8")
+    locked = re.search(
+        r"^ruff==([\d.]+)", (ROOT / "requirements-dev.txt").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert {repo.get("rev") for repo in hooks} == {f"v{locked[1]}", None}
+
+
 def test_the_container_copies_every_package_and_no_more():
     lines = (ROOT / "Containerfile").read_text(encoding="utf-8").splitlines()
     copied = {word for line in lines if line.startswith("COPY") for word in line.split()[1:-1]}
