@@ -152,7 +152,8 @@ _displays: list[Display] = []
 
 def is_interactive() -> bool:
     """Whether standard error is a terminal on which lines can be written again."""
-    return sys.stderr.isatty() and os.environ.get("TERM", "") not in ("dumb", "unknown")
+    # A display replaces standard error by an object that does not say that it is a terminal.
+    return bool(_displays) or (sys.stderr.isatty() and os.environ.get("TERM", "") not in ("dumb", "unknown"))
 
 
 def current() -> Display | None:

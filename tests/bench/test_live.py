@@ -15,12 +15,15 @@ from headbench.bench.live import BLOCKS, Curve
 PROGRAM = """
 import sys, time
 from headbench.bench import progress, live
-from headbench.bench.progress import log, log_to_terminal, run_progress
+from headbench.bench.progress import log, log_to_terminal, progress as counted, run_progress
 progress.SHOW_EVERY_S = 0
 cells = {"s1 ga": {"training": "ga"}, "s2 ga": {"training": "ga"}}
 with log_to_terminal(), run_progress(cells) as run, run.step("s1 ga", "training") as report:
     for done in range(1, 9):
         report(done, 8, f"loss {1 / done:.4f}")
+    with counted("cells") as cells_done:
+        for loss in (2.0, 1.0):
+            cells_done(1, 3, "2 running", lambda: {"s3/ga": f"training 5 of 9 (loss {loss})", "s3/gbs": "starting"})
     log.info("a message")
     report(8, 8)
     end = sys.argv[1]
@@ -90,6 +93,8 @@ def test_a_terminal_has_one_display_that_goes(end, code, left):
     assert "cell 1 of 2" in text
     assert "s1 ga: training 8 of 8" in text
     assert "loss █" in text
+    assert "cells: 1 of 3 (2 running)\r\n  s3/ga: training 5 of 9 (loss 1.0)\r\n  loss █▁" in text
+    assert "  s3/gbs: starting" in text
     assert "\x1b[?25" not in text  # the cursor is never hidden, so none has to be shown again
     assert screen(text) == left
 
