@@ -1,5 +1,6 @@
 """README and pages: links lead somewhere, commands exist, the CI example fits, the table is generated."""
 
+import json
 import re
 import subprocess
 import tomllib
@@ -8,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from headbench.bench.cli import main
 from headbench.bench.registry import discover
 
 ROOT = Path(__file__).parents[1]
@@ -15,6 +17,8 @@ PACKAGES = ("bench", "datasets", "methods", "metrics", "reports")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [
     ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
     *(path for name in PACKAGES for path in sorted((ROOT / name).rglob("README.md"))),
 ]
 
@@ -25,10 +29,26 @@ def test_links_lead_somewhere(page):
     assert [link for link in links if "://" not in link and not (page.parent / link).exists()] == []
 
 
-def test_the_commands_are_those_of_the_command_line():
-    named = set(re.findall(r"^\| `headbench ([a-z-]+(?: [a-z]+)?)(?: [A-Z]+)?`", README, re.MULTILINE))
+def test_every_command_is_listed_and_named_pages_exist(capsys):
     offered = {p.spec.name for p in discover("commands").values() if p.origin.split()[0] == "headbench"}
-    assert named == offered
+    assert main(["list", "commands", "--json"]) == 0
+    listed = json.dumps(json.loads(capsys.readouterr().out))
+    assert {name for name in offered if f'"{name}"' not in listed} == set()
+    line = re.search(r"## Main commands\n\n(.*?)\n`headbench list", README, re.DOTALL)[1]
+    named = {name.removeprefix("headbench ") for name in re.findall(r"`([^`]+)`", line)}
+    assert named <= offered
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_that_pages_call_exist(page):
+    offered = set(discover("commands"))
+    blocks = re.findall(r"```bash\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    called = re.findall(r"^(?:\w+=\S+ )*headbench ([a-z]+(?: [a-z]+)?)", "\n".join(blocks), re.MULTILINE)
+    assert [name for name in called if not {name, name.split()[0]} & offered] == []
+
+
+def test_the_readme_is_short():
+    assert README.count("\n") <= 150
 
 
 def test_the_ci_example_installs_from_checkouts():
@@ -168,7 +188,8 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
     }
     for name, block in blocks.items():
         begin, end = readme.marks(name)
-        assert README.split(begin)[1].split(end)[0].strip() == block.strip()
+        page = (ROOT / readme.PAGES[name]).read_text(encoding="utf-8")
+        assert page.split(begin)[1].split(end)[0].strip() == block.strip()
 
 
 @pytest.mark.slow
