@@ -18,7 +18,7 @@ from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
 from ..bench.io.files import write_bytes, write_text
 from ..bench.io.images import encode_image, read_png
-from ..bench.protocol import I
+from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from .runs import RunSet
 from .statistics.comparisons import PairedComparison, compare
@@ -140,7 +140,7 @@ def conclusions(runs: RunSet) -> str:
             for pair in compare(runs.rows, pairs, task=task, metric=spec.name, higher_is_better=better):
                 found.setdefault((pair.second, _conclusion(pair)), []).append(spec.label)
         said = [f"{verdict} by {_listed(metrics)}" for (_, verdict), metrics in found.items()]
-        lines.append(f"- {I.get(task, task)}: {'; '.join(said)}.")
+        lines.append(f"- {TASK_TITLES.get(task, task)}: {'; '.join(said)}.")
     how = "Exact sign-flip tests over subjects, corrected by Holm for the pairs of each metric, level 5%. They hold for these subjects and settings."
     return "\n".join(["What may be concluded:", "", *lines, "", how])
 
