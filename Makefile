@@ -122,9 +122,9 @@ baseline: setup
 bench: setup
 	$(BIN)/headbench doctor bench splats
 
-# The README's table and picture are those of the last demo.
+# The documentation's table and picture of the demo are those of the last one.
 readme: demo
-	$(BIN)/python -m headbench.reports.readme demo $(OUT) README.md
+	$(BIN)/python -m headbench.reports.readme demo $(OUT) .
 
 # The committed tree, ready to be built. An index page has no files beside it: with URL, the README's links become
 # absolute and the package names its repository.

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -40,6 +41,9 @@ from .progress import log_to_file
 from .progress import progress as show_progress
 from .registry import get, resolve
 from .specs import CommandResult
+
+if TYPE_CHECKING:
+    from .rows import Rows
 
 Preset = Literal["smoke", "demo", "fast", "paper"]
 
@@ -176,10 +180,32 @@ def _run(config: RunConfig, execution: Execution | None = None, **record: Any) -
     from .engine.run import run as run_comparison
 
     rows = run_comparison(config, execution, **record)
-    text = f"{_table([config.out])}\n\nPictures, tables and everything else: {config.out}"
+    text = f"{_table([config.out])}\n\n{closing(Path(config.out), rows)}"
     return CommandResult(
         text, {"out": config.out, "failed": rows.failed, "means": means(config.out)}, not rows.failed
     )
+
+
+def closing(run: Path, rows: Rows) -> str:
+    """Three lines at the end of a run: where its report is, what the report shows, and commands to try next."""
+    folder, page = shlex.quote(str(run)), run / "report.html"
+    first = f"Report: {page} (for a browser; it needs no network)"
+    if not page.is_file():
+        first = f"Report: none was written, see {run / 'run.log'}; `headbench report {folder} --out {folder}/report.html` tries again"
+    subjects, methods = len(rows.subjects), len(rows.methods)
+    contents = (
+        "tables, every method beside the captured images frame by frame, error maps, curves, worst frames"
+    )
+    failed = "; a training or measurement failed, and the tables say which" if rows.failed else ""
+    second = f"It shows {_counted(methods, 'method')} on {_counted(subjects, 'subject')}: {contents}{failed}."
+    why = [f"`headbench status {folder}` (why something failed)"] if rows.failed else []
+    tried = f"`headbench table {folder} --format latex` (the table for a paper)"
+    tested = f"`headbench compare {folder}` (differences with intervals and tests)"
+    return "\n".join([first, second, f"Next: {'; '.join([*why, tried, tested])}"])
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def _table(runs: Sequence[str], **options: Any) -> str:

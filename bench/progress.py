@@ -1,4 +1,4 @@
-"""Progress display: a bar with the remaining time on a terminal, log lines elsewhere."""
+"""Progress with the remaining time: one live display on a terminal, log lines elsewhere."""
 
 from __future__ import annotations
 
@@ -8,29 +8,27 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
+from . import live
 from .contracts import Progress
 from .io.files import no_link
-
-if TYPE_CHECKING:
-    from tqdm import tqdm
+from .live import Position
 
 LOG_EVERY_S, SHOW_EVERY_S = 15.0, 0.2
-"""Seconds between lines of a log, and between changes of the line on a terminal."""
+"""Seconds between lines of a log, and between changes of the display on a terminal."""
 BASIS_S, SAMPLES, SAMPLE_EVERY_S = 5.0, 60, 1.0
 """Seconds of steps after which their speed is known, number of samples kept, and their distance in
 seconds."""
-Show = Callable[[Callable[[], str]], None]
-"""Shows a line returned by a function if the refresh interval has passed."""
+Show = Callable[[Callable[[], Position]], None]
+"""Shows the position returned by a function if the refresh interval has passed."""
 log = logging.getLogger("headbench")
 
 
 def log_to_terminal() -> AbstractContextManager[None]:
     """Send the messages of headbench's log to the terminal while the block runs."""
-    return _logging(logging.StreamHandler(sys.stderr), "%(message)s")
+    return _logging(live.TerminalHandler(sys.stderr), "%(message)s")
 
 
 def log_to_file(path: Path) -> AbstractContextManager[None]:
@@ -74,15 +72,27 @@ class _LogFile(logging.StreamHandler):
         super().close()
 
 
+class CellProgress(Protocol):
+    """A `Progress` that is also told what each running cell does, by its name. Only a terminal shows that."""
+
+    def __call__(
+        self, done: int, total: int, note: str = "", cells: Callable[[], Mapping[str, str]] = dict
+    ) -> None: ...
+
+
 @contextmanager
-def progress(label: str) -> Iterator[Progress]:
+def progress(label: str) -> Iterator[CellProgress]:
     """Give a `Progress` callback that shows ``label``, the share done and the time left."""
     with _line() as show:
         left = TimeLeft()
 
-        def report(done: int, total: int, note: str = "") -> None:
+        def report(
+            done: int, total: int, note: str = "", cells: Callable[[], Mapping[str, str]] = dict
+        ) -> None:
             left.step(done, total)
-            show(lambda: _text(f"{label}: {done} of {total}", left.seconds, note))
+            text = _text(f"{label}: {done} of {total}", left.seconds, note)
+            running = cells() if live.is_interactive() else {}
+            show(lambda: Position(text, text, done / total if total else 1.0, running))
 
         yield report
 
@@ -116,13 +126,13 @@ class TimeLeft:
 
 @contextmanager
 def run_progress(cells: Mapping[str, Mapping[str, str]]) -> Iterator[RunProgress]:
-    """Show one line for all cells of a run, see `RunProgress`."""
+    """Show the progress of all cells of a run, see `RunProgress`."""
     with _line() as show:
         yield RunProgress(cells, show)
 
 
 class RunProgress:
-    """One line for all cells of a run: the current cell, its step, and the remaining time of the run.
+    """Progress of all cells of a run: the current cell, its step, and the remaining time of both.
 
     The time of a step is estimated from its own count, or, before it starts, from finished steps of the same
     kind. While some steps have no estimate, only a lower bound is shown.
@@ -133,7 +143,7 @@ class RunProgress:
         Steps of each cell, by name and in order, each with its kind (for example the method's name).
         Steps of one name and kind are assumed to take equally long.
     show : Show
-        Shows a line if the refresh interval has passed.
+        Shows a position if the refresh interval has passed.
     """
 
     def __init__(self, cells: Mapping[str, Mapping[str, str]], show: Show):
@@ -154,9 +164,9 @@ class RunProgress:
             if not first:
                 first.append((time.monotonic(), done - 1))
             left.step(done, total)
-            self._show(lambda: self._shown(cell, step, f" {done} of {total}", left.seconds, started, note))
+            self._show(lambda: self._shown(cell, step, (done, total), left.seconds, started, note))
 
-        self._show(lambda: self._shown(cell, step, "", None, started, ""))
+        self._show(lambda: self._shown(cell, step, None, None, started, ""))
         yield report
         seconds = time.monotonic() - started
         if first and steps > first[0][1]:  # steps that an earlier start did would have taken their time, too
@@ -165,7 +175,9 @@ class RunProgress:
         if step in self._cells[cell]:
             self._took.setdefault((step, self._cells[cell][step]), []).append(seconds)
 
-    def _shown(self, cell: str, step: str, count: str, left: float | None, started: float, note: str) -> str:
+    def _shown(
+        self, cell: str, step: str, at: tuple[int, int] | None, left: float | None, started: float, note: str
+    ) -> Position:
         index = self._names.index(cell)
         steps = list(self._cells[cell])
         if left is None and step in steps:
@@ -177,8 +189,17 @@ class RunProgress:
         parts = [left, *(self._mean(*part) for part in ahead)]
         known = [part for part in parts if part is not None]
         bound = "" if len(known) == len(parts) else "more than "
-        text = f"cell {index + 1} of {len(self._names)}, {cell}: {step}{count}"
-        return _text(text, sum(known) if known else None, note, bound)
+        count = "" if at is None else f" {at[0]} of {at[1]}"
+        place = f"cell {index + 1} of {len(self._names)}"
+        total = sum(known) if known else None
+        text = _text(f"{place}, {cell}: {step}{count}", total, note, bound)
+        # A cell's steps count alike, which is enough for a bar.
+        share = at[0] / at[1] if at is not None and at[1] else 0.0
+        before = steps.index(step) if step in steps else 0
+        share = (index + (before + share) / max(len(steps), 1)) / len(self._names)
+        return Position(
+            text, _text(place, total, "", bound), share, {cell: _text(f"{step}{count}", left, note)}
+        )
 
     def _mean(self, step: str, kind: str) -> float | None:
         took = self._took.get((step, kind))
@@ -192,31 +213,26 @@ def _text(text: str, left: float | None, note: str, bound: str = "") -> str:
 
 @contextmanager
 def _line() -> Iterator[Show]:
-    """Return a function that shows a line: replacing the last one on a terminal, as a log line elsewhere."""
-    on_terminal = sys.stderr.isatty()
+    """Return a function that shows a position: in the live display on a terminal, as a log line elsewhere."""
+    on_terminal = live.is_interactive()
     every = SHOW_EVERY_S if on_terminal else LOG_EVERY_S
     last = time.monotonic() - (every if on_terminal else 0.0)
-
-    def show(write: Callable[[str], object], text: Callable[[], str]) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last >= every:
-            last = now
-            write(text())
-
     with ExitStack() as stack:
-        bars: list[tqdm] = []
 
-        def write_over(text: str) -> None:
-            from tqdm import tqdm
-            from tqdm.contrib.logging import logging_redirect_tqdm
+        def show(position: Callable[[], Position]) -> None:
+            nonlocal last
+            now = time.monotonic()
+            if now - last < every:
+                return
+            last = now
+            if not on_terminal:
+                log.info("%s", position().text)
+                return
+            # Made here, since work that shows nothing takes no line; what runs inside other work shares its display.
+            display = live.current() or stack.enter_context(live.displayed())
+            display.show(position())
 
-            if not bars:  # a line in which nothing is shown takes none of the terminal
-                stack.enter_context(logging_redirect_tqdm([log]))
-                bars.append(stack.enter_context(tqdm(bar_format="{desc}", leave=False, dynamic_ncols=True)))
-            bars[0].set_description_str(text)
-
-        yield partial(show, write_over if on_terminal else partial(log.info, "%s"))
+        yield show
 
 
 def duration(seconds: float) -> str:

@@ -47,7 +47,8 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _leave(number: int, frame: FrameType | None = None) -> None:
-    os.write(2, f"headbench: {Interruption(number)}\n".encode())
+    begin = "\n" if os.isatty(2) else ""  # below the display of progress
+    os.write(2, f"{begin}headbench: {Interruption(number)}\n".encode())
     os._exit(Interruption(number).code)
 
 

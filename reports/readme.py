@@ -1,12 +1,13 @@
-"""Writes results into the README: the tables, the demo's picture, and their rows.
+"""Writes results into the README and the documentation: tables, what may be concluded, the demo's picture, and the rows.
 
-python -m headbench.reports.readme demo demo-output README.md
-python -m headbench.reports.readme suite suite-output README.md
+python -m headbench.reports.readme demo demo-output .
+python -m headbench.reports.readme suite suite-output .
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -17,8 +18,10 @@ from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
 from ..bench.io.files import write_bytes, write_text
 from ..bench.io.images import encode_image, read_png
+from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from .runs import RunSet
+from .statistics.comparisons import PairedComparison, compare
 from .suite.suite import suite_report
 from .table_report import table_of, table_text
 from .writers import to_markdown
@@ -27,25 +30,27 @@ GALLERY = "reports/gallery"
 SUITE = f"{GALLERY}/suite"
 PICTURE = "contact_sheet.jpg"
 RESULTS = "results.md"
+PAGES = {"demo": "docs/explanation/results.md", "suite": "README.md"}
+"""The page of each block, in the repository."""
 OURS = "ours"
 
 
-def publish_demo(out: Path, readme: Path) -> None:
-    """Copy manifest, rows and contact sheet of a run to the README's folder, and write its block."""
-    target = RunFolder(readme.parent / GALLERY)
+def publish_demo(out: Path, root: Path) -> None:
+    """Copy manifest, rows and contact sheet of a run to the repository ``root``, and write its block."""
+    target = RunFolder(root / GALLERY)
     _copy(RunFolder(out), target)
     # A page's picture, not a measurement: a lossy copy a third the size.
     path, sheet = target.root / PICTURE, read_png(RunFolder(out).contact_sheet)
     write_bytes(path, encode_image(sheet, path.suffix, (cv2.IMWRITE_JPEG_QUALITY, 90), place=path))
-    _write(readme, "demo", demo_block(target.root))
+    _write(root / PAGES["demo"], "demo", demo_block(target.root))
 
 
-def publish_suite(out: Path, readme: Path) -> None:
-    """Copy manifest and rows of a suite's run to the README's folder, and write its tables and block."""
-    target = readme.parent / SUITE
+def publish_suite(out: Path, root: Path) -> None:
+    """Copy manifest and rows of a suite's run to the repository ``root``, and write its tables and block."""
+    target = root / SUITE
     _copy(RunFolder(out / "run"), RunFolder(target / "run"))
     write_text(target / RESULTS, suite_results(target))
-    _write(readme, "suite", suite_block(target))
+    _write(root / PAGES["suite"], "suite", suite_block(target))
 
 
 def _copy(source: RunFolder, target: RunFolder) -> None:
@@ -59,26 +64,26 @@ def _copy(source: RunFolder, target: RunFolder) -> None:
 
 
 def marks(name: str) -> tuple[str, str]:
-    """Text before and after a block of the README."""
+    """Text before and after a block of a page."""
     return f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
 
 
-def _write(readme: Path, name: str, block: str) -> None:
+def _write(page: Path, name: str, block: str) -> None:
     begin, end = marks(name)
-    text = readme.read_text(encoding="utf-8")
+    text = page.read_text(encoding="utf-8")
     if text.count(begin) != 1 or text.count(end) != 1:
-        raise InputError(readme, "", f"the marks {begin} and {end} once each", "something else")
+        raise InputError(page, "", f"the marks {begin} and {end} once each", "something else")
     before, rest = text.split(begin)
     _, after = rest.split(end)
-    write_text(readme, f"{before}{begin}\n{block}\n{end}{after}")
+    write_text(page, f"{before}{begin}\n{block}\n{end}{after}")
 
 
 DEMO_DIGITS = ("psnr=1", "ssim=3", "lpips=3", "fps=0")
-"""Of the demo's table: further ones change with the processor, as the README states below the table."""
+"""Of the demo's table: further ones change with the processor, as the page states below the table."""
 
 
 def demo_block(gallery: Path) -> str:
-    """Return the README's block for the stored result of the demo: Markdown."""
+    """Return the block for the stored result of the demo: Markdown."""
     record = RunFolder(gallery).read_manifest()
     machine = record.machine
     timed = [(method, value) for method, value in _minutes(gallery) if value is not None]
@@ -87,8 +92,7 @@ def demo_block(gallery: Path) -> str:
         f"Minutes of training: {minutes}, on {machine['cores']} cores ({machine['processor']}); the largest process took "
         f"{(record.peak_memory_bytes or 0) / 1e9:.1f} GB."
     )
-    picture = f"![Ground truth, renders and error maps of every method]({GALLERY}/{PICTURE})"
-    return f"{picture}\n\n{table_text([gallery], 'md', digits=DEMO_DIGITS).strip()}\n\n{cost}"
+    return f"{table_text([gallery], 'md', digits=DEMO_DIGITS).strip()}\n\n{cost}"
 
 
 def _minutes(run_folder: Path) -> list[tuple[str, float | None]]:
@@ -110,18 +114,47 @@ def suite_results(folder: Path) -> str:
 
 
 def suite_block(folder: Path) -> str:
-    """Return the README's block for the stored results of the suite: Markdown."""
+    """Return the block for the stored results of the suite: Markdown."""
     runs = RunSet.read([folder / "run"])
     minutes = [value for _, value in _minutes(folder / "run")]
     hours = sum(value for value in minutes if value is not None) / 60
     interrupted = (
         f", not counting {minutes.count(None)} that were interrupted and continued" if None in minutes else ""
     )
+    shown = runs.only([*runs.ranked, *runs.trivial])
     return (
-        f"{to_markdown(table_of(runs.only([*runs.ranked, *runs.trivial]))).strip()}\n\n"
+        f"{to_markdown(table_of(shown)).strip()}\n\n{conclusions(shown)}\n\n"
         f"[Tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
         f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{interrupted}."
     )
+
+
+def conclusions(runs: RunSet) -> str:
+    """What the rows allow to conclude about `OURS` and every other ranked method: a Markdown list, a line for each task."""
+    pairs = [(OURS, method) for method in runs.ranked if method != OURS]
+    lines = []
+    for task in runs.tasks:
+        found: dict[tuple[str, str], list[str]] = {}
+        for spec in [spec for spec in runs.metrics if spec.name in ("psnr", "ssim", "lpips")]:
+            better = spec.higher_is_better
+            for pair in compare(runs.rows, pairs, task=task, metric=spec.name, higher_is_better=better):
+                found.setdefault((pair.second, _conclusion(pair)), []).append(spec.label)
+        said = [f"{verdict} by {_listed(metrics)}" for (_, verdict), metrics in found.items()]
+        lines.append(f"- {TASK_TITLES.get(task, task)}: {'; '.join(said)}.")
+    how = "Exact sign-flip tests over subjects, corrected by Holm for the pairs of each metric, level 5%. They hold for these subjects and settings."
+    return "\n".join(["What may be concluded:", "", *lines, "", how])
+
+
+def _conclusion(pair: PairedComparison) -> str:
+    if pair.verdict.endswith(" is better"):
+        first, second = f"`{pair.first}`", f"`{pair.second}`"
+        better, worse = (first, second) if pair.verdict.startswith(f"{pair.first} ") else (second, first)
+        return f"{better} is better than {worse}"
+    return f"`{pair.first}` and `{pair.second}`: {pair.verdict}"
+
+
+def _listed(words: Sequence[str]) -> str:
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 PUBLISH = {"demo": publish_demo, "suite": publish_suite}

@@ -1,5 +1,6 @@
 """README and pages: links lead somewhere, commands exist, the CI example fits, the table is generated."""
 
+import json
 import re
 import subprocess
 import tomllib
@@ -8,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from headbench.bench.cli import main
 from headbench.bench.registry import discover
 
 ROOT = Path(__file__).parents[1]
@@ -15,6 +17,8 @@ PACKAGES = ("bench", "datasets", "methods", "metrics", "reports")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = [
     ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
     *(path for name in PACKAGES for path in sorted((ROOT / name).rglob("README.md"))),
 ]
 
@@ -25,10 +29,26 @@ def test_links_lead_somewhere(page):
     assert [link for link in links if "://" not in link and not (page.parent / link).exists()] == []
 
 
-def test_the_commands_are_those_of_the_command_line():
-    named = set(re.findall(r"^\| `headbench ([a-z-]+(?: [a-z]+)?)(?: [A-Z]+)?`", README, re.MULTILINE))
+def test_every_command_is_listed_and_named_pages_exist(capsys):
     offered = {p.spec.name for p in discover("commands").values() if p.origin.split()[0] == "headbench"}
-    assert named == offered
+    assert main(["list", "commands", "--json"]) == 0
+    listed = json.dumps(json.loads(capsys.readouterr().out))
+    assert {name for name in offered if f'"{name}"' not in listed} == set()
+    line = re.search(r"## Main commands\n\n(.*?)\n`headbench list", README, re.DOTALL)[1]
+    named = {name.removeprefix("headbench ") for name in re.findall(r"`([^`]+)`", line)}
+    assert named <= offered
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_that_pages_call_exist(page):
+    offered = set(discover("commands"))
+    blocks = re.findall(r"```bash\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    called = re.findall(r"^(?:\w+=\S+ )*headbench ([a-z]+(?: [a-z]+)?)", "\n".join(blocks), re.MULTILINE)
+    assert [name for name in called if not {name, name.split()[0]} & offered] == []
+
+
+def test_the_readme_is_short():
+    assert README.count("\n") <= 150
 
 
 def test_the_ci_example_installs_from_checkouts():
@@ -75,6 +95,57 @@ def test_the_citation_has_the_version_of_the_package():
     assert (citation["version"], citation["license"]) == (project["version"], project["license"])
 
 
+def test_the_title_of_the_citation_is_that_of_the_package():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    name, _, what = citation["title"].partition(": ")
+    assert name == project["name"]
+    assert project["description"].lower().startswith(what.lower())
+    assert f"## [{project['version']}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+ELSEWHERE = {"docs"}
+"""Targets that are not in the Makefile yet."""
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
+def test_workflows_call_what_exists_and_hold_no_rights(path):
+    workflow = yaml.load(path.read_text(encoding="utf-8"), yaml.BaseLoader)
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    assert workflow["permissions"] == {"contents": "read"}
+    assert "pull_request_target" not in workflow["on"]
+    assert "secrets." not in path.read_text(encoding="utf-8")
+    for job in workflow["jobs"].values():
+        assert int(job["timeout-minutes"]) > 0
+        for step in job["steps"]:
+            assert re.fullmatch(r"[\w-]+/[\w-]+@v\d+", step.get("uses", "a/b@v1"))
+            script = step.get("run", "")
+            assert {*re.findall(r"\bmake ([\w-]+)", script)} <= targets | ELSEWHERE
+            named = re.findall(r"bin/headbench ([a-z]+(?: [a-z]+)?)", script)
+            assert all({name, name.split()[0]} & set(discover("commands")) for name in named)
+            assert (
+                "${{" not in script or "github.repository" in script
+            )  # what others write is no part of a script
+
+
+@pytest.mark.parametrize("name", ["bug.yml", "proposal.yml"])
+def test_issue_forms_have_what_forms_need(name):
+    form = yaml.safe_load((ROOT / ".github" / "ISSUE_TEMPLATE" / name).read_text(encoding="utf-8"))
+    assert {"name", "description", "body"} <= set(form)
+    assert all(field["attributes"]["label"] for field in form["body"])
+
+
+def test_the_hook_checks_what_make_check_does():
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))["repos"]
+    (mypy,) = (hook for repo in hooks for hook in repo["hooks"] if hook["id"] == "mypy")
+    assert mypy["entry"].removeprefix(".venv/bin/") in (ROOT / "Makefile").read_text(encoding="utf-8")
+    locked = re.search(
+        r"^ruff==([\d.]+)", (ROOT / "requirements-dev.txt").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert {repo.get("rev") for repo in hooks} == {f"v{locked[1]}", None}
+
+
 def test_the_container_copies_every_package_and_no_more():
     lines = (ROOT / "Containerfile").read_text(encoding="utf-8").splitlines()
     copied = {word for line in lines if line.startswith("COPY") for word in line.split()[1:-1]}
@@ -117,7 +188,8 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
     }
     for name, block in blocks.items():
         begin, end = readme.marks(name)
-        assert README.split(begin)[1].split(end)[0].strip() == block.strip()
+        page = (ROOT / readme.PAGES[name]).read_text(encoding="utf-8")
+        assert page.split(begin)[1].split(end)[0].strip() == block.strip()
 
 
 @pytest.mark.slow

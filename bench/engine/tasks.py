@@ -22,6 +22,7 @@ from ..executors.settings import Execution, is_speed
 from ..executors.task import Task
 from ..io.documents import checked, read_json
 from ..io.files import write_json
+from ..live import Position
 from ..machine import check_device
 from ..progress import RunProgress
 from ..protocol import Protocol
@@ -34,8 +35,8 @@ from .steps import Job, failed_rows, log_kept, steps_ahead, stored_rows, trained
 from .store import RunFolder
 
 log = logging.getLogger(__name__)
-REPORT_EVERY_S = 10.0
-"""Seconds between progress records of a cell."""
+REPORT_EVERY_S, LOG_EVERY_S = 2.0, 10.0
+"""Seconds between progress records of a cell, which a terminal shows, and between lines of its log."""
 
 
 def execute(
@@ -123,14 +124,18 @@ def cell_task(job: Job, capture: int, folder: RunFolder) -> Task:
 def execute_cell(task: Task, report: Callable[[str], None]) -> None:
     """Run a cell according to the record of its run, without its speed unless the task measures speed."""
     job, metrics = _opened.job(Path(task.root), **task.arguments)
-    last = time.monotonic()
+    reported = logged = time.monotonic()
 
-    def show(text: Callable[[], str]) -> None:
-        nonlocal last
-        if time.monotonic() - last > REPORT_EVERY_S:
-            last = time.monotonic()
-            log.info("%s", words := text().partition(": ")[2])
-            report(words)
+    def show(position: Callable[[], Position]) -> None:
+        nonlocal reported, logged
+        now = time.monotonic()
+        if now - reported < REPORT_EVERY_S:
+            return
+        reported, words = now, position().text.partition(": ")[2]
+        report(words)
+        if now - logged >= LOG_EVERY_S:
+            logged = now
+            log.info("%s", words)
 
     job = replace(job, line=RunProgress({job.name: steps_ahead(job, metrics)}, show))
     try:

@@ -18,8 +18,8 @@ from .results import TaskResult
 from .task import Task
 from .worker import execute_task
 
-STOP_S = 5.0
-"""Time for a worker to terminate, seconds."""
+STOP_S, POLL_S = 5.0, 1.0
+"""Time for a worker to terminate, and between updates of the progress, seconds."""
 
 
 @dataclass(eq=False)
@@ -46,9 +46,9 @@ class Processes:
         self._processes: list[_Process] = []
 
     @property
-    def running(self) -> int:
-        """Number of running tasks."""
-        return sum(process.task is not None for process in self._processes)
+    def running(self) -> Sequence[Task]:
+        """The running tasks."""
+        return [process.task for process in self._processes if process.task is not None]
 
     def submit(self, tasks: Sequence[Task]) -> None:
         """Execute these tasks, in order, after those already queued."""
@@ -59,7 +59,8 @@ class Processes:
     def poll(self, seconds: float) -> list[TaskResult]:
         """Wait at most ``seconds`` for a task to end; return the results of those that ended."""
         self._fill()
-        ready = wait([p.connection for p in self._processes if p.task is not None], seconds)
+        connections = [p.connection for p in self._processes if p.task is not None]
+        ready = wait(connections, min(seconds, POLL_S))
         ended = [self._ended(p) for p in list(self._processes) if p.connection in ready]
         self._fill()
         return ended

@@ -28,8 +28,8 @@ class Executor(Protocol):
     """Runs tasks: in this process, in workers, or on Slurm."""
 
     @property
-    def running(self) -> int:
-        """Number of running tasks."""
+    def running(self) -> Sequence[Task]:
+        """The running tasks."""
 
     def submit(self, tasks: Sequence[Task]) -> None:
         """Start these tasks."""

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from ..machine import processor_count
@@ -68,8 +69,9 @@ class Schedule:
                         executor.submit([again])
                     else:
                         done += 1
-                note = f"{executor.running} running" + (f", {len(failures)} failed" if failures else "")
-                report(done, len(tasks), note)
+                running = executor.running
+                note = f"{len(running)} running" + (f", {len(failures)} failed" if failures else "")
+                report(done, len(tasks), note, partial(_activities, running))
         return failures
 
     def _executor(self, root: Path, tasks: int, device: str) -> Executor:
@@ -99,3 +101,12 @@ class Schedule:
         failures[task.place] = reason
         log.error("%s failed: %s; see %s", task.place, reason, task.folder / TASK_LOG)
         return None
+
+
+def _activities(tasks: Sequence[Task]) -> dict[str, str]:
+    """What each running task does, by its name, as its process or job has recorded."""
+    found = {}
+    for task in tasks:
+        outcome = read_outcome(task.folder)
+        found[task.place] = "starting" if outcome is None else outcome.get("doing", "starting")
+    return found

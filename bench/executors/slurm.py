@@ -97,7 +97,8 @@ class Slurm:
     def __init__(self, root: Path, execution: Execution, speed: bool):
         self._root, self._execution, self._speed = root, execution, speed
         self._jobs: dict[str, _Job] = {}
-        self._running = self._unanswered = 0
+        self._running: list[Task] = []
+        self._unanswered = 0
         self._warned: set[str] = set()
         known = read_submitted(root)
         self._numbers = known["jobs"] if known is not None and known["speed"] == speed else {}
@@ -105,8 +106,8 @@ class Slurm:
         self._strays_gone = False
 
     @property
-    def running(self) -> int:
-        """Number of running jobs."""
+    def running(self) -> Sequence[Task]:
+        """The tasks of running jobs."""
         return self._running
 
     def submit(self, tasks: Sequence[Task]) -> None:
@@ -149,9 +150,9 @@ class Slurm:
             return []
         self._unanswered = 0
         found = []
-        own = [states[job.number] for job in self._jobs.values() if job.number in states]
-        self._running = sum(each.state == "RUNNING" for each in own)
-        for reason in {each.reason for each in own} & STUCK - self._warned:
+        own = [(job.task, states[job.number]) for job in self._jobs.values() if job.number in states]
+        self._running = [task for task, each in own if each.state == "RUNNING"]
+        for reason in {each.reason for _, each in own} & STUCK - self._warned:
             log.warning(WAITING, reason, job_name(self._root))
             self._warned.add(reason)
         for place, job in list(self._jobs.items()):

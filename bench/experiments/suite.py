@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..comparison import closing
 from ..condition import PLAIN, Condition
 from ..contracts import Progress, no_progress
 from ..engine.config import RunConfig, parse_size, resolve_cells, resolve_metrics
@@ -69,8 +70,10 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
         execution=execution,
         progress=progress,
     )
-    failed = run(config, execution).failed
+    rows = run(config, execution)
     text = resolve(get("reports", "suite").implementation)(out / "run", OURS)
     write_text(out / "results.md", text)
-    data = {"out": out, "run": out / "run", "failed": failed}
-    return CommandResult(f"{text}\n{out / 'results.md'}", data, not failed)
+    data = {"out": out, "run": out / "run", "failed": rows.failed}
+    return CommandResult(
+        f"{text}\n{out / 'results.md'}\n\n{closing(out / 'run', rows)}", data, not rows.failed
+    )

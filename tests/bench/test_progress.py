@@ -1,15 +1,13 @@
 """What a waiting person reads: where the work is, and time left only where something is known of it."""
 
-import io
 import logging
 import re
-import sys
 
 import pytest
 
 from headbench.bench import progress as module
 from headbench.bench.engine import run as runner
-from headbench.bench.progress import RunProgress, TimeLeft, duration, progress, run_progress
+from headbench.bench.progress import RunProgress, TimeLeft, duration, progress
 
 
 class Clock:
@@ -46,7 +44,7 @@ def lines(monkeypatch):
 
 
 def progress_of(cells, lines):
-    return RunProgress(cells, lambda text: lines.append(text()))
+    return RunProgress(cells, lambda position: lines.append(position().text))
 
 
 def work(clock, report, total, seconds, start=0, note=""):
@@ -149,20 +147,6 @@ def test_a_stage_that_fails_or_was_not_ahead_is_no_basis(clock, lines):
     with run.step("s3 ga", "training"):
         pass
     assert lines[-1] == "cell 3 of 3, s3 ga: training"
-
-
-def test_on_a_terminal_the_line_is_written_over(clock, monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    with run_progress(cells(("s1", "ga"))) as run, run.step("s1 ga", "training") as report:
-        work(clock, report, 10, 2.0, note="loss 1")
-    shown = terminal.getvalue()
-    assert "\rcell 1 of 1, s1 ga: training 9 of 10" in shown
-    assert "\n" not in shown
 
 
 @pytest.mark.parametrize("subjects", [("subject1", "subject2")])

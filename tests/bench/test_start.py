@@ -196,7 +196,7 @@ USED_BY_COMMANDS = {
         "pycolmap",
         "pydantic",
     ),
-    *("pymeshlab", "safetensors", "scipy", "skimage", "sklearn", "torch", "torchmetrics", "tqdm"),
+    *("pymeshlab", "rich", "safetensors", "scipy", "skimage", "sklearn", "torch", "torchmetrics"),
 }
 
 

@@ -1,8 +1,12 @@
 """What is published of a suite: its run without this machine's folders."""
 
+import pytest
+
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.manifest import PROTOCOLS
 from headbench.reports import readme
+from headbench.reports.runs import RunSet
+from headbench.reports.statistics.comparisons import PairedComparison
 
 
 def test_the_run_of_a_suite_is_published_without_folders(write_run, tmp_path, monkeypatch):
@@ -12,7 +16,7 @@ def test_the_run_of_a_suite_is_published_without_folders(write_run, tmp_path, mo
     write_run("run", {"ga": 30.0, "ours": 31.0})
     monkeypatch.setattr(readme, "suite_results", lambda folder: "tables")
     monkeypatch.setattr(readme, "suite_block", lambda folder: "block")
-    readme.publish_suite(tmp_path, page)
+    readme.publish_suite(tmp_path, page.parent)
     target = page.parent / readme.SUITE
     found = {path.relative_to(target).as_posix() for path in target.rglob("*.json")}
     protocols = {f"run/{PROTOCOLS}/hash-{task}.json" for task in ("novel_view", "self_reenactment")}
@@ -20,3 +24,33 @@ def test_the_run_of_a_suite_is_published_without_folders(write_run, tmp_path, mo
     published = RunFolder(target / "run").read_manifest()
     assert published.protocols == RunFolder(tmp_path / "run").read_manifest().protocols
     assert published.configuration.out == ""
+
+
+@pytest.mark.parametrize(
+    ("difference", "p", "said"),
+    [
+        (1.0, 0.01, "`ours` is better than `ga`"),
+        (-1.0, 0.01, "`ga` is better than `ours`"),
+        (1.0, 0.2, "`ours` and `ga`: cannot be told apart"),
+    ],
+)
+def test_conclusions_name_the_better_method(difference, p, said):
+    values = tuple((f"s{n}", difference) for n in range(10))
+    pair = PairedComparison(
+        "novel_view",
+        "psnr",
+        True,
+        "ours",
+        "ga",
+        differences=values,
+        difference=difference,
+        p_holm=p,
+        family=1,
+    )
+    assert readme._conclusion(pair) == said
+
+
+def test_too_few_subjects_allow_no_conclusion(write_run):
+    text = readme.conclusions(RunSet.read([write_run("run", {"ga": 30.0, "ours": 31.0})]))
+    assert "- Novel view: `ours` and `ga`: not testable with 4 subjects" in text
+    assert "is better" not in text

@@ -1,0 +1,122 @@
+"""The live display: under a real terminal it appears, shows a curve, and leaves nothing behind, however the work ends."""
+
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from headbench.bench.live import BLOCKS, Curve
+
+PROGRAM = """
+import sys, time
+from headbench.bench import progress, live
+from headbench.bench.progress import log, log_to_terminal, progress as counted, run_progress
+progress.SHOW_EVERY_S = 0
+cells = {"s1 ga": {"training": "ga"}, "s2 ga": {"training": "ga"}}
+with log_to_terminal(), run_progress(cells) as run, run.step("s1 ga", "training") as report:
+    for done in range(1, 9):
+        report(done, 8, f"loss {1 / done:.4f}")
+    with counted("cells") as cells_done:
+        for loss in (2.0, 1.0):
+            cells_done(1, 3, "2 running", lambda: {"s3/ga": f"training 5 of 9 (loss {loss})", "s3/gbs": "starting"})
+    log.info("a message")
+    report(8, 8)
+    end = sys.argv[1]
+    if end == "error":
+        raise SystemExit("failed")
+    if end == "interrupt":
+        print("waiting", flush=True)
+        time.sleep(60)
+print("result")
+"""
+
+
+def on_terminal(end):
+    """What a terminal of 100 columns gets from the program, standard output included, and the exit code."""
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100", "LINES": "30"}
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, end], stdin=theirs, stdout=theirs, stderr=theirs, env=environment
+    )
+    os.close(theirs)
+    got, until, interrupted = b"", time.monotonic() + 60, False
+    while time.monotonic() < until:
+        if not select.select([ours], [], [], 1.0)[0]:
+            continue
+        try:
+            part = os.read(ours, 65536)
+        except OSError:  # the other end is closed
+            break
+        got += part
+        if b"waiting" in got and not interrupted:
+            interrupted = True
+            process.send_signal(signal.SIGINT)
+    os.close(ours)
+    return got.decode(), process.wait(60)
+
+
+def screen(text):
+    """The lines that a terminal shows in the end; follows the few sequences that the display uses."""
+    lines, row = [""], 0
+    for part in text.replace("\x1b", "\0\x1b").split("\0"):
+        rest = part
+        if part.startswith("\x1b["):
+            length = next(i for i, c in enumerate(part[2:], 2) if c.isalpha()) + 1
+            code, rest = part[2:length], part[length:]
+            if code.endswith("A"):
+                row -= int(code[:-1] or 1)
+            elif code == "2K":
+                lines[row] = ""
+            else:
+                raise AssertionError(code)
+        for char in rest:
+            if char == "\n":
+                row += 1
+                lines += [""] * (row + 1 - len(lines))
+            elif char != "\r":
+                lines[row] += char
+    return [line for line in lines if line]
+
+
+@pytest.mark.parametrize(
+    ("end", "code", "left"),
+    [("well", 0, ["a message", "result"]), ("error", 1, ["a message", "failed"])],
+)
+def test_a_terminal_has_one_display_that_goes(end, code, left):
+    text, ended = on_terminal(end)
+    assert ended == code
+    assert "cell 1 of 2" in text
+    assert "s1 ga: training 8 of 8" in text
+    assert "loss █" in text
+    assert "cells: 1 of 3 (2 running)\r\n  s3/ga: training 5 of 9 (loss 1.0)\r\n  loss █▁" in text
+    assert "  s3/gbs: starting" in text
+    assert "\x1b[?25" not in text  # the cursor is never hidden, so none has to be shown again
+    assert screen(text) == left
+
+
+def test_an_interrupted_display_goes():
+    text, ended = on_terminal("interrupt")
+    assert ended == -signal.SIGINT
+    shown = screen(text)
+    assert shown[0] == "a message"
+    assert not [line for line in shown if "cell 1 of 2" in line or "loss" in line.split()[:1]]
+
+
+def test_a_pipe_gets_no_control_characters():
+    ended = subprocess.run([sys.executable, "-c", PROGRAM, "well"], check=True, capture_output=True)
+    assert (ended.stderr, ended.stdout) == (b"a message\n", b"result\n")
+
+
+def test_a_curve_keeps_its_width_and_its_shape():
+    curve = Curve(8)
+    for value in range(1000, 0, -1):
+        curve.add(value)
+    drawn = [BLOCKS.index(block) for block in curve.text()]
+    assert len(drawn) <= 8
+    assert drawn == sorted(drawn, reverse=True)
+    assert (drawn[0], drawn[-1]) == (len(BLOCKS) - 1, 0)
