@@ -1,0 +1,38 @@
+"""Cards of methods: what each is, by whom, and how it ran here."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...bench.registry import discover
+from ...bench.specs import MethodSpec
+from ..runs import RunSet
+
+
+def cards_of(runs: RunSet) -> list[dict[str, Any]]:
+    """A card for each method, in the order of the table of the runs.
+
+    Summary, source and citation are those of the registered method of the same name and implementation; a method that is
+    not registered here has none. ``anchor`` is the name of the card in the page.
+    """
+    specs = {name: plugin.spec for name, plugin in discover("methods").items()}
+    cards = []
+    for index, (label, record) in enumerate(runs.records.items()):
+        spec = specs.get(record.name)
+        known = spec if isinstance(spec, MethodSpec) and spec.implementation == record.implementation else None
+        budget = {name: value for name, value in record.budget.items() if value is not None}
+        cards.append(
+            {
+                "anchor": f"method-{index + 1}",
+                "label": label,
+                "name": record.name,
+                "trivial": record.trivial,
+                "summary": known.summary if known else "",
+                "source": known.source if known else "",
+                "bibtex": known.bibtex.strip() if known else "",
+                "version": record.version,
+                "implementation": record.implementation,
+                "budget": ", ".join(f"{value:,} {name}" for name, value in budget.items()),
+            }
+        )
+    return cards
