@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,6 +14,7 @@ from threading import Lock
 from typing import NamedTuple
 
 import cv2
+from PIL import Image
 
 from ...bench.contracts import ByteArray, Clip, FrameKey, Progress
 from ...bench.engine.captures import open_run_clips
@@ -130,6 +132,12 @@ def encode(image: ByteArray, quality: int) -> str:
     """An (H, W, 3) image as the base64 of a WebP."""
     data = encode_image(image, ".webp", (cv2.IMWRITE_WEBP_QUALITY, quality), place="report")
     return base64.b64encode(data).decode("ascii")
+
+
+def size_of(image: str) -> tuple[int, int]:
+    """Width and height of a picture that `encode` made."""
+    with Image.open(io.BytesIO(base64.b64decode(image))) as opened:
+        return opened.size
 
 
 def choose_pictures(

@@ -211,7 +211,7 @@ function layOut() {
 function captionOf(tile, i) {
   const metric = metrics[state.metric];
   if (!tile.index) {
-    const kind = frames[i].p && metric ? frames[i].l ? "lossless" : "lossy" : "";
+    const kind = frames[i].p && frames[i].p[0] >= 0 ? frames[i].l ? "lossless" : "lossy" : "";
     return [make("b", {textContent: TRUTH}), make("span", {className: "less", textContent: kind})];
   }
   const values = frames[i].v[state.metric] || [], value = values[tile.index - 1] ?? null;
@@ -516,9 +516,6 @@ function places() {
   const list = worstOf === "all" ? offered.flatMap(m => moments(bad(m), offered.length > 5 ? 2 : 3).map(([value, i]) => ({value, i, methods: [m]}))) : moments(bad(+worstOf), 10).map(([value, i]) => ({value, i, methods: [+worstOf]}));
   return list.sort((a, b) => b.value - a.value).map(one => ({...one, text: shown(sign * one.value, metric)}));
 }
-const seen = new IntersectionObserver(entries => {
-  for (const {target, isIntersecting} of entries) if (isIntersecting) { seen.unobserve(target); thumbnails(target); }
-}, {rootMargin: "300px"});
 async function thumbnails(button) {
   const {frame, methods} = button, pair = button.querySelectorAll("canvas");
   const wantedPair = methods.length > 1 ? methods.map(m => content(frame, m + 1, false)) : [content(frame, 0, false), content(frame, methods[0] + 1, true)];
@@ -534,10 +531,13 @@ function strip() {
     Object.assign(button, {frame: i, methods});
     button.setAttribute("aria-current", i === state.frame);
     button.addEventListener("click", () => pick(button));
-    seen.observe(button);
     return make("li", {}, button);
   }));
   $("worst-frames").hidden = !metrics.length;
+  fill([...document.querySelectorAll("#worst button")]);
+}
+async function fill(buttons) { // one after the other, so that a scrub meanwhile does not wait
+  for (const button of buttons) if (button.isConnected) await thumbnails(button);
 }
 function pick({frame, methods}) {
   for (const m of methods) if (!state.methods.includes(m)) state.methods = [...state.methods.slice(0, MOST - 1), m];
@@ -645,6 +645,7 @@ if ($("part")) {
   $("part").addEventListener("change", () => showPart(+$("part").value));
 }
 
+$("facts").open = !phone.matches;
 schemes();
 if (frames.length) {
   state.frame = data.opening.frame ?? 0;

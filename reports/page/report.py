@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ...bench.contracts import Progress, no_progress
@@ -18,10 +16,10 @@ from ...bench.engine.scoring import FULL
 from ...bench.engine.store import RunFolder
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_text
-from ...bench.io.provenance import COMPOSITE, source_type, tool
+from ...bench.io.provenance import COMPOSITE, source_type
+from ...bench.io.style import SHAPES, policy_hash, stylesheet
 from ...bench.protocol import TASK_TITLES
 from ...bench.specs import CommandResult, MetricSpec
-from ...bench.io.style import SHAPES, policy_hash, stylesheet
 from ..aggregate import summarise
 from ..compact import compact
 from ..drawing import colour_map
@@ -32,9 +30,9 @@ from ..table_report import COMPARISON, layouts, table_of
 from ..tables import AVATAR_TITLE, TITLES, Table
 from ..writers import render_page
 from .cards import cards_of
-from .frames import Pictures, ShownFrame, choose_pictures, frame_values, worst_frames
+from .frames import Pictures, ShownFrame, choose_pictures, frame_values, size_of, worst_frames
 from .opening import Opening, opening
-from .record import failed_cells, name_of, record_of
+from .record import failed_cells, record_of
 from .settings import MAX_MB, MAX_SPLIT_MB, PageSettings
 from .split import (
     ENTRY_BYTES,
@@ -202,11 +200,13 @@ def _tiles(
 ) -> list[dict[str, Any]]:
     """The opening pictures: ground truth and methods, each with its label, mark, value, and the picture or a reason."""
     tiles: list[dict[str, Any]] = []
-    for label in ("", *first.methods) if first.frame is not None else ():
+    if first.frame is None:
+        return tiles
+    for label in ("", *first.methods):
         place = runs.methods.index(label) + 1 if label else 0
         value = values.get((metrics[0].name, label, first.frame)) if metrics and label else None
         image = pictures.shown[first.frame][place]
-        width, height = (1, 1) if image is None else _size_of(image)
+        width, height = (1, 1) if image is None else size_of(image)
         tiles.append(
             {
                 "label": label or "Ground truth",
@@ -220,12 +220,6 @@ def _tiles(
             }
         )
     return tiles
-
-
-def _size_of(image: str) -> tuple[int, int]:
-    """Width and height of a picture in base64."""
-    decoded = cv2.imdecode(np.frombuffer(base64.b64decode(image), np.uint8), cv2.IMREAD_COLOR)
-    return decoded.shape[1], decoded.shape[0]
 
 
 def _filled(
@@ -381,7 +375,11 @@ FOREST = 120
 def _comparisons(runs: RunSet) -> dict[str, Any]:
     """Paired differences by task and metric, or the reason why they are missing; ``all`` are plain comparisons."""
     if len(runs.ranked) < 2:
-        return {"reason": "A comparison takes two methods that are no trivial baselines.", "groups": [], "all": []}
+        return {
+            "reason": "A comparison takes two methods that are no trivial baselines.",
+            "groups": [],
+            "all": [],
+        }
     specs = {spec.name: spec for spec in runs.metrics}
     settings = CompareSettings(tuple(str(run.folder.root) for run in runs.runs))
     findings = compare_methods(runs, settings)
@@ -431,7 +429,9 @@ def _with_forest(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for line in lines:
         one = line["one"]
         line["forest"] = {
-            "subjects": [(subject, place(value), f"{value:+.4g}") for subject, value in one["differences"].items()],
+            "subjects": [
+                (subject, place(value), f"{value:+.4g}") for subject, value in one["differences"].items()
+            ],
             "mean": place(one["difference"]),
             "low": place(one["low"]),
             "high": place(one["high"]),

@@ -71,7 +71,7 @@ def page(toy_run, tmp_path):
 def numbers(table):
     """Method, then the full value and the text without marks of each cell, of a table of the page."""
     body = [row for row in table[2:] if len(row) > 1]
-    return {row[0][1]: [cell[0] for cell in row[1:]] for row in body}
+    return {row[0][1].strip(): [cell[0] for cell in row[1:]] for row in body}
 
 
 def test_the_tables_show_the_numbers_of_headbench_table(page, write_run):
@@ -94,7 +94,7 @@ def test_parts_are_the_regions_and_sequences_of_the_run(page, write_run):
     face = rows[rows["timestep"] >= 0].assign(region="face", value=rows["value"] + 1)
     Rows.joined([Rows(rows), Rows(face)]).write(run.folder.rows)
     found = page([run.folder.root])
-    titles = [attributes["data-title"] for tag, attributes in found.elements if tag == "article"]
+    titles = [attributes["data-title"] for _, attributes in found.elements if "data-title" in attributes]
     assert titles == ["All frames", "Region: face"]
     expected = json.loads(table_text([run.folder.root], "json", region="face"))
     first = expected["groups"][0][1][0]
@@ -172,10 +172,9 @@ def test_without_renders_the_page_says_so(page, toy_run):
 def test_nothing_refers_to_another_place(page, toy_run):
     found = page()
     for tag, attributes in found.elements:
-        assert tag not in ("link", "img", "iframe", "object", "base", "form")
-        assert not [
-            name for name in attributes if name.startswith("on") or name in ("src", "style", "srcset")
-        ]
+        assert tag not in ("link", "iframe", "object", "base", "form")
+        assert not [name for name in attributes if name.startswith("on") or name in ("style", "srcset")]
+        assert attributes.get("src", "data:image/webp;base64,").startswith("data:image/webp;base64,")
         assert attributes.get("href", "#").startswith("#")
     (policy,) = [
         a["content"] for tag, a in found.elements if a.get("http-equiv") == "Content-Security-Policy"
@@ -190,8 +189,8 @@ def test_hostile_names_stand_as_text(page, write_run):
     found = page([write_run("run", {HOSTILE: 30.0, "other": 31.0})])
     assert found.data["methods"] == [HOSTILE, "other"]
     assert HOSTILE in numbers(found.tables[0])
-    assert [tag for tag, _ in found.elements].count("script") == 3
-    assert "img" not in [tag for tag, _ in found.elements]
+    assert [tag for tag, _ in found.elements].count("script") == 4
+    assert not [a for tag, a in found.elements if tag == "img" and a["src"] == "x"]
 
 
 def test_an_error_cannot_end_the_script_it_stands_in(page, toy_run):
@@ -200,7 +199,7 @@ def test_an_error_cannot_end_the_script_it_stands_in(page, toy_run):
     reason = "</script><script>alert(1)</script>"
     Rows(rows.assign(reason=rows["reason"].where(rows["status"] != "failed", reason))).write(run.folder.rows)
     found = page()
-    assert [tag for tag, _ in found.elements].count("script") == 3
+    assert [tag for tag, _ in found.elements].count("script") == 4
     assert found.data["reasons"] == [reason]
 
 
