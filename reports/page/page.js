@@ -556,6 +556,7 @@ function toggle(m) {
 }
 function update() { controls(); show(); if (worstOf === "apart") strip(); }
 const visible = data.methods.map((_, m) => m).sort((a, b) => data.marks[a] - data.marks[b]);
+let folded = scored.length > 1 && data.trivial.length > 0; // trivial baselines stand behind one button until they are asked for
 function controls() {
   const active = document.activeElement?.id, [task, subject, , camera] = at(), all = frames.map((_, i) => i), box = $("choices");
   const of = (depth, value, rest) => all.filter(i => frames[i].at[depth] === value && rest(frames[i].at));
@@ -563,11 +564,18 @@ function controls() {
   const subjects = unique(all.filter(i => frames[i].at[0] === task).map(i => frames[i].at[1])).sort((a, b) => a - b);
   const cameras = unique(of(0, task, a => a[1] === subject).map(i => frames[i].at[3])).sort((a, b) => a - b);
   const chips = make("div", {className: "chips", role: "group", "aria-label": "Methods shown, four at most"});
-  chips.append(...visible.map((m, n) => {
+  const there = visible.filter(m => !folded || !data.trivial.includes(data.methods[m]) || state.methods.includes(m));
+  chips.append(...there.map(m => {
+    const n = visible.indexOf(m);
     const chip = make("button", {type: "button", className: "chip", id: `chip-${m}`, title: data.methods[m], "aria-pressed": state.methods.includes(m)}, mark(m), make("span", {textContent: data.methods[m]}), n < 9 ? make("kbd", {textContent: n + 1, "aria-hidden": "true"}) : null);
     chip.addEventListener("click", () => toggle(m));
     return chip;
   }));
+  if (there.length < visible.length) {
+    const more = make("button", {type: "button", className: "chip", id: "more", textContent: `+${visible.length - there.length} baselines`});
+    more.addEventListener("click", () => { folded = false; controls(); $(`chip-${visible.find(m => !there.includes(m))}`).focus(); });
+    chips.append(more);
+  }
   const modes = choice(group("mode", "How methods are compared"), "mode", [["side", "Side by side"], ["wipe", "Wipe"]], state.wipe ? "wipe" : "side", value => { state.wipe = value === "wipe"; update(); });
   const errors = make("input", {type: "checkbox", id: "errors", checked: state.errors, role: "switch"});
   errors.addEventListener("change", () => { state.errors = errors.checked; update(); });

@@ -87,6 +87,15 @@ def test_runs_on_the_same_frames_share_a_table(write_run, submit, build):
     assert "<b>" not in page
 
 
+def test_axe_finds_nothing_serious(write_run, submit, build, new_tab, serious):
+    submit(sound(write_run("one", {"mine": 30.0, "slow": 10.0})), "first")
+    _, page = build()
+    tab = new_tab(390, 700)
+    tab.set_content(page)
+    assert serious(tab) == []
+    assert tab.locator("th[aria-sort] button").count() == 1
+
+
 def test_other_frames_make_another_table(write_run, submit, build):
     submit(sound(write_run("one", {"mine": 30.0})), "first")
     submit(sound(write_run("two", {"mine": 31.0}), "96x128"), "second")
