@@ -572,7 +572,7 @@ function controls() {
     return chip;
   }));
   if (there.length < visible.length) {
-    const more = make("button", {type: "button", className: "chip", id: "more", textContent: `+${visible.length - there.length} baselines`});
+    const more = make("button", {type: "button", className: "chip", id: "more", textContent: `+${visible.length - there.length} baseline${visible.length - there.length > 1 ? "s" : ""}`});
     more.addEventListener("click", () => { folded = false; controls(); $(`chip-${visible.find(m => !there.includes(m))}`).focus(); });
     chips.append(more);
   }

@@ -256,7 +256,7 @@ def _limits(runs: RunSet, methods: int, spans: Sequence[Markup], untested: bool)
 
 def _facts(runs: RunSet) -> list[tuple[str, str]]:
     """What was compared, in short lines."""
-    first = runs.runs[0]
+    cores = runs.runs[0].manifest.machine.get("cores", "")
     trivial = f"{in_words(len(runs.trivial))} trivial baseline{'s' * (len(runs.trivial) != 1)}"
     methods = ", ".join(runs.ranked)
     changed = f"{in_words(len(runs.changed))} under other conditions"
@@ -283,7 +283,7 @@ def _facts(runs: RunSet) -> list[tuple[str, str]]:
             "; ".join(filter(None, [methods, changed * bool(runs.changed), trivial * bool(runs.trivial)])),
         ),
         ("Subjects" if len(subjects) > 1 else "Subject", ", ".join(subjects)),
-        ("Frames", ", ".join(frames) + f"; {counted(len(cameras), 'camera')}"),
+        ("Frames", ", ".join(frames) + f"; {counted(len(cameras), 'camera')}" * bool(cameras)),
         ("Images", f"{runs.image_size} pixels" if runs.image_size else ""),
         (
             "Training",
@@ -291,10 +291,7 @@ def _facts(runs: RunSet) -> list[tuple[str, str]]:
                 filter(None, [f"preset {preset}", f"{iterations} iterations" * bool(iterations), seeds])
             ),
         ),
-        (
-            "Machine",
-            ", ".join(filter(None, [runs.machine, f"{first.manifest.machine.get('cores', '')} cores"])),
-        ),
+        ("Machine", ", ".join(filter(None, [runs.machine, cores and f"{cores} cores"]))),
         ("Results of", f"{when.day} {when:%B %Y}" if written else ""),
     ]
     return [(name, text) for name, text in lines if text]

@@ -330,3 +330,11 @@ def test_losses_are_means_of_subjects_with_equal_iterations(page, make_run, firs
 def test_a_run_writes_its_page_beside_the_tables(toy_run):
     assert write_page(toy_run) == [toy_run / "report.html"]
     assert Page(toy_run / "report.html").data["methods"] == ["toy", "failing"]
+
+
+def test_cards_name_the_method_and_its_paper(page, write_run):
+    found = page([write_run("run", {"mine": 30.0, "other": 31.0})])
+    anchors = [a["href"][1:] for tag, a in found.elements if tag == "a" and "#method-" in a.get("href", "")]
+    ids = {attributes["id"] for _, attributes in found.elements if "id" in attributes}
+    assert set(anchors) == {"method-1", "method-2"}
+    assert set(anchors) <= ids
