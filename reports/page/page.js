@@ -346,7 +346,7 @@ $("stage").tabIndex = 0;
 // Drawings: axes with round numbers, labels beside the ends of their lines.
 function ticks(low, high, count = 4) {
   const rough = (high - low) / count || 1, power = 10 ** Math.floor(Math.log10(rough));
-  const by = [1, 2, 5, 10].find(k => k * power >= rough) * power, found = [];
+  const by = [1, 2, 5, 10].find(k => k * power >= 0.7 * rough) * power, found = [];
   for (let i = Math.ceil(low / by); i * by <= high + 1e-9; i++) found.push(+(i * by).toPrecision(10));
   return found;
 }
@@ -392,7 +392,7 @@ function curve() {
       const to = k + 1 < starts.length ? starts[k + 1] : last + 1;
       if (n) svg.append(draw("line", {class: "grid", x1: x(n - 0.5), x2: x(n - 0.5), y1: box.t, y2: H}));
       const room = x(to - 1) - x(n) + (last ? (W - L - R) / last : W) - 4, text = data.sequences[frames[series[n]].at[2]];
-      if (room > 24) svg.append(draw("text", {x: n ? x(n - 0.5) + 5 : x(n), y: H - 5}, short(text, Math.max(3, Math.floor(room / 7)))));
+      if (room > 56) svg.append(draw("text", {x: n ? x(n - 0.5) + 5 : x(n), y: H - 5}, short(text, Math.max(3, Math.floor(room / 7)))));
     });
     for (const m of state.methods) {
       const value = n => frames[series[n]].v[state.metric][m];
