@@ -43,7 +43,7 @@ MIDDLE = 0.9
 
 
 @dataclass
-class Verdict:
+class Conclusions:
     """Texts of the head of a page; ``sentences`` and ``limits`` are HTML."""
 
     title: str
@@ -80,7 +80,7 @@ def verdict(
     metrics: Sequence[MetricSpec],
     comparisons: Sequence[Mapping[str, Any]],
     values: Values,
-) -> Verdict:
+) -> Conclusions:
     """Describe the results of the methods that ``table`` ranks.
 
     Parameters
@@ -93,7 +93,7 @@ def verdict(
         Of `frame_values`, for spans of frames where nothing can be tested.
     """
     ranked = [row.method for row in table.rows if not row.trivial]
-    found = Verdict(title_of(runs), facts=_facts(runs))
+    found = Conclusions(title_of(runs), facts=_facts(runs))
     spans = []
     for task in runs.tasks if metrics else ():
         scores = _scores(runs, ranked, metrics[0], task)
