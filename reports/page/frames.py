@@ -13,7 +13,6 @@ from threading import Lock
 from typing import NamedTuple
 
 import cv2
-import numpy as np
 
 from ...bench.contracts import ByteArray, Clip, FrameKey, Progress
 from ...bench.engine.captures import open_run_clips
@@ -131,13 +130,6 @@ def encode(image: ByteArray, quality: int) -> str:
     """An (H, W, 3) image as the base64 of a WebP."""
     data = encode_image(image, ".webp", (cv2.IMWRITE_WEBP_QUALITY, quality), place="report")
     return base64.b64encode(data).decode("ascii")
-
-
-def size_of(image: str) -> tuple[int, int]:
-    """Width and height of a picture that `encode` made."""
-    content = np.frombuffer(base64.b64decode(image), np.uint8)
-    height, width = np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR)).shape[:2]
-    return width, height
 
 
 def choose_pictures(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from ...bench.engine.scoring import FULL
 from ...bench.engine.store import RunFolder
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_text
+from ...bench.io.images import probe_image
 from ...bench.io.provenance import COMPOSITE, source_type
 from ...bench.io.style import SHAPES, policy_hash, stylesheet
 from ...bench.protocol import TASK_TITLES
@@ -30,7 +32,7 @@ from ..table_report import COMPARISON, layouts, table_of
 from ..tables import AVATAR_TITLE, TITLES, Table
 from ..writers import render_page
 from .cards import cards_of
-from .frames import Pictures, ShownFrame, choose_pictures, frame_values, size_of, worst_frames
+from .frames import Pictures, ShownFrame, choose_pictures, frame_values, worst_frames
 from .opening import Opening, opening
 from .record import failed_cells, record_of
 from .settings import MAX_MB, MAX_SPLIT_MB, PageSettings
@@ -134,6 +136,7 @@ def page_text(
         "failed": failed_cells(runs),
         "source_type": source_type(COMPOSITE),
         "scripts": [(HERE.parent / "sort.js").read_text("utf-8"), (HERE / "page.js").read_text("utf-8")],
+        "ratio": "1000 / 1000",
         "own_style": (HERE / "page.css").read_text("utf-8"),
     }
     data = _data(runs, metrics, values)
@@ -150,6 +153,7 @@ def page_text(
     best = [row.method for row in compact(parts[0].table).rows if not row.trivial]
     first = opening(runs, best, metrics, values, pictures)
     data["opening"] = _opening(runs, first)
+    content["ratio"] = _ratio(runs, first)
     images: list[str] = []
     entries = dict(zip(_frames(runs), data["frames"]))
     for frame in sorted(pictures.shown, key=lambda f: (f.group, f.key.timestep)):  # in viewing order
@@ -191,6 +195,18 @@ def _opening(runs: RunSet, first: Opening) -> dict[str, Any]:
     return {"frame": frame, "methods": [runs.methods.index(label) for label in first.methods]}
 
 
+def _ratio(runs: RunSet, first: Opening) -> str:
+    """Width and height of the opening renders, for the page's style."""
+    for label in first.methods if first.frame is not None else ():
+        run, name = runs.shown[label]
+        path = run.render_path(name, first.frame.task, first.frame.key) if first.frame else None
+        if path is not None:
+            with suppress(InputError):
+                info = probe_image(path)
+                return f"{info.width} / {info.height}"
+    return "3 / 4"
+
+
 def _tiles(
     runs: RunSet,
     first: Opening,
@@ -206,7 +222,6 @@ def _tiles(
         place = runs.methods.index(label) + 1 if label else 0
         value = values.get((metrics[0].name, label, first.frame)) if metrics and label else None
         image = pictures.shown[first.frame][place]
-        width, height = (1, 1) if image is None else size_of(image)
         tiles.append(
             {
                 "label": label or "Ground truth",
@@ -214,8 +229,6 @@ def _tiles(
                 "value": "" if value is None else f"{value:.{metrics[0].digits}f}",
                 "unit": metrics[0].unit if metrics else "",
                 "image": image,
-                "width": width,
-                "height": height,
                 "reason": pictures.reasons[first.frame][place],
             }
         )
@@ -231,8 +244,7 @@ def _filled(
     *,
     apart: bool = False,
 ) -> str:
-    shape = next(((tile["width"], tile["height"]) for tile in tiles if tile["image"] is not None), (3, 4))
-    size = f":root {{ --tiles: {max(1, len(tiles))}; --ratio: {shape[0]} / {shape[1]}; }}\n"
+    size = f":root {{ --tiles: {max(1, len(tiles))}; --ratio: {content['ratio']}; }}\n"
     style = stylesheet() + content["own_style"] + size
     # A page opened from a disk has no origin, so that 'self' matches nothing.
     beside = " 'self' file:" if apart else ""
