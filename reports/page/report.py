@@ -197,9 +197,9 @@ def _opening(runs: RunSet, first: Opening) -> dict[str, Any]:
 
 def _ratio(runs: RunSet, first: Opening) -> str:
     """Width and height of the opening renders, for the page's style."""
-    for label in first.methods if first.frame is not None else ():
+    for label in first.methods:
         run, name = runs.shown[label]
-        path = run.render_path(name, first.frame.task, first.frame.key) if first.frame else None
+        path = None if first.frame is None else run.render_path(name, *first.frame)
         if path is not None:
             with suppress(InputError):
                 info = probe_image(path)

@@ -338,3 +338,14 @@ def test_cards_name_the_method_and_its_paper(page, write_run):
     ids = {attributes["id"] for _, attributes in found.elements if "id" in attributes}
     assert set(anchors) == {"method-1", "method-2"}
     assert set(anchors) <= ids
+
+
+def test_a_card_has_the_citation_of_the_registered_method(page, write_run, change_manifest):
+    from headbench.methods.ga.spec import GA
+
+    run = write_run("run", {"ga": 30.0, "mine": 31.0})
+    assert GA.bibtex not in " ".join(page([run]).texts.values())  # another implementation of that name
+    change_manifest(run, lambda m: [r.update(implementation=GA.implementation) for r in m["methods"]])
+    text = " ".join(page([run]).texts.values())
+    assert text.count(GA.bibtex) == 1
+    assert GA.source in text
