@@ -2,6 +2,7 @@
 const $ = id => document.getElementById(id);
 const data = JSON.parse($("data").textContent);
 const NONE = -1e9, TRUTH = "Ground truth", MOST = 4, names = [TRUTH, ...data.methods];
+const measured = data.metrics.map((_, n) => n).filter(n => data.frames.some(f => f.v[n].some(value => value !== null)));
 const phone = matchMedia("(max-width: 40rem)"), metrics = data.metrics, frames = data.frames;
 document.documentElement.classList.add("scripted");
 
@@ -602,7 +603,7 @@ function play() {
 }
 function tools() {
   const button = (id, text, label, act) => { const made = make("button", {type: "button", className: "plain", id, textContent: text, "aria-label": label}); made.addEventListener("click", act); return made; };
-  const metric = choice(group("metric", "Metric of the curve"), "metric", metrics.map((m, n) => [String(n), m.label]), String(state.metric), value => { state.metric = +value; show(); strip(); });
+  const metric = choice(group("metric", "Metric of the curve"), "metric", measured.map(n => [String(n), metrics[n].label]), String(state.metric), value => { state.metric = +value; show(); strip(); });
   const legend = make("canvas", {id: "legend", width: 256, height: 1, role: "img", "aria-label": "Colours of error maps, from none to the largest"}), colours = legend.getContext("2d");
   data.colours.forEach((c, i) => { colours.fillStyle = `rgb(${c})`; colours.fillRect(i, 0, 1, 1); });
   const scale = make("span", {id: "scale-box", className: "field", hidden: true}, "0", legend, selectOf("", "scale", SCALES.map(v => [v, `${v} levels`]), state.scale, value => { state.scale = value; show(); strip(); }));

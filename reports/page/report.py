@@ -417,7 +417,10 @@ def _comparisons(runs: RunSet) -> dict[str, Any]:
         "all": findings.data["comparisons"],
         "subjects": subjects,
         "level": findings.data["level"],
-        "testable": any("not testable" not in line["texts"][-1] for own in groups.values() for line in own),
+        "testable": any(
+            one["p_holm"] is not None and not one["verdict"].startswith("not testable")
+            for one in findings.data["comparisons"]
+        ),
         "groups": [
             {"title": f"{task}, {what}", "lines": _with_forest(own) if subjects > 1 else own}
             for (task, what), own in groups.items()

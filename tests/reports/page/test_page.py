@@ -5,6 +5,7 @@ from html.parser import HTMLParser
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 
 from headbench.bench.contracts import FrameKey
@@ -349,3 +350,13 @@ def test_a_card_has_the_citation_of_the_registered_method(page, write_run, chang
     text = " ".join(page([run]).texts.values())
     assert text.count(GA.bibtex) == 1
     assert GA.source in text
+
+
+def test_a_missing_metric_makes_no_difference_testable(page, write_run):
+    run = write_run("run", {"good": 30.0, "better": 31.0})
+    rows = pd.read_parquet(run / "rows.parquet")
+    rows.loc[rows["metric"] == "lpips", ["status", "reason"]] = ["missing", "no weights"]
+    rows.to_parquet(run / "rows.parquet", index=False)
+    text = " ".join(page([run]).texts.values())
+    assert "So few subjects cannot show" in text
+    assert "may be said of the subjects of captures like these" not in text
