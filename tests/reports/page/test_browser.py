@@ -95,6 +95,17 @@ def test_frames_follow_keys_and_error_maps(opened, toy_run):
     assert "the training diverged" in tab.locator("#tiles .reason").nth(2).text_content()
 
 
+def test_play_steps_through_the_frames(opened, toy_run):
+    tab = opened(toy_run)
+    pixels(tab, "toy")
+    before = tab.locator("#where").text_content()
+    tab.keyboard.press(" ")
+    assert tab.locator("#play").get_attribute("aria-label") == "Pause"
+    changed(tab, "where", before)
+    tab.keyboard.press(" ")
+    assert tab.locator("#play").get_attribute("aria-label") == "Play the frames"
+
+
 def test_the_held_key_t_shows_the_truth_everywhere(opened, toy_run):
     tab = opened(toy_run)
     truth, render = pixels(tab, "Ground truth"), pixels(tab, "toy")
