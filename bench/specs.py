@@ -123,6 +123,8 @@ class MethodSpec:
         Version of the results. Raise it with each change of the code that changes results: a finished
         avatar is kept as long as version, settings and data are the same. After a change of the code,
         methods of this package give a warning; a run with an external plug-in is refused.
+    source, bibtex : str, str
+        The paper that describes the method, in words and as a BibTeX entry; "" for none.
     trivial : bool
         Whether it is a trivial baseline that every method should beat; shown in tables, never ranked.
     default : bool
@@ -154,6 +156,7 @@ class MethodSpec:
     native: bool = True
     version: str = "1"
     source: str = ""
+    bibtex: str = ""
     trivial: bool = False
     default: bool = False
     demo: bool = False

@@ -23,7 +23,7 @@ from ..bench.registry import unknown
 from ..bench.specs import MetricSpec
 from ..bench.streams import on_terminal
 from .runs import WHOLE, FrameSelection, RunSet
-from .tables import AVATAR_TITLE, RowGroup, Table, TableCell, TableRow, build_table
+from .tables import AVATAR_TITLE, TITLES, RowGroup, Table, TableCell, TableRow, build_table
 from .writers import WRITERS, column_name, to_text
 
 NAMES = {
@@ -238,7 +238,6 @@ def with_published(table: Table, layout: str, records: Mapping[str, MethodRecord
 
 
 COMPARISON = "comparison"
-TITLES = {"speed": "Speed", "cost": "Storage and training"}
 
 
 def write_tables(run_folder: Path) -> list[Path]:

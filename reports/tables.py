@@ -187,6 +187,8 @@ class Table:
 
 PUBLISHED = "Columns headed published: figures from papers, of other data and code, not comparable."
 AVATAR_TITLE = "Avatar"
+TITLES = {"speed": "Speed", "cost": "Storage and training"}
+"""Titles of layouts whose columns belong to no task."""
 METHODS_TITLE = "Methods"
 TRIVIAL_TITLE = "Trivial baselines (not ranked)"
 SUSPECT_TITLE = "Suspect: better than any method that has not seen the frames (not ranked)"

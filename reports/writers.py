@@ -13,7 +13,10 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from .tables import Column, Table, TableCell
+from ..bench.io.provenance import tool
+from ..bench.io.style import SHAPES, stylesheet
+from .compact import compact
+from .tables import TITLES, Column, Table, TableCell
 
 MARKDOWN_RANKS = {1: ("**", "**"), 2: ("<ins>", "</ins>"), 3: ("*", "*")}
 
@@ -218,12 +221,13 @@ def _latex_cell(cell: TableCell) -> str:
 
 
 def to_html(table: Table) -> str:
-    """Write one page that needs no script, font or network. Values in full precision stand in tooltips."""
-    return render_page("table.html", table=table)
+    """Write one page that needs no script, font or network, the best rows first. Values in full precision stand in tooltips."""
+    heading = " and ".join(task.title.lower() if i else task.title for i, task in enumerate(table.tasks))
+    return render_page("table.html", table=table, heading=heading or TITLES.get(table.name, "Comparison"))
 
 
 def render_page(template: str, **content: Any) -> str:
-    """Fill an HTML template of this package; text is escaped."""
+    """Fill an HTML template of this package, with the shared style as ``look``; text is escaped."""
     from jinja2 import Environment, FileSystemLoader
 
     here = Path(__file__).parent
@@ -232,8 +236,16 @@ def render_page(template: str, **content: Any) -> str:
         keep_trailing_newline=True,
         loader=FileSystemLoader([here, here / "leaderboard", here / "page"]),
     )
+    shared = {
+        "look": stylesheet(),
+        "shapes": SHAPES,
+        "sort": (here / "sort.js").read_text("utf-8"),
+        "tool": tool(),
+    }
     ranks = {1: "first", 2: "second", 3: "third"}
-    return environment.get_template(template).render(spans=_spans, ranks=ranks, **content)
+    return environment.get_template(template).render(
+        **shared | content, spans=_spans, ranks=ranks, compact=compact
+    )
 
 
 FORMULA_STARTS = ("=", "+", "-", "@")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from ...bench.executors.settings import check_executor
 from ...bench.io.files import entries, write_text
 from ...bench.specs import CommandResult
 from ..runs import RunSet
+from ..statistics.comparisons import counted
 from ..table_report import table_of
 from ..tables import RowGroup, Table
 from ..writers import escape_markdown, render_page, to_markdown
@@ -106,6 +108,7 @@ def build(settings: LeaderboardSettings, progress: Progress = no_progress) -> Co
             raise errors[0]
         boards = _boards(submissions)
         content = {"title": settings.title, "boards": boards, "heads": HEADS, "refused": refused}
+        content["summary"] = _summary(submissions, boards)
         write_text(out / "leaderboard.md", _markdown(boards, settings.title, refused))
         write_text(out / "leaderboard.html", render_page("leaderboard.html", **content))
     text = f"{len(files)} bundles, {len(boards)} tables: {out / 'leaderboard.md'}, {out / 'leaderboard.html'}"
@@ -118,6 +121,13 @@ def build(settings: LeaderboardSettings, progress: Progress = no_progress) -> Co
         "refused": refused,
     }
     return CommandResult(text, data)
+
+
+def _summary(submissions: Sequence[Submission], boards: Sequence[Board]) -> str:
+    """One sentence: how many bundles and tables, and by what their values are supported."""
+    states = [f"{n} {state.lower()}" for state, n in Counter(each.state for each in submissions).items()]
+    bundles, tables = counted(len(submissions), "bundle"), counted(len(boards), "table")
+    return f"{bundles} in {tables}, one for each set of frames: {', '.join(states)}."
 
 
 def _boards(submissions: Sequence[Submission]) -> list[Board]:

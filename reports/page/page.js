@@ -1,19 +1,18 @@
 "use strict";
 const $ = id => document.getElementById(id);
-const data = JSON.parse($("data").textContent), images = JSON.parse($("images").textContent);
-const NONE = -1e9, GROUND = "Ground truth", names = [GROUND, ...data.methods];
-// Okabe and Ito's colours, trivial baselines after the others; yellow, faint on white, last.
-const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c", "#c9b800"];
-const trivial = name => data.trivial.includes(name), turns = [...data.methods].sort((a, b) => trivial(a) - trivial(b));
-const turn = m => turns.indexOf(data.methods[m]), colour = m => COLOURS[turn(m) % COLOURS.length];
-const dash = m => ["", "7 3", "2 3"][Math.floor(turn(m) / COLOURS.length) % 3];
-const PARTS = [["Task", data.tasks], ["Subject", data.subjects], ["Sequence", data.sequences], ["Camera", data.cameras]];
+const data = JSON.parse($("data").textContent);
+const NONE = -1e9, TRUTH = "Ground truth", MOST = 4, names = [TRUTH, ...data.methods];
+const measured = data.metrics.map((_, n) => n).filter(n => data.frames.some(f => f.v[n].some(value => value !== null)));
+const phone = matchMedia("(max-width: 40rem)"), metrics = data.metrics, frames = data.frames;
 document.documentElement.classList.add("scripted");
 
 function make(name, properties, ...children) {
   const element = document.createElement(name);
-  Object.assign(element, properties);
-  element.append(...children);
+  for (const [key, value] of Object.entries(properties || {})) {
+    if (key.includes("-") || key === "role") element.setAttribute(key, value);
+    else element[key] = value;
+  }
+  element.append(...children.filter(child => child !== null));
   return element;
 }
 function draw(name, attributes, text) {
@@ -22,83 +21,102 @@ function draw(name, attributes, text) {
   if (text !== undefined) element.textContent = text;
   return element;
 }
-function options(select, texts, chosen) {
-  select.replaceChildren(...texts.map(([value, text]) => make("option", {value, textContent: text})));
-  if (chosen !== undefined) select.value = chosen;
-}
-const short = text => text.length > 28 ? text.slice(0, 26) + "…" : text;
-const numbered = texts => texts.map((text, index) => [index, text]);
-
-for (const box of document.querySelectorAll("div.wide:not([role])")) { // scrolled by keys, too
-  const title = box.parentElement.dataset.title || box.previousElementSibling?.textContent || "Table";
-  Object.entries({role: "region", tabindex: 0, "aria-label": title}).forEach(pair => box.setAttribute(...pair));
-}
-// Tables: sorted by a column within methods and within baselines; the part of the frames.
-for (const table of document.querySelectorAll("table:not(.text)")) {
-  const heads = [...table.tHead.rows[table.tHead.rows.length - 1].cells];
-  heads.forEach((head, column) => {
-    const button = make("button", {type: "button"});
-    button.append(...head.childNodes);
-    head.append(button);
-    button.addEventListener("click", () => {
-      const rising = head.getAttribute("aria-sort") === "descending" || (column === 0 && !head.hasAttribute("aria-sort"));
-      heads.forEach(other => other.removeAttribute("aria-sort"));
-      head.setAttribute("aria-sort", rising ? "ascending" : "descending");
-      for (const body of table.tBodies) {
-        const rows = [...body.rows].filter(row => !row.classList.contains("group"));
-        const key = row => column ? parseFloat(row.cells[column].title) : row.cells[0].textContent;
-        const missing = row => column !== 0 && Number.isNaN(key(row));
-        const order = (a, b) => (key(a) < key(b) ? -1 : key(a) > key(b) ? 1 : 0) * (rising ? 1 : -1);
-        rows.sort((a, b) => missing(a) - missing(b) || (missing(a) ? 0 : order(a, b)));
-        body.append(...rows);
-      }
-    });
-  });
-}
-const parts = [...document.querySelectorAll(".part")];
-options($("part"), parts.map((part, index) => [index, part.dataset.title]));
-const showPart = () => parts.forEach((part, index) => part.classList.toggle("chosen", index === +$("part").value));
-$("part").addEventListener("change", showPart);
-showPart();
-
-// Frames: which are there, and which one is shown.
-const frames = data.frames, selects = [];
-let series = [], moments = [], now = null, timer = 0;
-const matching = depth => frames.filter(f => selects.slice(0, depth).every((s, i) => f.at[i] === +s.value));
-PARTS.forEach(([title, texts], depth) => {
-  const select = make("select", {id: title.toLowerCase()});
-  selects.push(select);
-  $("choice").append(make("label", {}, title + " ", select));
-  select.addEventListener("change", () => choose(depth + 1));
-});
-function choose(depth, wanted) {
-  const before = now;
-  for (let d = depth; d < PARTS.length; d++) {
-    const there = new Set(matching(d).map(f => f.at[d]));
-    const old = wanted ? wanted.at[d] : +selects[d].value;
-    options(selects[d], numbered(PARTS[d][1]).filter(([index]) => there.has(index)));
-    if (there.has(old)) selects[d].value = old;
-  }
-  series = matching(PARTS.length).sort((a, b) => a.at[4] - b.at[4]);
-  moments = series.filter(f => f.p);
-  if (!moments.length) moments = series;
-  $("scrub").max = Math.max(0, moments.length - 1);
-  show(wanted || nearest(before ? before.at[4] : -1));
-}
-const nearest = t => moments.reduce((best, f) => !best || Math.abs(f.at[4] - t) < Math.abs(best.at[4] - t) ? f : best, null);
-function go(frame) {
-  PARTS.forEach(([, texts], d) => { options(selects[d], numbered(texts)); selects[d].value = frame.at[d]; });
-  choose(0, frame);
-  $("viewer").scrollIntoView({block: "start"});
-}
-function step(by) {
-  if (moments.length) show(moments[(moments.indexOf(now) + by + moments.length) % moments.length]);
-}
+const short = (text, most = 24) => text.length > most ? text.slice(0, most - 1) + "…" : text;
 const shown = (value, metric) => value === null ? "–" : `${value.toFixed(metric.digits)} ${metric.unit}`.trim();
+const shape = m => data.shapes[data.marks[m] % data.shapes.length], tint = m => `m${data.marks[m] % data.shapes.length}`;
+const hollow = m => data.marks[m] >= data.shapes.length ? " hollow" : "";
+function mark(m) {
+  const svg = draw("svg", {class: `mark ${tint(m)}${hollow(m)}`, viewBox: "0 0 12 12", "aria-hidden": "true"});
+  svg.append(draw("path", {d: shape(m)}));
+  return svg;
+}
+const markAt = (m, x, y, size = 11) => draw("path", {d: shape(m), class: `shape ${tint(m)}${hollow(m)}`, transform: `translate(${x - size / 2} ${y - size / 2}) scale(${size / 12})`});
+const dashes = m => data.marks[m] % 2 ? "6 3" : "none";
+function choice(box, name, texts, chosen, act) { // a group of radio buttons
+  box.append(...texts.map(([value, text]) => {
+    const input = make("input", {type: "radio", name, value, checked: value === chosen});
+    input.addEventListener("change", () => act(value));
+    return make("label", {}, input, make("span", {textContent: text}));
+  }));
+  return box;
+}
+const check = (name, value) => { for (const input of document.querySelectorAll(`input[name="${name}"]`)) input.checked = input.value === String(value); };
+function selectOf(title, id, texts, chosen, act) {
+  const select = make("select", {id});
+  select.append(...texts.map(([value, text]) => make("option", {value, textContent: text})));
+  select.value = chosen;
+  select.addEventListener("change", () => act(+select.value));
+  return make("label", {className: "field"}, make("span", {textContent: title}), select);
+}
+const group = (id, title) => make("fieldset", {className: "choice", id}, make("legend", {className: "unseen", textContent: title}));
+const say = text => { $("status").textContent = text; };
+
+// What is shown. Frames of a task, subject and camera stand in order of sequences and time.
+const state = {frame: 0, methods: [], metric: 0, wipe: false, against: 0, border: 0.5, errors: false, scale: 50, zoom: 1, x: 0, y: 0, keys: true};
+const at = () => frames[state.frame].at;
+const unique = list => [...new Set(list)];
+let series = [], stops = [], timer = 0, held = false;
+const order = (a, b) => frames[a].at[2] - frames[b].at[2] || frames[a].at[4] - frames[b].at[4];
+function collect() {
+  const [task, subject, , camera] = at();
+  series = frames.map((_, i) => i).filter(i => frames[i].at[0] === task && frames[i].at[1] === subject && frames[i].at[3] === camera).sort(order);
+  stops = series.filter(i => frames[i].p);
+  if (!stops.length) stops = series;
+}
+function nearest(place) { // of the frames with pictures, the one nearest to a place in the series
+  return stops.reduce((best, i) => Math.abs(series.indexOf(i) - place) < Math.abs(series.indexOf(best) - place) ? i : best, stops[0]);
+}
+function closest(list, wanted) { // of some frames, one like the current one, with pictures if there is any
+  const [, subject, sequence, camera, timestep] = wanted;
+  const cost = i => (frames[i].p ? 0 : 1e9) + (frames[i].at[1] !== subject) * 1e7 + (frames[i].at[3] !== camera) * 1e6 + (frames[i].at[2] !== sequence) * 1e5 + Math.abs(frames[i].at[4] - timestep);
+  return list.reduce((best, i) => cost(i) < cost(best) ? i : best, list[0]);
+}
+const where = i => {
+  const [, subject, sequence, camera, timestep] = frames[i].at, camera_ = data.cameras[camera];
+  return `${data.subjects.length > 1 ? data.subjects[subject] + " " : ""}${data.sequences[sequence]} ${timestep}, camera ${camera_.length > 5 ? "…" + camera_.slice(-3) : camera_}`;
+};
+
+// The address holds the state, so that a view can be sent.
+let waiting = 0;
+function remember() {
+  clearTimeout(waiting);
+  waiting = setTimeout(() => {
+    const [task, subject, sequence, camera, timestep] = at(), words = new URLSearchParams();
+    Object.entries({task: data.tasks[task], subject: data.subjects[subject], sequence: data.sequences[sequence], camera: data.cameras[camera], timestep}).forEach(([key, value]) => words.set(key, value));
+    for (const m of state.methods) words.append("method", data.methods[m]);
+    if (metrics[state.metric]) words.set("metric", metrics[state.metric].label);
+    if (state.errors) words.set("errors", state.scale);
+    if (state.wipe) { words.set("wipe", names[state.against]); words.set("border", state.border.toFixed(3)); }
+    if (state.zoom > 1) words.set("zoom", [state.zoom, state.x, state.y].map(v => +v.toFixed(4)).join("_"));
+    if (!state.keys) words.set("keys", "off");
+    try { history.replaceState(null, "", "#" + words); } catch { /* a frame without an address of its own */ }
+  }, 300);
+}
+function recall() {
+  if (!location.hash.includes("=")) return false;
+  const words = new URLSearchParams(location.hash.slice(1));
+  const place = [["task", data.tasks], ["subject", data.subjects], ["sequence", data.sequences], ["camera", data.cameras]].map(([key, texts]) => texts.indexOf(words.get(key)));
+  const found = frames.findIndex(f => place.every((p, i) => f.at[i] === p) && f.at[4] === +words.get("timestep"));
+  if (found < 0) return false;
+  state.frame = found;
+  const methods = words.getAll("method").map(name => data.methods.indexOf(name)).filter(m => m >= 0).slice(0, MOST);
+  if (methods.length) state.methods = unique(methods);
+  state.metric = Math.max(0, metrics.findIndex(m => m.label === words.get("metric")));
+  state.errors = words.has("errors");
+  if (SCALES.includes(+words.get("errors"))) state.scale = +words.get("errors");
+  state.wipe = words.has("wipe");
+  state.against = Math.max(0, names.indexOf(words.get("wipe")));
+  state.border = Math.min(1, Math.max(0, +(words.get("border") ?? 0.5) || 0));
+  const [zoom, x, y] = (words.get("zoom") || "1_0_0").split("_").map(Number);
+  if ([zoom, x, y].every(Number.isFinite)) Object.assign(state, {zoom: Math.min(32, Math.max(1, zoom)), x, y});
+  state.keys = words.get("keys") !== "off";
+  return true;
+}
+const SCALES = [10, 20, 32, 50, 100, 255];
 
 // Pictures in files beside the page: each file is a script that calls addPictures. The last few are kept.
-const files = new Map();
-const wanted = {};
+const files = new Map(), wanted = {};
+let images = null;
 function addPictures(file, pictures) { wanted[file](pictures); }
 function fileOf(file) {
   if (!files.has(file)) {
@@ -114,13 +132,12 @@ function fileOf(file) {
   return files.get(file);
 }
 async function bytesOf(index) {
-  if (!data.files.length) return images[index];
+  if (!data.files.length) return (images ??= JSON.parse($("images").textContent))[index];
   let file = 0;
   for (; index >= data.files[file][1]; file++) index -= data.files[file][1];
   return (await fileOf(file))[index];
 }
-// Pictures, decoded once and kept for a while.
-const decoded = new Map();
+const decoded = new Map(); // kept for a while
 function picture(index) {
   if (!decoded.has(index)) {
     decoded.set(index, bytesOf(index).then(text => {
@@ -133,287 +150,530 @@ function picture(index) {
   }
   return decoded.get(index);
 }
-const views = [];
-let zoom = 1, left = 0, top_ = 0;
-function view(parent, title) {
-  const canvas = make("canvas", {width: 1, height: 1}), reason = make("p", {className: "reason"});
-  const box = make("div", {className: "view"}, canvas, reason), caption = make("figcaption");
-  canvas.setAttribute("role", "img");
-  parent.append(make("figure", {}, box, caption));
-  const own = {canvas, reason, box, caption, title};
-  views.push(own);
-  let from = null;
-  box.addEventListener("pointerdown", e => { if (zoom > 1) { from = [e.clientX, e.clientY]; box.setPointerCapture(e.pointerId); } });
-  box.addEventListener("pointermove", e => {
-    if (!from) return;
-    left += (e.clientX - from[0]) / box.clientWidth;
-    top_ += (e.clientY - from[1]) / box.clientHeight;
-    from = [e.clientX, e.clientY];
-    place();
-  });
-  for (const end of ["pointerup", "pointercancel"]) box.addEventListener(end, () => { from = null; });
-  box.addEventListener("dblclick", e => {
-    const r = box.getBoundingClientRect();
-    zoomBy(2, (e.clientX - r.left) / r.width, (e.clientY - r.top) / r.height);
-  });
-  box.addEventListener("wheel", e => {
-    if (!e.ctrlKey && zoom === 1) return; // the page scrolls
-    e.preventDefault();
-    const r = box.getBoundingClientRect();
-    zoomBy(e.deltaY < 0 ? 1.25 : 0.8, (e.clientX - r.left) / r.width, (e.clientY - r.top) / r.height);
-  }, {passive: false});
-  return own;
-}
-function place() {
-  left = Math.min(0, Math.max(1 - zoom, left));
-  top_ = Math.min(0, Math.max(1 - zoom, top_));
-  for (const {canvas, box} of views) {
-    canvas.style.transform = `translate(${100 * left}%, ${100 * top_}%) scale(${zoom})`;
-    box.classList.toggle("near", zoom >= 2);
-    box.style.touchAction = zoom > 1 ? "none" : "pan-y";
-  }
-}
-function zoomBy(factor, x = 0.5, y = 0.5) {
-  const next = Math.min(32, Math.max(1, zoom * factor));
-  left = x - (x - left) * next / zoom;
-  top_ = y - (y - top_) * next / zoom;
-  zoom = next;
-  place();
-}
-function whole() { zoom = 1; place(); }
-
 function pixels(image) {
-  const canvas = make("canvas", {width: image.width, height: image.height});
-  const context = canvas.getContext("2d", {willReadFrequently: true});
+  const canvas = make("canvas", {width: image.width, height: image.height}), context = canvas.getContext("2d", {willReadFrequently: true});
   context.drawImage(image, 0, 0);
   return context.getImageData(0, 0, image.width, image.height);
 }
-function errorMap(truth, image) {
-  const a = pixels(truth).data, made = pixels(image), b = made.data, scale = 255 / (3 * +$("scale").value);
+function errorMap(truth, image) { // absolute differences, mean over channels, on the colour scale
+  const a = pixels(truth).data, made = pixels(image), b = made.data, scale = 255 / (3 * state.scale);
   for (let i = 0; i < b.length; i += 4) {
     const sum = Math.abs(a[i] - b[i]) + Math.abs(a[i + 1] - b[i + 1]) + Math.abs(a[i + 2] - b[i + 2]);
     const c = data.colours[Math.min(255, Math.round(sum * scale))];
     b[i] = c[0]; b[i + 1] = c[1]; b[i + 2] = c[2];
   }
-  return made;
+  const canvas = make("canvas", {width: made.width, height: made.height});
+  canvas.getContext("2d").putImageData(made, 0, 0);
+  return canvas;
 }
-// What a panel shows: a picture (or an error map of it), or why there is none.
-async function content(frame, index, errors) {
-  const at = frame.p ? frame.p[index] : NONE;
-  if (at < 0) return {reason: at === NONE ? "No pictures of this frame in this file." : data.reasons[-1 - at]};
+// What a tile shows: a picture or an error map of it (something to draw), or why there is none.
+async function content(i, index, errors) {
+  const frame = frames[i], place = frame.p ? frame.p[index] : NONE;
+  if (place < 0) return {reason: place === NONE ? "This frame has values but no pictures in this file." : data.reasons[-1 - place]};
   try {
-    const image = await picture(at);
+    const image = await picture(place);
     if (!errors || index === 0) return {image};
-    return frame.p[0] < 0 ? {reason: "No error map without ground truth."} : {map: errorMap(await picture(frame.p[0]), image)};
+    return frame.p[0] < 0 ? {reason: "No error map without ground truth."} : {image: errorMap(await picture(frame.p[0]), image)};
   } catch (error) {
     return {reason: error.message};
   }
 }
-function paint(own, {image, map, reason}) {
-  own.reason.textContent = reason || "";
-  own.reason.hidden = !reason;
-  const size = image || map;
-  if (size) { own.canvas.width = size.width; own.canvas.height = size.height; }
-  const context = own.canvas.getContext("2d");
-  if (image) context.drawImage(image, 0, 0);
-  else if (map) context.putImageData(map, 0, 0);
-  else context.clearRect(0, 0, own.canvas.width, own.canvas.height);
-  return size;
-}
-const panels = names.map(name => view($("panels"), name)), pair = view($("pair"), "");
-async function show(frame) {
-  now = frame;
-  if (!frame) return;
-  const errors = $("errors").checked, metric = data.metrics[0];
-  $("scrub").value = moments.indexOf(frame);
-  $("scrub").setAttribute("aria-valuetext", `timestep ${frame.at[4]}`);
-  $("moment").textContent = `Timestep ${frame.at[4]}` + (frame.p ? frame.l ? ", lossless" : ", lossy" : "");
-  const contents = await Promise.all(names.map((_, index) => content(frame, index, errors)));
-  if (now !== frame) return;
-  const size = contents.map(c => c.image || c.map).find(Boolean);
-  contents.forEach((one, index) => {
-    const own = panels[index], value = index && metric ? `${metric.label} ${shown(frame.v[0][index - 1], metric)}` : "";
-    if (!(one.image || one.map) && size) { own.canvas.width = size.width; own.canvas.height = size.height; }
-    paint(own, one);
-    own.caption.replaceChildren(make("b", {textContent: own.title}), value);
-    own.canvas.setAttribute("aria-label", `${errors && index ? "Error map of " : ""}${own.title}, timestep ${frame.at[4]}${value && ", " + value}`);
-  });
-  compare(frame);
-  curves();
-}
-async function compare(frame) {
-  if (!$("between").open || !frame) return;
-  const [a, b] = await Promise.all([+$("left").value, +$("right").value].map(i => content(frame, i, $("errors").checked)));
-  if (now !== frame) return;
-  paint(pair, a.reason ? a : b.reason ? b : b);
-  if (a.reason || b.reason) return;
-  const context = pair.canvas.getContext("2d"), x = Math.round(pair.canvas.width * $("border").value / 100);
-  const source = a.image || make("canvas", {width: a.map.width, height: a.map.height});
-  if (a.map) source.getContext("2d").putImageData(a.map, 0, 0);
-  if (x) context.drawImage(source, 0, 0, x, source.height, 0, 0, x, source.height);
-  context.fillStyle = "#d55e00";
-  context.fillRect(x, 0, 1, pair.canvas.height);
-  const texts = [$("left"), $("right")].map(s => names[+s.value]);
-  pair.caption.textContent = `${texts[0]} | ${texts[1]}`;
-  pair.canvas.setAttribute("aria-label", `${texts[0]} to the left of the border, ${texts[1]} to the right`);
+function paint(canvas, image) {
+  canvas.width = image.width;
+  canvas.height = image.height;
+  canvas.getContext("2d").drawImage(image, 0, 0);
 }
 
+// Tiles: the ground truth and up to four methods, or in a wipe each method against one other.
+let tiles = [], tileKey = "";
+function tileOf(index) {
+  const canvas = make("canvas", {width: 1, height: 1, role: "img"}), reason = make("p", {className: "reason", hidden: true});
+  const cursor = make("div", {className: "cursor"}), wiper = make("div", {className: "wiper", hidden: true});
+  const sides = ["side", "side right"].map(className => make("span", {className, hidden: true}));
+  const box = make("div", {className: "view"}, canvas, reason, ...sides, cursor, wiper), caption = make("figcaption");
+  const one = {index, canvas, reason, cursor, wiper, sides, box, caption, figure: make("figure", {className: "tile"}, caption, box)};
+  box.addEventListener("dblclick", e => zoomBy(2, ...inside(box, e)));
+  wiper.addEventListener("pointerdown", e => { wiper.setPointerCapture(e.pointerId); e.stopPropagation(); });
+  wiper.addEventListener("pointermove", e => {
+    if (!wiper.hasPointerCapture(e.pointerId)) return;
+    setBorder((inside(box, e)[0] - state.x) / state.zoom);
+    e.stopPropagation();
+  });
+  return one;
+}
+const inside = (box, e) => { const r = box.getBoundingClientRect(); return [(e.clientX - r.left) / r.width, (e.clientY - r.top) / r.height]; };
+function layOut() {
+  const list = state.wipe ? state.methods.map(m => m + 1) : [0, ...state.methods.map(m => m + 1)], key = list.join();
+  if (key === tileKey) return;
+  tileKey = key;
+  const known = new Map(tiles.map(tile => [tile.index, tile]));
+  tiles = list.map(index => known.get(index) || tileOf(index));
+}
+function captionOf(tile, i) {
+  const metric = metrics[state.metric];
+  if (!tile.index) {
+    const kind = frames[i].p && frames[i].p[0] >= 0 ? frames[i].l ? "lossless" : "lossy" : "";
+    return [make("b", {textContent: TRUTH}), make("span", {className: "less", textContent: kind})];
+  }
+  const values = frames[i].v[state.metric] || [], value = values[tile.index - 1] ?? null;
+  const found = [mark(tile.index - 1), make("b", {textContent: names[tile.index]})];
+  if (!metric || value === null) return found;
+  const own = state.methods.map(m => values[m]).filter(v => v !== null), best = metric.up ? Math.max(...own) : Math.min(...own);
+  const leads = own.length > 1 && value.toFixed(metric.digits) === best.toFixed(metric.digits);
+  found.push(make("span", {className: leads ? "best" : "value", textContent: value.toFixed(metric.digits)}), make("span", {textContent: metric.unit}));
+  if (own.length > 1 && !leads) found.push(make("span", {className: "less", textContent: `${value > best ? "+" : "−"}${Math.abs(value - best).toFixed(metric.digits)}`}));
+  return found;
+}
+let turn = 0;
+async function show() {
+  if (!frames.length) return;
+  const mine = ++turn, i = state.frame;
+  layOut();
+  const list = tiles, errors = state.errors && !held;
+  const [other, ...contents] = await Promise.all([state.wipe ? content(i, state.against, errors) : null, ...list.map(tile => content(i, held ? 0 : tile.index, errors))]);
+  if (mine !== turn) return;
+  const size = contents.map(c => c.image).find(Boolean);
+  const figures = $("tiles");
+  if (figures.children.length !== list.length || list.some((tile, n) => figures.children[n] !== tile.figure)) figures.replaceChildren(...list.map(tile => tile.figure));
+  const root = document.documentElement.style;
+  root.setProperty("--tiles", phone.matches && list.length === 1 ? 1 : list.length);
+  if (size) root.setProperty("--ratio", `${size.width} / ${size.height}`);
+  const metric = metrics[state.metric];
+  list.forEach((tile, n) => {
+    const {image, reason} = contents[n], wiping = state.wipe && image && other.image && tile.index !== state.against;
+    tile.reason.textContent = reason || "";
+    tile.reason.hidden = !reason;
+    if (image) paint(tile.canvas, image);
+    if (wiping) {
+      const edge = Math.round(tile.canvas.width * state.border);
+      if (edge) tile.canvas.getContext("2d").drawImage(other.image, 0, 0, edge, other.image.height, 0, 0, edge, other.image.height);
+    }
+    tile.wiper.hidden = !wiping;
+    tile.sides.forEach((side, k) => { side.hidden = !wiping; side.textContent = names[k ? tile.index : state.against]; });
+    tile.box.classList.toggle("errors", errors && tile.index > 0);
+    tile.caption.replaceChildren(...captionOf(tile, i));
+    const value = tile.index && metric ? `, ${metric.label} ${shown(frames[i].v[state.metric][tile.index - 1], metric)}` : "";
+    const what = wiping ? `${names[state.against]} to the left of the border, ${names[tile.index]} to the right` : `${errors && tile.index ? "Error map of " : ""}${held ? TRUTH : names[tile.index]}`;
+    tile.canvas.setAttribute("aria-label", `${what}, ${where(i)}${value}`);
+  });
+  place();
+  $("where").textContent = `${where(i)}, frame ${series.indexOf(i) + 1} of ${series.length}`;
+  $("scrub").max = Math.max(0, series.length - 1);
+  $("scrub").value = series.indexOf(i);
+  $("scrub").setAttribute("aria-valuetext", where(i));
+  curve();
+  for (const button of document.querySelectorAll("#worst button")) button.setAttribute("aria-current", button.frame === i);
+  remember();
+}
+function go(i) {
+  const before = at();
+  state.frame = i;
+  if (before[0] !== at()[0] || before[1] !== at()[1] || before[3] !== at()[3] || !series.length) { collect(); controls(); }
+  return show();
+}
+const step = by => { const n = stops.indexOf(state.frame); return go(n < 0 ? nearest(series.indexOf(state.frame)) : stops[(n + by + stops.length) % stops.length]); };
+
+// One zoom for all tiles; a cursor in each.
+function place() {
+  state.x = Math.min(0, Math.max(1 - state.zoom, state.x));
+  state.y = Math.min(0, Math.max(1 - state.zoom, state.y));
+  for (const {canvas, box, wiper} of tiles) {
+    canvas.style.transform = state.zoom > 1 ? `translate(${100 * state.x}%, ${100 * state.y}%) scale(${state.zoom})` : "";
+    box.classList.toggle("near", state.zoom > 1);
+    box.classList.toggle("pixels", state.zoom * box.clientWidth > 6 * canvas.width);
+    wiper.style.left = `${100 * (state.border * state.zoom + state.x)}%`;
+  }
+  if ($("zoom")) $("zoom").textContent = `${+state.zoom.toFixed(1)}×`;
+}
+function zoomBy(factor, x = 0.5, y = 0.5) {
+  const next = Math.min(32, Math.max(1, state.zoom * factor));
+  state.x = x - (x - state.x) * next / state.zoom;
+  state.y = y - (y - state.y) * next / state.zoom;
+  state.zoom = next;
+  place();
+  remember();
+}
+function setBorder(value) {
+  state.border = Math.min(1, Math.max(0, value));
+  if ($("border")) $("border").value = 100 * state.border;
+  show();
+}
+const pointers = new Map();
+let start = null;
+$("stage").addEventListener("pointerdown", e => {
+  const box = e.target.closest(".view");
+  if (!box) return;
+  pointers.set(e.pointerId, e);
+  start = pointers.size === 1 ? {x: e.clientX, y: e.clientY, time: e.timeStamp, swipe: e.pointerType === "touch" && state.zoom === 1} : null;
+  if (e.pointerType === "mouse") box.setPointerCapture(e.pointerId);
+});
+$("stage").addEventListener("pointermove", e => {
+  const box = e.target.closest(".view"), before = pointers.get(e.pointerId);
+  if (box && e.pointerType === "mouse") {
+    const [x, y] = inside(box, e);
+    for (const {cursor} of tiles) Object.assign(cursor.style, {visibility: "visible", left: `${100 * x}%`, top: `${100 * y}%`});
+  }
+  if (!before || !box) return;
+  const r = box.getBoundingClientRect();
+  if (pointers.size === 2) {
+    const [other] = [...pointers].filter(([id]) => id !== e.pointerId).map(([, event]) => event);
+    const far = (a, b) => Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY) || 1;
+    zoomBy(far(e, other) / far(before, other), ((e.clientX + other.clientX) / 2 - r.left) / r.width, ((e.clientY + other.clientY) / 2 - r.top) / r.height);
+  } else if (state.zoom > 1) {
+    state.x += (e.clientX - before.clientX) / r.width;
+    state.y += (e.clientY - before.clientY) / r.height;
+    place();
+    remember();
+  }
+  pointers.set(e.pointerId, e);
+});
+for (const kind of ["pointerup", "pointercancel"]) $("stage").addEventListener(kind, e => {
+  pointers.delete(e.pointerId);
+  if (kind === "pointerup" && start && start.swipe && state.zoom === 1) {
+    const dx = e.clientX - start.x, dy = e.clientY - start.y;
+    if (Math.abs(dx) > 40 && Math.abs(dx) > 2 * Math.abs(dy)) step(dx < 0 ? 1 : -1);
+  }
+  start = null;
+});
+$("stage").addEventListener("pointerleave", () => { for (const {cursor} of tiles) cursor.style.visibility = "hidden"; });
+$("stage").addEventListener("wheel", e => {
+  const box = e.target.closest(".view");
+  if (!box || !(e.ctrlKey || $("stage").contains(document.activeElement))) return;
+  e.preventDefault();
+  zoomBy(Math.exp(-e.deltaY * (e.deltaMode ? 0.06 : 0.002)), ...inside(box, e));
+}, {passive: false});
+$("stage").tabIndex = 0;
+
 // Drawings: axes with round numbers, labels beside the ends of their lines.
-function ticks(low, high, count = 5) {
+function ticks(low, high, count = 4) {
   const rough = (high - low) / count || 1, power = 10 ** Math.floor(Math.log10(rough));
-  const by = [1, 2, 5, 10].find(k => k * power >= rough) * power, found = [];
+  const by = [1, 2, 5, 10].find(k => k * power >= 0.7 * rough) * power, found = [];
   for (let i = Math.ceil(low / by); i * by <= high + 1e-9; i++) found.push(+(i * by).toPrecision(10));
   return found;
 }
-function apart(labels, gap, low, high) {
+function spread(labels, gap, low, high) {
   labels.sort((a, b) => a.y - b.y);
   labels.forEach((l, i) => { l.at = Math.max(l.y, i ? labels[i - 1].at + gap : low); });
   for (let i = labels.length - 1, limit = high; i >= 0; i--) { labels[i].at = Math.min(labels[i].at, limit); limit = labels[i].at - gap; }
   return labels;
 }
-function frameOf(W, H, right, ys, yText, xText, label, text = t => t) {
-  const box = {l: 56, r: W - right, t: 24, b: H - 40}, svg = draw("svg", {viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": label});
+function axes(W, H, margins, ys, label, text = t => t) {
+  const box = {l: margins.l, r: W - margins.r, t: margins.t, b: H - margins.b}, svg = draw("svg", {viewBox: `0 0 ${W} ${H}`, height: H, role: "img", "aria-label": label});
   let low = Math.min(...ys), high = Math.max(...ys);
-  const margin = (high - low || Math.abs(high) || 1) * 0.06;
+  const margin = (high - low || Math.abs(high) || 1) * 0.08;
   low -= margin; high += margin;
   const y = v => box.b - (v - low) / (high - low) * (box.b - box.t);
   for (const t of ticks(low, high)) {
-    svg.append(draw("line", {class: "grid", x1: box.l, x2: box.r, y1: y(t), y2: y(t)}), draw("text", {x: box.l - 6, y: y(t) + 4, "text-anchor": "end"}, text(t)));
+    svg.append(draw("line", {class: "grid", x1: box.l, x2: box.r, y1: y(t), y2: y(t)}), draw("text", {x: box.l - 8, y: y(t) + 4, "text-anchor": "end"}, text(t)));
   }
-  svg.append(draw("text", {x: 4, y: 14}, yText), draw("text", {x: (box.l + box.r) / 2, y: H - 6, "text-anchor": "middle"}, xText));
   return {svg, box, y};
 }
-function legendOf(svg, box, labels) {
-  for (const l of apart(labels, 15, box.t, box.b)) {
-    svg.append(draw("line", {class: "line", x1: box.r + 8, x2: box.r + 26, y1: l.at, y2: l.at, stroke: colour(l.i), "stroke-dasharray": dash(l.i)}), draw("text", {x: box.r + 31, y: l.at + 4}, short(l.name)));
+function ends(svg, box, labels) {
+  for (const l of spread(labels, 16, box.t, box.b)) {
+    svg.append(markAt(l.m, box.r + 14, l.at, 9));
+    const text = draw("text", {x: box.r + 24, y: l.at + 4, class: "halo"});
+    text.append(draw("tspan", {class: "strong", "font-weight": 600}, short(l.name, 14) + " "), draw("tspan", {}, l.text));
+    svg.append(text);
   }
 }
-let curveKey = "", cursor = null;
-function curves() {
-  const m = +$("metric").value, metric = data.metrics[m];
-  if (!metric || !series.length) return;
-  const key = `${m} ${selects.map(s => s.value)}`, ts = series.map(f => f.at[4]);
-  const x = (t, box) => box.l + (ts.length > 1 ? (t - ts[0]) / (ts[ts.length - 1] - ts[0]) : 0.5) * (box.r - box.l);
+let curveKey = "", cursorLine = null, readings = null;
+function curve() {
+  const metric = metrics[state.metric], W = Math.round($("curve").clientWidth);
+  if (!metric || !W) return;
+  const L = 42, R = phone.matches ? 10 : 150, H = phone.matches ? 130 : 150, last = series.length - 1;
+  const x = n => L + (last ? n / last : 0.5) * (W - L - R);
+  const key = [W, state.metric, state.methods, series[0], series.length].join();
   if (key !== curveKey) {
     curveKey = key;
-    const ys = series.flatMap(f => f.v[m]).filter(v => v !== null);
-    if (!ys.length) { $("curves").replaceChildren(make("p", {textContent: "No values of this metric here."})); cursor = null; return; }
-    const {svg, box, y} = frameOf(960, 320, 190, ys, metric.unit ? `${metric.label} (${metric.unit})` : metric.label, "Timestep", `${metric.label} over timesteps, a line for each method; the values of a frame stand under its pictures`);
-    for (const t of ticks(ts[0], ts[ts.length - 1], 10).filter(Number.isInteger)) svg.append(draw("text", {x: x(t, box), y: box.b + 18, "text-anchor": "middle"}, t));
-    const labels = [];
-    data.methods.forEach((name, i) => {
-      const points = series.filter(f => f.v[m][i] !== null).map(f => [x(f.at[4], box), y(f.v[m][i])]);
-      if (!points.length) return;
-      svg.append(points.length > 1 ? draw("polyline", {class: "line", points: points.join(" "), stroke: colour(i), "stroke-dasharray": dash(i)}) : draw("circle", {cx: points[0][0], cy: points[0][1], r: 4, fill: colour(i)}));
-      labels.push({y: points[points.length - 1][1], name, i});
+    const ys = series.flatMap(i => state.methods.map(m => frames[i].v[state.metric][m])).filter(v => v !== null);
+    if (!ys.length) { $("curve").replaceChildren(make("p", {className: "note", textContent: `No values of ${metric.label} here.`})); cursorLine = null; return; }
+    const {svg, box, y} = axes(W, H, {l: L, r: R, t: 10, b: 24}, ys, `${metric.label} of the methods shown, frame by frame; marks stand on each method's worst frame`);
+    const starts = series.map((i, n) => n).filter(n => n === 0 || frames[series[n]].at[2] !== frames[series[n - 1]].at[2]);
+    starts.forEach((n, k) => {
+      const to = k + 1 < starts.length ? starts[k + 1] : last + 1;
+      if (n) svg.append(draw("line", {class: "grid", x1: x(n - 0.5), x2: x(n - 0.5), y1: box.t, y2: H}));
+      const room = x(to - 1) - x(n) + (last ? (W - L - R) / last : W) - 4, text = data.sequences[frames[series[n]].at[2]];
+      if (room > 56) svg.append(draw("text", {x: n ? x(n - 0.5) + 5 : x(n), y: H - 5}, short(text, Math.max(3, Math.floor(room / 7)))));
     });
-    legendOf(svg, box, labels);
-    cursor = draw("line", {class: "now", y1: box.t, y2: box.b});
-    const hit = draw("rect", {class: "hit", x: box.l, y: box.t, width: box.r - box.l, height: box.b - box.t});
-    hit.addEventListener("click", e => {
-      const r = hit.getBoundingClientRect();
-      show(nearest(ts[0] + (e.clientX - r.left) / r.width * (ts[ts.length - 1] - ts[0])));
-    });
-    svg.append(cursor, hit);
-    $("curves").replaceChildren(svg);
-    cursor.box = box;
+    for (const m of state.methods) {
+      const value = n => frames[series[n]].v[state.metric][m];
+      starts.forEach((from, k) => {
+        const points = [];
+        for (let n = from; n < (k + 1 < starts.length ? starts[k + 1] : last + 1); n++) if (value(n) !== null) points.push(`${x(n)},${y(value(n))}`);
+        if (points.length > 1) svg.append(draw("polyline", {class: `line ${tint(m)}`, points: points.join(" "), "stroke-dasharray": dashes(m)}));
+        else if (points.length) svg.append(draw("circle", {class: `shape ${tint(m)}`, cx: points[0].split(",")[0], cy: points[0].split(",")[1], r: 4}));
+      });
+      const known = series.map((_, n) => n).filter(n => value(n) !== null);
+      if (known.length > 2) {
+        const worst = known.reduce((a, b) => (metric.up ? value(b) < value(a) : value(b) > value(a)) ? b : a);
+        svg.append(markAt(m, x(worst), y(value(worst))));
+      }
+    }
+    cursorLine = draw("line", {class: "now", y1: box.t - 6, y2: box.b});
+    readings = draw("g", {});
+    svg.append(cursorLine, readings);
+    $("curve").replaceChildren(svg);
+    Object.assign(cursorLine, {x, y, box});
+    $("scrub").style.marginLeft = `${L - 8}px`;
+    $("scrub").style.width = `${W - L - R + 16}px`;
   }
-  if (cursor && now) for (const end of ["x1", "x2"]) cursor.setAttribute(end, x(now.at[4], cursor.box));
+  if (!cursorLine) return;
+  const now = cursorLine.x(series.indexOf(state.frame));
+  for (const end of ["x1", "x2"]) cursorLine.setAttribute(end, now);
+  readings.replaceChildren();
+  const labels = [];
+  for (const m of state.methods) {
+    const value = frames[state.frame].v[state.metric][m];
+    if (value === null) continue;
+    readings.append(draw("circle", {class: tint(m), cx: now, cy: cursorLine.y(value), r: 3, fill: "currentColor"}));
+    labels.push({m, y: cursorLine.y(value), name: data.methods[m], text: value.toFixed(metric.digits)});
+  }
+  if (!phone.matches) ends(readings, cursorLine.box, labels);
 }
-for (const plot of data.plots) {
-  const xs = plot.points.map(p => Math.log10(p[1])), low = Math.min(...xs), high = Math.max(...xs);
-  const {svg, box, y} = frameOf(520, 320, 20, plot.points.map(p => p[2]), plot.y, plot.x, `${plot.title}: ${plot.points.map(p => `${p[0]} ${p[2].toPrecision(4)} at ${p[1].toPrecision(3)}`).join("; ")}`);
-  const x = v => box.l + 30 + (high > low ? (Math.log10(v) - low) / (high - low) : 0.5) * (box.r - box.l - 120);
-  for (let e = Math.floor(low); e <= high + 1; e++) for (const k of [1, 2, 5]) {
-    const t = k * 10 ** e;
-    if (x(t) >= box.l && x(t) <= box.r) svg.append(draw("text", {x: x(t), y: box.b + 18, "text-anchor": "middle"}, +t.toPrecision(3)));
-  }
-  svg.append(draw("polyline", {class: "front", points: plot.front.map(i => [x(plot.points[i][1]), y(plot.points[i][2])]).join(" ")}));
-  const labels = plot.points.map((p, i) => ({y: y(p[2]), x: x(p[1]), name: p[0], i}));
-  for (const l of labels) svg.append(draw("circle", {cx: l.x, cy: l.y, r: 5, fill: colour(data.methods.indexOf(l.name))}));
-  for (const l of labels) {
-    const crossed = labels.some(o => o !== l && Math.abs(o.y - l.y) < 15 && o.x > l.x && o.x - l.x < 110);
-    svg.append(draw("text", {x: l.x + (crossed ? -9 : 9), y: l.y - 7, "text-anchor": crossed ? "end" : "start"}, short(l.name)));
-  }
-  $("plots").append(make("div", {}, make("h3", {textContent: plot.title}), svg));
+function scrubAt(e) {
+  const r = $("curve").getBoundingClientRect(), L = 42, R = phone.matches ? 10 : 150;
+  const i = nearest((e.clientX - r.left - L) / (r.width - L - R) * (series.length - 1));
+  if (i !== state.frame) go(i);
 }
-if (!data.plots.length) $("front").hidden = true;
-if (data.training.length) {
-  const points = data.training.flatMap(c => c.points), end = Math.max(...points.map(p => p[0]));
-  const {svg, box, y} = frameOf(960, 320, 190, points.map(p => Math.log10(p[1])), "Loss, first = 1", "Iteration",
-    `Training loss over iterations, divided by the first one: ${data.training.map(c => `${data.methods[c.method]} ends at ${c.points.at(-1)[1]}`).join("; ")}`, t => +(10 ** t).toPrecision(2));
-  const x = t => box.l + t / end * (box.r - box.l), labels = [];
-  for (const t of ticks(0, end, 8)) svg.append(draw("text", {x: x(t), y: box.b + 18, "text-anchor": "middle"}, t));
-  for (const {method, points} of data.training) {
-    svg.append(draw("polyline", {class: "line", points: points.map(p => [x(p[0]), y(Math.log10(p[1]))]).join(" "), stroke: colour(method), "stroke-dasharray": dash(method)}));
-    labels.push({y: y(Math.log10(points.at(-1)[1])), name: data.methods[method], i: method});
-  }
-  legendOf(svg, box, labels);
-  $("losses").append(svg);
-} else $("training").hidden = true;
+$("curve").addEventListener("pointerdown", e => { $("curve").setPointerCapture(e.pointerId); scrubAt(e); });
+$("curve").addEventListener("pointermove", e => { if ($("curve").hasPointerCapture(e.pointerId)) scrubAt(e); });
 
-// Places worth a look: one frame for each timestep of a subject and sequence.
-function list(target, score, text) {
-  const seen = new Map(), task = +selects[0].value;
-  for (const f of frames) {
-    const value = f.at[0] === task ? score(f) : null, moment = [f.at[1], f.at[2], f.at[4]].join();
-    if (value !== null && !(seen.has(moment) && seen.get(moment)[0] >= value)) seen.set(moment, [value, f]);
+// Quality against cost. Each label takes the first of four places that nothing else covers.
+let costTask = data.plots.length ? data.plots[0].task : 0;
+function plots() {
+  const kept = data.plots.filter(plot => plot.task === costTask);
+  $("plots").replaceChildren(...kept.map(() => make("div")));
+  kept.forEach((plot, n) => {
+    const parent = $("plots").children[n], W = Math.max(260, Math.round(parent.clientWidth)), H = 300;
+    const xs = plot.points.map(p => Math.log10(p[1])), low = Math.min(...xs), high = Math.max(...xs);
+    const [title, unit] = plot.x.split(/ \(|\)/), points = plot.points.map(p => ({m: data.methods.indexOf(p[0]), name: p[0], cost: p[1], quality: p[2]}));
+    const {svg, box, y} = axes(W, H, {l: 42, r: 12, t: 12, b: 40}, points.map(p => p.quality), `${plot.title}: ${points.map(p => `${p.name} ${p.quality.toPrecision(4)} at ${p.cost.toPrecision(3)} ${unit}`).join("; ")}`);
+    const x = v => box.l + 24 + (high > low ? (Math.log10(v) - low) / (high - low) : 0.5) * (box.r - box.l - 90);
+    let before = -Infinity;
+    for (let e = Math.floor(low); e <= high + 1; e++) for (const k of [1, 2, 5]) {
+      const t = k * 10 ** e;
+      if (x(t) < box.l || x(t) > box.r || x(t) < before + 34) continue;
+      before = x(t);
+      svg.append(draw("text", {x: x(t), y: box.b + 18, "text-anchor": "middle"}, +t.toPrecision(3)));
+    }
+    svg.append(draw("text", {x: box.l, y: H - 4}, `${plot.y}, upwards`), draw("text", {x: box.r, y: H - 4, "text-anchor": "end"}, `${unit || title}, logarithmic`));
+    svg.append(draw("polyline", {class: "front", points: plot.front.map(i => [x(points[i].cost), y(points[i].quality)]).join(" ")}));
+    const taken = points.map(p => [x(p.cost) - 8, y(p.quality) - 8, x(p.cost) + 8, y(p.quality) + 8]);
+    for (const p of points) {
+      const px = x(p.cost), py = y(p.quality), name = short(p.name, 18), text = ` ${+p.cost.toPrecision(3)} ${unit}`, width = 7.2 * (name.length + text.length);
+      const places = [[px + 11, py - 7, "start"], [px - 11, py - 7, "end"], [px + 11, py + 16, "start"], [px - 11, py + 16, "end"], [px - width / 2, py - 14, "start"], [px - width / 2, py + 24, "start"]];
+      const rect = ([tx, ty, anchor]) => anchor === "end" ? [tx - width, ty - 11, tx, ty + 3] : [tx, ty - 11, tx + width, ty + 3];
+      const bad = r => (r[0] < box.l - 2 || r[2] > W || r[1] < 0 || r[3] > box.b ? 10 : 0) + taken.filter(t => t[0] < r[2] && r[0] < t[2] && t[1] < r[3] && r[1] < t[3]).length;
+      const best = places.reduce((a, b) => bad(rect(b)) < bad(rect(a)) ? b : a);
+      taken.push(rect(best));
+      const label = draw("text", {x: best[0], y: best[1], "text-anchor": best[2], class: "halo"});
+      label.append(draw("tspan", {class: "strong", "font-weight": 600}, name), draw("tspan", {}, text));
+      svg.append(label);
+    }
+    for (const p of points) svg.append(markAt(p.m, x(p.cost), y(p.quality), 13));
+    parent.append(make("h3", {textContent: plot.title}), svg, make("p", {className: "note", textContent: `On the front: ${plot.front.map(i => points[i].name).join(", ")}.`}));
+  });
+}
+function losses() {
+  const W = Math.round($("losses").clientWidth);
+  if (!W || !data.training.length) return;
+  const points = data.training.flatMap(c => c.points), end = Math.max(...points.map(p => p[0]));
+  const label = `Training loss over iterations, divided by the first one: ${data.training.map(c => `${data.methods[c.method]} ends at ${c.points.at(-1)[1]}`).join("; ")}`;
+  const {svg, box, y} = axes(W, 280, {l: 52, r: phone.matches ? 80 : 150, t: 12, b: 40}, points.map(p => Math.log10(p[1])), label, t => +(10 ** t).toPrecision(2));
+  const x = t => box.l + t / end * (box.r - box.l), labels = [];
+  for (const t of ticks(0, end, Math.min(8, W / 90))) svg.append(draw("text", {x: x(t), y: box.b + 18, "text-anchor": "middle"}, t));
+  svg.append(draw("text", {x: box.l, y: 276}, "loss, first = 1, logarithmic"), draw("text", {x: box.r, y: 276, "text-anchor": "end"}, "iteration"));
+  for (const {method, points} of data.training) {
+    svg.append(draw("polyline", {class: `line ${tint(method)}`, points: points.map(p => [x(p[0]), y(Math.log10(p[1]))]).join(" "), "stroke-dasharray": dashes(method)}));
+    labels.push({m: method, y: y(Math.log10(points.at(-1)[1])), name: data.methods[method], text: ""});
   }
-  const best = [...seen.values()].sort((a, b) => b[0] - a[0]).slice(0, 8);
-  target.replaceChildren(...best.map(([, f]) => {
-    const where = `${data.subjects[f.at[1]]} ${data.sequences[f.at[2]]} timestep ${f.at[4]}, camera ${data.cameras[f.at[3]]}`;
-    const button = make("button", {type: "button", disabled: !f.p, textContent: `${text(f)}: ${where}${f.p ? "" : " (no pictures)"}`});
-    button.addEventListener("click", () => go(f));
-    return make("li", {}, button);
-  }));
+  ends(svg, box, labels);
+  $("losses").replaceChildren(svg);
+}
+
+// Frames worth a look: one camera for each moment.
+const valued = data.methods.map((_, m) => m).filter(m => frames.some(f => f.v.length && f.v[0][m] !== null));
+const scored = valued.filter(m => !data.trivial.includes(data.methods[m])), offered = scored.length ? scored : valued;
+let worstOf = "all";
+function moments(score, most) { // frames with pictures of highest score, one for each task, subject, sequence and timestep
+  const seen = new Map();
+  frames.forEach((f, i) => {
+    const value = f.p ? score(f) : null, moment = [f.at[0], f.at[1], f.at[2], f.at[4]].join();
+    if (value !== null && !(seen.has(moment) && seen.get(moment)[0] >= value)) seen.set(moment, [value, i]);
+  });
+  return [...seen.values()].sort((a, b) => b[0] - a[0]).slice(0, most);
 }
 function places() {
-  const m = +$("metric").value, metric = data.metrics[m];
-  if (!metric) return;
-  const i = +$("worst-method").value, a = +$("first").value, b = +$("second").value, sign = metric.up ? -1 : 1;
-  list($("worst"), f => f.v[m][i] === null ? null : sign * f.v[m][i], f => `${metric.label} ${shown(f.v[m][i], metric)}`);
-  list($("apart"), f => f.v[m][a] === null || f.v[m][b] === null || a === b ? null : Math.abs(f.v[m][a] - f.v[m][b]),
-    f => `${metric.label} ${shown(f.v[m][a], metric)} and ${shown(f.v[m][b], metric)}`);
+  const metric = metrics[state.metric], v = f => f.v[state.metric];
+  if (!metric) return [];
+  const sign = metric.up ? -1 : 1, bad = m => f => v(f)[m] === null ? null : sign * v(f)[m];
+  if (worstOf === "apart") {
+    const own = f => state.methods.map(m => v(f)[m]).filter(value => value !== null);
+    return moments(f => own(f).length > 1 ? Math.max(...own(f)) - Math.min(...own(f)) : null, 10).map(([value, i]) => {
+      const sorted = state.methods.filter(m => v(frames[i])[m] !== null).sort((a, b) => bad(a)(frames[i]) - bad(b)(frames[i]));
+      return {i, methods: [sorted[0], sorted.at(-1)], text: `${value.toFixed(metric.digits)} ${metric.unit} apart`};
+    });
+  }
+  const list = worstOf === "all" ? offered.flatMap(m => moments(bad(m), offered.length > 5 ? 2 : 3).map(([value, i]) => ({value, i, methods: [m]}))) : moments(bad(+worstOf), 10).map(([value, i]) => ({value, i, methods: [+worstOf]}));
+  return list.sort((a, b) => b.value - a.value).map(one => ({...one, text: shown(sign * one.value, metric)}));
+}
+async function thumbnails(button) {
+  const {frame, methods} = button, pair = button.querySelectorAll("canvas");
+  const wantedPair = methods.length > 1 ? methods.map(m => content(frame, m + 1, false)) : [content(frame, 0, false), content(frame, methods[0] + 1, true)];
+  (await Promise.all(wantedPair)).forEach(({image}, n) => image && paint(pair[n], image));
+}
+function strip() {
+  const chosen = places();
+  $("worst").replaceChildren(...chosen.map(({i, methods, text}) => {
+    const button = make("button", {type: "button"}), task = data.tasks[frames[i].at[0]];
+    button.append(make("span", {className: "pair", "aria-hidden": "true"}, make("canvas"), make("canvas")),
+      make("span", {className: "line"}, ...methods.flatMap(m => [mark(m), make("b", {textContent: data.methods[m]})]), make("span", {textContent: text})),
+      make("span", {className: "note", textContent: `${where(i)}${data.tasks.length > 1 ? `, ${task.toLowerCase()}` : ""}`}));
+    Object.assign(button, {frame: i, methods});
+    button.setAttribute("aria-current", i === state.frame);
+    button.addEventListener("click", () => pick(button));
+    return make("li", {}, button);
+  }));
+  $("worst-frames").hidden = !metrics.length;
+  fill([...document.querySelectorAll("#worst button")]);
+}
+async function fill(buttons) { // one after the other, so that a scrub meanwhile does not wait
+  for (const button of buttons) if (button.isConnected) await thumbnails(button);
+}
+function pick({frame, methods}) {
+  for (const m of methods) if (!state.methods.includes(m)) state.methods = [...state.methods.slice(0, MOST - 1), m];
+  go(frame).then(controls);
+  $("pictures").scrollIntoView({block: "start"});
+  $("stage").focus({preventScroll: true});
 }
 
 // Controls.
-const valued = numbered(data.methods).filter(([index]) => frames.some(f => f.v.length && f.v[0][index] !== null));
-const scored = valued.filter(([, name]) => !trivial(name)), offered = scored.length ? scored : valued;
-options($("scale"), [10, 20, 50, 100, 255].map(v => [v, v]), 50);
-options($("left"), numbered(names), 0);
-options($("right"), numbered(names), offered.length ? offered[offered.length - 1][0] + 1 : 0);
-options($("metric"), numbered(data.metrics.map(m => m.label)));
-for (const id of ["worst-method", "first", "second"]) options($(id), valued);
-$("worst-method").value = $("second").value = offered.length ? offered[offered.length - 1][0] : 0;
-$("first").value = offered.length ? offered[0][0] : 0;
-const legend = $("legend").getContext("2d");
-data.colours.forEach((c, i) => { legend.fillStyle = `rgb(${c})`; legend.fillRect(i, 0, 1, 10); });
-function play() {
-  if (timer) clearInterval(timer);
-  timer = timer ? 0 : setInterval(() => step(1), 160);
-  $("play").textContent = timer ? "Pause" : "Play";
-  $("play").setAttribute("aria-pressed", Boolean(timer));
+function toggle(m) {
+  const list = state.methods;
+  if (list.includes(m)) { if (list.length > 1) state.methods = list.filter(other => other !== m); }
+  else state.methods = [...list.slice(list.length >= MOST ? 1 : 0), m];
+  say(`Shown: ${state.methods.map(n => data.methods[n]).join(", ")}`);
+  update();
 }
-const again = () => show(now);
-function toggle() { $("errors").checked = !$("errors").checked; again(); $("status").textContent = $("errors").checked ? "Error maps" : "Renders"; }
-$("scrub").addEventListener("input", () => show(moments[+$("scrub").value]));
-$("play").addEventListener("click", play);
-for (const id of ["errors", "scale"]) $(id).addEventListener("change", again);
-for (const id of ["left", "right"]) $(id).addEventListener("change", () => compare(now));
-$("border").addEventListener("input", () => compare(now));
-$("between").addEventListener("toggle", () => compare(now));
-$("metric").addEventListener("change", () => { curves(); places(); });
-for (const id of ["worst-method", "first", "second"]) $(id).addEventListener("change", places);
-selects[0].addEventListener("change", places);
-$("closer").addEventListener("click", () => zoomBy(1.5));
-$("further").addEventListener("click", () => zoomBy(1 / 1.5));
-$("whole").addEventListener("click", whole);
-document.addEventListener("keydown", e => {
-  if (e.ctrlKey || e.metaKey || e.altKey || e.target.matches("select, input, textarea, pre, .wide")) {
-    if (!(e.target.matches("input[type=checkbox], input[type=range]") && "e+-0".includes(e.key)) || e.ctrlKey || e.metaKey || e.altKey) return;
+function update() { controls(); show(); if (worstOf === "apart") strip(); }
+const visible = data.methods.map((_, m) => m).sort((a, b) => data.marks[a] - data.marks[b]);
+let folded = scored.length > 1 && data.trivial.length > 0; // trivial baselines stand behind one button until they are asked for
+function controls() {
+  const active = document.activeElement?.id, [task, subject, , camera] = at(), all = frames.map((_, i) => i), box = $("choices");
+  const of = (depth, value, rest) => all.filter(i => frames[i].at[depth] === value && rest(frames[i].at));
+  const tasks = choice(group("task", "Task"), "task", data.tasks.map((text, n) => [String(n), text]), String(task), value => go(closest(of(0, +value, () => true), at())));
+  const subjects = unique(all.filter(i => frames[i].at[0] === task).map(i => frames[i].at[1])).sort((a, b) => a - b);
+  const cameras = unique(of(0, task, a => a[1] === subject).map(i => frames[i].at[3])).sort((a, b) => a - b);
+  const chips = make("div", {className: "chips", role: "group", "aria-label": "Methods shown, four at most"});
+  const there = visible.filter(m => !folded || !data.trivial.includes(data.methods[m]) || state.methods.includes(m));
+  chips.append(...there.map(m => {
+    const n = visible.indexOf(m);
+    const chip = make("button", {type: "button", className: "chip", id: `chip-${m}`, title: data.methods[m], "aria-pressed": state.methods.includes(m)}, mark(m), make("span", {textContent: data.methods[m]}), n < 9 ? make("kbd", {textContent: n + 1, "aria-hidden": "true"}) : null);
+    chip.addEventListener("click", () => toggle(m));
+    return chip;
+  }));
+  if (there.length < visible.length) {
+    const more = make("button", {type: "button", className: "chip", id: "more", textContent: `+${visible.length - there.length} baseline${visible.length - there.length > 1 ? "s" : ""}`});
+    more.addEventListener("click", () => { folded = false; controls(); $(`chip-${visible.find(m => !there.includes(m))}`).focus(); });
+    chips.append(more);
   }
-  if (e.key === " " && e.target.matches("button, summary")) return;
-  const keys = {ArrowLeft: () => step(-1), ArrowRight: () => step(1), " ": play, e: toggle, "+": () => zoomBy(1.5), "-": () => zoomBy(1 / 1.5), 0: whole};
-  if (keys[e.key]) { keys[e.key](); e.preventDefault(); }
+  const modes = choice(group("mode", "How methods are compared"), "mode", [["side", "Side by side"], ["wipe", "Wipe"]], state.wipe ? "wipe" : "side", value => { state.wipe = value === "wipe"; update(); });
+  const errors = make("input", {type: "checkbox", id: "errors", checked: state.errors, role: "switch"});
+  errors.addEventListener("change", () => { state.errors = errors.checked; update(); });
+  const end = make("div", {className: "end"}, modes);
+  if (state.wipe) {
+    const border = make("input", {type: "range", id: "border", min: 0, max: 100, value: 100 * state.border, "aria-label": "Border of the wipe"});
+    border.addEventListener("input", () => setBorder(border.value / 100));
+    end.append(selectOf("against", "against", names.map((text, n) => [n, short(text)]), state.against, value => { state.against = value; update(); }), border);
+  }
+  end.append(make("label", {className: "switch"}, errors, "Error maps"));
+  box.replaceChildren(...[data.tasks.length > 1 ? tasks : null,
+    data.subjects.length > 1 ? selectOf("Subject", "subject", subjects.map(n => [n, data.subjects[n]]), subject, value => go(closest(of(0, task, a => a[1] === value), at()))) : null,
+    selectOf("Camera", "camera", cameras.map(n => [n, data.cameras[n]]), camera, value => go(closest(of(0, task, a => a[1] === subject && a[3] === value), at()))),
+    chips, end].filter(Boolean));
+  $("tools").querySelector("#scale-box").hidden = !state.errors;
+  check("metric", state.metric);
+  if (active && $(active) && box.contains($(active))) $(active).focus();
+}
+function play() {
+  clearInterval(timer);
+  timer = timer ? 0 : setInterval(() => { if (!document.hidden) step(1); }, 160);
+  $("play").textContent = timer ? "❚❚" : "▶";
+  $("play").setAttribute("aria-label", timer ? "Pause" : "Play the frames");
+}
+function tools() {
+  const button = (id, text, label, act) => { const made = make("button", {type: "button", className: "plain", id, textContent: text, "aria-label": label}); made.addEventListener("click", act); return made; };
+  const metric = choice(group("metric", "Metric of the curve"), "metric", measured.map(n => [String(n), metrics[n].label]), String(state.metric), value => { state.metric = +value; show(); strip(); });
+  const legend = make("canvas", {id: "legend", width: 256, height: 1, role: "img", "aria-label": "Colours of error maps, from none to the largest"}), colours = legend.getContext("2d");
+  data.colours.forEach((c, i) => { colours.fillStyle = `rgb(${c})`; colours.fillRect(i, 0, 1, 1); });
+  const scale = make("span", {id: "scale-box", className: "field", hidden: true}, "0", legend, selectOf("", "scale", SCALES.map(v => [v, `${v} levels`]), state.scale, value => { state.scale = value; show(); strip(); }));
+  scale.querySelector("select").setAttribute("aria-label", "Brightest colour of error maps, 8-bit levels, mean over channels");
+  const zoom = make("span", {className: "zoom"}, button("further", "−", "Zoom out", () => zoomBy(1 / 1.5)), make("output", {id: "zoom", textContent: "1×"}), button("closer", "+", "Zoom in", () => zoomBy(1.5)), button("whole", "⤢", "Whole picture", whole));
+  $("tools").append(button("play", "▶", "Play the frames", play), metric, make("span", {id: "where"}), make("div", {className: "end"}, scale, zoom, button("keys-help", "?", "Keys", () => $("help").showModal())));
+}
+function whole() { Object.assign(state, {zoom: 1, x: 0, y: 0}); place(); remember(); }
+function schemes() {
+  const texts = ["as the system", "light", "dark"], root = document.documentElement;
+  let n = 0;
+  $("scheme").addEventListener("click", () => {
+    n = (n + 1) % 3;
+    if (n) root.dataset.theme = texts[n]; else delete root.dataset.theme;
+    $("scheme").setAttribute("aria-label", `Colour scheme: ${texts[n]}`);
+    say(`Colour scheme: ${texts[n]}`);
+  });
+}
+function nextOf(list, value) { return list[(list.indexOf(value) + 1) % list.length]; }
+const KEYS = {
+  ArrowLeft: () => step(-1), ArrowRight: () => step(1), " ": play, "?": () => $("help").showModal(), 0: whole,
+  e: () => { state.errors = !state.errors; say(state.errors ? "Error maps" : "Renders"); update(); },
+  w: () => { state.wipe = !state.wipe; say(state.wipe ? "Wipe" : "Side by side"); update(); },
+  t: () => { if (!held) { held = true; show(); } },
+  c: () => { const [task, subject, , camera] = at(), own = frames.map((_, i) => i).filter(i => frames[i].at[0] === task && frames[i].at[1] === subject); const next = nextOf(unique(own.map(i => frames[i].at[3])).sort((a, b) => a - b), camera); go(closest(own.filter(i => frames[i].at[3] === next), at())); },
+  n: () => { const list = [...document.querySelectorAll("#worst button")]; if (list.length) pick(nextOf(list, list.find(b => b.frame === state.frame))); },
+  "+": () => zoomBy(1.5), "=": () => zoomBy(1.5), "-": () => zoomBy(1 / 1.5),
+};
+document.addEventListener("keydown", e => {
+  if (e.key === "Escape" && $("stage").contains(document.activeElement)) document.activeElement.blur();
+  if (!state.keys || e.ctrlKey || e.metaKey || e.altKey || $("help").open || e.target.matches("select, textarea, pre, input:not([type=checkbox]), .wide")) return;
+  if (e.key === " " && !e.target.matches("body, #stage")) return;
+  const m = /^[1-9]$/.test(e.key) ? visible[e.key - 1] : undefined, act = m === undefined ? KEYS[e.key] : () => toggle(m);
+  if (act) { act(); e.preventDefault(); }
 });
-if (frames.length) { choose(0); places(); } else $("viewer").hidden = true;
+document.addEventListener("keyup", e => { if (e.key === "t" && held) { held = false; show(); } });
+$("scrub").addEventListener("input", () => go(nearest(+$("scrub").value)));
+$("close").addEventListener("click", () => $("help").close());
+$("keys").addEventListener("change", () => { state.keys = $("keys").checked; remember(); });
+addEventListener("hashchange", () => { if (recall()) { collect(); update(); } });
+
+// Parts of the frames in the table.
+const parts = [...document.querySelectorAll("article.table")];
+const showPart = n => parts.forEach((part, k) => part.classList.toggle("chosen", k === n));
+showPart(0);
+if ($("part")) {
+  $("part").append(...parts.map((part, n) => make("option", {value: n, textContent: part.dataset.title})));
+  $("part").addEventListener("change", () => showPart(+$("part").value));
+}
+
+$("facts").open = !phone.matches;
+schemes();
+if (frames.length) {
+  state.frame = data.opening.frame ?? 0;
+  state.methods = data.opening.methods.length ? data.opening.methods : offered.slice(0, 3);
+  if (!state.methods.length) state.methods = data.methods.length ? [0] : [];
+  recall();
+  $("keys").checked = state.keys;
+  tools();
+  collect();
+  controls();
+  choice($("worst-of"), "worst-of", [["all", "All methods"], ...offered.map(m => [String(m), short(data.methods[m])]), ["apart", "Largest differences"]], "all", value => { worstOf = value; strip(); });
+  show().then(strip);
+} else for (const id of ["pictures", "worst-frames"]) $(id).hidden = true;
+const plotted = unique(data.plots.map(plot => plot.task));
+if (plotted.length) {
+  if (plotted.length > 1) choice($("cost-of"), "cost-of", plotted.map(n => [String(n), data.tasks[n]]), String(costTask), value => { costTask = +value; plots(); });
+  plots();
+} else $("cost").hidden = true;
+if (!data.training.length) $("training").hidden = true;
+$("training").addEventListener("toggle", losses);
+let width = innerWidth;
+addEventListener("resize", () => { if (width !== innerWidth) { width = innerWidth; curve(); plots(); losses(); place(); } });

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,19 +17,24 @@ from ...bench.engine.scoring import FULL
 from ...bench.engine.store import RunFolder
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_text
-from ...bench.io.provenance import COMPOSITE, source_type, tool
+from ...bench.io.images import probe_image
+from ...bench.io.provenance import COMPOSITE, source_type
+from ...bench.io.style import SHAPES, policy_hash, stylesheet
 from ...bench.protocol import TASK_TITLES
 from ...bench.specs import CommandResult, MetricSpec
 from ..aggregate import summarise
+from ..compact import compact
 from ..drawing import colour_map
 from ..pareto.points import LATENCY, SIZE, SPEED, pareto_front
 from ..runs import FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
-from ..table_report import COMPARISON, TITLES, layouts, table_of
-from ..tables import AVATAR_TITLE, Table
+from ..table_report import COMPARISON, layouts, table_of
+from ..tables import AVATAR_TITLE, TITLES, Table
 from ..writers import render_page
+from .cards import cards_of
 from .frames import Pictures, ShownFrame, choose_pictures, frame_values, worst_frames
-from .record import failed_cells, name_of, record_of
+from .opening import Opening, opening
+from .record import failed_cells, record_of
 from .settings import MAX_MB, MAX_SPLIT_MB, PageSettings
 from .split import (
     ENTRY_BYTES,
@@ -43,9 +47,12 @@ from .split import (
     write_pictures,
 )
 from .training import loss_curves
+from .verdict import verdict
 
 HERE = Path(__file__).parent
 MEGABYTE = 10**6
+OPENING_SHARE = 0.97
+"""Part of the bytes for pictures that is left for all but a second copy of those that open the page."""
 
 
 @dataclass(frozen=True)
@@ -108,31 +115,45 @@ def page_text(
     metrics = [spec for spec in runs.metrics if spec.per_frame and COMPARISON in spec.tables]
     values = frame_values(runs, metrics)
     worst = worst_frames(values, runs, metrics[0]) if metrics else []
+    parts = _parts(runs)
+    comparisons = _comparisons(runs)
+    words = verdict(runs, parts[0].table, metrics, comparisons["all"], values)
+    cards = cards_of(runs)
     content = {
-        "title": f"headbench: {', '.join(name_of(run) for run in runs.runs)}",
-        "tables": _parts(runs),
+        "title": words.title,
+        "verdict": words,
+        "tables": parts,
         "layouts": [
             TitledTable(TITLES.get(name, name), table_of(runs, name))
             for name in layouts(runs)
             if name != COMPARISON
         ],
-        "comparisons": _comparisons(runs),
+        "comparisons": comparisons,
+        "cards": cards,
+        "anchors": {card["label"]: card["anchor"] for card in cards},
+        "marks": _marks(runs),
         "records": [record_of(run) for run in runs.runs],
         "failed": failed_cells(runs),
-        "tool": tool(),
         "source_type": source_type(COMPOSITE),
-        "script": (HERE / "page.js").read_text("utf-8"),
-        "style": (HERE / "page.css").read_text("utf-8"),
+        "scripts": [(HERE.parent / "sort.js").read_text("utf-8"), (HERE / "page.js").read_text("utf-8")],
+        "ratio": "1000 / 1000",
+        "own_style": (HERE / "page.css").read_text("utf-8"),
     }
     data = _data(runs, metrics, values)
     empty = Pictures(truth="-" * 400)
     limit = int(max_mb * MEGABYTE)
-    room = limit - len(_filled(content, data, [], empty).encode()) - 1000
+    room = limit - len(_filled(content, data, [], empty, []).encode()) - 1000
     room -= (
         ENTRY_BYTES * (1 + 2 * limit // FILE_BYTES) if apart else 0
     )  # two files together have more than that
     entry = 8 * (len(runs.methods) + 2)  # bytes of a frame's entry in the list, without its pictures
-    pictures = choose_pictures(runs, worst, room - entry * len(data["frames"]), options, progress)
+    room -= entry * len(data["frames"])
+    # The pictures that open the page stand in it twice, so that they show before its script has run.
+    pictures = choose_pictures(runs, worst, int(room * OPENING_SHARE), options, progress)
+    best = [row.method for row in compact(parts[0].table).rows if not row.trivial]
+    first = opening(runs, best, metrics, values, pictures)
+    data["opening"] = _opening(runs, first)
+    content["ratio"] = _ratio(runs, first)
     images: list[str] = []
     entries = dict(zip(_frames(runs), data["frames"]))
     for frame in sorted(pictures.shown, key=lambda f: (f.group, f.key.timestep)):  # in viewing order
@@ -140,7 +161,8 @@ def page_text(
         entries[frame]["l"] = int(frame in pictures.lossless)
     files = split(images) if apart else []
     data["files"] = [[file.name, file.count] for file in files]
-    page = _filled(content, data, [] if apart else images, pictures, apart=apart)
+    tiles = _tiles(runs, first, metrics, values, pictures)
+    page = _filled(content, data, [] if apart else images, pictures, tiles, apart=apart)
     if (size := _size(page, files)) > limit:
         found = f"{size / MEGABYTE:.2f} needed"
         raise InputError("command line", "--max-mb", "room for tables and record", found)
@@ -161,22 +183,78 @@ def _places(frame: ShownFrame, pictures: Pictures, images: list[str], reasons: l
     return places
 
 
+def _marks(runs: RunSet) -> dict[str, int]:
+    """Number of each method's mark: trivial baselines after the others."""
+    order = sorted(runs.methods, key=lambda label: label in runs.trivial)
+    return {label: index for index, label in enumerate(order)}
+
+
+def _opening(runs: RunSet, first: Opening) -> dict[str, Any]:
+    """The opening for the script, by index."""
+    frame = None if first.frame is None else _frames(runs).index(first.frame)
+    return {"frame": frame, "methods": [runs.methods.index(label) for label in first.methods]}
+
+
+def _ratio(runs: RunSet, first: Opening) -> str:
+    """Width and height of the opening renders, for the page's style."""
+    for label in first.methods:
+        run, name = runs.shown[label]
+        path = None if first.frame is None else run.render_path(name, *first.frame)
+        if path is not None:
+            with suppress(InputError):
+                info = probe_image(path)
+                return f"{info.width} / {info.height}"
+    return "3 / 4"
+
+
+def _tiles(
+    runs: RunSet,
+    first: Opening,
+    metrics: Sequence[MetricSpec],
+    values: dict[tuple[str, str, ShownFrame], float],
+    pictures: Pictures,
+) -> list[dict[str, Any]]:
+    """The opening pictures: ground truth and methods, each with its label, mark, value, and the picture or a reason."""
+    tiles: list[dict[str, Any]] = []
+    if first.frame is None:
+        return tiles
+    for label in ("", *first.methods):
+        place = runs.methods.index(label) + 1 if label else 0
+        value = values.get((metrics[0].name, label, first.frame)) if metrics and label else None
+        image = pictures.shown[first.frame][place]
+        tiles.append(
+            {
+                "label": label or "Ground truth",
+                "mark": _marks(runs).get(label),
+                "value": "" if value is None else f"{value:.{metrics[0].digits}f}",
+                "unit": metrics[0].unit if metrics else "",
+                "image": image,
+                "reason": pictures.reasons[first.frame][place],
+            }
+        )
+    return tiles
+
+
 def _filled(
     content: dict[str, Any],
     data: dict[str, Any],
     images: Sequence[str],
     pictures: Pictures,
+    tiles: Sequence[dict[str, Any]],
     *,
     apart: bool = False,
 ) -> str:
+    size = f":root {{ --tiles: {max(1, len(tiles))}; --ratio: {content['ratio']}; }}\n"
+    style = stylesheet() + content["own_style"] + size
     # A page opened from a disk has no origin, so that 'self' matches nothing.
     beside = " 'self' file:" if apart else ""
+    hashes = " ".join(f"'{policy_hash(script)}'" for script in content["scripts"])
     policy = "; ".join(
         [
             "default-src 'none'",
             "img-src data:",
-            f"script-src '{_digest(content['script'])}'{beside}",
-            f"style-src '{_digest(content['style'])}'",
+            f"script-src {hashes}{beside}",
+            f"style-src '{policy_hash(style)}'",
             "base-uri 'none'",
             "form-action 'none'",
         ]
@@ -188,14 +266,8 @@ def _filled(
         "truth": pictures.truth,
         "first_cameras": pictures.first_cameras_lossless,
     }
-    return render_page(
-        "page.html", **content, policy=policy, words=words, data=_json(data), images=_json(list(images))
-    )
-
-
-def _digest(text: str) -> str:
-    """Source expression of a script or a style in a content security policy."""
-    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+    filled = {"policy": policy, "style": style, "words": words, "tiles": tiles}
+    return render_page("page.html", **content | filled, data=_json(data), images=_json(list(images)))
 
 
 def _json(value: Any) -> str:
@@ -226,7 +298,10 @@ def _data(
     return {
         "methods": list(runs.methods),
         "trivial": list(runs.trivial),
+        "marks": [_marks(runs)[label] for label in runs.methods],
+        "shapes": SHAPES,
         "tasks": [TASK_TITLES.get(task, task) for task in runs.tasks],
+        "opening": {"frame": None, "methods": []},
         "subjects": subjects,
         "sequences": sequences,
         "cameras": cameras,
@@ -286,6 +361,7 @@ def _plots(runs: RunSet, metrics: Sequence[MetricSpec]) -> list[dict[str, Any]]:
             sign = 1 if metrics[0].higher_is_better else -1
             plots.append(
                 {
+                    "task": runs.tasks.index(task),
                     "title": f"{TASK_TITLES.get(task, task)}: {metrics[0].label} against {words.split(' (')[0].lower()}",
                     "x": words,
                     "y": f"{metrics[0].label} ({metrics[0].unit})" if metrics[0].unit else metrics[0].label,
@@ -304,33 +380,75 @@ def _cost(runs: RunSet, label: str, cost: str) -> float | None:
     return milliseconds if milliseconds is not None or not rate else 1000.0 / rate
 
 
+FOREST = 120
+"""Half the width of a drawing of differences."""
+
+
 def _comparisons(runs: RunSet) -> dict[str, Any]:
-    """Paired differences by task and metric, or the reason why they are missing."""
+    """Paired differences by task and metric, or the reason why they are missing; ``all`` are plain comparisons."""
     if len(runs.ranked) < 2:
-        return {"reason": "A comparison takes two methods that are no trivial baselines.", "groups": []}
+        return {
+            "reason": "A comparison takes two methods that are no trivial baselines.",
+            "groups": [],
+            "all": [],
+        }
     specs = {spec.name: spec for spec in runs.metrics}
     settings = CompareSettings(tuple(str(run.folder.root) for run in runs.runs))
     findings = compare_methods(runs, settings)
-    groups: dict[tuple[str, str], list[list[str]]] = {}
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for one in findings.data["comparisons"]:
         spec = specs[one["metric"]]
         task = TASK_TITLES.get(one["task"], one["task"]) or AVATAR_TITLE
         unit = f" ({spec.unit})" if spec.unit else ""
         better = "higher" if spec.higher_is_better else "lower"
-        line = [f"{one['first']} − {one['second']}"]
+        texts = [f"{one['first']} − {one['second']}"]
         if one["difference"] is None:
-            line += ["–", "–", "–", f"{one['verdict']}: {one['reason']}"]
+            texts += ["–", "–", "–", f"{one['verdict']}: {one['reason']}"]
         else:
             digits = spec.digits + 1
             bounds = (one["low"], one["high"])
             interval = "–" if None in bounds else " to ".join(f"{bound:+.{digits}f}" for bound in bounds)
-            line += [f"{one['difference']:+.{digits}f}", interval, f"{one['p_holm']:.4f}", one["verdict"]]
+            texts += [f"{one['difference']:+.{digits}f}", interval, f"{one['p_holm']:.4f}", one["verdict"]]
+        line = {"texts": texts, "one": one}
         groups.setdefault((task, f"{spec.label}{unit}, {better} is better"), []).append(line)
     subjects = len(runs.rows.subjects)
     return {
         "reason": "",
+        "all": findings.data["comparisons"],
         "subjects": subjects,
         "level": findings.data["level"],
-        "testable": any("not testable" not in line[-1] for lines in groups.values() for line in lines),
-        "groups": [{"title": f"{task}, {what}", "lines": lines} for (task, what), lines in groups.items()],
+        "testable": any(
+            one["p_holm"] is not None and not one["verdict"].startswith("not testable")
+            for one in findings.data["comparisons"]
+        ),
+        "groups": [
+            {"title": f"{task}, {what}", "lines": _with_forest(own) if subjects > 1 else own}
+            for (task, what), own in groups.items()
+        ],
     }
+
+
+def _with_forest(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Add places of the subjects' differences, their mean and interval, on one axis for all lines."""
+    numbers = [
+        number
+        for line in lines
+        for number in (*line["one"]["differences"].values(), line["one"]["low"], line["one"]["high"])
+        if number is not None
+    ]
+    scale = (FOREST - 8) / (max(map(abs, numbers), default=1.0) or 1.0)
+
+    def place(number: float | None) -> float | None:
+        return None if number is None else round(FOREST + scale * number, 1)
+
+    for line in lines:
+        one = line["one"]
+        line["forest"] = {
+            "subjects": [
+                (subject, place(value), f"{value:+.4g}") for subject, value in one["differences"].items()
+            ],
+            "mean": place(one["difference"]),
+            "low": place(one["low"]),
+            "high": place(one["high"]),
+        }
+    return lines

@@ -8,12 +8,12 @@ import tyro
 
 from ...bench.engine.config import RunOptions
 
-MAX_MB, MAX_SPLIT_MB = 20.0, 500.0
+MAX_MB, MAX_SPLIT_MB = 10.0, 500.0
 
 
 @dataclass(frozen=True)
 class PageSettings(RunOptions):
-    """Write finished runs to one HTML file: tables, frames of all methods side by side, curves, provenance.
+    """Write finished runs to one HTML file: what it shows in words, frames of all methods side by side, tables, curves, provenance.
 
     It needs no network and no other file. Pictures are chosen to fit in --max-mb: the worst frames of each
     method and task always, the others evenly over time. With --split it is a folder whose index.html loads
@@ -30,7 +30,7 @@ class PageSettings(RunOptions):
     """Whether pictures are in separate files, in a folder with the page."""
 
     max_mb: float | None = None
-    """Maximum size in megabytes (10^6 bytes). By default 20, with --split 500."""
+    """Maximum size in megabytes (10^6 bytes). By default 10, with --split 500."""
 
     def __post_init__(self) -> None:
         if not self.runs:
