@@ -12,6 +12,7 @@ import numpy as np
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
 from ...bench.errors import InputError
+from ...bench.expressions import Expression
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, check_arrays, read_arrays
 from ...bench.io.files import atomic_path, digest
 from .geometry import triangle_areas
@@ -157,6 +158,12 @@ class HeadArrays:
         shape = np.zeros(self.shape_basis.shape[2]) if shape is None else shape
         offset = np.zeros(self.template.shape) if static_offset is None else static_offset
         return PosedSubject(self, shape, offset).meshes([pose])[0]
+
+    def named_expressions(self) -> list[Expression]:
+        """The expressions that the model names; none for models like FLAME."""
+        from .names import named_expressions  # which imports this module
+
+        return named_expressions(self.version, self.expression_names, self.expression_basis.shape[2])
 
     def fingerprint(self) -> str:
         """Hex digest of the content: version, all arrays, regions and landmarks."""

@@ -9,14 +9,10 @@ from typing import Any
 import numpy as np
 
 from ....bench.contracts import Clip, FloatArray, HeadPose
+from ....bench.expressions import expressions_of
 from ....datasets.head.arrays import HeadArrays
-from ....datasets.head.names import named_expressions, strongest
 from .model import JOINTS, Slider
 
-COEFFICIENT = 2.0
-"""Range of sliders of expressions without a name and without a capture: standard deviations of FLAME's coefficients."""
-BEYOND = 1.5
-"""Range of sliders of expressions without a name, relative to the largest coefficient tracked in training."""
 JAW, JAW_SIDE, NECK, EYES = 0.4, 0.12, 0.4, 0.4
 """Radians."""
 MOST_HIDDEN = 6
@@ -54,22 +50,7 @@ def recorded_sequences(clip: Clip, version: str) -> list[Recorded]:
 
 def make_sliders(head: HeadArrays, count: int, poses: Sequence[HeadPose]) -> tuple[Slider, ...]:
     """The strongest expressions, then jaw, neck and eyes; then directions without a name that ``poses`` need."""
-    named = named_expressions(head)
-    expressions = [
-        _expression(name, shape.coefficients, -1.0 if shape.two_sided else 0.0, 1.0)
-        for name, shape in named.items()
-    ]
-    if not named:
-        reach = np.full(head.expression_basis.shape[2], COEFFICIENT)
-        if poses:
-            largest = np.abs([pose.expression for pose in poses]).max(axis=0)
-            reach = np.where(largest > 0, BEYOND * largest, reach)
-        expressions = [
-            _expression(f"expression {number + 1}", row, -far, far)
-            for number, (row, far) in enumerate(zip(np.eye(len(reach)), reach.round(4).tolist()))
-        ]
-    order = strongest(head, [slider.high * np.array(slider.direction) for slider in expressions])
-    chosen = [expressions[number] for number in order[:count]]
+    chosen = [_expression(*shape) for shape in expressions_of(head, count, poses)]
     both = (JOINTS.index("left eye"), JOINTS.index("right eye"))
     return (
         *chosen,

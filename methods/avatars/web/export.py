@@ -39,7 +39,7 @@ VIEWS = ((0.0, 0.0), (0.6, 0.0), (-0.6, 0.2))
 SIZE = 320
 MOST_MOMENTS = 8
 """Moments of the recorded sequences in which the loss is measured."""
-PICTURE_PX, PICTURE_NEAR, PICTURE_UP = 72, 0.5, 0.06
+PICTURE_PX, PICTURE_NEAR, PICTURE_UP = 96, 0.36, 0.02
 """Pictures of expressions: side in pixels; distance, and height above the middle, relative to the distance of the page's view."""
 DISTANCE_BY_HEIGHT = 2.6
 """Distance of the camera relative to the extent of the splats."""
@@ -123,8 +123,10 @@ def pictures(source: Source, sliders: Sequence[Slider], view: Mapping[str, Any])
             continue
         pose = source.pose([slider], [slider.high])
         image = quantise(source.avatar.render(source.camera(camera), pose).rgb)
-        image = cv2.resize(image, (PICTURE_PX, PICTURE_PX), interpolation=cv2.INTER_AREA)
-        encoded = encode_image(image, ".webp", (cv2.IMWRITE_WEBP_QUALITY, 80), place="a page")
+        small = np.asarray(
+            cv2.resize(image, (PICTURE_PX, PICTURE_PX), interpolation=cv2.INTER_AREA), np.uint8
+        )
+        encoded = encode_image(small, ".webp", (cv2.IMWRITE_WEBP_QUALITY, 80), place="a page")
         found.append(f"data:image/webp;base64,{base64.b64encode(encoded).decode()}")
     return found
 
@@ -181,7 +183,11 @@ def recorded_loss(
     source: Source, page: WebAvatar, view: Mapping[str, Any], poses: Sequence[HeadPose], values: FloatArray
 ) -> float:
     """Minimum PSNR in dB of recorded poses, (T, M) values of the sliders, from the front."""
-    place = {"rotation": source.rest.rotation, "translation": source.rest.translation, "timestep": None}
+    place: dict[str, Any] = {
+        "rotation": source.rest.rotation,
+        "translation": source.rest.translation,
+        "timestep": None,
+    }
     camera = _camera(view, *VIEWS[0])
     return min(_psnr(source, page, replace(pose, **place), row, camera) for pose, row in zip(poses, values))
 
