@@ -115,7 +115,7 @@ def training_images(clip: Clip, rule: ResolutionRule) -> dict[str, Any]:
 def pictures(source: Source, sliders: Sequence[Slider], view: Mapping[str, Any]) -> list[str]:
     """A small picture of the face at the upper end of each slider of an expression, as data URIs; "" for others."""
     center = np.array(view["target"]) + [0.0, PICTURE_UP * view["distance"], 0.0]
-    camera = orbit_camera(direction_of(0.0, 0.0), PICTURE_NEAR * view["distance"], center, 2 * PICTURE_PX)
+    camera = orbit_camera(direction_of(0.0, 0.0), PICTURE_NEAR * view["distance"], center, PICTURE_PX)
     found = []
     for slider in sliders:
         if slider.joints or not slider.name:
