@@ -18,10 +18,10 @@ from ...bench.engine.scoring import FULL
 from ...bench.engine.store import RunFolder
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_text
-from ...bench.io.provenance import COMPOSITE, source_type, tool
+from ...bench.io.provenance import COMPOSITE, source_type
+from ...bench.io.style import SHAPES, policy_hash, stylesheet
 from ...bench.protocol import TASK_TITLES
 from ...bench.specs import CommandResult, MetricSpec
-from ...bench.io.style import SHAPES, policy_hash, stylesheet
 from ..aggregate import summarise
 from ..compact import compact
 from ..drawing import colour_map
@@ -34,7 +34,7 @@ from ..writers import render_page
 from .cards import cards_of
 from .frames import Pictures, ShownFrame, choose_pictures, frame_values, worst_frames
 from .opening import Opening, opening
-from .record import failed_cells, name_of, record_of
+from .record import failed_cells, record_of
 from .settings import MAX_MB, MAX_SPLIT_MB, PageSettings
 from .split import (
     ENTRY_BYTES,

@@ -21,7 +21,7 @@ from ..tables import Table
 from .frames import ShownFrame
 
 Values = Mapping[tuple[str, str, ShownFrame], float]
-WORDS = "no one two three four five six seven eight nine ten eleven twelve".split()
+WORDS = ["no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
 NAMED = 3
 """Methods that a title names, and that a sentence compares one by one."""
 MIDDLE = 0.9

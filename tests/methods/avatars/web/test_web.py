@@ -42,7 +42,8 @@ def test_splats_at_the_step_of_a_slider_are_the_avatars(exported):
 
 def test_sliders_moved_together_stay_near_the_avatar(exported):
     source, baked = exported.source, exported.baked
-    values = values_of(baked, jaw_open=0.2, neck_turn=0.3, neck_nod=-0.1, eyes_sideways=0.2, expression_1=0.1)
+    moved = {baked.sliders[0].name.replace(" ", "_"): 0.1}
+    values = values_of(baked, jaw_open=0.2, neck_turn=0.3, neck_nod=-0.1, eyes_sideways=0.2, **moved)
     moved = baked.moved(values, CENTER).means
     theirs = source.seen(source.pose(baked.sliders, values)).means
     travelled = np.linalg.norm(theirs - baked.means, axis=1)
