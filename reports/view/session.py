@@ -33,8 +33,9 @@ DRAFT_S = 0.026
 """Time of a draft while something moves, so that 30 a second arrive; its size follows from the time of the last one."""
 TOLD_S = 0.5
 """Between two texts about drafts: the browser takes longer to set a text than to show a draft."""
-ONE_THREAD = "headbench.methods.shared.threads:torch_on_one_thread"
-"""For drafts, whose steps are too short for several threads of torch; by name, since this package imports no method."""
+THREADS = "headbench.methods.shared.threads:torch_threads"
+"""Drafts take one thread: their steps are short, and threads that wait for each other lose to the browser on the same cores.
+By name, since this package imports no method."""
 REST_S = 0.3
 """Time without a change after which the image is drawn in full."""
 LEAST_DRAFT = 0.12
@@ -70,7 +71,7 @@ class Session:
         self._tasks: list[Callable[[], None]] = []
         self.updates = 0
         self._told = -np.inf
-        self._one_thread = resolve(ONE_THREAD)
+        self._threads = resolve(THREADS)
         self._look_at_head()
         self._panel = ControlPanel(client, scene, expressions, self._changed.set, self._jump)
         client.camera.on_update(lambda _: self._camera_moved())
@@ -127,8 +128,8 @@ class Session:
         for handle in self._handles.values():
             handle.visible = False
         whole = scale == 1.0
-        # With one thread of torch the last digits differ, so that whole images are drawn as for metrics.
-        with self._lock, nullcontext() if whole else self._one_thread(True):
+        # With one thread the last digits differ, so that whole images are drawn as for metrics.
+        with self._lock, nullcontext() if whole else self._threads(1):
             drawn = draw(self._scene, state, self._view(), self._size(), scale)
         between = time.perf_counter()
         self._client.scene.set_background_image(
