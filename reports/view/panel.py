@@ -18,6 +18,11 @@ REACH = {"jaw": 0.4, "neck": 0.5, "eyes": 0.5}
 FREE = "free"
 IMAGES, SPLATS = "images", "splats"
 MOST_FPS = 60
+LABELS = """<style>
+:root { --mantine-color-dimmed: light-dark(#495057, #c1c2c5) !important; }
+p.mantine-Text-root:has(> label) { font-size: 1em !important; letter-spacing: 0 !important; }
+</style>"""
+"""Labels of 13 pixels with a contrast above 4.5; viser's have 11.6 pixels, narrowed, and a contrast of 3.3."""
 
 
 class ControlPanel:
@@ -42,6 +47,7 @@ class ControlPanel:
         self._expressions: dict[str, list[tuple[Any, FloatArray]]] = {}
         self._joints: dict[str, list[Any]] = {}
         gui.set_panel_label("headbench")
+        gui.add_html(LABELS)
         self._legend = gui.add_markdown("")
         self._mode = self._add(
             gui.add_dropdown(

@@ -138,11 +138,14 @@ def test_a_recorded_sequence_plays(exported, opened):
         return
     tab.get_by_label("Sequence", exact=True).select_option(index=len(exported.more["sequences"]) - 1)
     tab.get_by_role("button", name="Play").click()
-    tab.wait_for_function("window.avatar.state.moment > 0")
+    for _ in range(100):  # the page's policy forbids what wait_for_function does
+        tab.wait_for_timeout(50)
+        if tab.evaluate("window.avatar.state.moment") > 0:
+            break
     tab.get_by_role("button", name="Pause").click()
     moment = tab.evaluate("window.avatar.state.moment")
     tab.wait_for_timeout(300)
-    assert tab.evaluate("window.avatar.state.moment") == moment
+    assert tab.evaluate("window.avatar.state.moment") == moment > 0
     assert tab.evaluate("window.avatar.state.values.some(value => value !== 0)")
 
 
