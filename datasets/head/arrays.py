@@ -161,7 +161,7 @@ class HeadArrays:
 
     def named_expressions(self) -> list[Expression]:
         """The expressions that the model names; none for models like FLAME."""
-        from .names import named_expressions  # which imports this module
+        from .names import named_expressions  # which are needed by few
 
         return named_expressions(self.version, self.expression_names, self.expression_basis.shape[2])
 

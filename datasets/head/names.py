@@ -9,7 +9,7 @@ import numpy as np
 from ...bench.contracts import FloatArray
 from ...bench.expressions import Expression
 from .procedural.expressions import PAIRED, SEMANTIC_NAMES, SIDEWAYS, SINGLE
-from .procedural.model import VERSIONS, semantic_to_coefficients
+from .procedural.versions import VERSIONS, semantic_to_coefficients
 
 SIDES = (("_left", "_right"), ("_L", "_R"))
 """Endings of the names of two shapes that are mirror images."""

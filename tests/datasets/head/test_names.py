@@ -10,8 +10,9 @@ from headbench.bench.errors import InputError
 from headbench.bench.expressions import expressions_of
 from headbench.datasets.head.arrays import read_head, save_head
 from headbench.datasets.head.procedural.expressions import LIDS
-from headbench.datasets.head.procedural.model import procedural_head, version_shapes
+from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.head.procedural.surface import load_sculpture
+from headbench.datasets.head.procedural.versions import version_shapes
 
 from .toy import toy_head
 
@@ -40,7 +41,7 @@ def test_the_strongest_expressions_come_first():
     assert len(found) == 6
 
 
-def test_models_without_names_have_coefficients_in_the_recorded_range():
+def test_models_without_names_have_single_coefficients():
     head = toy_head(16)
     size = head.expression_basis.shape[2]
     none = np.zeros(3)

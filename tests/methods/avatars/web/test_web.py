@@ -125,7 +125,7 @@ def test_pictures_show_the_expressions(exported):
     assert max(map(len, pictures)) < 6000
 
 
-def test_pixels_of_the_training_are_as_wide_as_the_rule_makes_them(run):
+def test_pixels_of_the_training_follow_the_rule(run):
     clip = open_clip(str(run.read_manifest().configuration.data))
     camera = next(iter(clip.cameras.values()))
     plain, halved = (training_images(clip, ResolutionRule(divide=divide)) for divide in (1, 2))
