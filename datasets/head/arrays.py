@@ -12,6 +12,7 @@ import numpy as np
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
 from ...bench.errors import InputError
+from ...bench.expressions import Expression
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, check_arrays, read_arrays
 from ...bench.io.files import atomic_path, digest
 from .geometry import triangle_areas
@@ -77,6 +78,8 @@ class HeadArrays:
         Vertex indices by name, unique; sorted except for `RING_REGIONS`.
     landmarks : Mapping[str, int]
         Vertex index by name; may be empty.
+    expression_names : tuple[str, ...]
+        Names of the expression directions, in order; () if they have none.
     """
 
     version: str
@@ -91,6 +94,7 @@ class HeadArrays:
     eyelid_basis: FloatArray | None = None
     regions: Mapping[str, IntArray] = field(default_factory=dict)
     landmarks: Mapping[str, int] = field(default_factory=dict)
+    expression_names: tuple[str, ...] = ()
 
     def validate(self, file: str | PathLike[str]) -> HeadArrays:
         """Validate the model and return self.
@@ -112,6 +116,9 @@ class HeadArrays:
             arrays["eyelid_basis"] = self.eyelid_basis
         sizes = {"J": len(JOINT_NAMES), "9 (J - 1)": 9 * (len(JOINT_NAMES) - 1)}
         sizes = check_arrays(file, arrays, _MEMBERS, sizes)
+        if self.expression_names and len(self.expression_names) != sizes["E"]:
+            expected = f"as many names as expression directions, {sizes['E']}"
+            raise InputError(file, "expression_names", expected, str(len(self.expression_names)))
         if sizes["V"] == 0 or sizes["F"] == 0:
             raise InputError(file, "template", "at least one vertex and one triangle", "an empty mesh")
         sums = self.skinning_weights.sum(axis=1, dtype=np.float64)
@@ -151,6 +158,12 @@ class HeadArrays:
         shape = np.zeros(self.shape_basis.shape[2]) if shape is None else shape
         offset = np.zeros(self.template.shape) if static_offset is None else static_offset
         return PosedSubject(self, shape, offset).meshes([pose])[0]
+
+    def named_expressions(self) -> list[Expression]:
+        """The expressions that the model names; none for models like FLAME."""
+        from .names import named_expressions  # which are needed by few
+
+        return named_expressions(self.version, self.expression_names, self.expression_basis.shape[2])
 
     def fingerprint(self) -> str:
         """Hex digest of the content: version, all arrays, regions and landmarks."""
@@ -213,6 +226,7 @@ _FILE = {
     "version": TEXT,
     "landmark_names": Member("U", ("L",)),
     "landmark_vertices": Member("iu", ("L",)),
+    "expression_names": Member("U", ("E",), optional=True),
 }
 
 
@@ -220,7 +234,7 @@ def save_head(path: Path, arrays: HeadArrays) -> None:
     """Write a head as one npz file (no pickled objects), whole or not at all.
 
     Members: ``format``, ``version``, the array fields by name, ``eyelid_basis`` if there is one,
-    ``region/<name>`` for each region, ``landmark_names`` and ``landmark_vertices``. Equal heads give equal bytes: the
+    ``region/<name>`` for each region, ``landmark_names`` and ``landmark_vertices``, ``expression_names`` if there are. Equal heads give equal bytes: the
     file is uncompressed because compression depends on the library's version.
     """
     content: dict[str, np.ndarray] = {"format": np.array(FORMAT), "version": np.array(arrays.version)}
@@ -230,6 +244,8 @@ def save_head(path: Path, arrays: HeadArrays) -> None:
     content |= {f"region/{name}": members for name, members in arrays.regions.items()}
     content["landmark_names"] = np.array(list(arrays.landmarks), dtype=np.str_)
     content["landmark_vertices"] = np.array(list(arrays.landmarks.values()), dtype=np.int64)
+    if arrays.expression_names:
+        content["expression_names"] = np.array(arrays.expression_names, dtype=np.str_)
     with atomic_path(Path(path)) as temporary, temporary.open("wb") as stream:
         np.savez(stream, allow_pickle=False, **content)
 
@@ -256,6 +272,7 @@ def read_head(path: Path) -> HeadArrays:
         eyelid_basis=content.get("eyelid_basis"),
         regions=regions,
         landmarks={str(name): int(vertex) for name, vertex in zip(names, vertices)},
+        expression_names=tuple(map(str, content.get("expression_names", ()))),
     ).validate(path)
 
 

@@ -124,6 +124,7 @@ def _rigged(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> Hea
         parents=np.array([-1, 0, 1, 1, 1]),
         regions=regions_of(template, faces, parts, profile, landmarks),
         landmarks=dict(zip(LANDMARKS, landmarks.tolist())),
+        expression_names=expression_names(content),
     )
 
 

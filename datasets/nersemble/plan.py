@@ -14,7 +14,7 @@ from ...bench.io.files import digest
 from ..ga import layout
 from ..head.arrays import HeadArrays
 from ..head.loaders import load_head
-from ..head.procedural.model import VERSIONS
+from ..head.procedural.versions import VERSIONS
 from .names import (
     PAPER_SEQUENCES,
     SEQUENCES,

@@ -19,7 +19,8 @@ from ...bench.errors import InputError
 from ..clip import CaptureClip, as_capture
 from ..ga.tracking import find_head
 from ..head.arrays import HeadArrays
-from ..head.procedural.model import VERSIONS, procedural_head
+from ..head.procedural.model import procedural_head
+from ..head.procedural.versions import VERSIONS
 from ..head.refit.refit import refit
 from ..head.subject import PosedSubject, camera_in_head_frame, pose_in_head_frame
 from .resolution import align_clip, alignments

@@ -16,7 +16,7 @@ from scipy.interpolate import PchipInterpolator
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose
 from ...bench.errors import InputError
 from ..head.procedural.expressions import SEMANTIC_NAMES
-from ..head.procedural.model import semantic_to_coefficients
+from ..head.procedural.versions import semantic_to_coefficients
 from ..rounding import COEFFICIENT_BITS, on_grid
 from . import natural
 from .anatomy import SIDES

@@ -21,6 +21,7 @@ from ...bench.engine.stored import avatar_folder, open_avatar
 from ...bench.errors import HeadbenchError, InputError
 from ...bench.experiments.extremes import head_center, training_poses
 from ...bench.experiments.reenactment import RigidMean, check_heads, retarget
+from ...bench.expressions import Expression, expressions_of
 from .settings import ViewSettings
 
 log = logging.getLogger(__name__)
@@ -64,12 +65,6 @@ class ShownAvatar:
         none = {name: np.zeros_like(getattr(pose, name)) for name in ("expression", "neck", "jaw", "eyes")}
         lids = None if pose.eyelids is None else np.zeros_like(pose.eyelids)
         return replace(pose, **none, eyelids=lids, timestep=None)
-
-    @cached_property
-    def reach(self) -> FloatArray:
-        """(E,) how far the slider of each expression goes: 1.5 times the largest coefficient tracked in training."""
-        largest = np.abs([pose.expression for pose in training_poses(self.form.clip)]).max(axis=0)
-        return np.asarray(np.where(largest > 0, 1.5 * largest, 1.0))
 
     @cached_property
     def center(self) -> FloatArray:
@@ -129,13 +124,14 @@ class Scene:
         """The avatar in whose world the viewer's camera is."""
         return self.shown[0]
 
-    def heads(self) -> dict[str, FloatArray]:
-        """Ranges of the sliders of each head model, by its version."""
-        reach: dict[str, FloatArray] = {}
+    def expressions(self, count: int) -> dict[str, list[Expression]]:
+        """The strongest expressions of each head model, by its version; ranges are those of the training of the first avatar."""
+        found: dict[str, list[Expression]] = {}
         for shown in self.shown:
-            known = reach.get(shown.version)
-            reach[shown.version] = shown.reach if known is None else np.maximum(known, shown.reach)
-        return reach
+            if shown.version not in found:
+                poses = training_poses(shown.form.clip)
+                found[shown.version] = expressions_of(shown.form.clip.head, count, poses)
+        return found
 
 
 def open_scene(settings: ViewSettings, kept: Path) -> Scene:

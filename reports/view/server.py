@@ -62,7 +62,7 @@ def serving(scene: Scene, settings: ViewSettings) -> Iterator[Any]:
     server.address = guard.address(server.get_port())
     # It can open a tunnel to a public address on a browser's wish; no picture of anybody leaves this way.
     server.request_share_url = lambda verbose=True: None
-    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()
     # Drawing for a browser that disconnects is discarded.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")

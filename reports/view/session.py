@@ -7,6 +7,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from ...bench.experiments.viewpoints import turntable
 from ...bench.io.images import write_png
 from ...bench.io.provenance import COMPOSITE
 from ...bench.io.video import write_webm
+from ...bench.registry import resolve
 from .drawing import draw, rotations, splats_of
 from .panel import ControlPanel
 from .scene import Scene
@@ -27,8 +29,13 @@ from .state import FreeView, State
 log = logging.getLogger(__name__)
 SCALE = 100.0
 """Units of the browser's world in a metre: covariances travel as 16-bit floats, which would round those in square metres."""
-DRAFT_S = 0.06
-"""Maximum time of a draft while something moves; its size follows from the time of the last one."""
+DRAFT_S = 0.026
+"""Time of a draft while something moves, so that 30 a second arrive; its size follows from the time of the last one."""
+TOLD_S = 0.5
+"""Between two texts about drafts: the browser takes longer to set a text than to show a draft."""
+THREADS = "headbench.methods.shared.threads:torch_threads"
+"""Drafts take one thread: their steps are short, and threads that wait for each other lose to the browser on the same cores.
+By name, since this package imports no method."""
 REST_S = 0.3
 """Time without a change after which the image is drawn in full."""
 LEAST_DRAFT = 0.12
@@ -63,6 +70,8 @@ class Session:
         self._offset: FloatArray = np.zeros(3)
         self._tasks: list[Callable[[], None]] = []
         self.updates = 0
+        self._told = -np.inf
+        self._threads = resolve(THREADS)
         self._look_at_head()
         self._panel = ControlPanel(client, scene, expressions, self._changed.set, self._jump)
         client.camera.on_update(lambda _: self._camera_moved())
@@ -118,10 +127,11 @@ class Session:
             return
         for handle in self._handles.values():
             handle.visible = False
-        with self._lock:
+        whole = scale == 1.0
+        # With one thread the last digits differ, so that whole images are drawn as for metrics.
+        with self._lock, nullcontext() if whole else self._threads(1):
             drawn = draw(self._scene, state, self._view(), self._size(), scale)
         between = time.perf_counter()
-        whole = scale == 1.0
         self._client.scene.set_background_image(
             drawn.image, "png" if whole else "jpeg", jpeg_quality=DRAFT_QUALITY
         )
@@ -130,6 +140,9 @@ class Session:
         self.updates += 1
         if not whole:
             self._draft = float(np.clip(scale * np.sqrt(DRAFT_S / (end - start)), LEAST_DRAFT, 0.99))
+            if end - self._told < TOLD_S:
+                return
+        self._told = end
         each = ", ".join(f"{name} {time_:.0f} ms" for name, time_ in drawn.milliseconds.items())
         height, width = drawn.image.shape[:2]
         self._panel.show_times(

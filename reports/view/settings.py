@@ -29,7 +29,7 @@ class ViewSettings(RunOptions):
     """Capture of another subject, with the same head model, whose sequences drive the avatars too."""
 
     expressions: int = 10
-    """Number of sliders for the leading expressions of each head model."""
+    """Number of sliders for expressions of each head model: the named ones, else the single coefficients, that move it farthest."""
 
     method: str = ""
     """Method of an avatar outside of runs as package.module:SPEC, where it is not registered."""

@@ -18,7 +18,7 @@ class Sliders:
     Attributes
     ----------
     expressions : Mapping[str, tuple[float, ...]]
-        Leading coefficients by head model, in the model's units.
+        Coefficients by head model, in the model's units; only the leading ones if they are fewer.
     jaw, neck : tuple[float, ...]
         (3,) rotations about x, y and z.
     eyes : tuple[float, ...]

@@ -64,7 +64,8 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
 def target_head(name: str) -> HeadArrays:
     """The head model of ``--target``: a version of the procedural head, or a file."""
     from ..loaders import load_head
-    from ..procedural.model import VERSIONS, procedural_head
+    from ..procedural.model import procedural_head
+    from ..procedural.versions import VERSIONS
 
     short = [version.removeprefix("procedural") for version in VERSIONS]
     if name in (*short, *VERSIONS):

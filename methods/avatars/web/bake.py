@@ -63,7 +63,7 @@ class Source:
         }
         for slider, value in zip(sliders, values):
             if not slider.joints:
-                parts["expression"][slider.number] += value
+                parts["expression"] += value * np.array(slider.direction)
             for joint in slider.joints:
                 name, first = (("neck", 0), ("jaw", 0), ("eyes", 0), ("eyes", 3))[joint]
                 parts[name][first + slider.axis] += value
@@ -145,7 +145,7 @@ def _weights(source: Source, rest: Seen) -> FloatArray:
     for joint in range(len(JOINTS)):
         products, squares = np.zeros(len(rest.means)), np.zeros(len(rest.means))
         for axis in (0, 1):
-            slider = Slider("", (joint,), axis, 0, 0.0, 1.0, 1.0)
+            slider = Slider("", (joint,), axis, (), 0.0, 1.0, 1.0)
             moved = source.seen(source.pose([slider], [TRIAL_TURN])).means
             vector = np.zeros((1, 3))
             vector[0, axis] = TRIAL_TURN

@@ -3,45 +3,44 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
-from ....bench.contracts import Camera, FloatArray, HeadPose, Progress, no_progress
+from ....bench.contracts import Camera, Clip, FloatArray, HeadPose, Progress, no_progress
 from ....bench.engine.stored import AVATAR_FILE, HEAD_FILE
 from ....bench.errors import InputError
+from ....bench.experiments.extremes import head_center
 from ....bench.io.files import check_writable, write_text
+from ....bench.io.images import encode_image, quantise
 from ....bench.io.provenance import RENDER, note, source_type, tool
-from ....bench.specs import CommandResult
+from ....bench.io.style import policy_hash, stylesheet
+from ....bench.specs import CommandResult, ResolutionRule
 from ...shared.avatar_files import read_shared_head
 from ...shared.rendering import view_of
 from ...splats import rasterize
 from ..export import neutral_pose, open_splats
 from ..views import direction_of, orbit_camera
 from .bake import Source, bake
+from .controls import make_sliders, packed_sequences, recorded_sequences, slider_values
 from .model import JOINTS, Moved, Slider, WebAvatar
 from .payload import decode, encode, quaternions
 from .settings import ExportHtmlSettings
 
 DIRECTIONS = 96
 """Number of viewing directions, evenly spread over the sphere, in which colours are sampled."""
-COEFFICIENT = 2.0
-"""Range of expression sliders without a capture: standard deviations of FLAME's coefficients."""
-BEYOND = 1.5
-"""Range of expression sliders with a capture, relative to the largest coefficient tracked in training."""
-JAW, JAW_SIDE, NECK, EYES = 0.4, 0.12, 0.4, 0.4
-"""Radians."""
 VIEWS = ((0.0, 0.0), (0.6, 0.0), (-0.6, 0.2))
 """Azimuth and elevation, radians, of the views in which the loss is measured."""
 SIZE = 320
-TOGETHER = ("expression 1", "expression 2", "jaw open")
-"""Number of sliders that are also tested together at their upper ends, since avatars need not be additive as morphs
-are."""
+MOST_MOMENTS = 8
+"""Moments of the recorded sequences in which the loss is measured."""
+PICTURE_PX, PICTURE_NEAR, PICTURE_UP = 96, 0.36, 0.02
+"""Pictures of expressions: side in pixels; distance, and height above the middle, relative to the distance of the page's view."""
 DISTANCE_BY_HEIGHT = 2.6
 """Distance of the camera relative to the extent of the splats."""
 
@@ -52,12 +51,13 @@ def export_page(settings: ExportHtmlSettings, progress: Progress = no_progress) 
     check_writable(out, "--out")
     stored, avatar = open_splats(settings)
     head = read_shared_head(stored.folder)
-    rest, reach = neutral_pose(head), np.full(head.expression_basis.shape[2], COEFFICIENT)
+    rest, sequences, trained = neutral_pose(head), [], None
     if settings.capture is not None:
         clip = settings.open(settings.capture, progress)
-        poses = [clip.poses[t] for t in sorted({key.timestep for key in clip.splits["train"]})]
-        rest = replace(rest, rotation=poses[0].rotation, translation=poses[0].translation)
-        reach = _reach(poses, head.version, reach)
+        first = clip.poses[min(key.timestep for key in clip.splits["train"])]
+        rest = replace(rest, rotation=first.rotation, translation=first.translation)
+        sequences = recorded_sequences(clip, head.version)
+        trained = training_images(clip, stored.record["resolution"])
     shape, size = np.asarray(stored.record["shape"]), head.shape_basis.shape[2]
     if len(shape) > size:
         expected = f"at most {size} coefficients, as {HEAD_FILE} beside it has"
@@ -65,51 +65,70 @@ def export_page(settings: ExportHtmlSettings, progress: Progress = no_progress) 
     shaped = head.template + head.shape_basis[..., : len(shape)] @ shape
     joints = np.asarray(head.joint_regressor @ shaped, np.float64)
     source = Source(avatar, rest, joints[0], joints[1 : 1 + len(JOINTS)])
-    sliders = make_sliders(reach[: settings.expressions])
+    poses = [pose for sequence in sequences for pose in sequence.poses]
+    sliders = make_sliders(head, settings.expressions, poses)
     baked = bake(source, sliders, settings.degree, DIRECTIONS, progress)
     low, high = np.quantile(baked.means, (0.005, 0.995), axis=0)
     view = {
         "distance": round(DISTANCE_BY_HEIGHT * float((high - low).max()), 4),
         "target": ((low + high) / 2).round(5).tolist(),
     }
-    content = encode(baked, view)
-    page = fill_page(content, settings.title or stored.record["subject"])
+    more = {
+        "trained": trained,
+        "sequences": packed_sequences(head, sliders, sequences),
+        "pictures": pictures(source, sliders, view),
+    }
+    content = encode(baked, view, more)
+    page = fill_page(content, settings.title or f"{stored.record['subject']}, {stored.record['method']}")
     write_text(out, page)
-    losses = measure_losses(source, decode(content), view, progress)
+    read = decode(content)
+    losses = measure_losses(source, read, view, progress)
+    if poses:
+        chosen = [poses[number] for number in _spread(len(poses))]
+        losses["recorded"] = recorded_loss(source, read, view, chosen, slider_values(head, sliders, chosen))
     size = out.stat().st_size
     worst = min(losses, key=lambda name: losses[name])
-    text = f"{out}: {len(baked.means)} splats, {len(sliders)} sliders, {size / 1e6:.2f} MB; PSNR against headbench's renderer: "
+    shown = [slider.name for slider in sliders if slider.name]
+    text = f"{out}: {len(baked.means)} splats, {len(shown)} sliders, {len(sequences)} recorded sequences, {size / 1e6:.2f} MB; "
+    text += "PSNR against headbench's renderer: "
     text += ", ".join(f"{name} {value:.1f}" for name, value in losses.items()) + f" dB; minimum: {worst}"
-    return CommandResult(text, {"out": out, "splats": len(baked.means), "bytes": size, "psnr": losses})
+    if settings.capture is not None and not sequences:
+        text += f"\nThe capture was tracked with another head model than {head.version}; the page has no sequences to play."
+    data = {"out": out, "splats": len(baked.means), "bytes": size, "psnr": losses, "sliders": shown}
+    return CommandResult(text, data | {"sequences": [sequence.name for sequence in sequences]})
 
 
-def _reach(poses: Sequence[HeadPose], version: str, reach: FloatArray) -> FloatArray:
-    if poses[0].head_model != version:
-        return reach  # tracked with another head model, as for gbs
-    largest = np.abs([pose.expression for pose in poses]).max(axis=0)
-    return np.asarray(np.where(largest > 0, BEYOND * largest, reach))
-
-
-def make_sliders(reach: FloatArray) -> tuple[Slider, ...]:
-    """One for each expression, then jaw, neck and eyes."""
-    expressions = [
-        Slider(f"expression {n + 1}", (), 0, n, -float(r), float(r), float(r) / 2)
-        for n, r in enumerate(reach.round(4))
-    ]
-    both = (JOINTS.index("left eye"), JOINTS.index("right eye"))
-    return (
-        *expressions,
-        Slider("jaw open", (1,), 0, 0, 0.0, JAW, 0.75 * JAW),
-        Slider("jaw sideways", (1,), 1, 0, -JAW_SIDE, JAW_SIDE, JAW_SIDE),
-        *(
-            Slider(f"neck {name}", (0,), axis, 0, -NECK, NECK, 0.75 * NECK)
-            for axis, name in enumerate(("nod", "turn", "tilt"))
-        ),
-        *(
-            Slider(f"eyes {name}", both, axis, 0, -EYES, EYES, 0.75 * EYES)
-            for axis, name in enumerate(("up and down", "sideways"))
-        ),
+def training_images(clip: Clip, rule: ResolutionRule) -> dict[str, Any]:
+    """Size of the images of the training and the width of their pixels at the head, metres, both at the size of a rule."""
+    center = head_center(clip)
+    cameras = [clip.cameras[name] for name in sorted({key.camera for key in clip.splits["train"]})]
+    widths = [float(np.linalg.norm(camera.center - center) / camera.K[1, 1]) for camera in cameras]
+    camera = cameras[0]
+    side = {"pad": max, "crop": min}.get(rule.square, lambda width, height: height)(
+        camera.width, camera.height
     )
+    reduced = side / (rule.size[1] if rule.size else side / rule.divide * rule.multiply)
+    size = [max(1, round(length / rule.divide)) for length in (camera.width, camera.height)]
+    return {"size": size, "pixel": float(f"{reduced * np.median(widths):.4g}")}
+
+
+def pictures(source: Source, sliders: Sequence[Slider], view: Mapping[str, Any]) -> list[str]:
+    """A small picture of the face at the upper end of each slider of an expression, as data URIs; "" for others."""
+    center = np.array(view["target"]) + [0.0, PICTURE_UP * view["distance"], 0.0]
+    camera = orbit_camera(direction_of(0.0, 0.0), PICTURE_NEAR * view["distance"], center, PICTURE_PX)
+    found = []
+    for slider in sliders:
+        if slider.joints or not slider.name:
+            found.append("")
+            continue
+        pose = source.pose([slider], [slider.high])
+        image = quantise(source.avatar.render(source.camera(camera), pose).rgb)
+        small = np.asarray(
+            cv2.resize(image, (PICTURE_PX, PICTURE_PX), interpolation=cv2.INTER_AREA), np.uint8
+        )
+        encoded = encode_image(small, ".webp", (cv2.IMWRITE_WEBP_QUALITY, 80), place="a page")
+        found.append(f"data:image/webp;base64,{base64.b64encode(encoded).decode()}")
+    return found
 
 
 def fill_page(content: bytes, title: str) -> str:
@@ -117,11 +136,12 @@ def fill_page(content: bytes, title: str) -> str:
     from jinja2 import Environment, FileSystemLoader
 
     here = Path(__file__).parent
-    script, style = ((here / name).read_text(encoding="utf-8") for name in ("page.js", "page.css"))
-    allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    script, own = ((here / name).read_text(encoding="utf-8") for name in ("page.js", "page.css"))
+    style = stylesheet() + own
+    allowed = f"script-src '{policy_hash(script)}'; style-src '{policy_hash(style)}'"
     environment = Environment(autoescape=True, loader=FileSystemLoader(here))
     return environment.get_template("page.html").render(
-        policy=f"default-src 'none'; script-src 'sha256-{allowed}'; style-src 'unsafe-inline'",
+        policy=f"default-src 'none'; img-src data:; {allowed}; base-uri 'none'; form-action 'none'",
         tool=tool(),
         source_type=source_type(RENDER),
         note=f"Drawn by a trained model, not recorded. {note(RENDER)}",
@@ -138,26 +158,53 @@ def measure_losses(
     """Minimum PSNR in dB against the avatar itself, by group of sliders, each at its ends, over `VIEWS`."""
     trials = [("rest", np.zeros(len(page.sliders)))]
     for number, slider in enumerate(page.sliders):
+        if not slider.name:
+            continue
         group = "expressions" if not slider.joints else slider.name.split()[0]
         for value in {slider.low, slider.high} - {0.0}:
             values = np.zeros(len(page.sliders))
             values[number] = value
             trials.append((group, values))
-    trials.append(
-        ("together", np.array([slider.high * (slider.name in TOGETHER) for slider in page.sliders]))
-    )
+    # Several at once, since avatars need not be additive as morphs are.
+    names = [slider.name for slider in page.sliders if slider.name and not slider.joints][:2] + ["jaw open"]
+    trials.append(("together", np.array([slider.high * (slider.name in names) for slider in page.sliders])))
     losses: dict[str, float] = {}
     for done, (group, values) in enumerate(trials):
-        pose = source.pose(page.sliders, values)
-        for azimuth, elevation in VIEWS:
-            camera = orbit_camera(
-                direction_of(azimuth, elevation), view["distance"], np.array(view["target"]), SIZE
-            )
-            wanted = source.avatar.render(source.camera(camera), pose).rgb
-            error = float(np.square(draw(page.moved(values, camera.center), camera) - wanted).mean())
-            losses[group] = min(losses.get(group, np.inf), -10 * float(np.log10(max(error, 1e-12))))
+        lost = [
+            _psnr(source, page, source.pose(page.sliders, values), values, _camera(view, *angles))
+            for angles in VIEWS
+        ]
+        losses[group] = min(losses.get(group, np.inf), *lost)
         progress(done + 1, len(trials), f"comparing, {group}")
     return losses
+
+
+def recorded_loss(
+    source: Source, page: WebAvatar, view: Mapping[str, Any], poses: Sequence[HeadPose], values: FloatArray
+) -> float:
+    """Minimum PSNR in dB of recorded poses, (T, M) values of the sliders, from the front."""
+    place: dict[str, Any] = {
+        "rotation": source.rest.rotation,
+        "translation": source.rest.translation,
+        "timestep": None,
+    }
+    camera = _camera(view, *VIEWS[0])
+    return min(_psnr(source, page, replace(pose, **place), row, camera) for pose, row in zip(poses, values))
+
+
+def _psnr(source: Source, page: WebAvatar, pose: HeadPose, values: FloatArray, camera: Camera) -> float:
+    wanted = source.avatar.render(source.camera(camera), pose).rgb
+    error = float(np.square(draw(page.moved(values, camera.center), camera) - wanted).mean())
+    return -10 * float(np.log10(max(error, 1e-12)))
+
+
+def _camera(view: Mapping[str, Any], azimuth: float, elevation: float) -> Camera:
+    return orbit_camera(direction_of(azimuth, elevation), view["distance"], np.array(view["target"]), SIZE)
+
+
+def _spread(count: int) -> list[int]:
+    """At most `MOST_MOMENTS` numbers below ``count``, evenly spread."""
+    return sorted({round(number) for number in np.linspace(0, count - 1, min(count, MOST_MOMENTS))})
 
 
 def draw(moved: Moved, camera: Camera) -> FloatArray:

@@ -26,12 +26,16 @@ class Slider(NamedTuple):
 
     Attributes
     ----------
+    name : str
+        "" for motion that recorded sequences need besides the other sliders; it has no control.
     joints : tuple[int, ...]
         Indices into `JOINTS` of the joints that it rotates; none for an expression.
     axis : int
         0, 1 or 2 for x, y, z.
+    direction : tuple[float, ...]
+        (E,) expression coefficients at 1; () for joints.
     low, high : float
-        Ends of the slider: coefficients or radians.
+        Ends of the slider: multiples of ``direction``, or radians.
     step : float
         Value at which its morph has full weight.
     """
@@ -39,7 +43,7 @@ class Slider(NamedTuple):
     name: str
     joints: tuple[int, ...]
     axis: int
-    number: int
+    direction: tuple[float, ...]
     low: float
     high: float
     step: float

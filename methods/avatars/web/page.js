@@ -1,6 +1,6 @@
 "use strict";
 // Draws an avatar of 3D Gaussians with sliders. The layout of the bytes and the arithmetic are those of payload.py and model.py.
-const HEIGHT_FIELD = 30 * Math.PI / 180, LOW_PASS = 0.3, ALPHA_MIN = 1 / 255, ALPHA_MAX = 0.99, TEXELS = 4, MARGIN = 0.3;
+const HEIGHT_FIELD = 30 * Math.PI / 180, LOW_PASS = 0.3, ALPHA_MIN = 1 / 255, ALPHA_MAX = 0.99, TEXELS = 4, MARGIN = 0.3, FRAMES_PER_SECOND = 25;
 const at = id => document.getElementById(id);
 
 async function read() {
@@ -165,7 +165,7 @@ function order(data, ahead, center) {
 
 const VERTEX = `#version 300 es
 precision highp float; precision highp sampler2D;
-uniform sampler2D splats; uniform int perRow; uniform mat3 turn; uniform vec3 center; uniform vec2 size; uniform float focal;
+uniform sampler2D splats; uniform int perRow; uniform mat3 turn; uniform vec3 center; uniform vec2 size; uniform float focal, pixel;
 layout(location = 0) in vec2 corner; layout(location = 1) in uint index;
 out vec2 offset; flat out vec3 conic; flat out vec4 color;
 vec4 texel(int k) { int i = int(index); return texelFetch(splats, ivec2(${TEXELS} * (i % perRow) + k, i / perRow), 0); }
@@ -178,7 +178,8 @@ void main() {
   mat3 S = mat3(b.x, b.y, b.z, b.y, b.w, c.x, b.z, c.x, c.y);
   mat3 V = turn * S * transpose(turn);
   vec3 jx = vec3(1, 0, -slope.x) * focal / p.z, jy = vec3(0, 1, -slope.y) * focal / p.z;
-  float xx = dot(jx, V * jx) + ${LOW_PASS}, xy = dot(jx, V * jy), yy = dot(jy, V * jy) + ${LOW_PASS};
+  float enlarged = max(1.0, pixel * focal / p.z), low = ${LOW_PASS} * enlarged * enlarged;
+  float xx = dot(jx, V * jx) + low, xy = dot(jx, V * jy), yy = dot(jy, V * jy) + low;
   float det = xx * yy - xy * xy;
   if (!(det > 0.0)) return;
   conic = vec3(yy, -xy, xx) / det; color = vec4(d.rgb, a.w);
@@ -231,7 +232,7 @@ function renderer(canvas, data) {
   gl.bindBuffer(gl.ARRAY_BUFFER, indices);
   gl.enableVertexAttribArray(1); gl.vertexAttribIPointer(1, 1, gl.UNSIGNED_INT, 0, 0); gl.vertexAttribDivisor(1, 1);
   let width = 0, height = 0;
-  return (camera, ground) => {
+  return (camera, ground, pixel) => {
     if (width !== canvas.width || height !== canvas.height) {
       [width, height] = [canvas.width, canvas.height];
       gl.bindTexture(gl.TEXTURE_2D, target);
@@ -249,7 +250,7 @@ function renderer(canvas, data) {
     gl.uniform1i(splat.at("splats"), 0); gl.uniform1i(splat.at("perRow"), data.perRow);
     gl.uniformMatrix3fv(splat.at("turn"), true, camera.turn); gl.uniform3fv(splat.at("center"), camera.center);
     gl.uniform2f(splat.at("size"), width, height);
-    gl.uniform1f(splat.at("focal"), Math.min(width, height) / 2 / Math.tan(HEIGHT_FIELD / 2));
+    gl.uniform1f(splat.at("focal"), focal(width, height)); gl.uniform1f(splat.at("pixel"), pixel);
     gl.enable(gl.BLEND); gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, data.n);
     gl.disable(gl.BLEND); gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -259,6 +260,7 @@ function renderer(canvas, data) {
   };
 }
 
+const focal = (width, height) => Math.min(width, height) / 2 / Math.tan(HEIGHT_FIELD / 2);
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 function view({azimuth, elevation, distance, target}) {
   const ahead = [-Math.sin(azimuth) * Math.cos(elevation), -Math.sin(elevation), -Math.cos(azimuth) * Math.cos(elevation)];
@@ -266,35 +268,100 @@ function view({azimuth, elevation, distance, target}) {
   return {turn: [...right, ...cross(ahead, right), ...ahead], center: target.map((v, i) => v - distance * ahead[i])};
 }
 
+// Sliders by the first word of joints' names; expressions have no joint.
+const groupOf = slider => slider.joints.length ? slider.name.split(" ")[0] : "expressions";
+function made(tag, attributes, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  element.append(...children);
+  return element;
+}
+
 async function main() {
-  const data = await read(), {sliders, view: first} = data.header, canvas = at("view"), draw = renderer(canvas, data);
-  const start = {azimuth: 0, elevation: 0, ...first}, state = {camera: {...start}, values: sliders.map(() => 0)};
-  let posed = false, waiting = false;
+  const data = await read(), {sliders, view: first, pictures, sequences, trained} = data.header;
+  const canvas = at("view"), draw = renderer(canvas, data), dark = matchMedia("(prefers-color-scheme: dark)");
+  const start = {azimuth: 0, elevation: 0, ...first}, state = {camera: {...start}, values: sliders.map(() => 0), playing: false, moment: 0};
+  let posed = false, waiting = false, told = "";
+  const ground = () => {
+    const [, hex] = /^#(.*)/.exec(at("ground").value) || [], rgb = getComputedStyle(document.body).backgroundColor.match(/[\d.]+/g);
+    return hex ? [0, 2, 4].map(i => parseInt(hex.slice(i, i + 2), 16) / 255) : rgb.slice(0, 3).map(v => v / 255);
+  };
   const show = () => {
     waiting = false;
     const begun = performance.now(), box = canvas.getBoundingClientRect(), ratio = state.exact ? 1 : Math.min(devicePixelRatio, 2);
     canvas.width = Math.max(1, Math.round(box.width * ratio)); canvas.height = Math.max(1, Math.round(box.height * ratio));
     if (!posed) pose(data, state.values);
     posed = true;
-    const hex = at("ground").value, ground = [1, 3, 5].map(i => parseInt(hex.slice(i, i + 2), 16) / 255);
-    draw(view(state.camera), ground);
-    at("time").textContent = `${data.n.toLocaleString("en")} splats, ${(performance.now() - begun).toFixed(0)} ms of script`;
+    const pixel = trained && !state.sharp ? trained.pixel : 0;
+    draw(view(state.camera), state.exact ? [1, 1, 1] : ground(), pixel);
+    const took = `${data.n.toLocaleString("en")} splats, ${(performance.now() - begun).toFixed(0)} ms of script`;
+    // A status that changes with every frame would be read aloud with every frame.
+    if (!told || !state.playing) at("time").textContent = told = took;
+    if (trained) {
+      const times = trained.pixel * focal(canvas.width, canvas.height) / state.camera.distance;
+      at("size").textContent = `Trained on images of ${trained.size.join(" × ")} pixels` +
+        (times > 1 ? `, shown enlarged ${times.toFixed(1)} times and therefore smoothed to their resolution.` : ".");
+    }
     state.drawn = (state.drawn || 0) + 1;
   };
   const ask = () => { if (!waiting) { waiting = true; requestAnimationFrame(show); } };
-  const inputs = sliders.map((slider, i) => {
-    const label = document.createElement("label"), name = document.createElement("span"), input = document.createElement("input");
-    name.textContent = slider.name;
-    Object.assign(input, {type: "range", min: slider.low, max: slider.high, step: (slider.high - slider.low) / 200, value: 0});
-    input.addEventListener("input", () => { state.values[i] = +input.value; posed = false; ask(); });
-    label.append(name, input); at("sliders").append(label);
-    return input;
+  const inputs = [], faces = [];
+  const moved = () => {
+    inputs.forEach((input, i) => { if (input) { input.value = state.values[i]; faces[i]?.setAttribute("aria-pressed", state.values[i] >= 0.99 * sliders[i].high); } });
+    posed = false; ask();
+  };
+  const stop = () => { state.playing = false; at("play").textContent = "Play"; };
+  const groups = {};
+  sliders.forEach((slider, i) => {
+    if (!slider.name) return;
+    const group = groupOf(slider), title = group[0].toUpperCase() + group.slice(1), id = `slider-${i}`;
+    groups[group] ||= made("section", {"aria-labelledby": `group-${group}`}, made("h2", {id: `group-${group}`}, title));
+    const name = slider.joints.length ? slider.name.slice(group.length + 1) : slider.name;
+    const input = inputs[i] = made("input", {id, type: "range", min: slider.low, max: slider.high, step: (slider.high - slider.low) / 200,
+                                             value: 0, "aria-label": slider.name});
+    const row = made("div", {class: "row"}, made("label", {for: id}, name), input);
+    input.addEventListener("input", () => { stop(); state.values[i] = +input.value; moved(); });
+    if (pictures[i]) {
+      const face = faces[i] = made("button", {class: "face", type: "button", "aria-label": `${slider.name} at its end`, "aria-pressed": false},
+                                   made("img", {src: pictures[i], alt: ""}));
+      face.addEventListener("click", () => {
+        const value = face.getAttribute("aria-pressed") === "true" ? 0 : slider.high;
+        stop(); sliders.forEach((other, k) => { if (!other.joints.length) state.values[k] = 0; }); state.values[i] = value; moved();
+      });
+      row.prepend(face);
+    }
+    groups[group].append(row);
   });
-  at("reset").addEventListener("click", () => {
-    inputs.forEach((input, i) => { input.value = 0; state.values[i] = 0; });
-    state.camera = {...start}; posed = false; ask();
-  });
-  at("ground").addEventListener("input", ask);
+  at("groups").append(...Object.values(groups));
+
+  const chosen = () => sequences[at("sequence").value];
+  const seek = moment => {
+    state.moment = moment; at("moment").value = moment;
+    state.values = chosen().values[moment].map((value, i) => value * sliders[i].step); moved();
+  };
+  const choose = () => { at("moment").max = chosen().values.length - 1; at("moment").disabled = at("play").disabled = chosen().values.length < 2; };
+  if (sequences.length) {
+    at("recorded").hidden = false;
+    at("sequence").append(...sequences.map(({name, note}, i) => made("option", {value: i}, note ? `${name}, ${note}` : name)));
+    choose();
+    at("sequence").addEventListener("change", () => { choose(); seek(0); });
+    at("moment").addEventListener("input", () => { stop(); seek(+at("moment").value); });
+    at("play").addEventListener("click", () => {
+      if (state.playing) return stop();
+      state.playing = true; at("play").textContent = "Pause";
+      const begun = performance.now(), from = state.moment;
+      const next = now => {
+        if (!state.playing) return;
+        const moment = (from + Math.floor(Math.max(0, now - begun) * FRAMES_PER_SECOND / 1000)) % chosen().values.length;
+        if (moment !== state.moment) seek(moment);
+        requestAnimationFrame(next);
+      };
+      requestAnimationFrame(next);
+    });
+  }
+  at("reset").addEventListener("click", () => { stop(); state.values.fill(0); state.camera = {...start}; state.moment = 0; at("moment").value = 0; moved(); });
+  at("ground").addEventListener("change", ask);
+  dark.addEventListener("change", ask);
   const turn = (dx, dy) => {
     state.camera.azimuth -= 0.006 * dx;
     state.camera.elevation = Math.max(-1.4, Math.min(1.4, state.camera.elevation + 0.006 * dy)); ask();

@@ -38,10 +38,11 @@ MOST_OF = 0.9995
 others coarse."""
 
 
-def encode(avatar: WebAvatar, view: Mapping[str, Any]) -> bytes:
+def encode(avatar: WebAvatar, view: Mapping[str, Any], more: Mapping[str, Any] | None = None) -> bytes:
     """Quantise and pack. Means have 16 bits, everything else 8.
 
-    ``view`` is the initial view: ``distance`` in metres from ``target``, (3,).
+    ``view`` is the initial view: ``distance`` in metres from ``target``, (3,). ``more`` are further entries of the header,
+    for the page alone.
     """
     count = len(avatar.means)
     arrays: list[dict[str, Any]] = []
@@ -102,6 +103,7 @@ def encode(avatar: WebAvatar, view: Mapping[str, Any]) -> bytes:
         "turned": avatar.turned,
         "joints": np.round(avatar.joints, 6).tolist(),
         "view": dict(view),
+        **(more or {}),
         "sliders": [slider._asdict() for slider in avatar.sliders],
         "arrays": arrays,
     }
@@ -127,7 +129,10 @@ def decode(content: bytes) -> WebAvatar:
                 place += count
             columns.append(low + step * levels)
         arrays[array["name"]] = np.stack(columns, axis=1)
-    sliders = tuple(Slider(**{**slider, "joints": tuple(slider["joints"])}) for slider in header["sliders"])
+    sliders = tuple(
+        Slider(**slider | {name: tuple(slider[name]) for name in ("joints", "direction")})
+        for slider in header["sliders"]
+    )
     morphs = {
         name: np.stack([arrays[f"{name} {number}"] for number in range(len(sliders))])
         for name in ("d_means", "d_turns", "d_log_scales", "d_logits", "d_colors")

@@ -17,16 +17,17 @@ class ExportHtmlSettings(AvatarOptions):
     """
 
     capture: str | None = None
-    """Capture whose poses determine the range of the sliders and the pose of the head; without one the range is -2 to 2."""
+    """Capture whose sequences the page plays. It also determines the pose of the head, the range of expressions without a
+    name (otherwise -2 to 2), and the resolution to which a large picture is smoothed."""
 
     expressions: int = 10
-    """Number of leading expressions with sliders."""
+    """Number of expressions with sliders: the named ones, else the single coefficients, that move the head farthest."""
 
     degree: int = 3
     """Degree of the spherical harmonics of view-dependent colours, 0 to 3; a lower degree takes fewer bytes."""
 
     title: str = ""
-    """Title of the page; default: the name of the subject."""
+    """Title of the page; default: the names of subject and method."""
 
     dependent = (DependentOptions(("reader", "head", "cy", "set"), "capture"),)
 

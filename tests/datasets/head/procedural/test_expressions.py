@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.procedural.expressions import SEMANTIC_NAMES, principal_basis
-from headbench.datasets.head.procedural.model import procedural_head, semantic_to_coefficients, version_shapes
+from headbench.datasets.head.procedural.model import procedural_head
+from headbench.datasets.head.procedural.versions import semantic_to_coefficients, version_shapes
 
 EYE_RADIUS = 0.012
 

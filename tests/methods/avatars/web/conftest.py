@@ -17,6 +17,7 @@ class Exported(NamedTuple):
     source: Source
     baked: WebAvatar
     view: dict
+    more: dict
     page: object
     findings: object
 
@@ -38,9 +39,9 @@ def exported(run, request, tmp_path_factory):
         kept["source"], kept["baked"] = source, bake(source, *arguments)
         return kept["baked"]
 
-    def encoded(avatar, view):
-        kept["view"] = view
-        return encode(avatar, view)
+    def encoded(avatar, view, more):
+        kept["view"], kept["more"] = view, more
+        return encode(avatar, view, more)
 
     page = tmp_path_factory.mktemp("page") / "avatar.html"
     capture = str(run.read_manifest().configuration.data)

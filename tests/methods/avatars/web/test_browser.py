@@ -28,21 +28,21 @@ def opened(new_tab):
     return start
 
 
-def pixels(tab, values, azimuth=0.0):
-    """(SIDE, SIDE, 3) of the canvas with sliders at values, in [0, 1]."""
+def pixels(tab, values, azimuth=0.0, side=SIDE, sharp=True):
+    """(side, side, 3) of the canvas with sliders at values, in [0, 1]; not smoothed unless ``sharp`` is False."""
     shown = tab.evaluate(
-        """([values, azimuth, side]) => {
+        """([values, azimuth, side, sharp]) => {
             const {state, show} = window.avatar, canvas = document.getElementById("view");
             Object.assign(canvas.style, {width: side + "px", height: side + "px"});
-            state.exact = true; state.values = values; state.camera.azimuth = azimuth; show();
+            state.exact = true; state.sharp = sharp; state.values = values; state.camera.azimuth = azimuth; show();
             const copy = Object.assign(document.createElement("canvas"), {width: side, height: side});
             const context = copy.getContext("2d", {willReadFrequently: true});
             context.drawImage(canvas, 0, 0);
             return [...context.getImageData(0, 0, side, side).data];
         }""",
-        [list(map(float, values)), azimuth, SIDE],
+        [list(map(float, values)), azimuth, side, sharp],
     )
-    return np.array(shown).reshape(SIDE, SIDE, 4)[..., :3] / 255
+    return np.array(shown).reshape(side, side, 4)[..., :3] / 255
 
 
 def test_webgl_draws_what_the_renderer_draws(exported, opened):
@@ -50,7 +50,7 @@ def test_webgl_draws_what_the_renderer_draws(exported, opened):
     page, view = decode(encode(exported.baked, exported.view)), exported.view
     for azimuth, moved in (
         (0.0, {}),
-        (0.5, {"neck turn": 0.3, "jaw open": 0.3, "expression 1": 0.1, "eyes sideways": 0.2}),
+        (0.5, {page.sliders[0].name: 0.1, "neck turn": 0.3, "jaw open": 0.3, "eyes sideways": 0.2}),
     ):
         values = np.array([moved.get(slider.name, 0.0) for slider in page.sliders])
         camera = orbit_camera(direction_of(azimuth, 0.0), view["distance"], np.array(view["target"]), SIDE)
@@ -77,7 +77,7 @@ def test_a_slider_and_a_drag_change_what_is_seen(exported, opened):
     tab.get_by_role("button", name="Reset").click()
     tab.wait_for_timeout(300)
     assert tab.locator("#view").screenshot() == before
-    assert tab.get_by_role("heading").text_content() == "<script>x</script>"
+    assert tab.get_by_role("heading", level=1).text_content() == "<script>x</script>"
 
 
 @pytest.mark.parametrize("width", [640, 900, 390])
@@ -96,6 +96,106 @@ def test_sliders_and_words_are_inside_the_page(exported, opened, width):
     assert tab.evaluate(
         "[...document.querySelectorAll('aside, .note')].every(e => e.scrollWidth <= e.clientWidth)"
     )
+
+
+def test_an_enlarged_picture_has_the_detail_of_the_training(exported, opened):
+    """A picture of many pixels, reduced to those of the training, is the picture that was trained."""
+    tab, trained, view = opened(exported.page), exported.more["trained"], exported.view
+    side = round(2 * np.tan(np.radians(15)) * view["distance"] / trained["pixel"])
+    rest = np.zeros(len(exported.baked.sliders))
+    small = pixels(tab, rest, side=side, sharp=False)
+    assert np.abs(small - pixels(tab, rest, side=side)).max() < 0.1  # nothing is enlarged
+    reduced = {
+        sharp: cv2.resize(
+            pixels(tab, rest, side=4 * side, sharp=sharp), (side, side), interpolation=cv2.INTER_AREA
+        )
+        for sharp in (True, False)
+    }
+    smoothed, sharp = (cv2.PSNR(reduced[how], small, 1.0) for how in (False, True))
+    assert smoothed > 30
+    assert smoothed > sharp
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_background_follows_the_reader(exported, new_tab, scheme):
+    tab = new_tab(color_scheme=scheme)
+    tab.goto(exported.page.as_uri())
+    tab.get_by_text("ms of script").wait_for()
+    shot = cv2.imdecode(np.frombuffer(tab.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    corner, panel = shot[4, 4].astype(int), shot[-4, -40].astype(int)
+    assert np.abs(corner - panel).max() <= 2
+    assert (corner.mean() < 60) == (scheme == "dark")
+    tab.get_by_label("Background").select_option("white")
+    tab.wait_for_timeout(300)
+    shot = cv2.imdecode(np.frombuffer(tab.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    assert shot[4, 4].min() == 255
+
+
+def test_a_recorded_sequence_plays(exported, opened):
+    tab = opened(exported.page)
+    if not exported.more["sequences"]:
+        assert not tab.locator("#recorded").is_visible()
+        return
+    tab.get_by_label("Sequence", exact=True).select_option(index=len(exported.more["sequences"]) - 1)
+    tab.get_by_role("button", name="Play").click()
+    for _ in range(100):  # the page's policy forbids what wait_for_function does
+        tab.wait_for_timeout(50)
+        if tab.evaluate("window.avatar.state.moment") > 0:
+            break
+    tab.get_by_role("button", name="Pause").click()
+    moment = tab.evaluate("window.avatar.state.moment")
+    tab.wait_for_timeout(300)
+    assert tab.evaluate("window.avatar.state.moment") == moment > 0
+    assert tab.evaluate("window.avatar.state.values.some(value => value !== 0)")
+
+
+def test_a_picture_shows_its_expression_in_full(exported, opened):
+    tab = opened(exported.page)
+    name, high = exported.baked.sliders[0].name, exported.baked.sliders[0].high
+    face = tab.get_by_role("button", name=f"{name} at its end")
+    face.click()
+    assert float(tab.get_by_role("slider", name=name).input_value()) == pytest.approx(high, rel=0.01)
+    assert face.get_attribute("aria-pressed") == "true"
+    face.press("Enter")
+    assert tab.get_by_role("slider", name=name).input_value() in ("0", "0.0")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_serves_keyboards_and_screen_readers(exported, new_tab, scheme):
+    """Names of all controls, unique ids, one main heading, a visible focus, readable text."""
+    tab = new_tab(900, 700, color_scheme=scheme)
+    tab.goto(exported.page.as_uri())
+    tab.get_by_text("ms of script").wait_for()
+    faults = tab.evaluate(
+        r"""() => {
+            const faults = [], ids = [...document.querySelectorAll("[id]")].map(e => e.id);
+            if (new Set(ids).size !== ids.length) faults.push("ids are not unique");
+            if (document.querySelectorAll("h1").length !== 1) faults.push("one h1");
+            if (!document.documentElement.lang || !document.querySelector("main")) faults.push("language or main");
+            for (const e of document.querySelectorAll("input, select, button, canvas, img")) {
+                if (e.closest("[hidden]")) continue;
+                const name = e.getAttribute("aria-label") || e.labels?.[0]?.textContent || e.textContent.trim() || e.alt === "";
+                if (!name) faults.push("no name: " + e.outerHTML.slice(0, 80));
+                e.focus();
+                const style = getComputedStyle(e);
+                if (e.tagName !== "IMG" && style.outlineStyle === "none") faults.push("no focus: " + e.outerHTML.slice(0, 80));
+            }
+            for (const e of document.querySelectorAll("[aria-labelledby]"))
+                if (!document.getElementById(e.getAttribute("aria-labelledby"))) faults.push("labelled by nothing");
+            const light = text => {
+                const rgb = text.match(/[\d.]+/g).slice(0, 3).map(v => v / 255).map(v => v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4);
+                return .2126 * rgb[0] + .7152 * rgb[1] + .0722 * rgb[2];
+            };
+            const paper = light(getComputedStyle(document.body).backgroundColor);
+            for (const e of document.querySelectorAll("h1, h2, label, p, span, button:not(.face), select")) {
+                const style = getComputedStyle(e), ink = light(style.color), [a, b] = [ink, paper].sort((x, y) => y - x);
+                if ((a + .05) / (b + .05) < 4.5) faults.push("contrast: " + e.textContent);
+                if (parseFloat(style.fontSize) < 12) faults.push("small: " + e.textContent);
+            }
+            return faults;
+        }"""
+    )
+    assert faults == []
 
 
 def test_a_damaged_file_says_so(run, exported, opened, tmp_path):

@@ -8,6 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from headbench.bench.experiments.extremes import head_center
+from headbench.bench.specs import ResolutionRule
+from headbench.datasets.open import open_clip
+from headbench.methods.avatars.web.export import training_images
 from headbench.methods.avatars.web.payload import decode, encode
 from headbench.methods.avatars.web.settings import ExportHtmlSettings
 
@@ -15,6 +19,8 @@ CENTER = np.array([0.0, 0.0, 1.0])
 
 
 def values_of(baked, **wanted):
+    names = [slider.name.replace(" ", "_") for slider in baked.sliders]
+    assert {*wanted} <= {*names}
     return np.array([wanted.get(slider.name.replace(" ", "_"), 0.0) for slider in baked.sliders])
 
 
@@ -36,7 +42,8 @@ def test_splats_at_the_step_of_a_slider_are_the_avatars(exported):
 
 def test_sliders_moved_together_stay_near_the_avatar(exported):
     source, baked = exported.source, exported.baked
-    values = values_of(baked, jaw_open=0.2, neck_turn=0.3, neck_nod=-0.1, eyes_sideways=0.2, expression_1=0.1)
+    moved = {baked.sliders[0].name.replace(" ", "_"): 0.1}
+    values = values_of(baked, jaw_open=0.2, neck_turn=0.3, neck_nod=-0.1, eyes_sideways=0.2, **moved)
     moved = baked.moved(values, CENTER).means
     theirs = source.seen(source.pose(baked.sliders, values)).means
     travelled = np.linalg.norm(theirs - baked.means, axis=1)
@@ -60,7 +67,8 @@ def test_the_bytes_keep_what_can_be_seen(exported):
 def test_what_the_page_loses_is_told(exported):
     findings = exported.findings
     assert findings.data["bytes"] == exported.page.stat().st_size
-    assert findings.data["psnr"].keys() == {"rest", "expressions", "jaw", "neck", "eyes", "together"}
+    groups = {"rest", "expressions", "jaw", "neck", "eyes", "together"}
+    assert findings.data["psnr"].keys() - {"recorded"} == groups
     assert min(findings.data["psnr"].values()) > 38
     assert "dB" in findings.text
 
@@ -70,7 +78,12 @@ def test_the_page_allows_its_own_script_alone(exported):
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1].replace("&#39;", "'")
     script = text.rpartition("<script>")[2].rpartition("</script>")[0]
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    assert policy == f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'"
+    style = re.search(r"<style>(.*?)</style>", text, re.DOTALL)[1]
+    of_style = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    assert policy.split("; ") == [
+        *("default-src 'none'", "img-src data:", f"script-src 'sha256-{digest}'"),
+        *(f"style-src 'sha256-{of_style}'", "base-uri 'none'", "form-action 'none'"),
+    ]
     assert "<title>&lt;script&gt;x&lt;/script&gt;</title>" in text
     assert "digitalsourcetype/trainedAlgorithmicMedia" in text
     assert not re.search(r"https?://(?!cv\.iptc\.org)", text)
@@ -80,3 +93,43 @@ def test_the_page_allows_its_own_script_alone(exported):
 def test_bad_settings_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         replace(ExportHtmlSettings("a", "b"), **bad)
+
+
+def test_sequences_replay_what_was_recorded(exported, run):
+    """The splats of a recorded pose against those of the page at the values of its moment."""
+    source, baked, sequences = exported.source, exported.baked, exported.more["sequences"]
+    if not sequences:  # tracked with another head model
+        assert "no sequences" in exported.findings.text
+        return
+    clip = open_clip(str(run.read_manifest().configuration.data))
+    keys = sorted(clip.splits["self_reenactment"])
+    (held_out,) = [sequence for sequence in sequences if sequence["note"] == "held out"]
+    assert held_out["name"] == keys[0].sequence
+    poses = [clip.poses[timestep] for timestep in sorted({key.timestep for key in keys})]
+    assert len(held_out["values"]) == len(poses)
+    for pose, row in zip(poses, held_out["values"]):
+        values = np.array(row) * [slider.step for slider in baked.sliders]
+        there = replace(
+            pose, rotation=source.rest.rotation, translation=source.rest.translation, timestep=None
+        )
+        theirs = source.seen(there).means
+        moved = baked.moved(values, CENTER).means
+        assert np.abs(moved - theirs).max() < 0.25 * np.abs(theirs - baked.means).max() + 5e-4
+
+
+def test_pictures_show_the_expressions(exported):
+    pictures = [picture for picture in exported.more["pictures"] if picture]
+    expressions = [slider for slider in exported.baked.sliders if slider.name and not slider.joints]
+    assert len(pictures) == len(expressions) > 1
+    assert len({*pictures}) == len(pictures)
+    assert max(map(len, pictures)) < 6000
+
+
+def test_pixels_of_the_training_follow_the_rule(run):
+    clip = open_clip(str(run.read_manifest().configuration.data))
+    camera = next(iter(clip.cameras.values()))
+    plain, halved = (training_images(clip, ResolutionRule(divide=divide)) for divide in (1, 2))
+    assert plain["size"] == [camera.width, camera.height]
+    assert halved["pixel"] == pytest.approx(2 * plain["pixel"], rel=1e-3)
+    near = plain["pixel"] * camera.K[1, 1]
+    assert near == pytest.approx(np.linalg.norm(camera.center - head_center(clip)), rel=0.2)
