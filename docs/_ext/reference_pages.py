@@ -694,6 +694,19 @@ def indexes(app: Any, env: Any, added: set[str], changed: set[str], removed: set
     return [page for page in env.found_docs if page.endswith("/index")] if added or removed else []
 
 
+def name_outside_pages(app: Any, page: str, source: list[str]) -> None:
+    """Show the path of a page that is not on the site, such as the README of the repository, in place of a link."""
+    folder = Path(app.srcdir, page).parent
+
+    def shown(match: re.Match[str]) -> str:
+        path = (folder / match[2]).resolve()
+        if path.is_relative_to(app.srcdir) or not path.is_file():
+            return match[0]
+        return f"{match[1]} (`{path.relative_to(Path(app.srcdir).parent)}`)"
+
+    source[0] = re.sub(r"\[([^\]]+)\]\(((?:\.\./)+[^)#]+\.md)(?:#[^)]*)?\)", shown, source[0])
+
+
 def setup(app: Any) -> dict[str, bool]:
     """Register pages, object types and the role."""
     os.environ.setdefault("COLUMNS", "100")
@@ -703,6 +716,7 @@ def setup(app: Any) -> dict[str, bool]:
     app.connect("autodoc-process-signature", parseable_signature)
     app.connect("env-get-outdated", indexes)
     app.connect("source-read", complete_index)
+    app.connect("source-read", name_outside_pages)
     app.add_role("public", public_name_role)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
