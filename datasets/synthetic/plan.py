@@ -117,10 +117,10 @@ def plan_subject(out: Path, index: int, geometry: Geometry, settings: SyntheticS
     tongue_shows = share_that_shows(geometry.mouth(who, anatomy, shape), anatomy, neutral)
     views = cameras(settings.cameras, width, height, target, seed=settings.seed + 101 * index)
     performed, poses = {}, {}
-    every = frames_kept(settings.timesteps)
+    interval = frames_kept(settings.timesteps)
     for sequence, count in share_out(settings.timesteps, settings.performance).items():
         performed[sequence] = perform(
-            sequence, count, settings.seed + 101 * index, tongue_shows, settings.performance, every
+            sequence, count, settings.seed + 101 * index, tongue_shows, settings.performance, interval
         )
         poses[sequence] = tuple(
             geometry.translation.pose(activations, name, timestep)
