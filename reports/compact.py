@@ -26,7 +26,8 @@ def compact(table: Table) -> Table:
             why = "" if note is None else table.notes[note]
             left_out.setdefault(why, []).append(f"{column.title} {column.label}".strip())
     sentences = [
-        f"No values of {', '.join(names)}{f': {why}' if why else '.'}" for why, names in left_out.items()
+        f"No values of {', '.join(names)}{f': {why}' if why else ''}".rstrip(".") + "."
+        for why, names in left_out.items()
     ]
     used: dict[int, int] = {}
 

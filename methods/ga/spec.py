@@ -22,4 +22,12 @@ GA = MethodSpec(
     variants="headbench.methods.avatars.derived.ga_variants:variants",
     presets=splat_presets(SHORT, {}),
     source="GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians, CVPR 2024, arXiv 2312.02069",
+    bibtex=r"""@inproceedings{qian2024gaussianavatars,
+  title     = {{GaussianAvatars}: Photorealistic Head Avatars with Rigged {3D} {Gaussians}},
+  author    = {Qian, Shenhan and Kirschstein, Tobias and Schoneveld, Liam and Davoli, Davide and Giebenhain, Simon and
+               Nie{\ss}ner, Matthias},
+  booktitle = {Proceedings of the IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
+  year      = {2024},
+  eprint    = {2312.02069},
+}""",
 )

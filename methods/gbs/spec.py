@@ -54,4 +54,11 @@ GBS = MethodSpec(
     head_models=("flame2020", "procedural2020", "ict-facekit"),
     monocular=True,
     source="3D Gaussian Blendshapes for Head Avatar Animation, SIGGRAPH 2024, arXiv 2404.19398",
+    bibtex=r"""@inproceedings{ma2024blendshapes,
+  title     = {{3D} {Gaussian} Blendshapes for Head Avatar Animation},
+  author    = {Ma, Shengjie and Weng, Yanlin and Shao, Tianjia and Zhou, Kun},
+  booktitle = {ACM SIGGRAPH 2024 Conference Papers},
+  year      = {2024},
+  eprint    = {2404.19398},
+}""",
 )

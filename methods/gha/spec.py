@@ -79,4 +79,12 @@ GHA = MethodSpec(
         ("gpu", "paper"), ResolutionRule(square="pad", size=(2048, 2048), speed_size=(1024, 1024))
     ),
     source="Gaussian Head Avatar: Ultra High-fidelity Head Avatar via Dynamic Gaussians, CVPR 2024, arXiv 2312.03029",
+    bibtex=r"""@inproceedings{xu2024gaussianheadavatar,
+  title     = {{Gaussian} Head Avatar: Ultra High-fidelity Head Avatar via Dynamic {Gaussians}},
+  author    = {Xu, Yuelang and Chen, Benwang and Li, Zhe and Zhang, Hongwen and Wang, Lizhen and Zheng, Zerong and
+               Liu, Yebin},
+  booktitle = {Proceedings of the IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
+  year      = {2024},
+  eprint    = {2312.03029},
+}""",
 )

@@ -58,4 +58,11 @@ INSTA = MethodSpec(
     },
     monocular=True,
     source="Instant Volumetric Head Avatars, CVPR 2023, arXiv 2211.12499",
+    bibtex=r"""@inproceedings{zielonka2023insta,
+  title     = {Instant Volumetric Head Avatars},
+  author    = {Zielonka, Wojciech and Bolkart, Timo and Thies, Justus},
+  booktitle = {Proceedings of the IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
+  year      = {2023},
+  eprint    = {2211.12499},
+}""",
 )

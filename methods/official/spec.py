@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from ...bench.specs import MethodSpec
-from ..ga.spec import SHORT
+from ..ga.spec import GA, SHORT
 from ..gbs.spec import GBS
 from ..gbs.spec import SHORT as GBS_SHORT
 from ..gbs.spec import SHORT_SPLATS as GBS_SHORT_SPLATS
 from ..gha.spec import GHA
 from ..insta.spec import INSTA
+from ..ours.spec import OURS
 from ..shared.config import PAPER_ITERATIONS, SHORT_SPLATS
 
 
@@ -42,6 +43,7 @@ GA_OFFICIAL = MethodSpec(
     },
     native=False,
     source="GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians, CVPR 2024, arXiv 2312.02069",
+    bibtex=GA.bibtex,
 )
 
 TGA_OFFICIAL = MethodSpec(
@@ -56,6 +58,7 @@ TGA_OFFICIAL = MethodSpec(
     native=False,
     source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
     "CVPR 2025, arXiv 2504.14967",
+    bibtex=OURS.bibtex,
 )
 
 
@@ -91,6 +94,7 @@ GBS_OFFICIAL = MethodSpec(
     monocular=True,
     native=False,
     source=GBS.source,
+    bibtex=GBS.bibtex,
 )
 
 GHA_OFFICIAL = MethodSpec(
@@ -106,6 +110,7 @@ GHA_OFFICIAL = MethodSpec(
     preset_resolutions=GHA.preset_resolutions,
     native=False,
     source=GHA.source,
+    bibtex=GHA.bibtex,
 )
 
 INSTA_OFFICIAL = MethodSpec(
@@ -120,4 +125,5 @@ INSTA_OFFICIAL = MethodSpec(
     monocular=True,
     native=False,
     source=INSTA.source,
+    bibtex=INSTA.bibtex,
 )

@@ -37,4 +37,11 @@ OURS = MethodSpec(
     presets=splat_presets(SHORT, {"planes": {"bounds_variant": "paper"}}),
     source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
     "CVPR 2025, arXiv 2504.14967",
+    bibtex=r"""@inproceedings{wang2025compact,
+  title     = {{3D} {Gaussian} Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations},
+  author    = {Wang, Yating and Wang, Xuan and Yi, Ran and Fan, Yanbo and Hu, Jichen and Zhu, Jingcheng and Ma, Lizhuang},
+  booktitle = {Proceedings of the IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
+  year      = {2025},
+  eprint    = {2504.14967},
+}""",
 )

@@ -10,7 +10,7 @@ from ..runs import RunSet
 
 
 def cards_of(runs: RunSet) -> list[dict[str, Any]]:
-    """A card for each method, in the order of the table of the runs.
+    """A card for each method, trivial baselines last.
 
     Summary, source and citation are those of the registered method of the same name and implementation; a method that is
     not registered here has none. ``anchor`` is the name of the card in the page.
@@ -19,7 +19,9 @@ def cards_of(runs: RunSet) -> list[dict[str, Any]]:
     cards = []
     for index, (label, record) in enumerate(runs.records.items()):
         spec = specs.get(record.name)
-        known = spec if isinstance(spec, MethodSpec) and spec.implementation == record.implementation else None
+        known = (
+            spec if isinstance(spec, MethodSpec) and spec.implementation == record.implementation else None
+        )
         budget = {name: value for name, value in record.budget.items() if value is not None}
         cards.append(
             {
@@ -32,7 +34,7 @@ def cards_of(runs: RunSet) -> list[dict[str, Any]]:
                 "bibtex": known.bibtex.strip() if known else "",
                 "version": record.version,
                 "implementation": record.implementation,
-                "budget": ", ".join(f"{value:,} {name}" for name, value in budget.items()),
+                "budget": "" if record.trivial else ", ".join(f"{n:,} {name}" for name, n in budget.items()),
             }
         )
-    return cards
+    return sorted(cards, key=lambda card: card["trivial"])

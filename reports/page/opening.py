@@ -31,9 +31,11 @@ def opening(
     which the first metric's values are farthest apart; if there is none, the first frame with any picture.
     """
     place = {label: index + 1 for index, label in enumerate(runs.methods)}
-    drawn = {label for label in place for images in pictures.shown.values() if images[place[label]] is not None}
+    drawn = {
+        label for label in place for images in pictures.shown.values() if images[place[label]] is not None
+    }
     offered = [label for label in (*best, *runs.ranked, *runs.methods) if label in drawn]
-    chosen = tuple(dict.fromkeys(offered))[:TILES] or tuple(runs.ranked or runs.methods)[:TILES]
+    chosen = tuple(dict.fromkeys(offered))[:TILES] or (*best, *runs.methods)[:TILES]
     spreads: dict[ShownFrame, float] = {}
     for frame, images in sorted(pictures.shown.items()):
         own = [values.get((metrics[0].name, label, frame)) for label in chosen] if metrics else []

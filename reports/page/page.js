@@ -2,6 +2,7 @@
 const $ = id => document.getElementById(id);
 const data = JSON.parse($("data").textContent);
 const NONE = -1e9, TRUTH = "Ground truth", MOST = 4, names = [TRUTH, ...data.methods];
+const measured = data.metrics.map((_, n) => n).filter(n => data.frames.some(f => f.v[n].some(value => value !== null)));
 const phone = matchMedia("(max-width: 40rem)"), metrics = data.metrics, frames = data.frames;
 document.documentElement.classList.add("scripted");
 
@@ -211,7 +212,7 @@ function layOut() {
 function captionOf(tile, i) {
   const metric = metrics[state.metric];
   if (!tile.index) {
-    const kind = frames[i].p && metric ? frames[i].l ? "lossless" : "lossy" : "";
+    const kind = frames[i].p && frames[i].p[0] >= 0 ? frames[i].l ? "lossless" : "lossy" : "";
     return [make("b", {textContent: TRUTH}), make("span", {className: "less", textContent: kind})];
   }
   const values = frames[i].v[state.metric] || [], value = values[tile.index - 1] ?? null;
@@ -346,7 +347,7 @@ $("stage").tabIndex = 0;
 // Drawings: axes with round numbers, labels beside the ends of their lines.
 function ticks(low, high, count = 4) {
   const rough = (high - low) / count || 1, power = 10 ** Math.floor(Math.log10(rough));
-  const by = [1, 2, 5, 10].find(k => k * power >= rough) * power, found = [];
+  const by = [1, 2, 5, 10].find(k => k * power >= 0.7 * rough) * power, found = [];
   for (let i = Math.ceil(low / by); i * by <= high + 1e-9; i++) found.push(+(i * by).toPrecision(10));
   return found;
 }
@@ -392,7 +393,7 @@ function curve() {
       const to = k + 1 < starts.length ? starts[k + 1] : last + 1;
       if (n) svg.append(draw("line", {class: "grid", x1: x(n - 0.5), x2: x(n - 0.5), y1: box.t, y2: H}));
       const room = x(to - 1) - x(n) + (last ? (W - L - R) / last : W) - 4, text = data.sequences[frames[series[n]].at[2]];
-      if (room > 24) svg.append(draw("text", {x: n ? x(n - 0.5) + 5 : x(n), y: H - 5}, short(text, Math.max(3, Math.floor(room / 7)))));
+      if (room > 56) svg.append(draw("text", {x: n ? x(n - 0.5) + 5 : x(n), y: H - 5}, short(text, Math.max(3, Math.floor(room / 7)))));
     });
     for (const m of state.methods) {
       const value = n => frames[series[n]].v[state.metric][m];
@@ -516,9 +517,6 @@ function places() {
   const list = worstOf === "all" ? offered.flatMap(m => moments(bad(m), offered.length > 5 ? 2 : 3).map(([value, i]) => ({value, i, methods: [m]}))) : moments(bad(+worstOf), 10).map(([value, i]) => ({value, i, methods: [+worstOf]}));
   return list.sort((a, b) => b.value - a.value).map(one => ({...one, text: shown(sign * one.value, metric)}));
 }
-const seen = new IntersectionObserver(entries => {
-  for (const {target, isIntersecting} of entries) if (isIntersecting) { seen.unobserve(target); thumbnails(target); }
-}, {rootMargin: "300px"});
 async function thumbnails(button) {
   const {frame, methods} = button, pair = button.querySelectorAll("canvas");
   const wantedPair = methods.length > 1 ? methods.map(m => content(frame, m + 1, false)) : [content(frame, 0, false), content(frame, methods[0] + 1, true)];
@@ -534,10 +532,13 @@ function strip() {
     Object.assign(button, {frame: i, methods});
     button.setAttribute("aria-current", i === state.frame);
     button.addEventListener("click", () => pick(button));
-    seen.observe(button);
     return make("li", {}, button);
   }));
   $("worst-frames").hidden = !metrics.length;
+  fill([...document.querySelectorAll("#worst button")]);
+}
+async function fill(buttons) { // one after the other, so that a scrub meanwhile does not wait
+  for (const button of buttons) if (button.isConnected) await thumbnails(button);
 }
 function pick({frame, methods}) {
   for (const m of methods) if (!state.methods.includes(m)) state.methods = [...state.methods.slice(0, MOST - 1), m];
@@ -556,6 +557,7 @@ function toggle(m) {
 }
 function update() { controls(); show(); if (worstOf === "apart") strip(); }
 const visible = data.methods.map((_, m) => m).sort((a, b) => data.marks[a] - data.marks[b]);
+let folded = scored.length > 1 && data.trivial.length > 0; // trivial baselines stand behind one button until they are asked for
 function controls() {
   const active = document.activeElement?.id, [task, subject, , camera] = at(), all = frames.map((_, i) => i), box = $("choices");
   const of = (depth, value, rest) => all.filter(i => frames[i].at[depth] === value && rest(frames[i].at));
@@ -563,11 +565,18 @@ function controls() {
   const subjects = unique(all.filter(i => frames[i].at[0] === task).map(i => frames[i].at[1])).sort((a, b) => a - b);
   const cameras = unique(of(0, task, a => a[1] === subject).map(i => frames[i].at[3])).sort((a, b) => a - b);
   const chips = make("div", {className: "chips", role: "group", "aria-label": "Methods shown, four at most"});
-  chips.append(...visible.map((m, n) => {
+  const there = visible.filter(m => !folded || !data.trivial.includes(data.methods[m]) || state.methods.includes(m));
+  chips.append(...there.map(m => {
+    const n = visible.indexOf(m);
     const chip = make("button", {type: "button", className: "chip", id: `chip-${m}`, title: data.methods[m], "aria-pressed": state.methods.includes(m)}, mark(m), make("span", {textContent: data.methods[m]}), n < 9 ? make("kbd", {textContent: n + 1, "aria-hidden": "true"}) : null);
     chip.addEventListener("click", () => toggle(m));
     return chip;
   }));
+  if (there.length < visible.length) {
+    const more = make("button", {type: "button", className: "chip", id: "more", textContent: `+${visible.length - there.length} baseline${visible.length - there.length > 1 ? "s" : ""}`});
+    more.addEventListener("click", () => { folded = false; controls(); $(`chip-${visible.find(m => !there.includes(m))}`).focus(); });
+    chips.append(more);
+  }
   const modes = choice(group("mode", "How methods are compared"), "mode", [["side", "Side by side"], ["wipe", "Wipe"]], state.wipe ? "wipe" : "side", value => { state.wipe = value === "wipe"; update(); });
   const errors = make("input", {type: "checkbox", id: "errors", checked: state.errors, role: "switch"});
   errors.addEventListener("change", () => { state.errors = errors.checked; update(); });
@@ -594,7 +603,7 @@ function play() {
 }
 function tools() {
   const button = (id, text, label, act) => { const made = make("button", {type: "button", className: "plain", id, textContent: text, "aria-label": label}); made.addEventListener("click", act); return made; };
-  const metric = choice(group("metric", "Metric of the curve"), "metric", metrics.map((m, n) => [String(n), m.label]), String(state.metric), value => { state.metric = +value; show(); strip(); });
+  const metric = choice(group("metric", "Metric of the curve"), "metric", measured.map(n => [String(n), metrics[n].label]), String(state.metric), value => { state.metric = +value; show(); strip(); });
   const legend = make("canvas", {id: "legend", width: 256, height: 1, role: "img", "aria-label": "Colours of error maps, from none to the largest"}), colours = legend.getContext("2d");
   data.colours.forEach((c, i) => { colours.fillStyle = `rgb(${c})`; colours.fillRect(i, 0, 1, 1); });
   const scale = make("span", {id: "scale-box", className: "field", hidden: true}, "0", legend, selectOf("", "scale", SCALES.map(v => [v, `${v} levels`]), state.scale, value => { state.scale = value; show(); strip(); }));
@@ -645,6 +654,7 @@ if ($("part")) {
   $("part").addEventListener("change", () => showPart(+$("part").value));
 }
 
+$("facts").open = !phone.matches;
 schemes();
 if (frames.length) {
   state.frame = data.opening.frame ?? 0;

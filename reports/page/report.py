@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ...bench.contracts import Progress, no_progress
@@ -18,6 +17,7 @@ from ...bench.engine.scoring import FULL
 from ...bench.engine.store import RunFolder
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_text
+from ...bench.io.images import probe_image
 from ...bench.io.provenance import COMPOSITE, source_type
 from ...bench.io.style import SHAPES, policy_hash, stylesheet
 from ...bench.protocol import TASK_TITLES
@@ -136,6 +136,7 @@ def page_text(
         "failed": failed_cells(runs),
         "source_type": source_type(COMPOSITE),
         "scripts": [(HERE.parent / "sort.js").read_text("utf-8"), (HERE / "page.js").read_text("utf-8")],
+        "ratio": "1000 / 1000",
         "own_style": (HERE / "page.css").read_text("utf-8"),
     }
     data = _data(runs, metrics, values)
@@ -152,6 +153,7 @@ def page_text(
     best = [row.method for row in compact(parts[0].table).rows if not row.trivial]
     first = opening(runs, best, metrics, values, pictures)
     data["opening"] = _opening(runs, first)
+    content["ratio"] = _ratio(runs, first)
     images: list[str] = []
     entries = dict(zip(_frames(runs), data["frames"]))
     for frame in sorted(pictures.shown, key=lambda f: (f.group, f.key.timestep)):  # in viewing order
@@ -193,6 +195,18 @@ def _opening(runs: RunSet, first: Opening) -> dict[str, Any]:
     return {"frame": frame, "methods": [runs.methods.index(label) for label in first.methods]}
 
 
+def _ratio(runs: RunSet, first: Opening) -> str:
+    """Width and height of the opening renders, for the page's style."""
+    for label in first.methods:
+        run, name = runs.shown[label]
+        path = None if first.frame is None else run.render_path(name, *first.frame)
+        if path is not None:
+            with suppress(InputError):
+                info = probe_image(path)
+                return f"{info.width} / {info.height}"
+    return "3 / 4"
+
+
 def _tiles(
     runs: RunSet,
     first: Opening,
@@ -202,11 +216,12 @@ def _tiles(
 ) -> list[dict[str, Any]]:
     """The opening pictures: ground truth and methods, each with its label, mark, value, and the picture or a reason."""
     tiles: list[dict[str, Any]] = []
-    for label in ("", *first.methods) if first.frame is not None else ():
+    if first.frame is None:
+        return tiles
+    for label in ("", *first.methods):
         place = runs.methods.index(label) + 1 if label else 0
         value = values.get((metrics[0].name, label, first.frame)) if metrics and label else None
         image = pictures.shown[first.frame][place]
-        width, height = (1, 1) if image is None else _size_of(image)
         tiles.append(
             {
                 "label": label or "Ground truth",
@@ -214,18 +229,10 @@ def _tiles(
                 "value": "" if value is None else f"{value:.{metrics[0].digits}f}",
                 "unit": metrics[0].unit if metrics else "",
                 "image": image,
-                "width": width,
-                "height": height,
                 "reason": pictures.reasons[first.frame][place],
             }
         )
     return tiles
-
-
-def _size_of(image: str) -> tuple[int, int]:
-    """Width and height of a picture in base64."""
-    decoded = cv2.imdecode(np.frombuffer(base64.b64decode(image), np.uint8), cv2.IMREAD_COLOR)
-    return decoded.shape[1], decoded.shape[0]
 
 
 def _filled(
@@ -237,8 +244,7 @@ def _filled(
     *,
     apart: bool = False,
 ) -> str:
-    shape = next(((tile["width"], tile["height"]) for tile in tiles if tile["image"] is not None), (3, 4))
-    size = f":root {{ --tiles: {max(1, len(tiles))}; --ratio: {shape[0]} / {shape[1]}; }}\n"
+    size = f":root {{ --tiles: {max(1, len(tiles))}; --ratio: {content['ratio']}; }}\n"
     style = stylesheet() + content["own_style"] + size
     # A page opened from a disk has no origin, so that 'self' matches nothing.
     beside = " 'self' file:" if apart else ""
@@ -381,7 +387,11 @@ FOREST = 120
 def _comparisons(runs: RunSet) -> dict[str, Any]:
     """Paired differences by task and metric, or the reason why they are missing; ``all`` are plain comparisons."""
     if len(runs.ranked) < 2:
-        return {"reason": "A comparison takes two methods that are no trivial baselines.", "groups": [], "all": []}
+        return {
+            "reason": "A comparison takes two methods that are no trivial baselines.",
+            "groups": [],
+            "all": [],
+        }
     specs = {spec.name: spec for spec in runs.metrics}
     settings = CompareSettings(tuple(str(run.folder.root) for run in runs.runs))
     findings = compare_methods(runs, settings)
@@ -407,7 +417,10 @@ def _comparisons(runs: RunSet) -> dict[str, Any]:
         "all": findings.data["comparisons"],
         "subjects": subjects,
         "level": findings.data["level"],
-        "testable": any("not testable" not in line["texts"][-1] for own in groups.values() for line in own),
+        "testable": any(
+            one["p_holm"] is not None and not one["verdict"].startswith("not testable")
+            for one in findings.data["comparisons"]
+        ),
         "groups": [
             {"title": f"{task}, {what}", "lines": _with_forest(own) if subjects > 1 else own}
             for (task, what), own in groups.items()
@@ -431,7 +444,9 @@ def _with_forest(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for line in lines:
         one = line["one"]
         line["forest"] = {
-            "subjects": [(subject, place(value), f"{value:+.4g}") for subject, value in one["differences"].items()],
+            "subjects": [
+                (subject, place(value), f"{value:+.4g}") for subject, value in one["differences"].items()
+            ],
             "mean": place(one["difference"]),
             "low": place(one["low"]),
             "high": place(one["high"]),

@@ -14,14 +14,28 @@ from ...bench.protocol import TASK_TITLES
 from ...bench.specs import MetricSpec
 from ..aggregate import summarise
 from ..conditions import conditions
-from ..pareto.points import LATENCY, SIZE
+from ..pareto.points import SIZE, SPEED
 from ..runs import RunSet
 from ..statistics.comparisons import LEVEL, counted, subjects_needed
 from ..tables import Table
 from .frames import ShownFrame
 
 Values = Mapping[tuple[str, str, ShownFrame], float]
-WORDS = ["no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
+WORDS = [
+    "no",
+    "one",
+    "two",
+    "three",
+    "four",
+    "five",
+    "six",
+    "seven",
+    "eight",
+    "nine",
+    "ten",
+    "eleven",
+    "twelve",
+]
 NAMED = 3
 """Methods that a title names, and that a sentence compares one by one."""
 MIDDLE = 0.9
@@ -29,7 +43,7 @@ MIDDLE = 0.9
 
 
 @dataclass
-class Verdict:
+class Conclusions:
     """Texts of the head of a page; ``sentences`` and ``limits`` are HTML."""
 
     title: str
@@ -66,7 +80,7 @@ def verdict(
     metrics: Sequence[MetricSpec],
     comparisons: Sequence[Mapping[str, Any]],
     values: Values,
-) -> Verdict:
+) -> Conclusions:
     """Describe the results of the methods that ``table`` ranks.
 
     Parameters
@@ -79,18 +93,22 @@ def verdict(
         Of `frame_values`, for spans of frames where nothing can be tested.
     """
     ranked = [row.method for row in table.rows if not row.trivial]
-    found = Verdict(title_of(runs), facts=_facts(runs))
+    found = Conclusions(title_of(runs), facts=_facts(runs))
     spans = []
     for task in runs.tasks if metrics else ():
         scores = _scores(runs, ranked, metrics[0], task)
         if not scores:
             continue
         (leader, best), others = scores[0], scores[1:]
-        own = [_seen_from(leader, c) for c in comparisons if (c["task"], c["metric"]) == (task, metrics[0].name)]
+        own = [
+            _seen_from(leader, c) for c in comparisons if (c["task"], c["metric"]) == (task, metrics[0].name)
+        ]
         against = {c["other"]: c for c in own if c["other"] in dict(others) and c["gain"] is not None}
         where, amount = _task(task), _amount(best, metrics[0])
         if not others:
-            text = Markup("<b>{}</b> reaches a {} of {} in {}.").format(leader, metrics[0].label, amount, where)
+            text = Markup("<b>{}</b> reaches a {} of {} in {}.").format(
+                leader, metrics[0].label, amount, where
+            )
             found.sentences.append(text)
         elif against and all(c["testable"] for c in against.values()):
             found.sentences.append(_tested(leader, amount, metrics[0], where, against))
@@ -119,6 +137,11 @@ def _task(task: str) -> str:
     return TASK_TITLES.get(task, task).lower() if task in TASK_TITLES else task
 
 
+def _signed(value: float, spec: MetricSpec, *, unit: bool = False) -> str:
+    text = f"{value:+.{spec.digits}f}".replace("-", "−")
+    return f"{text}\u00a0{spec.unit}" if unit and spec.unit else text
+
+
 def _amount(value: float, spec: MetricSpec) -> str:
     return f"{value:.{spec.digits}f}\u00a0{spec.unit}".rstrip("\u00a0")
 
@@ -145,11 +168,9 @@ def _tested(
     def with_interval(name: str) -> Markup:
         c = against[name]
         bounds = c["bounds"]
-        digits = spec.digits
-        interval = (
-            f", 95\u00a0% interval {bounds[0]:+.{digits}f} to {bounds[1]:+.{digits}f}" if bounds else ""
-        )
-        return Markup("{} ({:+.{}f}\u00a0{}{})").format(name, c["gain"], digits, spec.unit, interval)
+        ends = f"{_signed(bounds[0], spec)} to {_signed(bounds[1], spec)}" if bounds else ""
+        interval = f", 95\u00a0% interval {ends}" if ends else ""
+        return Markup("{} ({}{})").format(name, _signed(c["gain"], spec, unit=True), interval)
 
     better = sorted((n for n, c in against.items() if c["better"]), key=lambda n: against[n]["gain"])
     alike = sorted((n for n, c in against.items() if not c["better"]), key=lambda n: against[n]["gain"])
@@ -161,9 +182,10 @@ def _tested(
         parts = [*map(with_interval, shown)]
         if rest:
             gains = [against[name]["gain"] for name in rest]
-            numbers = " to ".join(dict.fromkeys(f"{gain:.{spec.digits}f}" for gain in (min(gains), max(gains))))
+            ends = dict.fromkeys(f"{gain:.{spec.digits}f}" for gain in (min(gains), max(gains)))
+            numbers = f"{' to '.join(ends)}\u00a0{spec.unit}".rstrip("\u00a0")
             of = f"the other {in_words(len(rest))}" if len(rest) > 1 else rest[0]
-            parts.append(Markup("{} (by {}\u00a0{})").format(of, numbers, spec.unit))
+            parts.append(Markup("{} (by {})").format(of, numbers))
         text += Markup(" It is better than {}.").format(listed(parts))
     return text
 
@@ -172,7 +194,7 @@ def _costs(runs: RunSet, names: Sequence[str]) -> list[Markup]:
     """The smallest and the fastest method, each with the next one."""
     known = {spec.name: spec for spec in runs.metrics}
     phrases = []
-    for metric, words in ((SIZE, "is the smallest, {} ({} {})"), (LATENCY, "draws a frame fastest, {} ({} {})")):
+    for metric, words in ((SIZE, "is the smallest, {} ({} {})"), (SPEED, "is the fastest, {} ({} {})")):
         if metric in known:
             scores = _scores(runs, names, known[metric], "")
             if len(scores) > 1:
@@ -180,7 +202,7 @@ def _costs(runs: RunSet, names: Sequence[str]) -> list[Markup]:
                 shown = words.format(_amount(value, known[metric]), second, _amount(other, known[metric]))
                 phrases.append(Markup("<b>{}</b> {}").format(first, shown))
     text = [Markup("; ").join(phrases) + "."] if phrases else []
-    times = conditions(runs.rows, [s for s in runs.metrics if s.name == LATENCY], list(names))
+    times = conditions(runs.rows, [s for s in runs.metrics if s.name == SPEED], list(names))
     if phrases and any(each.loaded for own in times.values() for each in own.values()):
         text.append(Markup("Times were measured while other processes used the machine."))
     return text
@@ -200,8 +222,9 @@ def _span(
     if len(leads) < 2:
         return None
     low, high = np.quantile(leads, [(1 - MIDDLE) / 2, (1 + MIDDLE) / 2])
-    return Markup("in {} the lead of {} over {} is from {:+.{}f} to {:+.{}f}\u00a0{} ({} of {} frames ahead)").format(
-        _task(task), leader, second, low, spec.digits, high, spec.digits, spec.unit, sum(lead > 0 for lead in leads), len(leads)
+    ahead = sum(lead > 0 for lead in leads)
+    return Markup("in {} the lead of {} over {} is from {} to {} ({} of {} frames ahead)").format(
+        _task(task), leader, second, _signed(low, spec), _signed(high, spec, unit=True), ahead, len(leads)
     )
 
 
@@ -233,27 +256,42 @@ def _limits(runs: RunSet, methods: int, spans: Sequence[Markup], untested: bool)
 
 def _facts(runs: RunSet) -> list[tuple[str, str]]:
     """What was compared, in short lines."""
-    first = runs.runs[0]
+    cores = runs.runs[0].manifest.machine.get("cores", "")
     trivial = f"{in_words(len(runs.trivial))} trivial baseline{'s' * (len(runs.trivial) != 1)}"
-    methods = ", ".join(name for name in runs.methods if name not in runs.trivial)
+    methods = ", ".join(runs.ranked)
+    changed = f"{in_words(len(runs.changed))} under other conditions"
     subjects = sorted(runs.rows.subjects)
     frames = [f"{len(keys)} {_task(task)}" for task, keys in runs.keys.items()]
     cameras = {key.camera for keys in runs.keys.values() for key in keys}
     budgets = sorted(
-        {int(r.budget["iterations"]) for r in runs.records.values() if not r.trivial and r.budget.get("iterations")}
+        {
+            int(r.budget["iterations"])
+            for r in runs.records.values()
+            if not r.trivial and r.budget.get("iterations")
+        }
     )
     iterations = " to ".join(f"{n:,}" for n in dict.fromkeys([*budgets[:1], *budgets[-1:]]))
     preset = ", ".join(dict.fromkeys(run.manifest.configuration.preset for run in runs.runs))
     seeds = counted(len({seed for run in runs.runs for seed in run.manifest.configuration.seeds}), "seed")
-    written = max((run.folder.rows.stat().st_mtime for run in runs.runs if run.folder.rows.exists()), default=0)
+    written = max(
+        (run.folder.rows.stat().st_mtime for run in runs.runs if run.folder.rows.exists()), default=0
+    )
     when = datetime.fromtimestamp(written)
     lines = [
-        ("Methods", "; ".join(filter(None, [methods, trivial if runs.trivial else ""]))),
+        (
+            "Methods",
+            "; ".join(filter(None, [methods, changed * bool(runs.changed), trivial * bool(runs.trivial)])),
+        ),
         ("Subjects" if len(subjects) > 1 else "Subject", ", ".join(subjects)),
-        ("Frames", ", ".join(frames) + f"; {counted(len(cameras), 'camera')}"),
+        ("Frames", ", ".join(frames) + f"; {counted(len(cameras), 'camera')}" * bool(cameras)),
         ("Images", f"{runs.image_size} pixels" if runs.image_size else ""),
-        ("Training", "; ".join(filter(None, [f"preset {preset}", f"{iterations} iterations" * bool(iterations), seeds]))),
-        ("Machine", ", ".join(filter(None, [runs.machine, f"{first.manifest.machine.get('cores', '')} cores"]))),
+        (
+            "Training",
+            "; ".join(
+                filter(None, [f"preset {preset}", f"{iterations} iterations" * bool(iterations), seeds])
+            ),
+        ),
+        ("Machine", ", ".join(filter(None, [runs.machine, cores and f"{cores} cores"]))),
         ("Results of", f"{when.day} {when:%B %Y}" if written else ""),
     ]
     return [(name, text) for name, text in lines if text]

@@ -234,7 +234,7 @@ def test_cells_say_what_they_are(page):
     assert by_method["third"][0] == ["third", "20.00"]
     assert by_method["third"][1] == ["", "–1"]
     assert by_method["floor"][0] == ["", "10.00"]
-    assert by_method["Method"][0][1] == "PSNR (dB) ↑"
+    assert by_method["Method"][0][1] == "PSNR ↑dB"
 
 
 def test_nothing_from_outside_is_live_and_nothing_is_fetched(page):

@@ -19,30 +19,30 @@ def opened(new_tab, tmp_path):
     """Open the page of a run at a width; afterwards there was no message, no dialog and no request but for the file."""
     faults, requests = new_tab.faults, []
 
-    def start(run, width=1200, scheme="light", split=False):
+    def start(run, width=1200, scheme="light", split=False, address="", **options):
         out = tmp_path / "page.html"
         write_report(PageSettings((str(run),), str(out), split=split, trust=True))
         out = out / "index.html" if split else out
-        tab = new_tab(width, 800, color_scheme=scheme)
+        tab = new_tab(width, 800, color_scheme=scheme, **options)
         tab.on("console", lambda message: faults.append(message.text))
         tab.on("dialog", lambda dialog: faults.append(dialog.message))
         tab.on("request", lambda request: requests.append(request.url))
-        tab.goto(out.as_uri())
+        tab.goto(out.as_uri() + address)
         return tab
 
     yield start
     beside = {url for url in requests if "/page.html/pictures/" in url and url.startswith("file:")}
-    assert {Path(url).name for url in {*requests} - beside if not url.startswith("data:")} <= {
-        *("page.html", "index.html")
-    }
+    assert {
+        Path(url.partition("#")[0]).name for url in {*requests} - beside if not url.startswith("data:")
+    } <= {*("page.html", "index.html")}
 
 
 def pixels(tab, name):
     """The pixels of the canvas whose label begins so."""
-    tab.wait_for_selector(f'#viewer canvas[aria-label^="{name}"]')
+    tab.wait_for_selector(f'#tiles canvas[aria-label^="{name}"]')
     return tab.evaluate(
         """name => {
-            const shown = document.querySelector(`#viewer canvas[aria-label^="${name}"]`);
+            const shown = document.querySelector(`#tiles canvas[aria-label^="${name}"]`);
             const copy = Object.assign(document.createElement("canvas"), {width: shown.width, height: shown.height});
             const context = copy.getContext("2d", {willReadFrequently: true});
             context.drawImage(shown, 0, 0);
@@ -54,19 +54,26 @@ def pixels(tab, name):
 
 def order(tab):
     """Methods in the first group of the table shown."""
-    names = tab.locator(".part.chosen tbody").first.locator("td:first-child").all_text_contents()
+    names = tab.locator("article.table.chosen tbody").first.locator("th.name").all_text_contents()
     return [name.strip() for name in names]
 
 
-def test_frames_follow_scrubber_keys_and_error_maps(opened, toy_run):
+def changed(tab, element, before):
+    """Wait until the text of an element is another, and return it."""
+    tab.wait_for_function(
+        "([id, text]) => document.getElementById(id).textContent !== text", arg=[element, before]
+    )
+    return tab.locator(f"#{element}").text_content()
+
+
+def test_frames_follow_keys_and_error_maps(opened, toy_run):
     tab = opened(toy_run)
     first = pixels(tab, "toy")
-    label = tab.locator("#moment").text_content()
-    assert tab.locator("figcaption").nth(1).text_content().startswith("toy")
+    label = tab.locator("#where").text_content()
     tab.keyboard.press("ArrowRight")
-    tab.wait_for_function("before => document.getElementById('moment').textContent !== before", arg=label)
+    changed(tab, "where", label)
     tab.keyboard.press("ArrowLeft")
-    tab.wait_for_function("before => document.getElementById('moment').textContent === before", arg=label)
+    tab.wait_for_function("before => document.getElementById('where').textContent === before", arg=label)
     truth = pixels(tab, "Ground truth")
     tab.keyboard.press("e")
     errors = pixels(tab, "Error map of toy")
@@ -79,10 +86,99 @@ def test_frames_follow_scrubber_keys_and_error_maps(opened, toy_run):
     tab.keyboard.press("e")
     assert pixels(tab, "toy") == first
     tab.keyboard.press("+")
-    assert "scale(1.5)" in tab.locator("#panels canvas").first.get_attribute("style")
+    assert "scale(1.5)" in tab.locator("#tiles canvas").first.get_attribute("style")
+    assert "scale(1.5)" in tab.locator("#tiles canvas").last.get_attribute("style")
     tab.keyboard.press("0")
-    assert "scale(1)" in tab.locator("#panels canvas").last.get_attribute("style")
-    assert "the training diverged" in tab.locator("#panels .reason").nth(2).text_content()
+    assert "scale" not in tab.locator("#tiles canvas").last.get_attribute("style")
+    tab.click("#chip-1")
+    tab.wait_for_function("document.querySelectorAll('#tiles figure').length === 3")
+    assert "the training diverged" in tab.locator("#tiles .reason").nth(2).text_content()
+
+
+def test_the_held_key_t_shows_the_truth_everywhere(opened, toy_run):
+    tab = opened(toy_run)
+    truth, render = pixels(tab, "Ground truth"), pixels(tab, "toy")
+    assert truth != render
+    tab.keyboard.down("t")
+    tab.wait_for_function(
+        "[...document.querySelectorAll('#tiles canvas')].every(c => c.ariaLabel.startsWith('Ground truth'))"
+    )
+    canvases = tab.locator("#tiles canvas")
+    assert canvases.nth(1).evaluate("c => c.toDataURL()") == canvases.nth(0).evaluate("c => c.toDataURL()")
+    tab.keyboard.up("t")
+    assert pixels(tab, "toy") == render
+
+
+def test_keys_can_be_switched_off(opened, toy_run):
+    tab = opened(toy_run)
+    pixels(tab, "toy")
+    tab.keyboard.press("?")
+    tab.uncheck("#keys")
+    tab.click("#close")
+    tab.locator("body").press("e")
+    assert not tab.is_checked("#errors")
+    tab.wait_for_url("**keys=off")
+
+
+def test_the_wheel_zooms_focused_pictures_only(opened, toy_run):
+    tab = opened(toy_run)
+    pixels(tab, "toy")
+    box = tab.locator("#tiles .view").first.bounding_box()
+    tab.mouse.move(box["x"] + 20, box["y"] + 20)
+    tab.mouse.wheel(0, -300)
+    tab.wait_for_timeout(200)
+    assert tab.evaluate("state.zoom") == 1
+    tab.mouse.click(box["x"] + 20, box["y"] + 20)
+    tab.mouse.wheel(0, -300)
+    tab.wait_for_function("state.zoom > 1")
+    styles = tab.locator("#tiles canvas").evaluate_all("list => list.map(c => c.style.transform)")
+    assert len(set(styles)) == 1
+    cursors = tab.locator("#tiles .cursor").evaluate_all(
+        "list => list.map(c => c.style.left + c.style.visibility)"
+    )
+    assert len(set(cursors)) == 1
+    assert "visible" in cursors[0]
+    tab.keyboard.press("Escape")
+    assert tab.evaluate("document.activeElement === document.body")
+
+
+def test_two_fingers_zoom_and_one_steps(opened, toy_run):
+    tab = opened(toy_run, 390, has_touch=True)
+    pixels(tab, "toy")
+    tab.locator("#stage").scroll_into_view_if_needed()
+    box = tab.locator("#tiles .view").first.bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    client = tab.context.new_cdp_session(tab)
+
+    def touch(kind, *shifts):
+        points = [{"x": middle[0] + shift, "y": middle[1], "id": n} for n, shift in enumerate(shifts)]
+        client.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    before = tab.locator("#where").text_content()
+    touch("touchStart", 0)
+    for shift in (-20, -40, -70):
+        touch("touchMove", shift)
+    touch("touchEnd")
+    changed(tab, "where", before)
+    touch("touchStart", -10, 10)
+    for shift in (15, 20, 30):
+        touch("touchMove", -shift, shift)
+    touch("touchEnd")
+    tab.wait_for_function("state.zoom > 1.5")
+
+
+def test_a_view_opens_again_by_its_address(opened, toy_run):
+    tab = opened(toy_run)
+    before = tab.locator("#where").text_content()
+    tab.keyboard.press("ArrowRight")
+    place = changed(tab, "where", before)
+    tab.keyboard.press("e")
+    tab.keyboard.press("+")
+    tab.wait_for_url("**zoom=1.5**")
+    again = opened(toy_run, address="#" + tab.url.partition("#")[2])
+    pixels(again, "Error map of toy")
+    assert again.locator("#where").text_content() == place
+    assert again.evaluate("state.zoom") == 1.5
 
 
 def test_pictures_apart_are_loaded_when_they_are_shown(opened, toy_run, tmp_path, monkeypatch):
@@ -97,35 +193,36 @@ def test_pictures_apart_are_loaded_when_they_are_shown(opened, toy_run, tmp_path
     assert 0 < loaded < there
 
 
-def test_the_slider_shows_one_left_and_the_other_right(opened, toy_run):
+def test_the_wipe_shows_one_left_and_the_other_right(opened, toy_run):
     tab = opened(toy_run)
     truth, render = pixels(tab, "Ground truth"), pixels(tab, "toy")
-    tab.click("#between summary")
-    tab.select_option("#right", label="toy")
+    tab.keyboard.press("w")
     for share, expected in (("100", truth), ("0", render)):
         tab.locator("#border").fill(share)
         tab.wait_for_timeout(200)
-        found = pixels(tab, "Ground truth to the left")
-        row = len(found) // 6  # bytes of a line of the 8 x 6 images
-        assert found[4 : row - 4] == expected[4 : row - 4]
+        assert pixels(tab, "Ground truth to the left") == expected
 
 
-def test_tables_sort_and_places_lead_to_frames(opened, toy_run, write_run):
+def test_tables_sort_best_first_and_places_lead_to_frames(opened, toy_run, write_run):
     tab = opened(write_run("sorted", {"a": 30.0, "b": 32.0, "c": 31.0}))
-    assert order(tab) == ["a", "b", "c"]
-    head = tab.locator(".part.chosen thead tr:last-child th button").nth(1)
-    for expected, way in ((["b", "c", "a"], "descending"), (["a", "c", "b"], "ascending")):
-        head.click()
+    assert order(tab) == ["b", "c", "a"]
+    heads = tab.locator("article.table.chosen thead tr:last-child th button")
+    lower = tab.locator("article.table.chosen thead tr:last-child th").all_text_contents().index("LPIPS ↓")
+    steps = (
+        (1, ["a", "c", "b"], "ascending"),
+        (lower, ["b", "c", "a"], "ascending"),
+        (0, ["a", "b", "c"], "ascending"),
+    )
+    for column, expected, way in steps:
+        heads.nth(column).click()
         assert order(tab) == expected
-        assert tab.locator(f'.part.chosen th[aria-sort="{way}"]').count() == 1
+        assert tab.locator(f'article.table.chosen th[aria-sort="{way}"]').count() == 1
     tab = opened(toy_run)
     tab.wait_for_selector("#worst button")
     button = tab.locator("#worst button").last
-    moment = button.text_content().split("timestep ")[1].split(",")[0]
+    place = button.locator(".note").text_content().rpartition(",")[0]
     button.click()
-    tab.wait_for_function(
-        "t => document.getElementById('moment').textContent.startsWith(`Timestep ${t},`)", arg=moment
-    )
+    tab.wait_for_function("text => document.getElementById('where').textContent.startsWith(text)", arg=place)
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1400, "light"), (390, "dark")])
@@ -135,7 +232,22 @@ def test_hostile_names_are_text_and_nothing_scrolls_sideways(opened, write_run, 
     one = replace(manifest.protocols["novel_view"], keys=(FrameKey("a", "EMO", 0, "a"),))
     replace(manifest, protocols={**manifest.protocols, "novel_view": one}).write(RunFolder(run).manifest)
     tab = opened(run, width, scheme)
-    assert order(tab) == [HOSTILE, "other"]
-    assert tab.locator("#panels b").nth(1).text_content() == HOSTILE
+    assert order(tab) == ["other", HOSTILE]
+    assert HOSTILE in tab.locator("#tiles b").all_text_contents()
     assert tab.locator("img").count() == 0
     assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1400, "light"), (390, "dark")])
+def test_axe_finds_nothing_serious_in_the_report(opened, toy_run, serious, width, scheme):
+    tab = opened(toy_run, width, scheme)
+    tab.wait_for_selector("#worst canvas[width]")
+    tab.evaluate("for (const d of document.querySelectorAll('details')) d.open = true")
+    assert serious(tab) == []
+
+
+def test_the_first_picture_stands_before_the_script(opened, toy_run):
+    tab = opened(toy_run, java_script_enabled=False)
+    shown = tab.locator("#tiles img")
+    assert shown.count() == 2
+    assert shown.evaluate_all("list => list.map(i => i.complete && i.naturalWidth > 0)") == [True, True]
