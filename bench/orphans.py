@@ -14,14 +14,22 @@ if TYPE_CHECKING:
 
 PATIENCE_S = 10.0
 """Seconds during which processes are sought that others started meanwhile."""
-_SET_SUBREAPER = 36
+_SET_SUBREAPER, _GET_SUBREAPER = 36, 37
 """From linux/prctl.h."""
 
 
-def become_subreaper() -> bool:
-    """Let this process become the parent of every descendant whose own parent has ended, for good; False without Linux."""
-    libc = ctypes.CDLL(None)
-    return hasattr(libc, "prctl") and libc.prctl(_SET_SUBREAPER, 1, 0, 0, 0) == 0
+def set_subreaper(on: bool) -> bool | None:
+    """Choose whether this process becomes the parent of descendants whose own parent has ended.
+
+    Returns
+    -------
+    bool | None
+        Whether it did so before; None without Linux.
+    """
+    libc, before = ctypes.CDLL(None), ctypes.c_int()
+    if not hasattr(libc, "prctl") or libc.prctl(_GET_SUBREAPER, ctypes.byref(before), 0, 0, 0) != 0:
+        return None
+    return bool(before.value) if libc.prctl(_SET_SUBREAPER, int(on), 0, 0, 0) == 0 else None
 
 
 def end_orphans(kept: Collection[int]) -> None:
@@ -45,12 +53,13 @@ def end_orphans(kept: Collection[int]) -> None:
 def orphans_ended() -> Iterator[None]:
     """Kill, at the end, processes that programs started in the block left behind. Without subreapers, none are found."""
     before = {child.pid for child in _orphans()}
-    becomes = become_subreaper()
+    earlier = set_subreaper(True)
     try:
         yield
     finally:
-        if becomes:
+        if earlier is not None:
             end_orphans(before)
+            set_subreaper(earlier)
 
 
 def _orphans() -> list[psutil.Process]:

@@ -36,7 +36,8 @@ def installed_with(names: list[str]) -> dict[str, str]:
             continue
         # The free text "License" may quote the licences of what a wheel bundles: only where nothing else is given.
         classifiers = [c for c in package.metadata.get_all("Classifier", []) if c.startswith("License")]
-        given = (package.metadata["License-Expression"], "\n".join(classifiers), package.metadata["License"])
+        texts = {field: package.metadata.get(field) for field in ("License-Expression", "License")}
+        given = (texts["License-Expression"], "\n".join(classifiers), texts["License"])
         found[normalised(name)] = next(filter(None, given), "")
         requirements = map(Requirement, package.requires or [])
         waiting += [r.name for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]

@@ -37,7 +37,7 @@ from ..contracts import (
     no_progress,
 )
 from ..errors import ChangedInputError, HeadbenchError, InputError, UnavailableError, shortened
-from ..orphans import become_subreaper, end_orphans
+from ..orphans import end_orphans, set_subreaper
 from ..start import starting_workers
 from .child import StoredHead
 from .landlock import SYSTEM, devices, without
@@ -176,6 +176,8 @@ class _Process:
 
     running: ClassVar[set[int]] = set()
     """Ids of all such processes."""
+    earlier: ClassVar[bool | None] = None
+    """Whether this process was a subreaper before the first of them started."""
 
     def __init__(self, resolved: Any, read: Sequence[Path], write: Sequence[Path], hidden: Sequence[Path]):
         self._resolved, self._read, self._write, self._hidden = resolved, read, write, hidden
@@ -187,7 +189,9 @@ class _Process:
     def __enter__(self) -> Self:
         if self._started is not None:
             return self
-        become_subreaper()
+        earlier = set_subreaper(True)
+        if not self.running:
+            type(self).earlier = earlier
         own, other = socket.socketpair()
         self._scratch = TemporaryDirectory(ignore_cleanup_errors=True)
         code = f"from {__package__}.child import main; main({other.fileno()})"
@@ -238,6 +242,8 @@ class _Process:
             started.wait()
             end_orphans(self.running)
             self.running.discard(started.pid)
+            if not self.running and self.earlier is not None:
+                set_subreaper(self.earlier)
             self._scratch.cleanup()
 
     def call(

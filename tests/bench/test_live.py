@@ -13,7 +13,8 @@ import pytest
 from headbench.bench.live import BLOCKS, Curve
 
 PROGRAM = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell in the background has ignored
 from headbench.bench import progress, live
 from headbench.bench.progress import log, log_to_terminal, progress as counted, run_progress
 progress.SHOW_EVERY_S = 0

@@ -63,7 +63,7 @@ def test_every_option_of_the_help_has_an_entry(entries, capsys):
     for command in sorted(installed("commands")):
         with pytest.raises(SystemExit):
             cli.main([*command.split(), "--help"])
-        shown = re.findall(r"^[│|]? {1,2}(--[a-z][a-z-]*)", capsys.readouterr().out, re.MULTILINE)
+        shown = re.findall(r"^[│|]? {1,2}(--[a-z][a-z-]*)(?=\s|│)", capsys.readouterr().out, re.MULTILINE)
         program = command.replace(" ", "-")
         listed = {
             name.partition(".")[2]

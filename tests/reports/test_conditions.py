@@ -76,7 +76,7 @@ def test_what_does_not_compare_has_a_note(conditions, notes, machine):
 MARKS = {
     "md": "10.0**<sup>1</sup>",
     "latex": r"10.0}\textsuperscript{1}",
-    "html": '10.0<sup><a href="#note-1">1</a></sup>',
+    "html": '10.0</span><sup><a href="#note-1">1</a></sup>',
     "csv": "Measured under load",
     "json": '"note": 0',
 }
