@@ -1,0 +1,81 @@
+"""``make pictures``: screenshots of the pages of a finished demo, and the README's picture.
+
+The report, the page of an avatar, a leaderboard and this site, at three widths in both schemes, as ``docs/pictures/*-after.webp``;
+the report as ``reports/gallery/report.jpg``. Needs Chromium.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from io import BytesIO
+from pathlib import Path
+
+from PIL import Image
+from playwright.sync_api import Page, sync_playwright
+
+ROOT = Path(__file__).parents[2]
+SIZES = {1440: 1800, 1024: 1365, 390: 2000}
+"""Height of a picture by width, pixels of the page."""
+STORED = 0.6
+"""Scale of stored pictures, except those of phones."""
+FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+
+
+def pages_of(demo: Path, work: Path) -> dict[str, Path]:
+    """Make the pages that a demo does not leave."""
+    headbench = str(Path(sys.executable).with_name("headbench"))
+    avatar = next(demo.glob("*/ours/seed-*"))
+    capture = next((demo / "capture").glob("UNION*"))
+    bundles = work / "bundles"
+    bundles.mkdir(parents=True)
+    for line in (
+        ["export", "html", avatar, "--capture", capture, "--out", work / "avatar.html"],
+        ["bundle", demo, "--out", bundles / "demo.zip", "--by", "headbench"],
+        ["report", "leaderboard", bundles, "--out", work],
+    ):
+        subprocess.run([headbench, *map(str, line)], check=True)
+    return {
+        "report": demo / "report.html",
+        "avatar": work / "avatar.html",
+        "leaderboard": work / "leaderboard.html",
+        "site": ROOT / "build" / "docs" / "index.html",
+    }
+
+
+def picture(page: Page, path: Path) -> Image.Image:
+    """A page after its pictures are there, as large as the window."""
+    page.goto(path.resolve().as_uri())
+    page.wait_for_timeout(1500)
+    return Image.open(BytesIO(page.screenshot())).convert("RGB")
+
+
+def main(demo: Path) -> None:
+    work = ROOT / "build" / "pictures"
+    shutil.rmtree(work, ignore_errors=True)
+    names = ("chromium", "chromium-browser", "google-chrome")
+    program = next(filter(None, map(shutil.which, names)), None)
+    if program is None:
+        raise SystemExit("Chromium is not installed.")
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=program, args=list(FLAGS))
+        for name, path in pages_of(demo, work).items():
+            for width, height in SIZES.items():
+                for scheme in ("light", "dark"):
+                    page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
+                    image = picture(page, path)
+                    page.close()
+                    scale = 0.8 if width < 600 else STORED
+                    small = image.resize(
+                        (round(scale * width), round(scale * height)), Image.Resampling.LANCZOS
+                    )
+                    small.save(ROOT / "docs" / "pictures" / f"{name}-{width}-{scheme}-after.webp", quality=60)
+                    if (name, width, scheme) == ("report", 1440, "light"):
+                        readme = image.crop((0, 0, 1440, 1270)).resize((1152, 1016), Image.Resampling.LANCZOS)
+                        readme.save(ROOT / "reports" / "gallery" / "report.jpg", quality=88)
+        browser.close()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
