@@ -105,6 +105,8 @@ def test_the_title_of_the_citation_is_that_of_the_package():
 
 
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+
+
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
 def test_workflows_call_what_exists_and_hold_no_rights(path):
     workflow = yaml.load(path.read_text(encoding="utf-8"), yaml.BaseLoader)
