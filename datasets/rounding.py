@@ -23,6 +23,11 @@ ANGLE_BITS = 30
 """Grid of rotation matrices and of angles in radians: 1e-9, which moves no pixel by 1e-5."""
 
 
+def share_left(seconds: FloatArray | float, constant: float) -> FloatArray:
+    """Share of a difference that is left after ``seconds``, 1/e after ``constant``, on the grid of coefficients."""
+    return on_grid(np.exp(-np.asarray(seconds) / constant), COEFFICIENT_BITS)
+
+
 def on_grid(values: FloatArray | float, bits: int) -> FloatArray:
     """Round to the nearest multiples of 2**-bits, ties to even; zeros come out positive."""
     scale = 2.0**bits

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...bench.contracts import FloatArray
-from ..rounding import COEFFICIENT_BITS, on_grid
+from ..rounding import COEFFICIENT_BITS, on_grid, share_left
 from .anatomy import SIDES, Person
 from .performance import Activations
 from .skin import FLUSHES, FOLDS, flush_strengths
@@ -67,8 +67,8 @@ def over_time(activations: Sequence[Activations], seconds: float, person: Person
 
 
 def _kept(seconds: float, constant: float) -> float:
-    """Share of a difference that is left after ``seconds``."""
-    return float(on_grid(np.exp(-seconds / constant), COEFFICIENT_BITS)) if constant else 0.0
+    """Share of a difference that is left after ``seconds``; none is where there is no delay."""
+    return float(share_left(seconds, constant)) if constant else 0.0
 
 
 _AGED = np.array(

@@ -1,7 +1,7 @@
 """Performances that move as tracked recordings do: speeds, pauses, blinks, gaze, and controls that act together.
 
-The amounts are those of tracked sequences of NeRSemble and of other public recordings; `motion.statistics_of` measures them,
-and its test compares them with the recorded values. Moments lie at a video's rate, of which a capture keeps every n-th.
+The amounts are those of tracked sequences of NeRSemble and of other public recordings; the tests measure them and
+compare them with the recorded values. Moments lie at a video's rate, of which a capture keeps every n-th.
 """
 
 from __future__ import annotations
@@ -19,21 +19,24 @@ FRAME_RATE = 73.0 / 3.0
 """Frames per second of NeRSemble's recordings."""
 
 Face = Mapping[str, float]
+"""Controls of a face by name; others are at rest."""
 Curves = dict[str, FloatArray]
+"""(T,) values of controls by name."""
 
 
-def _both(**values: float) -> dict[str, float]:
+def both(**values: float) -> dict[str, float]:
+    """Controls of both sides."""
     return {f"{name}_{side}": value for name, value in values.items() for side in SIDES}
 
 
 SYNERGIES: tuple[Face, ...] = (
-    _both(smile=1.0, cheek_raise=0.7, squint=0.4),
-    {**_both(brow_down=1.0, squint=0.5, nose_sneer=0.4), "lip_press": 0.4},
-    {**_both(brow_outer_up=0.9, eye_wide=0.7), "brow_inner_up": 1.0},
+    both(smile=1.0, cheek_raise=0.7, squint=0.4),
+    {**both(brow_down=1.0, squint=0.5, nose_sneer=0.4), "lip_press": 0.4},
+    {**both(brow_outer_up=0.9, eye_wide=0.7), "brow_inner_up": 1.0},
     {"mouth_frown": 1.0, "chin_raise": 0.8, "lip_press": 0.5, "brow_inner_up": 0.4},
-    {"pucker": 1.0, "funnel": 0.7, "lip_press": 0.4, **_both(cheek_raise=0.3)},
-    _both(nose_sneer=1.0, upper_lip_up=0.8, brow_down=0.4, cheek_raise=0.5),
-    _both(mouth_stretch=1.0, lower_lip_down=0.7, smile=0.4),
+    {"pucker": 1.0, "funnel": 0.7, "lip_press": 0.4, **both(cheek_raise=0.3)},
+    both(nose_sneer=1.0, upper_lip_up=0.8, brow_down=0.4, cheek_raise=0.5),
+    both(mouth_stretch=1.0, lower_lip_down=0.7, smile=0.4),
     {"lip_roll": 1.0, "chin_raise": 0.6, "cheek_puff": 0.5},
 )
 """Controls that act together, beside what a phrase asks for."""
@@ -51,7 +54,7 @@ OPENING = 0.15, (0.1, 0.5)
 """Probability that the jaw opens with a phrase that says nothing of it, and the range of openings."""
 WIDER, WIDEST = 1.25, 1.35
 """Factor on the openings of phrases, and the largest opening."""
-WITH_JAW: Face = {**_both(lower_lip_down=0.7), "funnel": 0.3}
+WITH_JAW: Face = {**both(lower_lip_down=0.7), "funnel": 0.3}
 """What an opening of the jaw adds to each control."""
 
 PHRASE_SECONDS = 0.85
@@ -70,7 +73,8 @@ def face_curves(
 ) -> Curves:
     """Controls of a sequence of ``seconds`` at the moments ``time`` (T,): its phrases in random order, repeated as needed.
 
-    Every phrase has a strength and a company of other controls of its own, ``new`` of them not among those of training. The jaw moves in strokes, and moves lips with it.
+    Every phrase has a strength and a company of other controls of its own, ``new`` of them not among those of training. The
+    jaw moves in strokes, and moves lips with it.
     """
     count = max(1, round(seconds / PHRASE_SECONDS) - 1)
     order: list[int] = []
@@ -91,9 +95,14 @@ def face_curves(
     for name in sorted(curves.keys() - FAST.keys()):
         curves[name] = curves[name] + (TREMBLE * curves[name] + RESTLESS) * wander(time, TREMBLE_SECONDS, rng)
     curves["jaw_open"] = opening = np.minimum(WIDER * curves["jaw_open"], WIDEST)
+    _move_with_jaw(curves, opening)
+    return curves
+
+
+def _move_with_jaw(curves: Curves, opening: FloatArray) -> None:
+    """Add to lips what an opening of the jaw (T,) moves."""
     for name, share in WITH_JAW.items():
         curves[name] = curves[name] + share * opening
-    return curves
 
 
 def _in_company(phrase: Face, rng: np.random.Generator, new: int) -> dict[str, float]:
@@ -120,9 +129,14 @@ def _steps(
     moments = switches + rng.uniform(-0.1, 0.1, len(switches))
     lengths = duration * rng.uniform(0.8, 1.25, len(switches))
     for before, after, moment, length in zip(values, values[1:], moments, lengths):
-        part = np.clip((time - moment) / length + 0.5, 0.0, 1.0)
-        curve = curve + (after - before) * (0.5 - 0.5 * np.cos(np.pi * part))
+        curve = curve + (after - before) * _rise(time, moment, length)
     return curve
+
+
+def _rise(time: FloatArray, moment: float, seconds: float) -> FloatArray:
+    """(T,) from 0 to 1 by half a cosine of ``seconds`` around a moment."""
+    part = np.clip((time - moment) / seconds + 0.5, 0.0, 1.0)
+    return np.asarray(0.5 - 0.5 * np.cos(np.pi * part))
 
 
 def wander(time: FloatArray, periods: tuple[float, float], rng: np.random.Generator) -> FloatArray:
@@ -134,12 +148,12 @@ def wander(time: FloatArray, periods: tuple[float, float], rng: np.random.Genera
 SYLLABLE_SECONDS = 0.21
 _VISEMES: tuple[Face, ...] = (
     {"jaw_open": 0.36},
-    {"jaw_open": 0.2, **_both(mouth_stretch=0.5, smile=0.2)},
+    {"jaw_open": 0.2, **both(mouth_stretch=0.5, smile=0.2)},
     {"jaw_open": 0.18, "funnel": 0.7, "pucker": 0.3},
     {"jaw_open": 0.08, "pucker": 0.8},
     {"lip_press": 0.8},
     {"jaw_open": 0.06, "lip_roll": 0.5},
-    {"jaw_open": 0.12, **_both(lower_lip_down=0.5)},
+    {"jaw_open": 0.12, **both(lower_lip_down=0.5)},
     {},
 )
 
@@ -155,8 +169,7 @@ def speech_curves(time: FloatArray, seconds: float, rng: np.random.Generator) ->
         syllables = _steps([face.get(name, 0.0) for face in faces], switches, 0.2, time, rng)
         curves[name] = curves.get(name, np.zeros(len(time))) + syllables
         if name == "jaw_open":
-            for other, share in WITH_JAW.items():
-                curves[other] = curves[other] + share * syllables
+            _move_with_jaw(curves, syllables)
     return curves
 
 
@@ -191,11 +204,15 @@ def gaze(time: FloatArray, seconds: float, rng: np.random.Generator) -> FloatArr
     places *= np.where(rng.random(len(places)) < _LONG[0], _LONG[1], 1.0)[:, None]
     turns = np.broadcast_to(places[0], (len(time), 2)).copy()
     for before, after, moment in zip(places, places[1:], moments):
-        part = np.clip((time - moment) / _SACCADE_SECONDS + 0.5, 0.0, 1.0)
-        turns += (after - before) * (0.5 - 0.5 * np.cos(np.pi * part))[:, None]
+        turns += (after - before) * _rise(time, moment, _SACCADE_SECONDS)[:, None]
     return turns
 
 
+JAW_ROLL = 0.12
+"""Deviation of a roll of the jaw of its own, in units of the control."""
+IDLE_SECONDS = (1.5, 6.0)
+SWAY = {"neck_turn": 0.004, "neck_nod": 0.004, "sway_x": 0.002, "sway_y": 0.0015, "sway_z": 0.002}
+"""Deviations of idle motion by control: radians, metres."""
 HEAD_IDLE = np.radians((1.0, 0.5, 0.4))
 """Standard deviations of pitch, yaw and roll of a head at rest over a few seconds."""
 TURN_GAP, _TURN_SECONDS, _TURN = 7.0, 0.24, np.radians((7.0, 9.0, 3.0))
@@ -207,15 +224,7 @@ def head(time: FloatArray, seconds: float, rng: np.random.Generator) -> FloatArr
     moment, place = rng.exponential(TURN_GAP), np.zeros(3)
     while moment < seconds:
         after = rng.standard_normal(3) * _TURN if not place.any() else np.zeros(3)
-        part = np.clip((time - moment) / _TURN_SECONDS + 0.5, 0.0, 1.0)
-        turns += (after - place) * (0.5 - 0.5 * np.cos(np.pi * part))[:, None]
+        turns += (after - place) * _rise(time, moment, _TURN_SECONDS)[:, None]
         place = after
         moment += 0.8 if place.any() else 0.5 + rng.exponential(TURN_GAP)
     return turns
-
-
-JAW_ROLL = 0.12
-"""Deviation of a roll of the jaw of its own, in units of the control."""
-IDLE_SECONDS = (1.5, 6.0)
-SWAY = {"neck_turn": 0.004, "neck_nod": 0.004, "sway_x": 0.002, "sway_y": 0.0015, "sway_z": 0.002}
-"""Deviations of idle motion by control: radians, metres."""

@@ -20,7 +20,7 @@ from ..head.procedural.versions import semantic_to_coefficients
 from ..rounding import COEFFICIENT_BITS, on_grid
 from . import natural
 from .anatomy import SIDES
-from .natural import SPEECH, Curves
+from .natural import SPEECH, Curves, Face, both
 
 Activations = Mapping[str, float]
 
@@ -82,8 +82,6 @@ class Translation:
         return HeadPose(self.head_model, **stored, eyelids=eyelids, subject=subject, timestep=timestep)
 
 
-Face = Mapping[str, float]
-
 Kind = Literal["full", "parts", "natural", "expressions", "still"]
 """Kind of performance: full; full with FREE in the parts of `FREE_PARTS`, each a sequence; these parts and speech with the
 motion of tracked recordings (see `natural`); without jaw and tongue; only head, neck and gaze."""
@@ -110,21 +108,16 @@ TONGUE_SHOWS = 0.6
 _PHRASE_SECONDS = 0.9
 
 
-def _both(**values: float) -> dict[str, float]:
-    """Controls of both sides."""
-    return {f"{name}_{side}": value for name, value in values.items() for side in SIDES}
-
-
 _REST: Face = {}
-_SHOUT: Face = {"jaw_open": 0.95, **_both(upper_lip_up=0.5, lower_lip_down=0.5, brow_down=0.5)}
-_LAUGH: Face = {"jaw_open": 0.45, **_both(smile=1.0, cheek_raise=0.8, squint=0.5)}
-_SURPRISE: Face = {"brow_inner_up": 1.0, "jaw_open": 0.55, **_both(brow_outer_up=1.0, eye_wide=0.8)}
-_FEAR: Face = {"brow_inner_up": 0.9, **_both(brow_down=0.3, eye_wide=0.9, mouth_stretch=0.8)}
-_ANGRY: Face = {"lip_press": 0.9, **_both(brow_down=1.0, squint=0.4, nose_sneer=0.25)}
+_SHOUT: Face = {"jaw_open": 0.95, **both(upper_lip_up=0.5, lower_lip_down=0.5, brow_down=0.5)}
+_LAUGH: Face = {"jaw_open": 0.45, **both(smile=1.0, cheek_raise=0.8, squint=0.5)}
+_SURPRISE: Face = {"brow_inner_up": 1.0, "jaw_open": 0.55, **both(brow_outer_up=1.0, eye_wide=0.8)}
+_FEAR: Face = {"brow_inner_up": 0.9, **both(brow_down=0.3, eye_wide=0.9, mouth_stretch=0.8)}
+_ANGRY: Face = {"lip_press": 0.9, **both(brow_down=1.0, squint=0.4, nose_sneer=0.25)}
 _SAD: Face = {"brow_inner_up": 0.85, "mouth_frown": 0.9, "chin_raise": 0.5, "gaze_up": -0.4}
-_DISGUST: Face = _both(nose_sneer=1.0, upper_lip_up=0.6, brow_down=0.5, squint=0.4)
-_HAPPY: Face = _both(smile=1.0, cheek_raise=0.5)
-_TONGUE: Face = {"jaw_open": 0.55, "tongue_out": 1.0, **_both(lower_lip_down=0.2)}
+_DISGUST: Face = both(nose_sneer=1.0, upper_lip_up=0.6, brow_down=0.5, squint=0.4)
+_HAPPY: Face = both(smile=1.0, cheek_raise=0.5)
+_TONGUE: Face = {"jaw_open": 0.55, "tongue_out": 1.0, **both(lower_lip_down=0.2)}
 
 SEQUENCES: Mapping[str, tuple[Face, ...]] = {
     "EMO-1-shout+laugh": (_REST, _SHOUT, _SHOUT, _REST, _LAUGH, {**_LAUGH, "jaw_open": 0.2}, _LAUGH, _REST),
@@ -158,37 +151,37 @@ SEQUENCES: Mapping[str, tuple[Face, ...]] = {
     "EXP-2-eyes": (
         {"gaze_left": 0.9},
         {"gaze_left": -0.9},
-        {"gaze_up": 0.9, "brow_inner_up": 0.4, **_both(brow_outer_up=0.4)},
-        {"gaze_up": -0.9, **_both(blink=0.3)},
-        _both(squint=1.0, blink=0.5, cheek_raise=0.6),
-        _both(blink=1.0),
+        {"gaze_up": 0.9, "brow_inner_up": 0.4, **both(brow_outer_up=0.4)},
+        {"gaze_up": -0.9, **both(blink=0.3)},
+        both(squint=1.0, blink=0.5, cheek_raise=0.6),
+        both(blink=1.0),
         {"blink_left": 1.0, "squint_left": 0.6},
         {"blink_right": 1.0, "squint_right": 0.6},
-        _both(eye_wide=1.0),
+        both(eye_wide=1.0),
     ),
     "EXP-3-cheeks+nose": (
         {"cheek_puff": 1.0},
         _REST,
-        _both(nose_sneer=1.0),
+        both(nose_sneer=1.0),
         {"nose_sneer_left": 1.0, "smile_left": 0.4},
         {"nose_sneer_right": 1.0, "smile_right": 0.4},
         {"cheek_puff": 0.8, "lip_press": 0.6},
-        _both(cheek_raise=1.0),
+        both(cheek_raise=1.0),
     ),
     "EXP-4-lips": (
         {"pucker": 1.0},
         {"funnel": 1.0, "jaw_open": 0.15},
         {"lip_press": 1.0},
         {"lip_roll": 1.0},
-        _both(mouth_stretch=1.0),
+        both(mouth_stretch=1.0),
         {"mouth_left": 1.0},
         {"mouth_right": 1.0},
-        _both(smile=0.8),
+        both(smile=0.8),
     ),
     "EXP-5-mouth": (
-        _both(upper_lip_up=1.0, smile=0.3),
-        _both(lower_lip_down=1.0),
-        _both(smile=1.0, upper_lip_up=0.5, lower_lip_down=0.4),
+        both(upper_lip_up=1.0, smile=0.3),
+        both(lower_lip_down=1.0),
+        both(smile=1.0, upper_lip_up=0.5, lower_lip_down=0.4),
         {"mouth_frown": 1.0, "chin_raise": 0.6},
         {"chin_raise": 1.0},
         {"smile_left": 1.0},
@@ -210,16 +203,16 @@ SEQUENCES: Mapping[str, tuple[Face, ...]] = {
     ),
     # Nothing here is new on its own; the combinations are.
     "FREE": (
-        {**_both(smile=0.6), "gaze_left": 0.4},
+        {**both(smile=0.6), "gaze_left": 0.4},
         {"brow_inner_up": 0.7, "brow_outer_up_left": 1.0, "smile_right": 0.7},
-        {**_both(brow_down=0.6), "pucker": 0.7},
-        {"jaw_open": 0.6, **_both(smile=0.7, brow_outer_up=0.7), "brow_inner_up": 0.7},
+        {**both(brow_down=0.6), "pucker": 0.7},
+        {"jaw_open": 0.6, **both(smile=0.7, brow_outer_up=0.7), "brow_inner_up": 0.7},
         _TONGUE,
-        {**_both(nose_sneer=0.6), "mouth_left": 0.5, "blink_left": 0.9},
-        {"jaw_open": 0.3, "jaw_side": 0.5, **_both(brow_down=0.5)},
+        {**both(nose_sneer=0.6), "mouth_left": 0.5, "blink_left": 0.9},
+        {"jaw_open": 0.3, "jaw_side": 0.5, **both(brow_down=0.5)},
         {"mouth_frown": 0.7, "brow_inner_up": 0.6, "gaze_left": -0.7},
-        {"jaw_open": 0.75, **_both(eye_wide=0.6, lower_lip_down=0.5)},
-        {**_both(cheek_raise=0.8), "lip_press": 0.5},
+        {"jaw_open": 0.75, **both(eye_wide=0.6, lower_lip_down=0.5)},
+        {**both(cheek_raise=0.8), "lip_press": 0.5},
     ),
 }
 """Phrases by sequence, in NeRSemble's order."""
@@ -239,7 +232,7 @@ FREE_PARTS: Mapping[str, tuple[Face, ...]] = {
         {**_HAPPY, "gaze_left": 0.5},
         {name: 0.8 * value for name, value in _SURPRISE.items()},
         {"pucker": 0.9},
-        _both(squint=0.8, blink=0.4, cheek_raise=0.5),
+        both(squint=0.8, blink=0.4, cheek_raise=0.5),
         {"jaw_open": 0.7},
         {name: 0.85 * value for name, value in _DISGUST.items()},
         {"mouth_frown": 0.8, "chin_raise": 0.5},
@@ -250,11 +243,11 @@ FREE_PARTS: Mapping[str, tuple[Face, ...]] = {
         map(
             _beyond,
             (
-                {**_both(smile=1.0), "gaze_left": 0.4},
+                {**both(smile=1.0), "gaze_left": 0.4},
                 _SURPRISE,
                 {"pucker": 1.0},
                 _DISGUST,
-                {"jaw_open": 0.95, **_both(lower_lip_down=0.6)},
+                {"jaw_open": 0.95, **both(lower_lip_down=0.6)},
                 {"mouth_frown": 0.9, "brow_inner_up": 0.9},
                 {**_ANGRY, "jaw_open": 0.0},
                 {"jaw_open": 0.5, "jaw_side": 0.9},

@@ -23,7 +23,7 @@ from scipy.optimize import nnls
 from ...bench.contracts import FloatArray, HeadPose
 from ..head.arrays import HeadArrays, region
 from ..head.model import HeadModel
-from ..rounding import COEFFICIENT_BITS, on_grid
+from ..rounding import COEFFICIENT_BITS, on_grid, share_left
 from .anatomy import SIDES
 from .performance import EXPRESSION_CONTROLS, Activations, Translation
 
@@ -148,7 +148,7 @@ def with_tracking_error(
     }
     if tracker == "video":
         for name, column, amount in _OWN_JITTER:
-            kept = _kept(apart, JITTER_SECONDS)
+            kept = share_left(apart, JITTER_SECONDS)
             total[name][:, column] += level * amount * _drift((len(poses), 1), begins, kept, rng)
     moved = iter(_moved(poses, total))
     return {name: [next(moved) for _ in each] for name, each in sequences.items()}
@@ -184,18 +184,13 @@ def _lasting(
 ) -> FloatArray:
     """(T, n) error of a tracker of videos in spreads; ``apart`` (T,) are the seconds between rows."""
     error = LASTING * _drift(shape, begins, 1.0, rng)
-    error += LASTING_DRIFT * _drift(shape, begins, _kept(apart, DRIFT_SECONDS), rng)
-    error += JITTER * _drift(shape, begins, _kept(apart, JITTER_SECONDS), rng)
+    error += LASTING_DRIFT * _drift(shape, begins, share_left(apart, DRIFT_SECONDS), rng)
+    error += JITTER * _drift(shape, begins, share_left(apart, JITTER_SECONDS), rng)
     starting = STARTING * rng.standard_normal(shape[1]) * (rng.random(shape[1]) < START_SHARE)
-    decay, left = _kept(apart, START_SECONDS), np.ones(shape[0])
+    decay, left = share_left(apart, START_SECONDS), np.ones(shape[0])
     for row in range(1, shape[0]):
         left[row] = 1.0 if row in begins else decay[row] * left[row - 1]
     return error + left[:, None] * starting
-
-
-def _kept(apart: FloatArray, seconds: float) -> FloatArray:
-    """Correlation over ``apart`` seconds of noise with a time constant; rounded, so that processors agree."""
-    return on_grid(np.exp(-apart / seconds), COEFFICIENT_BITS)
 
 
 _OWN_JITTER = (
