@@ -37,7 +37,7 @@ from .io.lock import locked
 from .listing import presets_of_methods
 from .machine import check_device
 from .options import DependentOptions
-from .progress import log_to_file
+from .progress import counted, log_to_file
 from .progress import progress as show_progress
 from .registry import get, resolve
 from .specs import CommandResult
@@ -188,24 +188,22 @@ def _run(config: RunConfig, execution: Execution | None = None, **record: Any) -
 
 def closing(run: Path, rows: Rows) -> str:
     """Three lines at the end of a run: where its report is, what the report shows, and commands to try next."""
-    folder, page = shlex.quote(str(run)), run / "report.html"
+    from .engine.store import RunFolder  # with pandas
+
+    folder, page = shlex.quote(str(run)), RunFolder(run).page
     first = f"Report: {page} (for a browser; it needs no network)"
     if not page.is_file():
-        first = f"Report: none was written, see {run / 'run.log'}; `headbench report {folder} --out {folder}/report.html` tries again"
+        first = f"Report: none was written, see {run / 'run.log'}; `headbench report {folder} --out {folder}/{page.name}` tries again"
     subjects, methods = len(rows.subjects), len(rows.methods)
     contents = (
         "tables, every method beside the captured images frame by frame, error maps, curves, worst frames"
     )
     failed = "; a training or measurement failed, and the tables say which" if rows.failed else ""
-    second = f"It shows {_counted(methods, 'method')} on {_counted(subjects, 'subject')}: {contents}{failed}."
+    second = f"It shows {counted(methods, 'method')} on {counted(subjects, 'subject')}: {contents}{failed}."
     why = [f"`headbench status {folder}` (why something failed)"] if rows.failed else []
     tried = f"`headbench table {folder} --format latex` (the table for a paper)"
     tested = f"`headbench compare {folder}` (differences with intervals and tests)"
     return "\n".join([first, second, f"Next: {'; '.join([*why, tried, tested])}"])
-
-
-def _counted(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def _table(runs: Sequence[str], **options: Any) -> str:

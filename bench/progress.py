@@ -235,6 +235,11 @@ def _line() -> Iterator[Show]:
         yield show
 
 
+def counted(number: int, noun: str) -> str:
+    """Such as "1 subject" or "2 subjects"."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def duration(seconds: float) -> str:
     """Format a duration: 42 s, 3 min 10 s, 2 h 05 min."""
     whole = round(seconds)

@@ -41,15 +41,18 @@ def displacement_metric(basis: FloatArray) -> FloatArray:
     return metric
 
 
-def novelty(train: FloatArray, test: FloatArray) -> Novelty:
-    """Compare faces, (T, E) and (N, E) as `displacement_metric` gives them; at least one of each."""
+def novelty(train: FloatArray, test: FloatArray, span: float = SPAN_VARIANCE) -> Novelty:
+    """Compare faces, (T, E) and (N, E) as `displacement_metric` gives them; at least one of each.
+
+    ``span`` is the fraction of the training variance in the span of training.
+    """
     mean = train.mean(axis=0)
     _, singular, axes = np.linalg.svd(train - mean, full_matrices=False)
     variance = singular**2
     if not variance.sum() > 0:
         moved = float(np.any(np.abs(test - mean) > 0))
         return Novelty(moved, moved)
-    kept = int(np.searchsorted(np.cumsum(variance) / variance.sum(), SPAN_VARIANCE) + 1)
+    kept = int(np.searchsorted(np.cumsum(variance) / variance.sum(), span) + 1)
     axes = axes[:kept]
     found, known = (test - mean) @ axes.T, (train - mean) @ axes.T
     total = ((test - mean) ** 2).sum()

@@ -12,12 +12,13 @@ from typing import Literal
 
 from ..bench.contracts import FrameKey
 from ..bench.engine.scoring import FULL
+from ..bench.progress import counted
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from ..bench.specs import MetricSpec
 from .aggregate import Aggregate, subject_means, summarise, whole_images
 from .conditions import conditions, marks, measured_on, suspects
-from .statistics.comparisons import LEVEL, BestSet, best_set, counted
+from .statistics.comparisons import LEVEL, BestSet, best_set
 
 
 @dataclass(frozen=True)

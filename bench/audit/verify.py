@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import shutil
 import tempfile
@@ -148,7 +147,10 @@ def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> Co
 
 @contextmanager
 def _scratch_folder(out: str | None) -> Iterator[Path]:
-    """An empty folder for temporary files, in ``out``, which its command locks, if it is given; what a killed process left is removed."""
+    """An empty folder for temporary files, in ``out`` if it is given, where what a killed process left is removed.
+
+    The command has locked ``out``.
+    """
     if out is None:
         with tempfile.TemporaryDirectory() as name:
             yield Path(name)
@@ -240,10 +242,9 @@ def _renders(folder: RunFolder, manifest: Manifest) -> Renders:
 def _pixels(path: Path) -> str:
     """Digest of an image's pixels, which another compression leaves as they are; "" where there is none."""
     try:
-        image = read_png(path)
+        return digest(read_png(path))
     except InputError:
         return ""
-    return hashlib.blake2b(image.tobytes(), digest_size=32).hexdigest()
 
 
 def equal_renders(renders: Renders) -> dict[str, tuple[str, ...]]:

@@ -47,8 +47,8 @@ _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 def read_json(path: Path, limit: int | None = None) -> dict[str, Any]:
     """Read a JSON file whose top level is an object.
 
-    Raises `InputError` for a file that is missing, cannot be read, is larger than ``limit`` bytes (default: `MAX_JSON_BYTES`), does not parse,
-    nests deeper than `MAX_DEPTH`, repeats a key, holds a number that is not finite, or something else than an object.
+    Raises `InputError` for a file that is missing, cannot be read, is larger than ``limit`` bytes (default: `MAX_JSON_BYTES`),
+    does not parse, nests deeper than `MAX_DEPTH`, repeats a key, holds a number that is not finite, or something else than an object.
     """
     return parse_json(read_text(path, "JSON", MAX_JSON_BYTES if limit is None else limit), path)
 

@@ -13,9 +13,9 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.executors.settings import check_executor
 from ...bench.io.files import entries, write_text
+from ...bench.progress import counted
 from ...bench.specs import CommandResult
 from ..runs import RunSet
-from ..statistics.comparisons import counted
 from ..table_report import table_of
 from ..tables import RowGroup, Table
 from ..writers import escape_markdown, render_page, to_markdown

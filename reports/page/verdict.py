@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
 from ...bench.specs import MetricSpec
 from ..aggregate import summarise
 from ..conditions import conditions
 from ..pareto.points import SIZE, SPEED
 from ..runs import RunSet
-from ..statistics.comparisons import LEVEL, counted, subjects_needed
+from ..statistics.comparisons import LEVEL, subjects_needed
 from ..tables import Table
 from .frames import ShownFrame
 
@@ -134,7 +135,7 @@ def _scores(runs: RunSet, names: Sequence[str], spec: MetricSpec, task: str) -> 
 
 
 def _task(task: str) -> str:
-    return TASK_TITLES.get(task, task).lower() if task in TASK_TITLES else task
+    return TASK_TITLES[task].lower() if task in TASK_TITLES else task
 
 
 def _signed(value: float, spec: MetricSpec, *, unit: bool = False) -> str:

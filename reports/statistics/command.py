@@ -14,6 +14,7 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.gate.settings import DEPENDENT, BaselineOptions
 from ...bench.options import DependentOptions
+from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
 from ...bench.specs import CommandResult, MetricSpec
 
@@ -166,7 +167,6 @@ def _csv(comparisons: Sequence[dict[str, Any]]) -> str:
 def _text(spec: MetricSpec, comparisons: Sequence[PairedComparison], note: str) -> str:
     """One metric's comparisons as a table for a terminal, with a note below."""
     from ..tables import AVATAR_TITLE
-    from .comparisons import counted
 
     first = comparisons[0]
     title = TASK_TITLES.get(first.task, first.task) if first.task else AVATAR_TITLE

@@ -15,6 +15,7 @@ from itertools import chain
 import numpy as np
 
 from ...bench.contracts import FloatArray
+from ...bench.progress import counted
 from ...bench.rows import Rows
 from ..aggregate import summarise, whole_images
 from .bootstrap import interval, pair
@@ -72,11 +73,6 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 LEVEL = 0.05
-
-
-def counted(number: int, noun: str) -> str:
-    """Such as "1 subject" or "2 subjects"."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 @dataclass(frozen=True)

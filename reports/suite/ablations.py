@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from ...bench.progress import counted
 from ..runs import RunSet
-from ..statistics.comparisons import LEVEL, PairedComparison, compare, counted, subjects_needed
+from ..statistics.comparisons import LEVEL, PairedComparison, compare, subjects_needed
 from ..table_report import table_of
 from ..tables import Table, TableCell, TableRow
 

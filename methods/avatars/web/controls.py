@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from ....bench.contracts import Clip, FloatArray, HeadPose
 from ....bench.expressions import expressions_of
 from ....datasets.head.arrays import HeadArrays
+from ....datasets.novelty import displacement_metric
 from .model import JOINTS, Slider
 
 JAW, JAW_SIDE, NECK, EYES = 0.4, 0.12, 0.4, 0.4
@@ -86,11 +87,11 @@ def packed_sequences(
 ) -> list[dict[str, Any]]:
     """The sequences for the header of a page, their values relative to the step of each slider."""
     steps = np.array([slider.step for slider in sliders])
-    packed: list[Mapping[str, Any]] = []
+    packed = []
     for sequence in sequences:
         values = slider_values(head, sliders, sequence.poses) / steps
         packed.append({"name": sequence.name, "note": sequence.note, "values": values.round(3).tolist()})
-    return [dict(entry) for entry in packed]
+    return packed
 
 
 def _expression(name: str, direction: FloatArray, low: float, high: float) -> Slider:
@@ -99,8 +100,7 @@ def _expression(name: str, direction: FloatArray, low: float, high: float) -> Sl
 
 def _root(head: HeadArrays) -> FloatArray:
     """(E, E) R with \\|R c\\| the root mean square displacement of the vertices, metres, by coefficients c."""
-    basis = np.asarray(head.expression_basis, np.float64).reshape(-1, head.expression_basis.shape[2])
-    return np.asarray(np.linalg.qr(basis, mode="r")) / np.sqrt(len(head.template))
+    return displacement_metric(head.expression_basis).T
 
 
 def _fitted(root: FloatArray, directions: FloatArray, wanted: FloatArray) -> FloatArray:

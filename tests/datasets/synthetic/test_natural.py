@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from headbench.datasets.synthetic.motion import outside_span, statistics_of
 from headbench.datasets.synthetic.natural import BLINK_GAP, FRAME_RATE, blinks
 from headbench.datasets.synthetic.performance import (
     CONTROLS,
@@ -17,6 +16,8 @@ from headbench.datasets.synthetic.performance import (
     share_out,
 )
 from headbench.datasets.synthetic.plan import load_geometry
+
+from .motion import outside_span, statistics_of
 
 SEEDS = range(4)
 NAMES = [name for name in SEQUENCES if name != HELD_OUT] + [*FREE_PARTS, SPEECH]

@@ -7,7 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from ...bench.contracts import FloatArray, HeadPose
+from headbench.bench.contracts import FloatArray, HeadPose
+from headbench.datasets.novelty import novelty
 
 WINDOW_SECONDS = 5.0
 OPEN_DEGREES = 4.0
@@ -25,7 +26,7 @@ def statistics_of(sequences: Mapping[str, Sequence[HeadPose]], rate: float) -> d
     """
     parts = [_angles(poses) for poses in sequences.values()]
     jaw = np.concatenate([part["jaw"] for part in parts])
-    opening = jaw[:, 0]
+    opening = np.concatenate([part["opening"] for part in parts])[:, 0]
     speeds = {
         name: np.concatenate([_speed(part[name], rate) for part in parts])
         for name in ("opening", "eyes", "head")
@@ -33,17 +34,19 @@ def statistics_of(sequences: Mapping[str, Sequence[HeadPose]], rate: float) -> d
     steps = np.concatenate([_saccades(part["eyes"]) for part in parts])
     seconds = len(jaw) / rate
     expression = np.concatenate([part["expression"] for part in parts])
-    spread = np.maximum(expression.std(axis=0), 1e-9)
-    centred = (expression - expression.mean(axis=0)) / spread
-    moving = centred[:, expression.std(axis=0) > 1e-6]
+    deviation = expression.std(axis=0)
+    spread = np.maximum(deviation, 1e-9)
+    moving = ((expression - expression.mean(axis=0)) / spread)[:, deviation > 1e-6]
     paces = np.concatenate([_speed(part["expression"] / spread, rate) for part in parts])
     eigenvalues = np.linalg.eigvalsh(np.cov(expression.T))[::-1].clip(0.0)
-    values = {
+    return {
         "jaw opening sd": float(opening.std()),
         "jaw opening 99 %": float(np.quantile(opening, 0.99)),
         "jaw speed 95 %": float(np.quantile(speeds["opening"], 0.95)),
         "jaw speed 99 %": float(np.quantile(speeds["opening"], 0.99)),
-        "jaw stroke": float(np.median(np.concatenate([_strokes(part["jaw"][:, 0], rate) for part in parts]))),
+        "jaw stroke": float(
+            np.median(np.concatenate([_strokes(part["opening"][:, 0], rate) for part in parts]))
+        ),
         "jaw sideways 99 %": float(np.quantile(np.linalg.norm(jaw[:, 1:], axis=1), 0.99)),
         "jaw roll share": float(jaw[:, 2].std() / max(np.hypot(jaw[:, 1].std(), jaw[:, 2].std()), 1e-9)),
         "mouth open": float((opening > np.quantile(opening, 0.1) + OPEN_DEGREES).mean()),
@@ -65,7 +68,6 @@ def statistics_of(sequences: Mapping[str, Sequence[HeadPose]], rate: float) -> d
         "still": float((paces < 0.25 * paces.mean()).mean()),
         "jaw from expression": _explained(parts),
     }
-    return values
 
 
 def outside_span(training: Sequence[HeadPose], held_out: Sequence[HeadPose]) -> float:
@@ -74,13 +76,8 @@ def outside_span(training: Sequence[HeadPose], held_out: Sequence[HeadPose]) -> 
     The span is that of the fewest principal components with `SPAN` of the variance of training, 1 - `SPAN` of which lies
     outside therefore.
     """
-    given = np.stack([pose.expression for pose in training])
-    mean = given.mean(axis=0)
-    _, values, axes = np.linalg.svd(given - mean, full_matrices=False)
-    count = 1 + int(np.searchsorted(np.cumsum(values**2) / (values**2).sum(), SPAN))
-    other = np.stack([pose.expression for pose in held_out]) - mean
-    inside = other @ axes[:count].T
-    return float(1.0 - (inside**2).sum() / (other**2).sum())
+    given, other = (np.stack([pose.expression for pose in poses]) for poses in (training, held_out))
+    return novelty(given, other, SPAN).outside ** 2
 
 
 def _angles(poses: Sequence[HeadPose]) -> dict[str, FloatArray]:
@@ -115,8 +112,7 @@ def _windowed(parts: Sequence[Mapping[str, FloatArray]], name: str, axis: int, r
 def _saccades(eyes: FloatArray) -> FloatArray:
     """(T,) whether a step of more than `SACCADE_DEGREES` within two frames begins; one at a time."""
     moved = np.linalg.norm(eyes[2:] - eyes[:-2], axis=1) > SACCADE_DEGREES
-    begins = moved & ~np.concatenate([[False], moved[:-1]])
-    return begins
+    return moved & ~np.concatenate([[False], moved[:-1]])
 
 
 def _strokes(opening: FloatArray, rate: float) -> FloatArray:
@@ -147,15 +143,15 @@ def _memory(values: FloatArray, rate: float) -> float:
 def _explained(parts: Sequence[Mapping[str, FloatArray]]) -> float:
     """R² of a linear prediction of the jaw's opening from expression, each sequence predicted from the others."""
     errors, total = 0.0, 0.0
-    every = np.concatenate([part["jaw"][:, 0] for part in parts])
+    every = np.concatenate([part["opening"][:, 0] for part in parts])
     for index, part in enumerate(parts):
         others = [other for i, other in enumerate(parts) if i != index]
         given = np.concatenate([other["expression"] for other in others])
-        wanted = np.concatenate([other["jaw"][:, 0] for other in others])
+        wanted = np.concatenate([other["opening"][:, 0] for other in others])
         design = np.column_stack([given, np.ones(len(given))])
         ridge = 1e-3 * np.trace(design.T @ design) / design.shape[1] * np.eye(design.shape[1])
         weights = np.linalg.solve(design.T @ design + ridge, design.T @ wanted)
         predicted = np.column_stack([part["expression"], np.ones(len(part["expression"]))]) @ weights
-        errors += ((predicted - part["jaw"][:, 0]) ** 2).sum()
-        total += ((part["jaw"][:, 0] - every.mean()) ** 2).sum()
+        errors += ((predicted - part["opening"][:, 0]) ** 2).sum()
+        total += ((part["opening"][:, 0] - every.mean()) ** 2).sum()
     return float(1.0 - errors / total)
