@@ -47,6 +47,7 @@ html_theme = "furo"
 html_title = "headbench"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_js_files = ["site.js"]
 html_copy_source = False
 html_show_search_summary = False  # summaries would be fetched, which pages from a disk cannot do
 html_show_sphinx = False

@@ -20,6 +20,8 @@ from hypothesis import HealthCheck, settings
 from headbench.bench.io import files
 from headbench.methods.shared.threads import torch_threads
 
+from .axe import serious_findings
+
 # How long an example takes says something of the machine's load, nothing of the code. The examples are the same in every
 # run, so that a red run is the change's doing; `make fuzz` looks for new ones.
 settings.register_profile(
@@ -83,6 +85,13 @@ def new_tab(browser):
     for context in contexts:
         context.close()
     assert faults == []
+
+
+@pytest.fixture
+def serious():
+    """Serious findings of axe-core on an open page."""
+    pytest.importorskip("axe_playwright_python", reason="axe-playwright-python is not installed")
+    return serious_findings
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -203,6 +203,19 @@ def test_pages_fit_and_are_silent(site, browser, scheme, width):
     context.close()
 
 
+READ = (*SEEN, "explanation/results", "reference/generated/api/contracts", "tutorials/paper-table")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing_serious_in_pages(site, new_tab, serious, scheme):
+    tab = new_tab(1440, 900, color_scheme=scheme)
+    found = {}
+    for name in READ:
+        tab.goto((Path(site[0].outdir) / f"{name}.html").as_uri())
+        found[name] = serious(tab)
+    assert found == dict.fromkeys(READ, [])
+
+
 def test_every_column_of_rows_is_explained():
     page = (ROOT / "docs" / "reference" / "run-folder.md").read_text(encoding="utf-8")
     table = page.split("## Columns of rows.parquet")[1].split("##")[0]

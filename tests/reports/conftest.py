@@ -13,7 +13,6 @@ from headbench.bench.rows import Rows
 from headbench.bench.specs import MetricSpec
 
 from ..small_run import run_on
-from .axe import serious_findings
 from .made_rows import TASKS, avatar_row, row
 
 PSNR = MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr")
@@ -93,13 +92,6 @@ def write_manifest():
         ).write(folder.manifest)
 
     return write
-
-
-@pytest.fixture
-def serious():
-    """Serious findings of axe-core on an open page."""
-    pytest.importorskip("axe_playwright_python", reason="axe-playwright-python is not installed")
-    return serious_findings
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ from headbench.methods.avatars.web.bake import Source
 from headbench.methods.avatars.web.model import WebAvatar
 from headbench.methods.avatars.web.settings import ExportHtmlSettings
 
-from ....reports.axe import serious_findings
 from ....small_run import small_run
 
 
@@ -55,10 +54,3 @@ def exported(run, request, tmp_path_factory):
         )
         findings = export.export_page(settings, no_progress)
     return Exported(**kept, page=page, findings=findings)
-
-
-@pytest.fixture
-def serious():
-    """Serious findings of axe-core on an open page."""
-    pytest.importorskip("axe_playwright_python", reason="axe-playwright-python is not installed")
-    return serious_findings
