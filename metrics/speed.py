@@ -161,8 +161,8 @@ def fps(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurem
     ``mean_ms``, ``p5_ms``, ``p50_ms``, ``p95_ms``, ``p99_ms``, ``iqr_ms``, ``max_ms`` and ``processor_ms`` (mean time
     of all threads) of the latency; ``throughput_fps``; ``<stage>_ms``, the median of each stage where the avatar reports
     stages; ``static_ms``, the median where neither camera nor pose changes; ``warm_up_frames``; ``stationary`` (1 or
-    0); ``load``, the mean number of busy processes of the last minute. A run adds threads and the cores that others kept busy,
-    see `bench.machine.ProcessorLoad`. Numbers of different machines do not compare.
+    0); ``load``, the mean number of busy processes of the last minute. A run adds threads and the cores that others kept busy.
+    Numbers of different machines do not compare.
 
     Raises `InputError` for a workload whose neighbours do not differ.
     """

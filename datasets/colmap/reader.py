@@ -137,7 +137,8 @@ def read_dataset(
     Parameters
     ----------
     head, masks, regions, eyelids : str | Path | None
-        Head model or its file, and the files that belong to it; see `find_head`.
+        Head model or its file, and the files that belong to it. None finds them: the head model in the
+        capture, the others beside the head model.
     subject : str
         Subject id; "" takes it from the image names, else from the folder's name.
     background : Sequence[float] | None

@@ -74,7 +74,8 @@ def read_capture(
     Parameters
     ----------
     head, masks, regions, eyelids : HeadArrays | str | Path | None
-        Head model or its file, and the files that belong to it; see `find_head`.
+        Head model or its file, and the files that belong to it. None finds them: the head model in the
+        capture, the others beside the head model.
     subject : str
         Subject id; "" takes it from ``headbench.json`` or the folder's name.
     cy : layout.CyConvention | Literal['auto']
@@ -82,20 +83,20 @@ def read_capture(
         compares the tracked mesh with the masks; an `InputError` is raised if the images are inconclusive and it makes
         a difference. "centre" puts the principal point at the image centre, as GaussianAvatars does.
     teeth : TeethPolicy
-        See `read_tracking`.
+        "auto" adds GaussianAvatars' teeth to every head model without teeth where its lips allow it, "add" requires
+        them, "keep" does not change the head model.
     background : Sequence[float] | None
         (r, g, b) in [0, 1]; None takes the declared one, else white. In images without alpha it is replaced using
-        their masks, see `set_background`.
+        their masks.
     below_neck : bool
-        Whether to keep pixels below the tracked neck; False turns them into background, see
-        `mask_below_neck`.
+        Whether to keep pixels below the tracked neck; False turns them into background.
     held_out_sequences, held_out_cameras : Sequence[str]
         Define new splits instead of those of the JSONs: all frames of these sequences (full names or
         unique prefixes) are self-reenactment, these cameras' other frames novel view, the rest
         training.
     exclude : Mapping[int, str] | str | Path | None
         Frames to leave out in addition to those of ``headbench.json``: reason by timestep, or a file
-        for `read_reasons`, such as the one that ``headbench prepare tongue`` writes.
+        such as ``headbench prepare tongue`` writes.
     leaks : LeakPolicy
         "error" refuses splits that share data; "record" only notes it in the step record.
     decode : bool

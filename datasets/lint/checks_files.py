@@ -277,7 +277,7 @@ def _empty_split(evidence: Evidence) -> Iterator[Hit]:
 def _undeclared(evidence: Evidence) -> Iterator[Hit]:
     """The capture does not declare its conventions.
 
-    Write headbench.json beside the JSONs (docs/reference/captures.md), so that nothing has to be inferred.
+    Write headbench.json beside the JSONs (its keys are listed in the documentation under "Captures and head models"), so that nothing has to be inferred.
     """
     if evidence.declaration is None and not evidence.declaration_faults:
         yield Hit(

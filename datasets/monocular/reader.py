@@ -75,7 +75,8 @@ def read_video(
     Parameters
     ----------
     head, masks, regions, eyelids : HeadArrays | str | Path | None
-        Head model that the video was tracked with, usually FLAME 2020; see `find_head`.
+        Head model that the video was tracked with, usually FLAME 2020, and the files that belong to it, which are
+        found beside it.
     subject : str
         Subject id; "" takes it from ``headbench.json`` or the folder's name.
     teeth : TeethPolicy

@@ -85,7 +85,7 @@ def synthesize(
     size : tuple[int, int]
         (width, height) of the images, pixels.
     head : str
-        See `plan.load_geometry`.
+        "procedural", or the file of a head model (npz of ICT-FaceKit).
     seed : int
         Decides the heads and their performances.
     tracking_noise : float
@@ -95,11 +95,11 @@ def synthesize(
         Rounded up to a count that the sampler supports; the default gives 40 dB between two renders
         of a frame.
     tracking_error : float
-        Level of simulated tracking errors, see `tracking.with_tracking_error`; 0 to 4.
+        Level of simulated tracking errors, 0 to 4; 1 is 0.5 to 1 mm on the face.
     tracker : Tracker
-        Whether these errors are those of a tracker of single frames or of videos, see `tracking`.
+        Whether these errors are those of a tracker of single frames or of videos.
     performance : Kind
-        See `performance.Kind`; other kinds than the full performance are easier to model.
+        What the subject does: "full", "parts", "natural", "expressions" or "still". `headbench synth --help` describes them.
     dynamics : float
         Scale of wrinkles and blush, 0 to 3: with 0 the skin has its colour at rest everywhere.
     pictures : str | Path | None
