@@ -600,6 +600,25 @@ def test_a_training_on_another_capture_supports_nothing(honest, make_board):
     assert re.search("Not trained again: .*protocol of", " ".join(bundles["f.zip"]["remarks"]))
 
 
+def without_metric(name):
+    """A run that did not ask for a metric."""
+
+    def change(values):
+        values["metrics"] = [each for each in values["metrics"] if each["name"] != name]
+        asked = values["configuration"]["metrics"]
+        values["configuration"]["metrics"] = [each for each in asked if each != name]
+
+    return together(record(change), rows(lambda t: t[t["metric"] != name]))
+
+
+def test_a_bundle_without_the_metric_that_marks_suspects(honest, make_board):
+    (table,), bundles, _ = make_board(x=without_metric("psnr")(OURS(honest)))
+    title, forged = cells(table, "mine [Stranger/x]")
+    assert title.startswith("Incomplete")
+    assert all(cell["rank"] is None for cell in forged.values())
+    assert "psnr: expected values" in bundles["x.zip"]["remarks"][0]
+
+
 STRANGER = record(lambda r: r["configuration"].update(methods=["stranger:METHOD"]))
 PROGRAM = together(
     renamed("ga-official"),
