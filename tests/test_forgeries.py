@@ -17,6 +17,7 @@ from headbench.bench.audit.bundle import INDEX
 from headbench.bench.audit.settings import VerifySettings
 from headbench.bench.audit.verify import verify_run
 from headbench.bench.errors import ExitCode
+from headbench.bench.protocol import Protocol
 from headbench.reports.leaderboard import submissions
 from headbench.reports.leaderboard.page import build
 from headbench.reports.leaderboard.settings import LeaderboardSettings
@@ -574,6 +575,48 @@ def test_a_training_is_repeated_and_compared(honest, make_board):
     assert "psnr: a single value differs by at most 0, a mean by 0 (tolerance 0.25)" in remarks["same"]
     assert "which is more" in remarks["raised"]
     assert "fps" in remarks["slower"].partition("Not verified")[2]
+
+
+def of_another_capture(files):
+    """Protocols and rows that name another capture, with hashes to match."""
+    forged, hashes = {}, {}
+    for name, content in files.items():
+        if name.startswith("protocols/"):
+            values = json.loads(content)
+            values["clips"] = [(subject, "0" * 32) for subject, _ in values["clips"]]
+            own = {key: value for key, value in values.items() if key not in ("id", "hash")}
+            own = {k: tuple(v) if isinstance(v, list) else v for k, v in own.items()}
+            hashes[values["hash"]] = values["hash"] = Protocol(**own).hash
+            name, content = f"protocols/{values['hash']}.json", json.dumps(values).encode()
+        forged[name] = content
+    change = record(lambda r: r.update(protocols={t: hashes[h] for t, h in r["protocols"].items()}))
+    return rows(lambda t: t.assign(protocol=t["protocol"].replace(hashes)))(change(forged))
+
+
+def test_a_training_on_another_capture_supports_nothing(honest, make_board):
+    forged = of_another_capture(together(only("nearest-camera"), one_seed, without_renders)(honest))
+    _, bundles, _ = make_board(words=["f.zip"], f=forged)
+    assert bundles["f.zip"]["state"] == "claimed"
+    assert re.search("Not trained again: .*protocol of", " ".join(bundles["f.zip"]["remarks"]))
+
+
+def without_metric(name):
+    """A run that did not ask for a metric."""
+
+    def change(values):
+        values["metrics"] = [each for each in values["metrics"] if each["name"] != name]
+        asked = values["configuration"]["metrics"]
+        values["configuration"]["metrics"] = [each for each in asked if each != name]
+
+    return together(record(change), rows(lambda t: t[t["metric"] != name]))
+
+
+def test_a_bundle_without_the_metric_that_marks_suspects(honest, make_board):
+    (table,), bundles, _ = make_board(x=without_metric("psnr")(OURS(honest)))
+    title, forged = cells(table, "mine [Stranger/x]")
+    assert title.startswith("Incomplete")
+    assert all(cell["rank"] is None for cell in forged.values())
+    assert "psnr: expected values" in bundles["x.zip"]["remarks"][0]
 
 
 STRANGER = record(lambda r: r["configuration"].update(methods=["stranger:METHOD"]))

@@ -128,7 +128,7 @@ def agreements(rows: Rows, again: Rows, metrics: Mapping[str, MetricSpec]) -> li
 def results_again(out: Path, manifest: Manifest) -> Rows | None:
     """Rows of a finished training of `train_again` into ``out``; None if there is none.
 
-    Raises `InputError` for a damaged run.
+    Raises `InputError` for a damaged run, and one that scored others than the frames and captures of the bundle's protocols.
     """
     folder = RunFolder(out / "run")
     if not folder.manifest.is_file():
@@ -136,4 +136,9 @@ def results_again(out: Path, manifest: Manifest) -> Rows | None:
     again = folder.read_manifest()
     if again.status != "done" or [m.label for m in again.methods] != [m.label for m in manifest.methods]:
         return None
+    claimed, made = ({t: record.hash for t, record in m.protocols.items()} for m in (manifest, again))
+    if made != claimed:
+        task = min(task for task in {*claimed, *made} if claimed.get(task) != made.get(task))
+        hashes = (str(each.get(task, "none")) for each in (claimed, made))
+        raise InputError(folder.manifest, f"protocol of {task}", *hashes)
     return folder.rows_by_condition(again)

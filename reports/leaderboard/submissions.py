@@ -31,7 +31,7 @@ STATES: dict[State, str] = {
     "recomputed": "Recomputed from the seed",
     "verified": "Verified from renders",
     "claimed": "Claimed, not verified (not ranked)",
-    "incomplete": "Incomplete: frames of the protocol are missing (not ranked)",
+    "incomplete": "Incomplete: frames of the protocol, or the metric that marks suspects, are missing (not ranked)",
     "contradicted": "Contradicted by renders, registry or another training (not ranked)",
 }
 """Titles of the groups of a table, in order; the first two are ranked."""
@@ -110,6 +110,8 @@ def read_submission(file: Path, into: Path) -> Submission:
     )
     known, methods = known_metrics(), known_methods()
     metrics = tuple(known[metric.name] for metric in manifest.metrics if metric.name in known)
+    if all(metric.suspect_above is None for metric in metrics):
+        lacking += ("psnr: expected values, found none: they show which results are suspect",)
     records = []
     for record in manifest.methods:
         spec = method_of(record.name, methods)
