@@ -67,8 +67,8 @@ class SynthSettings(ExecutionOptions):
     """Errors of masks at hair: without single hairs, and displaced by up to 4 mm at 1; pictures are composited by these masks.
     0 to 4."""
     correctives: float = 0.0
-    """Shapes of each subject that the head model lacks, where controls act together; 1 is 0.75 mm on the face. The tracked
-    mesh does not have them. 0 to 4."""
+    """Shapes of each subject that the head model lacks, where controls act together; each is 0.75 mm on the face at 1. The
+    tracked mesh does not have them. 0 to 4."""
 
 
 def synth(settings: SynthSettings, progress: Progress) -> CommandResult:

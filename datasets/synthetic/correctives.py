@@ -2,12 +2,11 @@
 
 Faces are not linear in their controls: where two act together, skin moves otherwise than by the sum of both. A corrective is a
 smooth displacement of the skin where its controls act, different for each subject, and is driven by the product of two controls
-or by the square of one. Pictures show it. The tracked mesh does not, even with exact tracking.
+or by the square of one. Pictures show it. The tracked mesh does not, even with exact tracking: no coefficients of the head
+model come closer to the skin, because what they could make of a corrective is taken off it.
 """
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from ..head.arrays import HeadArrays, region
 from ..rounding import LENGTH_BITS, on_grid
 from .anatomy import SIDES, Anatomy, Person
 from .fields import value_noise
-from .performance import EXPRESSION_CONTROLS, SEQUENCES, Activations, Translation
+from .performance import EXPRESSION_CONTROLS, Activations, Translation
 from .volume import without_joints
 
 DRIVERS: tuple[tuple[str, str], ...] = (
@@ -32,9 +31,11 @@ DRIVERS: tuple[tuple[str, str], ...] = (
 )
 """Two controls whose product drives a corrective; the same one twice is its square."""
 FACE_MM = 0.75
-"""Root mean square displacement of the face at level 1, over the phrases of all sequences. A choice within the 0.5 to 1 mm that
-the error of a tracker has on the face."""
-_PERIOD = 0.025
+"""Root mean square displacement of the face by each corrective at level 1, where both of its controls are 1. A choice in the
+range of the errors of trackers."""
+_BROAD = 0.2
+"""Share of the largest displacement by its controls at which a corrective has half of its reach."""
+_PERIOD = 0.04
 """Metres between the lattice points of a field, for a head of average size."""
 
 
@@ -49,28 +50,28 @@ def make_correctives(
     """(C, V, 3) displacements, metres, of a subject's neutral vertices (V, 3) at level 1; joints do not move."""
     skin = np.zeros(len(neutral), bool)
     skin[anatomy.skin_faces] = True
-    fields = []
+    basis = np.asarray(head.expression_basis, np.float64)
+    face = np.intersect1d(region(head, "face"), np.flatnonzero(skin))
+    made = []
     for number, pair in enumerate(DRIVERS):
         rows = [EXPRESSION_CONTROLS.index(name) for name in pair if name in EXPRESSION_CONTROLS]
-        coefficients = translation.expression[rows].sum(axis=0)
-        moved = np.linalg.norm(np.asarray(head.expression_basis, np.float64) @ coefficients, axis=1)
+        moved = np.linalg.norm(basis @ translation.expression[rows].sum(axis=0), axis=1)
         where = neutral / (_PERIOD * anatomy.scale)
         noise = [value_noise(where + 31.7 * axis, person.seed + 120 + number) for axis in range(3)]
-        reach = np.where(skin, moved / moved[skin].max(), 0.0)
-        fields.append(reach[:, None] * np.stack(noise, axis=1))
-    face = np.intersect1d(region(head, "face"), np.flatnonzero(skin))
-    spread = _spread(np.stack(fields)[:, face], [*SEQUENCES.values()])
-    amplitude = on_grid(1e-3 * FACE_MM / spread, LENGTH_BITS)
-    return np.stack([without_joints(head, amplitude * each) for each in fields])
+        reach = np.where(skin, moved / (moved + _BROAD * moved[skin].max()), 0.0)
+        field = _beyond(basis, reach[:, None] * np.stack(noise, axis=1), skin)
+        amount = on_grid(1e-3 * FACE_MM / np.sqrt((field[face] ** 2).sum(axis=1).mean()), LENGTH_BITS)
+        made.append(without_joints(head, amount * field))
+    return np.stack(made)
 
 
-def _spread(fields: FloatArray, sequences: Sequence[Sequence[Activations]]) -> float:
-    """Root mean square displacement over the phrases by ``fields`` (C, n, 3)."""
-    squares = []
-    for phrase in (phrase for phrases in sequences for phrase in phrases):
-        driven = strengths({name: phrase.get(name, 0.0) for pair in DRIVERS for name in pair})
-        squares.append((np.tensordot(driven, fields, 1) ** 2).sum(axis=1).mean())
-    return float(np.sqrt(np.mean(squares)))
+def _beyond(basis: FloatArray, field: FloatArray, skin: FloatArray) -> FloatArray:
+    """(V, 3) what no coefficients of a ``basis`` (V, 3, E) make of a field on the ``skin`` (V,): its closest fit taken off."""
+    directions, left = basis[skin].reshape(-1, basis.shape[2]), field.copy()
+    wanted = field[skin].ravel()
+    found, *_ = np.linalg.lstsq(directions, wanted, rcond=None)
+    left[skin] = (wanted - directions @ found).reshape(-1, 3)
+    return left
 
 
 def displacement(correctives: FloatArray, level: float, activations: Activations) -> FloatArray:

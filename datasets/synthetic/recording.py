@@ -89,11 +89,12 @@ def hair_pixels(hair: FloatArray, skin: FloatArray, metre: float) -> FloatArray:
 
     ``metre`` is the number of pixels of a metre at the head.
     """
-    near_hair, near_skin = (
-        distance_transform_edt(~covered) if covered.any() else np.full(covered.shape, 1e6)
-        for covered in (hair, skin)
-    )
-    return np.clip((near_skin - near_hair) / max(_BETWEEN * metre, 1.0), 0.0, 1.0)
+    return np.clip((_distance(skin) - _distance(hair)) / max(_BETWEEN * metre, 1.0), 0.0, 1.0)
+
+
+def _distance(covered: FloatArray) -> FloatArray:
+    """(H, W) distance in pixels to the nearest pixel that is ``covered`` (H, W); far where none is."""
+    return distance_transform_edt(~covered) if covered.any() else np.full(covered.shape, 1e6)
 
 
 def matte(alpha: FloatArray, hair: FloatArray, level: float, metre: float, seed: int) -> FloatArray:
@@ -108,13 +109,15 @@ def matte(alpha: FloatArray, hair: FloatArray, level: float, metre: float, seed:
     seed : int
         Of the field that displaces.
     """
-    inside = alpha > 0.5
-    if not inside.any() or inside.all():
+    reach = _SOFT * metre
+    core = _distance(alpha <= 0.5) > reach
+    if not core.any():
         return alpha
-    signed = np.where(inside, distance_transform_edt(inside) - 0.5, 0.5 - distance_transform_edt(~inside))
+    inside = _distance(core) <= reach  # what is narrower than twice the reach is gone
+    signed = np.where(inside, _distance(~inside) - 0.5, 0.5 - _distance(inside))
     rows, columns = np.indices(alpha.shape)
     place = np.stack([columns.ravel(), rows.ravel(), np.zeros(alpha.size)], axis=1)
     field = fractal_noise(place, MATTE_PERIOD * metre, seed, 2).reshape(alpha.shape)
     edge = signed + level * MATTE_METRES * metre * field
-    found = np.clip(0.5 + edge / max(_SOFT * metre, 1.0), 0.0, 1.0)
+    found = np.clip(0.5 + edge / max(reach, 1.0), 0.0, 1.0)
     return alpha + min(level, 1.0) * hair * (found - alpha)

@@ -227,7 +227,7 @@ def _neck_share(head: HeadAsset, anatomy: Anatomy) -> FloatArray:
     """(V, 1) share of the neck's lag by vertex: 0 in the face and at the border of the neck."""
     named = np.zeros((len(head.template), 1))
     named[head.regions.get("neck", [])] = 1.0
-    return smoothstep(smoothed(named, anatomy.skin_faces, _NECK_ROUNDS), 0.5, 1.0)
+    return named * smoothstep(smoothed(named, anatomy.skin_faces, _NECK_ROUNDS), 0.5, 1.0)
 
 
 def _area_around(vertices: FloatArray, faces: IntArray) -> FloatArray:
