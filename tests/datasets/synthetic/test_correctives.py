@@ -17,9 +17,7 @@ SMILE = {"smile_left": 1.0, "smile_right": 1.0, "jaw_open": 0.6, "cheek_raise_le
 @pytest.fixture(scope="module")
 def shapes(plan, subject):
     head = plan.geometry.head
-    return make_correctives(
-        plan.person, subject.anatomy, head, subject.neutral, plan.geometry.translation
-    )
+    return make_correctives(plan.person, subject.anatomy, head, subject.neutral, plan.geometry.translation)
 
 
 def test_each_displaces_the_face_by_the_amount_stated(plan, subject, shapes, rest):

@@ -90,7 +90,9 @@ def test_hair_and_neck_move_and_nothing_else(plan, subject, rest):
     neck, fine = plan.geometry.head.regions["neck"], subject._fine
     touching = subject.anatomy.skin_faces[np.isin(subject.anatomy.skin_faces, neck).any(1)]
     face = np.setdiff1d(plan.geometry.head.regions["face"], touching)  # their normals turn with the neck
-    assert moved["skin"][np.isin(fine.parents, face).all(1)].max() < 1e-4  # whose own turn the fine ones beside them
+    assert (
+        moved["skin"][np.isin(fine.parents, face).all(1)].max() < 1e-4
+    )  # whose own turn the fine ones beside them
     assert 1e-4 < moved["skin"].max() < 0.3 * 0.1 * 0.2  # 0.3 of a turn of 0.1 within 20 cm
     for name in moved.keys() - {"hair", "skin", "beard"}:
         assert moved[name].max() == 0.0, name
