@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from ...bench.contracts import Camera, FloatArray, IntArray
+from ...bench.contracts import BoolArray, Camera, FloatArray, IntArray
 from ..rounding import COEFFICIENT_BITS, LENGTH_BITS, on_grid
 from .fields import fractal_noise
 
@@ -72,7 +72,7 @@ def exposed(frames: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray
     return light / np.maximum(alpha, 1e-6)[..., None] * (alpha[..., None] > 0.0), alpha
 
 
-def outline(camera: Camera, vertices: FloatArray, faces: IntArray) -> FloatArray:
+def outline(camera: Camera, vertices: FloatArray, faces: IntArray) -> BoolArray:
     """(H, W) whether triangles cover a pixel, without regard to what is before them."""
     seen = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     pixels = seen @ camera.K.T
@@ -84,7 +84,7 @@ def outline(camera: Camera, vertices: FloatArray, faces: IntArray) -> FloatArray
     return covered > 0
 
 
-def hair_pixels(hair: FloatArray, skin: FloatArray, metre: float) -> FloatArray:
+def hair_pixels(hair: BoolArray, skin: BoolArray, metre: float) -> FloatArray:
     """(H, W) in [0, 1] how far pixels belong to hair: 0 where skin is nearer, by what hair and skin cover (H, W).
 
     ``metre`` is the number of pixels of a metre at the head.
@@ -92,7 +92,7 @@ def hair_pixels(hair: FloatArray, skin: FloatArray, metre: float) -> FloatArray:
     return np.clip((_distance(skin) - _distance(hair)) / max(_BETWEEN * metre, 1.0), 0.0, 1.0)
 
 
-def _distance(covered: FloatArray) -> FloatArray:
+def _distance(covered: BoolArray) -> FloatArray:
     """(H, W) distance in pixels to the nearest pixel that is ``covered`` (H, W); far where none is."""
     return distance_transform_edt(~covered) if covered.any() else np.full(covered.shape, 1e6)
 
@@ -116,7 +116,7 @@ def matte(alpha: FloatArray, hair: FloatArray, level: float, metre: float, seed:
     inside = _distance(core) <= reach  # what is narrower than twice the reach is gone
     signed = np.where(inside, _distance(~inside) - 0.5, 0.5 - _distance(inside))
     rows, columns = np.indices(alpha.shape)
-    place = np.stack([columns.ravel(), rows.ravel(), np.zeros(alpha.size)], axis=1)
+    place = np.stack([columns.ravel(), rows.ravel(), np.zeros(alpha.size)], axis=1).astype(np.float64)
     field = fractal_noise(place, MATTE_PERIOD * metre, seed, 2).reshape(alpha.shape)
     edge = signed + level * MATTE_METRES * metre * field
     found = np.clip(0.5 + edge / max(reach, 1.0), 0.0, 1.0)
