@@ -203,7 +203,7 @@ def test_masks_err_at_hair_and_not_along_the_skin(plan, recorded):
     assert not (changed & bare & ~locks).any()
 
 
-def test_a_wide_matte_shows_the_room_and_a_narrow_one_the_background():
+def test_a_matte_too_wide_shows_the_room_behind():
     rgb, white = np.full((1, 3, 3), 0.2), np.ones(3)
     alpha, found = np.array([[0.0, 1.0, 0.5]]), np.array([[1.0, 0.0, 0.5]])
     picture, mask = develop(rgb, alpha, white, found)
