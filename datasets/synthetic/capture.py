@@ -34,7 +34,15 @@ from ...bench.start import end_with_parent, starting_workers
 from ..images import is_whole
 from .panels import KERNEL, default_samples, sample_count
 from .performance import KINDS, Kind, share_out
-from .plan import SERIALS, SubjectPlan, SyntheticSettings, load_geometry, plan_subject
+from .plan import (
+    MOST_RESIDUAL,
+    RESIDUALS,
+    SERIALS,
+    SubjectPlan,
+    SyntheticSettings,
+    load_geometry,
+    plan_subject,
+)
 from .renderer import CaptureRenderer
 from .tracking import TRACKERS, Tracker
 
@@ -66,6 +74,11 @@ def synthesize(
     dynamics: float = 1.0,
     tracking_error: float = 0.0,
     tracker: Tracker = "per-frame",
+    hair_lag: float = 0.0,
+    camera_colour: float = 0.0,
+    motion_blur: float = 0.0,
+    mask_error: float = 0.0,
+    correctives: float = 0.0,
     pictures: str | Path | None = None,
     workers: int | None = None,
     execution: Execution | None = None,
@@ -98,6 +111,8 @@ def synthesize(
         Level of simulated tracking errors, 0 to 4; 1 is 0.5 to 1 mm on the face.
     tracker : Tracker
         Whether these errors are those of a tracker of single frames or of videos.
+    hair_lag, camera_colour, motion_blur, mask_error, correctives : float
+        Levels, 0 to 4, of what recordings have beside tracking errors.
     performance : Kind
         What the subject does: "full", "parts", "natural", "expressions" or "still". `headbench synth --help` describes them.
     dynamics : float
@@ -136,6 +151,11 @@ def synthesize(
         dynamics,
         tracking_error,
         tracker,
+        hair_lag,
+        camera_colour,
+        motion_blur,
+        mask_error,
+        correctives,
     )
     _check(settings)
     KERNEL.load()
@@ -287,7 +307,12 @@ def _check(settings: SyntheticSettings) -> None:
         ("--tracker", settings.tracker in TRACKERS, f"one of {', '.join(TRACKERS)}", repr(settings.tracker)),
         ("--tracking-noise", np.isfinite(noise) and noise >= 0.0, "a number from 0 up", noise),
     )
-    for option, fits, expected, found in checks:
+    levels = {name: getattr(settings, name) for name in RESIDUALS}
+    residuals = (
+        (f"--{name.replace('_', '-')}", 0.0 <= level <= MOST_RESIDUAL, f"0 to {MOST_RESIDUAL:g}", level)
+        for name, level in levels.items()
+    )
+    for option, fits, expected, found in (*checks, *residuals):
         if not fits:
             raise InputError(option, "", expected, str(found))
     share_out(settings.timesteps, settings.performance)

@@ -56,6 +56,19 @@ class SynthSettings(ExecutionOptions):
     tracker: Literal["per-frame", "video"] = "per-frame"
     """Kind of tracker that errs so: drift from frame to frame; or an error that lasts for a sequence, slow drift, jitter and
     1.2 mm on lips and lids, as trackers of videos have."""
+    hair_lag: float = 0.0
+    """Lag of hair and of the skin of the neck behind the head, which the tracked mesh does not have; 1 is as a rod of the
+    hair's length swings. 0 to 4."""
+    camera_colour: float = 0.0
+    """Differences between cameras in exposure (5 % at 1), white balance (2 %) and gamma (3 %). 0 to 4."""
+    motion_blur: float = 0.0
+    """Time of exposure in units of NeRSemble's 3 ms. Frames with motion take several times as long to render. 0 to 4."""
+    mask_error: float = 0.0
+    """Errors of masks at hair: without single hairs, and displaced by up to 4 mm at 1; pictures are composited by these masks.
+    0 to 4."""
+    correctives: float = 0.0
+    """Shapes of each subject that the head model lacks, where controls act together; each is 0.75 mm on the face at 1. The
+    tracked mesh does not have them. 0 to 4."""
 
 
 def synth(settings: SynthSettings, progress: Progress) -> CommandResult:

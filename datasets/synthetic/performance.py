@@ -6,7 +6,7 @@ monotone cubics, so nothing overshoots and a held face stays held. Blinks, gaze 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -270,12 +270,23 @@ _MINIMUM = 8  # timesteps below which another sequence is not worth opening
 
 @dataclass(frozen=True, eq=False)
 class Performed:
-    """A performed sequence: one dictionary of controls per timestep, the timesteps to label, and seconds between two."""
+    """A performed sequence: one dictionary of controls per timestep, the timesteps to label, and seconds between two.
+
+    ``moments`` (T,) are the timesteps in seconds, and ``curves`` are the controls at any moments (n,), (n,) each.
+    """
 
     name: str
     activations: Sequence[Mapping[str, float]]
     excluded: Mapping[int, str]
     step: float
+    moments: FloatArray
+    curves: Callable[[FloatArray], Curves]
+
+
+def at_moments(curves: Curves) -> list[Activations]:
+    """One dictionary of controls per moment."""
+    count = len(curves[CONTROLS[0]])
+    return [{control: float(curves[control][t]) for control in CONTROLS} for t in range(count)]
 
 
 def share_out(timesteps: int, kind: Kind = "full") -> dict[str, int]:
@@ -326,26 +337,32 @@ def perform(
     their phrases. What ``kind`` leaves out stays at rest; everything else moves as in the full performance.
     """
     names = [*SEQUENCES, *FREE_PARTS, SPEECH]
-    rng = np.random.default_rng([seed, names.index(name)])
+
+    def begin() -> np.random.Generator:
+        return np.random.default_rng([seed, names.index(name)])
+
     if kind == "natural":
+        moments = (np.arange(timesteps) + 0.5) * every / natural.FRAME_RATE
         seconds = timesteps * every / natural.FRAME_RATE
-        values = _natural_curves(
-            name, (np.arange(timesteps) + 0.5) * every / natural.FRAME_RATE, seconds, rng
-        )
     else:
         seconds = _PHRASE_SECONDS * (len({**SEQUENCES, **FREE_PARTS}[name]) + 1)
-        values = _smooth_curves(name, timesteps, seconds, rng)
-    values |= {control: np.zeros(timesteps) for control in CONTROLS if control not in values}
-    # Lids follow the eyes down.
-    for side in SIDES:
-        values[f"blink_{side}"] = np.clip(
-            values[f"blink_{side}"] + 0.35 * np.maximum(-values["gaze_up"], 0), 0, 1
-        )
-    values |= {control: np.zeros(timesteps) for control in _MUTED[kind]}
-    values = {control: on_grid(curve, COEFFICIENT_BITS) for control, curve in values.items()}
-    activations = [{control: float(values[control][t]) for control in CONTROLS} for t in range(timesteps)]
+        moments = _moments(name, timesteps, seconds, begin())
+
+    def curves(time: FloatArray) -> Curves:
+        made = _natural_curves if kind == "natural" else _smooth_curves
+        values = made(name, time, seconds, begin())
+        values |= {control: np.zeros(len(time)) for control in CONTROLS if control not in values}
+        # Lids follow the eyes down.
+        for side in SIDES:
+            values[f"blink_{side}"] = np.clip(
+                values[f"blink_{side}"] + 0.35 * np.maximum(-values["gaze_up"], 0), 0, 1
+            )
+        values |= {control: np.zeros(len(time)) for control in _MUTED[kind]}
+        return {control: on_grid(curve, COEFFICIENT_BITS) for control, curve in values.items()}
+
+    activations = at_moments(curves(moments))
     excluded = {t: TONGUE for t, a in enumerate(activations) if a["tongue_out"] >= tongue_shows}
-    return Performed(name, activations, excluded, seconds / timesteps)
+    return Performed(name, activations, excluded, seconds / timesteps, moments, curves)
 
 
 _NEW = {"FREE": 1, "FREE-1-seen": 1, "FREE-2-recombined": 1, "FREE-3-beyond": 2}
@@ -374,18 +391,29 @@ def _natural_curves(name: str, time: FloatArray, seconds: float, rng: np.random.
     return values
 
 
-def _smooth_curves(name: str, timesteps: int, seconds: float, rng: np.random.Generator) -> Curves:
-    """Controls of the other kinds: phrases as monotone cubics, with blinks and idle motion."""
+def _middles(phrases: Sequence[Face], rng: np.random.Generator) -> FloatArray:
+    """Moments of the phrases, seconds; the first that is drawn of a performance."""
+    return _PHRASE_SECONDS * np.arange(1, len(phrases) + 1) + rng.uniform(-0.08, 0.08, len(phrases))
+
+
+def _moments(name: str, timesteps: int, seconds: float, rng: np.random.Generator) -> FloatArray:
+    """(T,) timesteps of the other kinds in seconds, distributed evenly."""
     phrases = {**SEQUENCES, **FREE_PARTS}[name]
     time = (np.arange(timesteps) + 0.5) / timesteps * seconds
-    middles = _PHRASE_SECONDS * np.arange(1, len(phrases) + 1) + rng.uniform(-0.08, 0.08, len(phrases))
-    for middle, phrase in zip(middles, phrases):
+    for middle, phrase in zip(_middles(phrases, rng), phrases):
         if "tongue_out" in phrase:
             # However few the timesteps, one shows the tongue: a capture without it would test no exclusion.
             time[np.abs(time - middle).argmin()] = middle
+    return time
+
+
+def _smooth_curves(name: str, time: FloatArray, seconds: float, rng: np.random.Generator) -> Curves:
+    """Controls of the other kinds: phrases as monotone cubics, with blinks and idle motion."""
+    phrases = {**SEQUENCES, **FREE_PARTS}[name]
+    middles = _middles(phrases, rng)
     curves = _phrase_curves(phrases, middles, seconds, rng)
     values = {control: curve(time) for control, curve in curves.items()}
-    values |= {control: np.zeros(timesteps) for control in CONTROLS if control not in values}
+    values |= {control: np.zeros(len(time)) for control in CONTROLS if control not in values}
     blinks = _blinks(time, seconds, rng)
     for side in SIDES:
         values[f"blink_{side}"] = np.maximum(values[f"blink_{side}"], blinks)

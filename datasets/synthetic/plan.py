@@ -50,6 +50,12 @@ EDITION = 2
 """Version of the content: captures of one version and the same settings have the same content."""
 
 
+RESIDUALS = ("hair_lag", "camera_colour", "motion_blur", "mask_error", "correctives")
+"""Settings of what tracked parameters and calibrated cameras do not explain in recordings; each is a level, and 0 is without."""
+MOST_RESIDUAL = 4.0
+"""Highest level of these settings."""
+
+
 @dataclass(frozen=True)
 class SyntheticSettings:
     """Settings that define a synthetic capture's content. ``size`` is (width, height)."""
@@ -66,11 +72,17 @@ class SyntheticSettings:
     dynamics: float = 1.0
     tracking_error: float = 0.0
     tracker: Tracker = "per-frame"
+    hair_lag: float = 0.0
+    camera_colour: float = 0.0
+    motion_blur: float = 0.0
+    mask_error: float = 0.0
+    correctives: float = 0.0
 
     def described(self) -> dict[str, Any]:
         """The settings for records; those that came later are left out where they have their default."""
         described = {**asdict(self), "edition": EDITION}
         usual = {"performance": "full", "dynamics": 1.0, "tracking_error": 0.0, "tracker": "per-frame"}
+        usual |= dict.fromkeys(RESIDUALS, 0.0)
         for name, value in usual.items():
             if described[name] == value:
                 del described[name]

@@ -8,23 +8,40 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, FloatArray, HeadPose
 from .history import SkinState, over_time
+from .lag import follow
 from .panels import PanelTracer, panels, rig_middle
-from .performance import CONTROLS, Activations
-from .plan import FRONTAL, SubjectPlan
-from .subject import RenderedSubject
+from .performance import CONTROLS, Activations, at_moments
+from .plan import CAMERA_DISTANCE, FRONTAL, SERIALS, SubjectPlan
+from .recording import (
+    ROOM,
+    SHUTTER_SECONDS,
+    draw_response,
+    exposed,
+    hair_pixels,
+    matte,
+    outline,
+    sub_frames,
+)
+from .subject import LatePoses, RenderedSubject
 
 
-def develop(rgb: FloatArray, alpha: FloatArray, background: FloatArray) -> tuple[ByteArray, ByteArray]:
+def develop(
+    rgb: FloatArray, alpha: FloatArray, background: FloatArray, found: FloatArray | None = None
+) -> tuple[ByteArray, ByteArray]:
     """Turn linear straight colour into an 8-bit sRGB picture on ``background`` and an 8-bit mask.
 
-    Highlights above ``knee`` roll off towards 1 instead of clipping; below it the tone is untouched.
+    Highlights above ``knee`` roll off towards 1 instead of clipping; below it the tone is untouched. The mask is ``alpha``, or
+    what a matte ``found`` (H, W); the picture shows the room where the matte is too wide, and the background where it is not
+    wide enough.
     """
+    mask = alpha if found is None else found
     knee = 0.65
     over = np.maximum(rgb - knee, 0.0)
     tone = np.minimum(rgb, knee) + (1.0 - knee) * (1.0 - np.exp(-over / (1.0 - knee)))
     display = np.where(tone <= 0.0031308, 12.92 * tone, 1.055 * np.maximum(tone, 1e-8) ** (1 / 2.4) - 0.055)
-    picture = display * alpha[..., None] + background * (1.0 - alpha[..., None])
-    return np.round(255.0 * picture).astype(np.uint8), np.round(255.0 * alpha).astype(np.uint8)
+    seen = display * np.minimum(alpha, mask)[..., None] + ROOM * np.maximum(mask - alpha, 0.0)[..., None]
+    picture = seen + background * (1.0 - mask[..., None])
+    return np.round(255.0 * picture).astype(np.uint8), np.round(255.0 * mask).astype(np.uint8)
 
 
 class CaptureRenderer:
@@ -32,40 +49,99 @@ class CaptureRenderer:
 
     def __init__(self, plan: SubjectPlan):
         self._plan = plan
-        self._subject = RenderedSubject(plan.person, plan.geometry, plan.shape)
+        settings = plan.settings
+        self._subject = RenderedSubject(plan.person, plan.geometry, plan.shape, settings.correctives)
         lights = panels(rig_middle(plan.cameras[FRONTAL]))
-        self._tracer = PanelTracer(lights, plan.settings.samples_per_pixel, threads=1, seed=plan.person.seed)
+        self._tracer = PanelTracer(lights, settings.samples_per_pixel, threads=1, seed=plan.person.seed)
         self._states: dict[str, list[SkinState]] = {}
         rest = dict.fromkeys(CONTROLS, 0.0)
-        pose = plan.geometry.translation.pose(rest, plan.person.name, None)
         (skin,) = over_time([rest], 1.0, plan.person)
-        posed = self._subject.posed_meshes(pose, rest, skin)
-        for name, mesh in self._subject.rest_meshes().items():
-            self._tracer.add(name, posed[name].vertices, mesh.faces, mesh.albedo, mesh.material)
+        self._fixed = self._subject.rest_meshes()
+        self._posed = self._subject.posed_meshes(self._pose(rest), rest, skin)
+        for name, mesh in self._fixed.items():
+            self._tracer.add(name, self._posed[name].vertices, mesh.faces, mesh.albedo, mesh.material)
 
     def render_frames(self, sequence: str, timestep: int, cameras: Sequence[str]) -> None:
         """Render and store one timestep as the named cameras see it."""
         plan = self._plan
-        self.pose_at(sequence, timestep)
+        seeds = {camera: plan.render_seed(sequence, timestep, camera) for camera in cameras}
+        frames: dict[str, list[tuple[FloatArray, FloatArray]]] = {camera: [] for camera in cameras}
+        for offset in self.sub_frames(sequence, timestep):
+            self.pose_at(sequence, timestep, offset)
+            for camera in cameras:
+                frames[camera].append(self._tracer.image(plan.cameras[camera], seeds[camera]))
         for camera in cameras:
-            image, mask = self.render(camera, plan.render_seed(sequence, timestep, camera))
+            image, mask = self._developed(camera, seeds[camera], *exposed(frames[camera]))
             plan.writer.write_frame(sequence, timestep, camera, image, mask)
 
-    def pose_at(self, sequence: str, timestep: int) -> None:
-        """Move all meshes to where they are at a timestep, with the state of skin that the timesteps before led to."""
+    def sub_frames(self, sequence: str, timestep: int) -> FloatArray:
+        """(K,) seconds from a timestep to the moments whose mean is its frame."""
+        shutter = SHUTTER_SECONDS * self._plan.settings.motion_blur
+        if not shutter:
+            return np.zeros(1)
+        ends = (
+            self._subject.tracked(self._pose(self._activations(sequence, timestep, side * shutter)))
+            for side in (-0.5, 0.5)
+        )
+        moved = np.linalg.norm(np.subtract(*ends), axis=1).max()
+        return sub_frames(moved, float(self._plan.cameras[FRONTAL].K[0, 0]), CAMERA_DISTANCE, shutter)
+
+    def pose_at(self, sequence: str, timestep: int, offset: float = 0.0) -> None:
+        """Move all meshes to where they are at a timestep, with the state of skin that the timesteps before led to.
+
+        ``offset`` is the time from there in seconds: what moves in it is not the state of the skin.
+        """
         plan, performed = self._plan, self._plan.performed[sequence]
         if sequence not in self._states:
             self._states[sequence] = over_time(performed.activations, performed.step, plan.person)
-        self.set_pose(
-            plan.poses[sequence][timestep], performed.activations[timestep], self._states[sequence][timestep]
-        )
+        late, amount = None, plan.settings.hair_lag
+        if amount:
+            moment = float(performed.moments[timestep]) + offset
+            lagging = follow(performed, moment, amount, self._subject.hair_length)
+            late = LatePoses(self._pose(lagging.hair), self._pose(lagging.neck))
+        activations = self._activations(sequence, timestep, offset)
+        pose = plan.poses[sequence][timestep] if offset == 0.0 else self._pose(activations)
+        self.set_pose(pose, activations, self._states[sequence][timestep], late)
 
-    def set_pose(self, pose: HeadPose, activations: Activations, skin: SkinState) -> None:
+    def set_pose(
+        self, pose: HeadPose, activations: Activations, skin: SkinState, late: LatePoses | None = None
+    ) -> None:
         """Move all meshes to a pose, with the tongue of the ``activations`` and skin in a state."""
-        for name, mesh in self._subject.posed_meshes(pose, activations, skin).items():
+        self._posed = self._subject.posed_meshes(pose, activations, skin, late)
+        for name, mesh in self._posed.items():
             self._tracer.move(name, mesh.vertices, mesh.albedo, mesh.gloss)
 
     def render(self, camera: str, seed: int) -> tuple[ByteArray, ByteArray]:
-        """(H, W, 3) 8-bit image on the capture's background and (H, W) foreground mask."""
-        rgb, alpha = self._tracer.image(self._plan.cameras[camera], seed)
-        return develop(rgb, alpha, np.asarray(self._plan.writer.plan.background))
+        """(H, W, 3) 8-bit image on the capture's background and (H, W) foreground mask, without motion in an exposure."""
+        return self._developed(camera, seed, *self._tracer.image(self._plan.cameras[camera], seed))
+
+    def _developed(
+        self, camera: str, seed: int, rgb: FloatArray, alpha: FloatArray
+    ) -> tuple[ByteArray, ByteArray]:
+        settings, found = self._plan.settings, None
+        if settings.camera_colour:
+            rgb = draw_response(settings.camera_colour, settings.seed, SERIALS.index(camera))(rgb)
+        if settings.mask_error:
+            metre = float(self._plan.cameras[camera].K[0, 0]) / CAMERA_DISTANCE
+            hair = self.hair_pixels(camera)
+            found = matte(alpha, hair, settings.mask_error, metre, seed)
+        return develop(rgb, alpha, np.asarray(self._plan.writer.plan.background), found)
+
+    def hair_pixels(self, camera: str) -> FloatArray:
+        """(H, W) in [0, 1] how far pixels belong to hair on the head in the present pose."""
+        view = self._plan.cameras[camera]
+        skin, locks = (self._posed[name].vertices for name in ("skin", "hair"))
+        faces = self._fixed["skin"].faces
+        grown = self._subject.hair_share[faces].mean(axis=1) > 0.5
+        hair = outline(view, locks, self._fixed["hair"].faces) | outline(view, skin, faces[grown])
+        return hair_pixels(hair, outline(view, skin, faces[~grown]), float(view.K[0, 0]) / CAMERA_DISTANCE)
+
+    def _activations(self, sequence: str, timestep: int, offset: float) -> Activations:
+        performed = self._plan.performed[sequence]
+        if offset == 0.0:
+            return performed.activations[timestep]
+        (activations,) = at_moments(performed.curves(performed.moments[timestep : timestep + 1] + offset))
+        return activations
+
+    def _pose(self, activations: Activations) -> HeadPose:
+        return self._plan.geometry.translation.pose(activations, self._plan.person.name, None)

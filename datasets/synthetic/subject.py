@@ -9,21 +9,25 @@ import numpy as np
 import torch
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
-from ..head.geometry import triangle_areas, unique_pairs, vertex_normals
+from ..head.geometry import smoothstep, triangle_areas, unique_pairs, vertex_normals
 from ..head.model import HeadModel, joint_motions
 from ..head.rotations import axis_angle_to_matrix
 from .anatomy import SIDES, Anatomy, Person, measure
+from .correctives import displacement, make_correctives
 from .glasses import make_glasses
-from .hair import RootedStrands, ear_share, make_beard, make_brows_and_lashes, make_hair
+from .hair import STYLES, RootedStrands, Strands, ear_share, make_beard, make_brows_and_lashes, make_hair
 from .history import SkinState
+from .lag import FREE_LENGTH, NECK_SHARE
 from .parts import eye_mesh, tracked_parts
 from .performance import Activations
 from .plan import Geometry
 from .skin import gloss_at_rest, make_folds, paint_skin, sagging
+from .volume import smoothed
 
 _STRETCH_GLOSS = 3.0  # exponent of the stretch of area
 _WET = 1.2  # what wetness adds to the gloss of lips
 HEAD_JOINT, EYE_JOINTS = 1, (3, 4)
+_NECK_ROUNDS = 6  # of averaging over neighbours
 
 # Edge lengths of the fine mesh (metres at average size) by distance from the bridge of the nose.
 _DETAIL = ((0.085, 0.0018), (0.13, 0.0035), (np.inf, 0.007))
@@ -47,10 +51,28 @@ class RestMesh:
     material: str
 
 
-class RenderedSubject:
-    """A subject's visible body over a head model; ``shape`` (S,) are the subject's identity coefficients."""
+@dataclass(frozen=True, eq=False)
+class LatePoses:
+    """Poses that hair and neck have where they follow the head late, see `lag`."""
 
-    def __init__(self, person: Person, geometry: Geometry, shape: FloatArray) -> None:
+    hair: HeadPose
+    neck: HeadPose
+
+
+class RenderedSubject:
+    """A subject's visible body over a head model.
+
+    Parameters
+    ----------
+    shape : FloatArray
+        (S,) identity coefficients.
+    correctives : float
+        Level of shapes of the skin that the head model lacks, see `correctives`.
+    """
+
+    def __init__(
+        self, person: Person, geometry: Geometry, shape: FloatArray, correctives: float = 0.0
+    ) -> None:
         head = geometry.head
         self.shape = np.asarray(shape, np.float64)
         self._model = HeadModel(head, dtype=torch.float64)
@@ -67,6 +89,15 @@ class RenderedSubject:
         self._folds = make_folds(person, self.anatomy, points, paint.lips, 1.0 - hair.share)
         self._skin_albedo, self._cap = under, hair.cap
         self._hair = hair.strands
+        self.hair_share = hair.share
+        self.hair_length = STYLES[person.style].length * self.anatomy.scale
+        self._swing = swing(hair.strands)
+        self._neck = _neck_share(head, self.anatomy)
+        self._level, self._correctives = correctives, None
+        if correctives:
+            self._correctives = make_correctives(
+                person, self.anatomy, head, self.neutral, geometry.translation
+            )
         self._brows = make_brows_and_lashes(person, self.anatomy, points, normals)
         self._beard = make_beard(person, self.anatomy, points, normals, self._fine.faces, cavity)
         self._glasses = make_glasses(person, self.anatomy, points, normals)
@@ -107,12 +138,29 @@ class RenderedSubject:
         with torch.no_grad():
             return self._model(shape=torch.from_numpy(self.shape), **arguments)[0].numpy()
 
+    def _shown(self, pose: HeadPose, activations: Activations) -> FloatArray:
+        """(V, 3) vertices as pictures show them: with the shapes that the head model lacks."""
+        if self._correctives is None:
+            return self.tracked(pose)
+        neutral = self.neutral + displacement(self._correctives, self._level, activations)
+        with torch.no_grad():
+            arguments = self._model.pose_arguments([pose])
+            return self._model(canonical=torch.from_numpy(neutral)[None], **arguments)[0].numpy()
+
     def posed_meshes(
-        self, pose: HeadPose, activations: Activations, state: SkinState
+        self, pose: HeadPose, activations: Activations, state: SkinState, late: LatePoses | None = None
     ) -> dict[str, PosedMesh]:
-        """All meshes in a pose, with the tongue of the ``activations``, and wrinkles and colour of a state of skin."""
-        tracked = self.tracked(pose)
+        """All meshes in a pose, with the tongue of the ``activations``, and wrinkles and colour of a state of skin.
+
+        Hair and the skin of the neck are drawn towards the ``late`` poses.
+        """
+        tracked = self._shown(pose, activations)
         joints = self._joint_motions(pose)
+        hair = _moved(joints[HEAD_JOINT], self._hair.vertices)
+        if late is not None:
+            tracked = tracked + NECK_SHARE * self._neck * (self._shown(late.neck, activations) - tracked)
+            swung = _moved(self._joint_motions(late.hair)[HEAD_JOINT], self._hair.vertices)
+            hair = hair + self._swing * (swung - hair)
         points = self._fine.positions(tracked)
         normals = vertex_normals(points, self._fine.faces)
         lift, albedo = self._folds.apply(state.folds, state.flushes, self._skin_albedo)
@@ -121,7 +169,7 @@ class RenderedSubject:
         bare = points + lift[:, None] * normals
         made = {
             "skin": PosedMesh(outer, albedo, gloss),
-            "hair": PosedMesh(_moved(joints[HEAD_JOINT], self._hair.vertices), None),
+            "hair": PosedMesh(hair, None),
             "brows": PosedMesh(self._rooted_vertices(self._brows, self._brow_frames, tracked, bare), None),
         }
         if self._beard and self._beard_frames is not None:
@@ -166,6 +214,20 @@ class RenderedSubject:
         motions = joint_motions(rotations, joints, self._model.parents)[0].numpy()
         motions[..., 3] += pose.translation
         return motions
+
+
+def swing(strands: Strands) -> FloatArray:
+    """(n, 1) share of the hair's lag that vertices of ``strands`` show: 0 at the roots."""
+    first = np.unique(strands.strand, return_index=True)[1]
+    roots = strands.vertices[first][strands.strand]
+    return smoothstep(np.linalg.norm(strands.vertices - roots, axis=1), 0.0, FREE_LENGTH)[:, None]
+
+
+def _neck_share(head: HeadAsset, anatomy: Anatomy) -> FloatArray:
+    """(V, 1) share of the neck's lag by vertex: 0 in the face and at the border of the neck."""
+    named = np.zeros((len(head.template), 1))
+    named[head.regions.get("neck", [])] = 1.0
+    return named * smoothstep(smoothed(named, anatomy.skin_faces, _NECK_ROUNDS), 0.5, 1.0)
 
 
 def _area_around(vertices: FloatArray, faces: IntArray) -> FloatArray:

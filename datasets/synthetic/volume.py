@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...bench.contracts import FloatArray, HeadAsset
+from ...bench.contracts import FloatArray, HeadAsset, IntArray
 from ..head.geometry import mesh_edges, vertex_normals
 from ..rounding import LENGTH_BITS, on_grid
 from .anatomy import Anatomy, Person
@@ -38,13 +38,21 @@ def tracked_volume(person: Person, anatomy: Anatomy, head: HeadAsset, neutral: F
     skin = np.zeros(len(neutral), bool)
     skin[anatomy.skin_faces] = True
     offset = FOUND * np.where(skin, thickness, 0.0)[:, None] * vertex_normals(neutral, anatomy.skin_faces)
-    edges = mesh_edges(anatomy.skin_faces)
+    return without_joints(head, smoothed(offset, anatomy.skin_faces, _ROUNDS) * skin[:, None])
+
+
+def smoothed(values: FloatArray, faces: IntArray, rounds: int) -> FloatArray:
+    """(V, n) values at vertices, averaged ``rounds`` times with those of their neighbours."""
+    edges = mesh_edges(faces)
     both = np.concatenate([edges, edges[:, ::-1]])
-    around = np.bincount(both[:, 0], minlength=len(neutral))
-    for _ in range(_ROUNDS):
-        mean = [np.bincount(both[:, 0], offset[both[:, 1], axis], len(neutral)) for axis in range(3)]
-        offset = 0.5 * (offset + np.stack(mean, axis=1) / np.maximum(around, 1)[:, None])
-    offset *= skin[:, None]
-    # The least change that leaves the joints, which are regressed from these vertices, where the poses have them.
+    around = np.bincount(both[:, 0], minlength=len(values))
+    for _ in range(rounds):
+        mean = [np.bincount(both[:, 0], column[both[:, 1]], len(values)) for column in values.T]
+        values = 0.5 * (values + np.stack(mean, axis=1) / np.maximum(around, 1)[:, None])
+    return values
+
+
+def without_joints(head: HeadAsset, offset: FloatArray) -> FloatArray:
+    """(V, 3) offsets with the least change that leaves the joints, which are regressed from these vertices, in place."""
     regressor = np.asarray(head.joint_regressor, np.float64)
     return on_grid(offset - np.linalg.pinv(regressor) @ (regressor @ offset), LENGTH_BITS)

@@ -147,6 +147,11 @@ def test_foreign_folder_is_refused(tmp_path, name):
         {"performance": "asleep"},
         {"dynamics": -0.5},
         {"dynamics": float("nan")},
+        {"hair_lag": -0.1},
+        {"camera_colour": 4.1},
+        {"motion_blur": float("nan")},
+        {"mask_error": float("inf")},
+        {"correctives": -1.0},
         {"head": "no-such-file.npz"},
     ],
 )
@@ -218,7 +223,7 @@ _MACHINES = {
 }
 _MAKE = """
 import sys
-from headbench.datasets.synthetic import capture
+from headbench.datasets.synthetic import capture, plan
 
 class Blank:  # writes all but the pictures of a capture
     def __init__(self, plan):
@@ -232,8 +237,9 @@ class Blank:  # writes all but the pictures of a capture
 if sys.argv[2] == "blank":
     capture.CaptureRenderer = Blank
     capture._missing = lambda plan, sequence, timestep: tuple(plan.cameras)
+levels = dict.fromkeys(plan.RESIDUALS, 4.0) if sys.argv[2] == "with residuals" else {}
 capture.synthesize(sys.argv[1], cameras=2, timesteps=8, size=(32, 46), samples_per_pixel=9,
-                   tracking_noise=0.1, workers=1)
+                   tracking_noise=0.1, workers=1, **levels)
 """
 
 
@@ -256,7 +262,14 @@ def files_by_machine(folder, pictures):
     }
 
 
-@pytest.mark.parametrize("pictures", ["blank", pytest.param("rendered", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "pictures",
+    [
+        "blank",
+        pytest.param("rendered", marks=pytest.mark.slow),
+        pytest.param("with residuals", marks=pytest.mark.slow),
+    ],
+)
 def test_threads_and_instruction_sets_leave_all_bytes(tmp_path, pictures):
     first, *others = files_by_machine(tmp_path, pictures).values()
     assert any(name.endswith("head_model.npz") for name in first)
