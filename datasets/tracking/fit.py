@@ -1,0 +1,243 @@
+"""Fit a head model to images: landmarks first, then colours of surface points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from scipy.sparse import csr_array
+
+from ...bench.contracts import FloatArray, HeadAsset, IntArray, Progress, no_progress
+from .images import FrameStack
+from .landmarks import Landmarks, spread_vertices
+from .rig import ANGLES, PointRig, PoseColumns
+from .solve import NormalEquations, Prior, State
+from .views import Occlusion, Views
+
+ANGLE_SPREAD = (np.inf,) * 3 + (0.15,) * 3 + (0.3, 0.03, 0.02) + (0.2, 0.3, 0.02) * 2
+"""Standard deviations of the angles: rotation free, neck, jaw (which opens), eyes; radians."""
+LANDMARK_MM = 2.5
+"""Expected error of a landmark."""
+PARTS = (
+    *(("lips", 400), ("eyeballs", 300), ("eye_region", 500), ("face", 900)),
+    *(("ears", 150), ("neck", 200), ("scalp", 200)),
+)
+"""Regions of sampled vertices and their largest numbers; a vertex belongs to the first."""
+
+
+class Level(NamedTuple):
+    """Steps at one blur of the images."""
+
+    blur: float
+    """Standard deviation, pixels."""
+    steps: int
+    landmarks: float
+    """Weight of the landmarks."""
+
+
+LEVELS = (Level(4.0, 4, 0.3), Level(2.0, 5, 0.1), Level(1.2, 4, 0.03), Level(0.8, 4, 0.03))
+
+
+class Samples(NamedTuple):
+    """Observed colours of points: n observations of all timesteps, in order."""
+
+    frame: IntArray  # (n,) timestep x cameras + camera
+    point: IntArray  # (n,)
+    weight: FloatArray  # (n,)
+
+
+def sampled_vertices(head: HeadAsset) -> IntArray:
+    """Vertices whose colours are compared, spread over the regions `PARTS` that the head has."""
+    hidden = [
+        np.asarray(head.regions.get(name, ()), np.int64) for name in ("mouth_socket", "teeth", "boundary")
+    ]
+    taken = np.concatenate(hidden)
+    chosen = []
+    for name, count in PARTS:
+        members = np.setdiff1d(head.regions.get(name, ()), taken).astype(np.int64)
+        if len(members):
+            chosen.append(members[spread_vertices(np.asarray(head.template)[members], count)])
+            taken = np.concatenate([taken, members])
+    return np.unique(np.concatenate(chosen))
+
+
+@dataclass(frozen=True, eq=False)
+class Fitter:
+    """Data of a fit that does not change.
+
+    Attributes
+    ----------
+    head : HeadAsset
+        Head model.
+    views : Views
+        C cameras.
+    landmarks : Landmarks
+        Landmarks of T timesteps.
+    """
+
+    head: HeadAsset
+    views: Views
+    landmarks: Landmarks
+
+    @property
+    def prior(self) -> Prior:
+        """Weak prior of all parameters."""
+        columns = PoseColumns.of(self.head)
+        free = [np.inf] * 3
+        coefficients = [1.0] * columns.expression_size + [0.5] * columns.eyelid_size
+        return Prior(np.array([*ANGLE_SPREAD, *free, *coefficients]), np.ones(self.head.shape_basis.shape[2]))
+
+    def start(self) -> State:
+        """Mean shape in the rigid pose of the landmarks of the camera that saw most of them, at each timestep."""
+        columns = PoseColumns.of(self.head)
+        poses = np.zeros((len(self.landmarks.pixels), columns.size))
+        shape = np.zeros(self.head.shape_basis.shape[2])
+        rig = self.landmark_rig()
+        rest = rig.points(shape, poses[0]).astype(np.float64)
+        root = (np.asarray(self.head.joint_regressor, np.float64) @ self.head.template)[0]
+        last = np.zeros(6)
+        for row, pixels in enumerate(self.landmarks.pixels):
+            found = np.isfinite(pixels[..., 0])
+            camera = int(found.sum(axis=1).argmax())
+            kept = found[camera]
+            if kept.sum() >= 6:
+                last = self._rigid(rest[kept], pixels[camera, kept], camera, root)
+            poses[row, :3], poses[row, columns.translation] = last[:3], last[3:]
+        return State(shape, poses)
+
+    def _rigid(self, rest: FloatArray, pixels: FloatArray, camera: int, root: FloatArray) -> FloatArray:
+        """(6,) rotation about the root and translation that project points onto pixels."""
+        K = self.views.intrinsics[camera]
+        _, turn, shift = cv2.solvePnP(rest, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
+        rotation = self.views.rotations[camera].T @ cv2.Rodrigues(turn)[0]
+        moved = self.views.rotations[camera].T @ (shift[:, 0] - self.views.shifts[camera])
+        return np.concatenate([cv2.Rodrigues(rotation)[0][:, 0], moved - root + rotation @ root])
+
+    def landmark_rig(self) -> PointRig:
+        """The landmarks as points of the head."""
+        return PointRig(self.head, self.landmarks.corners, self.landmarks.weights)
+
+    def add_landmarks(self, equations: NormalEquations, rig: PointRig, state: State, weight: float) -> float:
+        """Add the landmarks to the equations; return their root mean square distance, pixels."""
+        squares, count = 0.0, 0
+        for row, pixels in enumerate(self.landmarks.pixels):
+            posed = rig.linearised(state.shape, state.poses[row])
+            projected = self.views.project(posed.points)
+            found = np.isfinite(pixels[..., 0])
+            gap = np.where(found[..., None], pixels - projected.pixels, 0.0)
+            sigma = (
+                1e-3 * LANDMARK_MM * self.views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
+            )
+            square = (gap**2).sum(axis=2)
+            robust = found * weight / (sigma * (1 + square / (9 * sigma**2))) ** 2
+            squares, count = squares + square.sum(), count + found.sum()
+            weighted = robust[..., None, None] * projected.derivative
+            curvature = np.einsum("cpki,cpkj->pij", weighted, projected.derivative)
+            slope = np.einsum("cpki,cpk->pi", weighted, gap)
+            equations.add(row, posed, curvature, slope)
+        return float(np.sqrt(squares / max(count, 1)))
+
+    def fit_landmarks(self, state: State, steps: int = 10, rigid: int = 4) -> State:
+        """Steps on the landmarks alone, the first of the rigid pose only."""
+        rig, prior = self.landmark_rig(), self.prior
+        still = Prior(np.where(np.isinf(prior.pose), np.inf, 0.0), np.zeros(len(prior.shape)))
+        for step in range(rigid + steps):
+            equations = self._equations(state)
+            self.add_landmarks(equations, rig, state, 1.0)
+            state = equations.step(state, still if step < rigid else prior, 1e-3)
+        return state
+
+    def fit_colours(
+        self,
+        state: State,
+        stack: FrameStack,
+        levels: Sequence[Level] = LEVELS,
+        progress: Progress = no_progress,
+    ) -> tuple[State, Any]:
+        """Steps on colours of points and landmarks."""
+        vertices = sampled_vertices(self.head)
+        rig = PointRig.at_vertices(self.head, vertices)
+        mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
+        marks = self.landmark_rig()
+        total, done = sum(level.steps for level in levels), 0
+        for level in levels:
+            stack.blur(level.blur)
+            samples = self._observations(state, mesh, vertices)
+            for _ in range(level.steps):
+                progress(done, total, f"blur {level.blur:g}")
+                equations = self._equations(state)
+                self.add_landmarks(equations, marks, state, level.landmarks)
+                self._add_colours(equations, rig, state, stack, samples)
+                state = equations.step(state, self.prior)
+                done += 1
+        return state, None
+
+    def _equations(self, state: State) -> NormalEquations:
+        return NormalEquations(*state.poses.shape, len(state.shape))
+
+    def _observations(self, state: State, mesh: PointRig, vertices: IntArray) -> Samples:
+        """The vertices that each frame sees."""
+        occlusion = Occlusion(self.head, mesh.points(state.shape, state.poses[0]), self.views)
+        frames, points, weights = [], [], []
+        for row, pose in enumerate(state.poses):
+            cosine = occlusion.visible(mesh.points(state.shape, pose).astype(np.float64), vertices)
+            camera, point = np.nonzero(cosine)
+            frames.append(row * len(cosine) + camera)
+            points.append(point)
+            weights.append(cosine[camera, point])
+        return Samples(np.concatenate(frames), np.concatenate(points), np.concatenate(weights))
+
+    def _add_colours(
+        self, equations: NormalEquations, rig: PointRig, state: State, stack: FrameStack, samples: Samples
+    ) -> None:
+        cameras = len(self.views.cameras)
+        bounds = np.searchsorted(samples.frame, np.arange(len(state.poses) + 1) * cameras)
+        posed = [rig.points(state.shape, pose) for pose in state.poses]
+        sampled = []
+        for row, (start, end) in enumerate(zip(bounds, bounds[1:])):
+            frame, point = samples.frame[start:end], samples.point[start:end]
+            projected = self.views.project(posed[row][point], frame - row * cameras)
+            values, gradients = stack.sample(frame, projected.pixels)
+            sampled.append((values, gradients @ projected.derivative.astype(np.float32)))
+        values = np.concatenate([part[0] for part in sampled])
+        texture, robust = _texture(values, samples, len(posed[0]))
+        residual = values - texture[samples.point]
+        weight = robust[:, None] * COLOUR_WEIGHT
+        for row, (start, end) in enumerate(zip(bounds, bounds[1:])):
+            by_point = sampled[row][1]  # (n, 3, 3): channel, axis
+            weighted = weight[start:end, :, None] * by_point
+            curvature = np.einsum("nci,ncj->nij", weighted, by_point).reshape(-1, 9)
+            slope = -np.einsum("nci,nc->ni", weighted, residual[start:end])
+            count = end - start
+            gather = csr_array(
+                (np.ones(count, np.float32), (samples.point[start:end], np.arange(count))),
+                shape=(len(posed[0]), count),
+            )
+            equations.add(
+                row,
+                rig.linearised(state.shape, state.poses[row]),
+                (gather @ curvature).reshape(-1, 3, 3),
+                gather @ slope,
+            )
+
+
+COLOUR_WEIGHT = 0.2
+"""Weight of an observation beside landmarks; those of neighbouring points share their error."""
+
+
+def _texture(values: FloatArray, samples: Samples, points: int) -> tuple[FloatArray, FloatArray]:
+    """Robust colour of every point (P, 3) and the Geman-McClure weight of every observation (n,), over its variance."""
+    weight = samples.weight.astype(np.float32)
+    robust = weight
+    for _ in range(4):
+        total = np.maximum(np.bincount(samples.point, robust, points), 1e-9)
+        texture = np.stack(
+            [np.bincount(samples.point, robust * channel, points) / total for channel in values.T], axis=1
+        )
+        square = ((values - texture[samples.point]) ** 2).sum(axis=1)
+        scale = max(2.0 * float(np.median(square)), 1e-5)
+        robust = weight / (1 + square / scale) ** 2
+    return texture.astype(np.float32), (3 * robust / scale).astype(np.float32)
