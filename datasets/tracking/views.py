@@ -12,8 +12,8 @@ from ..head.geometry import triangle_areas, vertex_normals
 
 CELL = 4
 """Side of a cell of the depth buffer, pixels."""
-MARGIN = 0.006
-"""A point is hidden if something is nearer by more than this, metres."""
+MARGIN = 0.002
+"""A point is hidden if something is nearer by more than this, metres, and by more than its surface slopes within a cell."""
 FACING = 0.25
 """Least cosine between the normal of a point and the direction to the camera."""
 _SPACING = 0.003  # between the samples of a surface that fill the buffer, metres
@@ -48,22 +48,32 @@ class Views:
         self.centers = np.stack([camera.center for camera in cameras])
         self.sizes = np.array([[camera.width, camera.height] for camera in cameras])
 
+    def place(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixels (C, P, 2) and depth (C, P) of points (P, 3), in float32."""
+        matrices = self.intrinsics @ np.concatenate([self.rotations, self.shifts[..., None]], axis=2)
+        homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1).astype(np.float32)
+        projected = homogeneous @ matrices.astype(np.float32).reshape(-1, 4).T  # (P, 3 C)
+        projected = projected.reshape(len(points), -1, 3).transpose(1, 0, 2)
+        depth = projected[..., 2]
+        return projected[..., :2] / np.maximum(depth, _NEAR)[..., None], depth
+
     def project(self, points: FloatArray, which: IntArray | None = None) -> Projection:
         """Project points (P, 3), or with ``which`` (P,) each in the camera of that index, then without the axis C."""
         if which is None:
             turn, shift, K = self.rotations[:, None], self.shifts[:, None], self.intrinsics[:, None]
-            seen = np.einsum("cij,pj->cpi", self.rotations, points) + shift
+            seen = points @ self.rotations.transpose(0, 2, 1) + shift
         else:
             turn, shift, K = self.rotations[which], self.shifts[which], self.intrinsics[which]
             seen = np.einsum("pij,pj->pi", turn, points) + shift
         depth = np.maximum(seen[..., 2], _NEAR)
         slopes = seen[..., :2] / depth[..., None]
-        # Intrinsics may have a skew, but their last row is (0, 0, 1).
-        pixels = np.einsum("...ij,...j->...i", K[..., :2, :2], slopes) + K[..., :2, 2]
-        by_seen = np.zeros((*depth.shape, 2, 3))
-        by_seen[..., 0, 0] = by_seen[..., 1, 1] = 1 / depth
-        by_seen[..., 2] = -slopes / depth[..., None]
-        return Projection(pixels, seen[..., 2], K[..., :2, :2] @ by_seen @ turn)
+        # The last row of the intrinsics is (0, 0, 1); the first two multiply the slopes.
+        linear = K[..., :2, :2]
+        pixels = slopes[..., :1] * linear[..., 0] + slopes[..., 1:] * linear[..., 1] + K[..., :2, 2]
+        by_point = turn[..., :2, :] - slopes[..., None] * turn[..., 2:, :]
+        scaled = linear / depth[..., None, None]
+        derivative = scaled[..., :1] * by_point[..., :1, :] + scaled[..., 1:] * by_point[..., 1:, :]
+        return Projection(pixels, seen[..., 2], derivative)
 
 
 class Occlusion:
@@ -113,27 +123,35 @@ class Occlusion:
             np.einsum("sk,fki->fsi", shares, mesh[faces]).reshape(-1, 3) for faces, shares in self._samples
         ]
         nearest = self._buffer(np.concatenate(surface))
-        projected = self._views.project(points)
-        cells, inside = self._cells(projected.pixels)
+        pixels, depth = self._views.place(points)
+        cells, inside = self._cells(pixels)
         rows = np.arange(len(cosine))[:, None]
-        seen = inside & (projected.depth < nearest[rows, cells] + MARGIN) & (cosine > FACING)
+        slope = np.sqrt(1 - np.minimum(cosine**2, 1)) / np.maximum(cosine, FACING)
+        margin = MARGIN + slope * CELL * depth / self._views.intrinsics[:, None, 0, 0]
+        seen = inside & (depth < nearest[rows, cells] + margin) & (cosine > FACING)
         return np.where(seen, cosine, 0.0)
 
     def _buffer(self, points: FloatArray) -> FloatArray:
         """(C, cells) nearest depth."""
         width, height = self._views.sizes.max(axis=0) // CELL + 1
-        projected = self._views.project(points)
-        cells, inside = self._cells(projected.pixels)
+        pixels, depth = self._views.place(points)
+        cells, inside = self._cells(pixels)
         count = width * height
-        nearest = np.full((len(cells), count), np.inf)
+        nearest = np.full((len(cells), count), np.inf, np.float32)
         for camera, (row, kept) in enumerate(zip(cells, inside)):
-            np.minimum.at(nearest[camera], row[kept], projected.depth[camera, kept])
+            np.minimum.at(nearest[camera], row[kept], depth[camera, kept])
         return nearest
 
     def _cells(self, pixels: FloatArray) -> tuple[IntArray, BoolArray]:
         """Cell of each point, (C, P), and whether it is in the image."""
         sizes = self._views.sizes[:, None]
         width, height = self._views.sizes.max(axis=0) // CELL + 1
-        inside = ((pixels >= 0) & (pixels < sizes)).all(axis=2)
-        at = np.clip(np.nan_to_num(pixels) // CELL, 0, [width - 1, height - 1]).astype(np.int64)
-        return at[..., 1] * width + at[..., 0], inside
+        inside = (
+            (pixels[..., 0] >= 0)
+            & (pixels[..., 1] >= 0)
+            & (pixels[..., 0] < sizes[..., 0])
+            & (pixels[..., 1] < sizes[..., 1])
+        )
+        at = (pixels * np.float32(1 / CELL)).astype(np.int32)
+        x, y = np.clip(at[..., 0], 0, width - 1), np.clip(at[..., 1], 0, height - 1)
+        return y * width + x, inside
