@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -32,13 +31,18 @@ class Level(NamedTuple):
     """Steps at one blur of the images."""
 
     blur: float
-    """Standard deviation, pixels."""
+    """Standard deviation on the head, millimetres; at least `SHARPEST` pixels."""
     steps: int
     landmarks: float
     """Weight of the landmarks."""
 
 
-LEVELS = (Level(4.0, 4, 0.3), Level(2.0, 5, 0.1), Level(1.2, 4, 0.03), Level(0.8, 4, 0.03))
+LEVELS = (Level(3.0, 4, 0.3), Level(1.5, 5, 0.1), Level(0.8, 8, 0.05))
+SHARPEST = 0.7
+WIDE_MM = 6.0
+"""Blur that is subtracted from the images."""
+COLOUR_WEIGHT = 0.2
+"""Weight of an observation beside landmarks; those of neighbouring points share their error."""
 
 
 class Samples(NamedTuple):
@@ -62,6 +66,16 @@ def sampled_vertices(head: HeadAsset) -> IntArray:
             chosen.append(members[spread_vertices(np.asarray(head.template)[members], count)])
             taken = np.concatenate([taken, members])
     return np.unique(np.concatenate(chosen))
+
+
+class Fitted(NamedTuple):
+    """Result of a fit."""
+
+    state: State
+    landmarks: FloatArray
+    """(T,) root mean square distance of the landmarks before the last step, pixels."""
+    colours: FloatArray
+    """(T,) median difference of a colour from that of its point, 8-bit levels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,9 +134,11 @@ class Fitter:
         """The landmarks as points of the head."""
         return PointRig(self.head, self.landmarks.corners, self.landmarks.weights)
 
-    def add_landmarks(self, equations: NormalEquations, rig: PointRig, state: State, weight: float) -> float:
-        """Add the landmarks to the equations; return their root mean square distance, pixels."""
-        squares, count = 0.0, 0
+    def add_landmarks(
+        self, equations: NormalEquations, rig: PointRig, state: State, weight: float
+    ) -> FloatArray:
+        """Add the landmarks to the equations; return their root mean square distance at each timestep, (T,) pixels."""
+        distance = np.zeros(len(state.poses))
         for row, pixels in enumerate(self.landmarks.pixels):
             posed = rig.linearised(state.shape, state.poses[row])
             projected = self.views.project(posed.points)
@@ -133,50 +149,61 @@ class Fitter:
             )
             square = (gap**2).sum(axis=2)
             robust = found * weight / (sigma * (1 + square / (9 * sigma**2))) ** 2
-            squares, count = squares + square.sum(), count + found.sum()
+            distance[row] = np.sqrt(square.sum() / max(found.sum(), 1))
             weighted = robust[..., None, None] * projected.derivative
             curvature = np.einsum("cpki,cpkj->pij", weighted, projected.derivative)
             slope = np.einsum("cpki,cpk->pi", weighted, gap)
             equations.add(row, posed, curvature, slope)
-        return float(np.sqrt(squares / max(count, 1)))
+        return distance
 
     def fit_landmarks(self, state: State, steps: int = 10, rigid: int = 4) -> State:
         """Steps on the landmarks alone, the first of the rigid pose only."""
         rig, prior = self.landmark_rig(), self.prior
         still = Prior(np.where(np.isinf(prior.pose), np.inf, 0.0), np.zeros(len(prior.shape)))
         for step in range(rigid + steps):
-            equations = self._equations(state)
+            equations = NormalEquations(*state.poses.shape, len(state.shape))
             self.add_landmarks(equations, rig, state, 1.0)
             state = equations.step(state, still if step < rigid else prior, 1e-3)
         return state
 
     def fit_colours(
-        self,
-        state: State,
-        stack: FrameStack,
-        levels: Sequence[Level] = LEVELS,
-        progress: Progress = no_progress,
-    ) -> tuple[State, Any]:
-        """Steps on colours of points and landmarks."""
+        self, state: State, stack: FrameStack, *, keep_shape: bool = False, progress: Progress = no_progress
+    ) -> Fitted:
+        """Steps on colours of points and landmarks, at the blurs of `LEVELS`.
+
+        Parameters
+        ----------
+        state : State
+            Estimate from landmarks.
+        stack : FrameStack
+            Images of all timesteps, the cameras of each together.
+        keep_shape : bool
+            Whether the shape stays as it is.
+        """
         vertices = sampled_vertices(self.head)
         rig = PointRig.at_vertices(self.head, vertices)
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
-        marks = self.landmark_rig()
-        total, done = sum(level.steps for level in levels), 0
-        for level in levels:
-            stack.blur(level.blur)
+        marks, prior = self.landmark_rig(), self.prior
+        if keep_shape:
+            prior = Prior(prior.pose, np.zeros(len(prior.shape)))
+        scale = self._pixels_per_millimetre(mesh, state)
+        total, done = sum(level.steps for level in LEVELS), 0
+        landmarks = colours = np.zeros(len(state.poses))
+        for level in LEVELS:
+            stack.filter(max(SHARPEST, level.blur * scale), WIDE_MM * scale)
             samples = self._observations(state, mesh, vertices)
             for _ in range(level.steps):
-                progress(done, total, f"blur {level.blur:g}")
-                equations = self._equations(state)
-                self.add_landmarks(equations, marks, state, level.landmarks)
-                self._add_colours(equations, rig, state, stack, samples)
-                state = equations.step(state, self.prior)
+                progress(done, total, f"blur of {level.blur:g} mm")
+                equations = NormalEquations(*state.poses.shape, len(state.shape))
+                landmarks = self.add_landmarks(equations, marks, state, level.landmarks)
+                colours = self._add_colours(equations, rig, state, stack, samples)
+                state = equations.step(state, prior)
                 done += 1
-        return state, None
+        return Fitted(state, landmarks, colours)
 
-    def _equations(self, state: State) -> NormalEquations:
-        return NormalEquations(*state.poses.shape, len(state.shape))
+    def _pixels_per_millimetre(self, mesh: PointRig, state: State) -> float:
+        depth = self.views.place(mesh.points(state.shape, state.poses[0]))[1]
+        return float(np.median(1e-3 * self.views.intrinsics[:, 0, 0] / np.median(depth, axis=1)))
 
     def _observations(self, state: State, mesh: PointRig, vertices: IntArray) -> Samples:
         """The vertices that each frame sees."""
@@ -192,7 +219,8 @@ class Fitter:
 
     def _add_colours(
         self, equations: NormalEquations, rig: PointRig, state: State, stack: FrameStack, samples: Samples
-    ) -> None:
+    ) -> FloatArray:
+        """Add the colours to the equations; return their median difference at each timestep, (T,) 8-bit levels."""
         cameras = len(self.views.cameras)
         bounds = np.searchsorted(samples.frame, np.arange(len(state.poses) + 1) * cameras)
         posed = [rig.points(state.shape, pose) for pose in state.poses]
@@ -205,27 +233,23 @@ class Fitter:
         values = np.concatenate([part[0] for part in sampled])
         texture, robust = _texture(values, samples, len(posed[0]))
         residual = values - texture[samples.point]
-        weight = robust[:, None] * COLOUR_WEIGHT
+        difference = np.zeros(len(state.poses))
+        weight = COLOUR_WEIGHT * robust
         for row, (start, end) in enumerate(zip(bounds, bounds[1:])):
-            by_point = sampled[row][1]  # (n, 3, 3): channel, axis
-            weighted = weight[start:end, :, None] * by_point
+            gap, by_point = residual[start:end], sampled[row][1]  # (n, 3), (n, 3, 3): channel, axis
+            weighted = weight[start:end, None, None] * by_point
             curvature = np.einsum("nci,ncj->nij", weighted, by_point).reshape(-1, 9)
-            slope = -np.einsum("nci,nc->ni", weighted, residual[start:end])
+            slope = -np.einsum("nci,nc->ni", weighted, gap)
             count = end - start
-            gather = csr_array(
-                (np.ones(count, np.float32), (samples.point[start:end], np.arange(count))),
-                shape=(len(posed[0]), count),
-            )
-            equations.add(
-                row,
-                rig.linearised(state.shape, state.poses[row]),
-                (gather @ curvature).reshape(-1, 3, 3),
-                gather @ slope,
-            )
+            entries = (np.ones(count, np.float32), (samples.point[start:end], np.arange(count)))
+            gather = csr_array(entries, shape=(len(posed[0]), count))
+            linearised = rig.linearised(state.shape, state.poses[row])
+            equations.add(row, linearised, (gather @ curvature).reshape(-1, 3, 3), gather @ slope)
+            difference[row] = 255 * np.median(np.abs(gap)) if count else 0.0
+        return difference
 
 
-COLOUR_WEIGHT = 0.2
-"""Weight of an observation beside landmarks; those of neighbouring points share their error."""
+_SPREAD = 4.0  # squared difference at which a weight is a quarter, relative to the usual one
 
 
 def _texture(values: FloatArray, samples: Samples, points: int) -> tuple[FloatArray, FloatArray]:
@@ -234,10 +258,11 @@ def _texture(values: FloatArray, samples: Samples, points: int) -> tuple[FloatAr
     robust = weight
     for _ in range(4):
         total = np.maximum(np.bincount(samples.point, robust, points), 1e-9)
-        texture = np.stack(
-            [np.bincount(samples.point, robust * channel, points) / total for channel in values.T], axis=1
-        )
+        sums = [np.bincount(samples.point, robust * channel, points) for channel in values.T]
+        texture = np.stack(sums, axis=1) / total[:, None]
         square = ((values - texture[samples.point]) ** 2).sum(axis=1)
-        scale = max(2.0 * float(np.median(square)), 1e-5)
+        # Points whose colour changes with light or expression count less than those whose colour stays.
+        own = np.bincount(samples.point, robust * square, points) / total
+        scale = _SPREAD * np.maximum(own, max(float(np.median(square)), 1e-5))[samples.point]
         robust = weight / (1 + square / scale) ** 2
     return texture.astype(np.float32), (3 * robust / scale).astype(np.float32)

@@ -24,17 +24,22 @@ class FrameStack:
         self._starts = np.concatenate([[0], np.cumsum(counts)])
         self._pixels = np.zeros((int(self._starts[-1]), 3), np.int16)
 
-    def blur(self, sigma: float) -> None:
-        """Replace the sampled images by blurred ones; ``sigma`` in pixels, 0 for none."""
+    def filter(self, sigma: float, wide: float = 0.0) -> None:
+        """Blur the sampled images by ``sigma`` pixels, and subtract their blur by ``wide``; 0 for none.
+
+        The difference contains less of slow changes such as shading, which turns with the head.
+        """
         for start, image in zip(self._starts, self._images):
             levels = image.astype(np.float32) * np.float32(_LEVELS / 255)
             if sigma > 0:
                 levels = cv2.GaussianBlur(levels, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+            if wide > 0:
+                levels = levels - cv2.GaussianBlur(levels, (0, 0), wide, borderType=cv2.BORDER_REPLICATE)
             flat = levels.reshape(-1, 3)
             self._pixels[start : start + len(flat)] = np.round(flat)
 
     def sample(self, frames: IntArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Values (n, 3) in [0, 1] and gradients (n, 3, 2) per pixel at places (n, 2) of frames (n,), bilinear.
+        """Values (n, 3), 1 being white, and gradients (n, 3, 2) per pixel at places (n, 2) of frames (n,), bilinear.
 
         Places outside an image take its border.
         """
