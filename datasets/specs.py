@@ -106,6 +106,16 @@ REFIT_COMMAND = CommandSpec(
     kinds=("captures",),
 )
 
+TRACK = CommandSpec(
+    name="track",
+    group="data",
+    summary="Track the head model of a capture in its images, without using its tracking.",
+    settings="headbench.datasets.tracking.settings:TrackSettings",
+    function="headbench.datasets.tracking.command:track_capture",
+    writes="out",
+    kinds=("captures",),
+)
+
 INSPECT = CommandSpec(
     name="inspect",
     group="inspect",

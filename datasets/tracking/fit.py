@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 from ...bench.contracts import FloatArray, HeadAsset, IntArray, Progress, no_progress
 from .images import FrameStack
 from .landmarks import Landmarks, spread_vertices
-from .rig import ANGLES, PointRig, PoseColumns
+from .rig import PointRig, PoseColumns
 from .solve import NormalEquations, Prior, State
 from .views import Occlusion, Views
 
@@ -96,22 +96,25 @@ class Fitter:
     views: Views
     landmarks: Landmarks
 
-    @property
-    def prior(self) -> Prior:
+    def _prior(self, keep_shape: bool) -> Prior:
         """Weak prior of all parameters."""
         columns = PoseColumns.of(self.head)
         free = [np.inf] * 3
         coefficients = [1.0] * columns.expression_size + [0.5] * columns.eyelid_size
-        return Prior(np.array([*ANGLE_SPREAD, *free, *coefficients]), np.ones(self.head.shape_basis.shape[2]))
+        return Prior(
+            np.array([*ANGLE_SPREAD, *free, *coefficients]),
+            np.full(self.head.shape_basis.shape[2], 0.0 if keep_shape else 1.0),
+        )
 
-    def start(self) -> State:
-        """Mean shape in the rigid pose of the landmarks of the camera that saw most of them, at each timestep."""
+    def start(self, shape: FloatArray | None = None) -> State:
+        """A shape, by default the mean, in the rigid pose of the landmarks of the camera that saw most of them, at each timestep."""
         columns = PoseColumns.of(self.head)
         poses = np.zeros((len(self.landmarks.pixels), columns.size))
-        shape = np.zeros(self.head.shape_basis.shape[2])
+        shape = np.zeros(self.head.shape_basis.shape[2]) if shape is None else shape
         rig = self.landmark_rig()
         rest = rig.points(shape, poses[0]).astype(np.float64)
-        root = (np.asarray(self.head.joint_regressor, np.float64) @ self.head.template)[0]
+        neutral = np.asarray(self.head.template + self.head.shape_basis @ shape, np.float64)
+        root = np.asarray(self.head.joint_regressor[0], np.float64) @ neutral
         last = np.zeros(6)
         for row, pixels in enumerate(self.landmarks.pixels):
             found = np.isfinite(pixels[..., 0])
@@ -156,9 +159,11 @@ class Fitter:
             equations.add(row, posed, curvature, slope)
         return distance
 
-    def fit_landmarks(self, state: State, steps: int = 10, rigid: int = 4) -> State:
+    def fit_landmarks(
+        self, state: State, *, keep_shape: bool = False, steps: int = 10, rigid: int = 4
+    ) -> State:
         """Steps on the landmarks alone, the first of the rigid pose only."""
-        rig, prior = self.landmark_rig(), self.prior
+        rig, prior = self.landmark_rig(), self._prior(keep_shape)
         still = Prior(np.where(np.isinf(prior.pose), np.inf, 0.0), np.zeros(len(prior.shape)))
         for step in range(rigid + steps):
             equations = NormalEquations(*state.poses.shape, len(state.shape))
@@ -183,9 +188,7 @@ class Fitter:
         vertices = sampled_vertices(self.head)
         rig = PointRig.at_vertices(self.head, vertices)
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
-        marks, prior = self.landmark_rig(), self.prior
-        if keep_shape:
-            prior = Prior(prior.pose, np.zeros(len(prior.shape)))
+        marks, prior = self.landmark_rig(), self._prior(keep_shape)
         scale = self._pixels_per_millimetre(mesh, state)
         total, done = sum(level.steps for level in LEVELS), 0
         landmarks = colours = np.zeros(len(state.poses))

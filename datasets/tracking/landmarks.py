@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -67,7 +68,9 @@ def rig_vertices(head: HeadAsset) -> IntArray:
     return np.unique(np.concatenate(taken))
 
 
-def known_rig_landmarks(clip: CaptureClip, cameras: list[str], timesteps: list[int], seed: int) -> Landmarks:
+def known_rig_landmarks(
+    clip: CaptureClip, cameras: Sequence[str], timesteps: Sequence[int], seed: int
+) -> Landmarks:
     """Projections of vertices of the clip's own tracked mesh with the error of a landmark network, seeded.
 
     They stand in for a network where its file is missing; only their error makes them a start that has to be refined. A
