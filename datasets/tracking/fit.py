@@ -20,11 +20,16 @@ ANGLE_SPREAD = (np.inf,) * 3 + (0.15,) * 3 + (0.3, 0.03, 0.02) + (0.2, 0.3, 0.02
 """Standard deviations of the angles: rotation free, neck, jaw (which opens), eyes; radians."""
 LANDMARK_MM = 2.5
 """Expected error of a landmark."""
+MISTAKEN_MM = 25.0
+"""Median distance from which the landmarks of an image are left out."""
 PARTS = (
     *(("lips", 400), ("eyeballs", 300), ("eye_region", 500), ("face", 900)),
     *(("ears", 150), ("neck", 200), ("scalp", 200)),
 )
 """Regions of sampled vertices and their largest numbers; a vertex belongs to the first."""
+
+
+_TRIED, _FEWEST = 4, 6  # cameras for the rigid pose, and landmarks of one
 
 
 class Level(NamedTuple):
@@ -107,7 +112,10 @@ class Fitter:
         )
 
     def start(self, shape: FloatArray | None = None) -> State:
-        """A shape, by default the mean, in the rigid pose of the landmarks of the camera that saw most of them, at each timestep."""
+        """A shape, by default the mean, in the rigid pose of the landmarks of one camera at each timestep.
+
+        Of the cameras that saw most landmarks it is the one whose pose fits the landmarks of all cameras best.
+        """
         columns = PoseColumns.of(self.head)
         poses = np.zeros((len(self.landmarks.pixels), columns.size))
         shape = np.zeros(self.head.shape_basis.shape[2]) if shape is None else shape
@@ -118,20 +126,26 @@ class Fitter:
         last = np.zeros(6)
         for row, pixels in enumerate(self.landmarks.pixels):
             found = np.isfinite(pixels[..., 0])
-            camera = int(found.sum(axis=1).argmax())
-            kept = found[camera]
-            if kept.sum() >= 6:
-                last = self._rigid(rest[kept], pixels[camera, kept], camera, root)
+            least = np.inf
+            for camera in np.argsort(-found.sum(axis=1), kind="stable")[:_TRIED]:
+                kept = found[camera]
+                if kept.sum() < _FEWEST:
+                    continue
+                turn, moved = self._rigid(rest[kept], pixels[camera, kept], camera)
+                gaps = np.linalg.norm(self.views.place(rest @ turn.T + moved)[0] - pixels, axis=2)
+                if np.median(gaps[found]) < least:
+                    least = float(np.median(gaps[found]))
+                    last = np.concatenate([cv2.Rodrigues(turn)[0][:, 0], moved - root + turn @ root])
             poses[row, :3], poses[row, columns.translation] = last[:3], last[3:]
         return State(shape, poses)
 
-    def _rigid(self, rest: FloatArray, pixels: FloatArray, camera: int, root: FloatArray) -> FloatArray:
-        """(6,) rotation about the root and translation that project points onto pixels."""
-        K = self.views.intrinsics[camera]
-        _, turn, shift = cv2.solvePnP(rest, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
-        rotation = self.views.rotations[camera].T @ cv2.Rodrigues(turn)[0]
-        moved = self.views.rotations[camera].T @ (shift[:, 0] - self.views.shifts[camera])
-        return np.concatenate([cv2.Rodrigues(rotation)[0][:, 0], moved - root + rotation @ root])
+    def _rigid(self, rest: FloatArray, pixels: FloatArray, camera: int) -> tuple[FloatArray, FloatArray]:
+        """Rotation (3, 3) and shift (3,) that take points to the world such that they project onto pixels."""
+        _, turn, shift = cv2.solvePnP(
+            rest, pixels, self.views.intrinsics[camera], None, flags=cv2.SOLVEPNP_SQPNP
+        )
+        back = self.views.rotations[camera].T
+        return back @ cv2.Rodrigues(turn)[0], back @ (shift[:, 0] - self.views.shifts[camera])
 
     def landmark_rig(self) -> PointRig:
         """The landmarks as points of the head."""
@@ -151,8 +165,11 @@ class Fitter:
                 1e-3 * LANDMARK_MM * self.views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
             )
             square = (gap**2).sum(axis=2)
+            # All landmarks of an image may be wrong, where a network takes something else for a face.
+            apart = np.nanmedian(np.where(found, np.sqrt(square) / sigma, np.nan), axis=1, keepdims=True)
+            found &= apart < MISTAKEN_MM / LANDMARK_MM
             robust = found * weight / (sigma * (1 + square / (9 * sigma**2))) ** 2
-            distance[row] = np.sqrt(square.sum() / max(found.sum(), 1))
+            distance[row] = np.sqrt((found * square).sum() / max(found.sum(), 1))
             weighted = robust[..., None, None] * projected.derivative
             curvature = np.einsum("cpki,cpkj->pij", weighted, projected.derivative)
             slope = np.einsum("cpki,cpk->pi", weighted, gap)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from ...bench.contracts import ByteArray, FloatArray, HeadAsset, IntArray, Progress, no_progress
+from ...bench.contracts import BoolArray, ByteArray, FloatArray, HeadAsset, IntArray, Progress, no_progress
 from ...bench.errors import InputError, UnavailableError
 from ..clip import CaptureClip
 from ..head.geometry import vertex_normals
@@ -31,6 +31,11 @@ LEARNING_FRAMES = 120
 """Images from which an embedding is learnt."""
 MOST_SPREAD = 0.004
 """Landmarks that slide on the mesh by more than this, median, are left out, metres."""
+MOST_CHANGE = 0.05
+"""Landmarks may move by this part of the face's size when the crop is repeated around them."""
+MOST_MISFIT = 0.04
+"""Largest median distance of landmarks from those of the mean head, relative to the face's size."""
+_TRIED, _ROUNDS = 6, 3
 _FACING = 0.5
 _FEWEST = 0.3  # part of the images in which a landmark has to hit the mesh
 
@@ -61,7 +66,8 @@ class LandmarkNetwork:
         try:
             from ai_edge_litert.interpreter import Interpreter
         except ImportError as error:
-            raise UnavailableError("Landmarks by a network need the package ai-edge-litert: pip install ai-edge-litert") from error
+            what = "Landmarks by a network need the package ai-edge-litert; it is not installed."
+            raise UnavailableError(what, "pip install ai-edge-litert") from error
         try:
             self._network: Any = Interpreter(model_path=str(path), num_threads=1)
             self._network.allocate_tensors()
@@ -70,7 +76,9 @@ class LandmarkNetwork:
             self._landmarks = next(one for one in outputs if np.prod(one["shape"]) == 3 * COUNT)
             self._score = next(one for one in outputs if np.prod(one["shape"]) == 1)
         except (ValueError, RuntimeError, StopIteration) as error:
-            raise InputError(path, "", f"a network that finds {COUNT} landmarks", str(error) or "other outputs") from error
+            raise InputError(
+                path, "", f"a network that finds {COUNT} landmarks", str(error) or "other outputs"
+            ) from error
         self._side = int(self._input["shape"][1])
 
     def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:
@@ -83,20 +91,28 @@ class LandmarkNetwork:
         near : FloatArray | None
             Landmarks of a similar image of the camera; without them, squares of several sizes are tried.
         """
-        crops = [_crop_around(near)] if near is not None else _candidates(image)
-        scored = [self._run(image, crop) for crop in crops]
-        found, score = max(scored, key=lambda one: one[1])
-        for _ in range(2 if near is None else 1):
-            if score > 0:
-                found, score = self._run(image, _crop_around(found))
-        if score > 0:
-            return found
-        return None if near is None else self.find(image)
+        if near is not None:
+            found, score = self._run(image, _crop_around(near))
+            return found if score > 0 else self.find(image)
+        scored = sorted((self._run(image, crop) for crop in _candidates(image)), key=lambda one: -one[1])
+        best, least = None, MOST_CHANGE
+        for found, score in scored[:_TRIED]:
+            change = np.inf
+            for _ in range(_ROUNDS):
+                if score > 0:
+                    before, (found, score) = found, self._run(image, _crop_around(found))
+                    change = float(np.abs(found - before).mean() / np.ptp(found, axis=0).max())
+            # Where the network sees a whole face, the landmarks of a crop around them are the same.
+            if score > 0 and change < least:
+                best, least = found, change
+        return best
 
     def _run(self, image: ByteArray, crop: _Crop) -> tuple[FloatArray, float]:
         """Landmarks, and the logit of the probability that the crop shows a face."""
-        turn = crop.side / self._side * np.array(
-            [[np.cos(crop.angle), -np.sin(crop.angle)], [np.sin(crop.angle), np.cos(crop.angle)]]
+        turn = (
+            crop.side
+            / self._side
+            * np.array([[np.cos(crop.angle), -np.sin(crop.angle)], [np.sin(crop.angle), np.cos(crop.angle)]])
         )
         to_image = np.concatenate([turn, (crop.middle - turn @ np.full(2, self._side / 2))[:, None]], axis=1)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -107,7 +123,9 @@ class LandmarkNetwork:
         self._network.set_tensor(self._input["index"], pixels[None].astype(np.float32) / 255)
         self._network.invoke()
         found = self._network.get_tensor(self._landmarks["index"]).reshape(COUNT, 3)[:, :2].astype(np.float64)
-        return found @ turn.T + to_image[:, 2], float(self._network.get_tensor(self._score["index"]).ravel()[0])
+        return found @ turn.T + to_image[:, 2], float(
+            self._network.get_tensor(self._score["index"]).ravel()[0]
+        )
 
 
 COUNT = 468
@@ -145,20 +163,24 @@ class Embedding(NamedTuple):
     """(L, 3) barycentric weights."""
 
 
-def learn_embedding(network: LandmarkNetwork, clip: CaptureClip, progress: Progress = no_progress) -> Embedding:
+def learn_embedding(
+    network: LandmarkNetwork, clip: CaptureClip, progress: Progress = no_progress
+) -> Embedding:
     """Where the network's landmarks are on the mesh of a clip with exact tracking: medians over images.
 
     Raises `InputError` if the network finds hardly any landmark in the images.
     """
     head, subject = clip.head, PosedSubject.of(clip)
-    keys = sorted(clip.files)
+    keys = sorted(clip.files, key=lambda key: (key.camera, key.timestep))
     keys = [keys[place] for place in np.unique(np.linspace(0, len(keys) - 1, LEARNING_FRAMES).astype(int))]
     template = np.asarray(head.template, np.float64)
     places = np.full((len(keys), COUNT, 3), np.nan)
+    found: FloatArray | None = None
     for row, key in enumerate(keys):
         progress(row, len(keys), "learning landmarks")
         camera = clip.cameras[key.camera]
-        found = network.find(clip.image(key))
+        near = found if row and keys[row - 1].camera == key.camera else None
+        found = network.find(clip.image(key), near)
         if found is None:
             continue
         mesh = subject.meshes([clip.poses[key.timestep]])[0]
@@ -175,7 +197,9 @@ def learn_embedding(network: LandmarkNetwork, clip: CaptureClip, progress: Progr
         places[row, hit] = np.einsum("lk,lki->li", weights, template[corners])[hit]
     enough = np.flatnonzero(np.isfinite(places[..., 0]).sum(axis=0) > _FEWEST * len(keys) / 2)
     if len(enough) < 10:
-        raise InputError(f"clip of {clip.subject}", "images", "faces that the network finds", f"{len(enough)} landmarks")
+        raise InputError(
+            f"clip of {clip.subject}", "images", "faces that the network finds", f"{len(enough)} landmarks"
+        )
     middle = np.nanmedian(places[:, enough], axis=0)
     spread = np.nanmedian(np.linalg.norm(places[:, enough] - middle, axis=2), axis=0)
     kept = spread < MOST_SPREAD
@@ -186,7 +210,9 @@ def learn_embedding(network: LandmarkNetwork, clip: CaptureClip, progress: Progr
 class NetworkLandmarks:
     """A source of landmarks: the network on the images of some cameras of a clip."""
 
-    def __init__(self, network: LandmarkNetwork, embedding: Embedding, clip: CaptureClip, cameras: Sequence[str]):
+    def __init__(
+        self, network: LandmarkNetwork, embedding: Embedding, clip: CaptureClip, cameras: Sequence[str]
+    ):
         self._network, self._embedding, self._clip, self._cameras = network, embedding, clip, [*cameras]
         self._keys = {(key.timestep, key.camera): key for key in clip.files}
         self._views = Views([clip.cameras[name] for name in cameras])
@@ -198,17 +224,29 @@ class NetworkLandmarks:
         for column, name in enumerate(self._cameras):
             near = None
             for row, timestep in enumerate(timesteps):
-                near = self._network.find(self._clip.image(self._keys[timestep, name]), near)
-                if near is not None:
-                    found = near[self._embedding.landmarks]
-                    pixels[row, column] = np.where(self._facing(found, column)[:, None], found, np.nan)
+                image = self._clip.image(self._keys[timestep, name])
+                for tried in (near, None) if near is not None else (None,):
+                    near = self._network.find(image, tried)
+                    facing = None if near is None else self._facing(near[self._embedding.landmarks], column)
+                    if near is not None and facing is not None:
+                        found = near[self._embedding.landmarks]
+                        pixels[row, column] = np.where(facing[:, None], found, np.nan)
+                        break
+                    near = None
         return Landmarks(self._embedding.corners, self._embedding.weights, pixels)
 
-    def _facing(self, found: FloatArray, camera: int) -> IntArray:
-        _, turn, shift = cv2.solvePnP(self._rest, found, self._views.intrinsics[camera], None, flags=cv2.SOLVEPNP_SQPNP)
+    def _facing(self, found: FloatArray, camera: int) -> BoolArray | None:
+        """(L,) which landmarks face the camera; None if they do not form a face."""
+        K = self._views.intrinsics[camera]
+        _, turn, shift = cv2.solvePnP(self._rest, found, K, None, flags=cv2.SOLVEPNP_SQPNP)
         rotation = cv2.Rodrigues(turn)[0]
         seen = self._rest @ rotation.T + shift[:, 0]
         cosine = -(seen * (self._normals @ rotation.T)).sum(axis=1) / np.linalg.norm(seen, axis=1)
+        projected = seen @ K.T
+        gaps = np.linalg.norm(projected[:, :2] / projected[:, 2:] - found, axis=1)
+        upright = -rotation[1, 1] > 0  # the head's y points up, the image's down
+        if not upright or np.median(gaps) > MOST_MISFIT * np.ptp(found, axis=0).max():
+            return None
         return cosine > _FACING
 
 
@@ -216,5 +254,8 @@ def _rest(head: HeadAsset, embedding: Embedding) -> tuple[FloatArray, FloatArray
     """Landmarks on the mean head, (L, 3) metres, and their normals."""
     template = np.asarray(head.template, np.float64)
     normals = vertex_normals(template, np.asarray(head.faces))
-    mixed = [np.einsum("lk,lki->li", embedding.weights, values[embedding.corners]) for values in (template, normals)]
+    mixed = [
+        np.einsum("lk,lki->li", embedding.weights, values[embedding.corners])
+        for values in (template, normals)
+    ]
     return mixed[0], mixed[1]
