@@ -70,8 +70,16 @@ def _source(
     settings: TrackSettings, clip: CaptureClip, cameras: Sequence[str], progress: Progress
 ) -> LandmarkSource:
     from .landmarks import known_rig_landmarks
+    from .network import LandmarkNetwork, NetworkLandmarks, learn_embedding
 
-    return partial(known_rig_landmarks, clip, cameras, seed=settings.seed)
+    if not settings.landmarks:
+        return partial(known_rig_landmarks, clip, cameras, seed=settings.seed)
+    network = LandmarkNetwork(Path(settings.landmarks))
+    teacher = settings.open(settings.embedding, progress)
+    if teacher.head.version != clip.head.version:
+        remedy = "Landmarks are learnt on another subject of the same head model."
+        raise InputError(settings.embedding, "head_model", clip.head.version, teacher.head.version, remedy)
+    return NetworkLandmarks(network, learn_embedding(network, teacher, progress), clip, cameras)
 
 
 def draw_overlay(tracked: Tracked, cameras: Sequence[str]) -> ByteArray:
@@ -104,9 +112,9 @@ def _spread(values: Sequence[Any], count: int) -> list[Any]:
 
 def _text(tracked: Tracked) -> list[str]:
     summary = tracked.report.summary()
+    count = f"{summary['timesteps']} timesteps"
     return [
-        f"{summary['timesteps']} timesteps, {len(tracked.report.cameras)} cameras, "
-        f"{summary['seconds_per_timestep']:.2f} s a timestep",
+        f"{count}, {len(tracked.report.cameras)} cameras, {summary['seconds_per_timestep']:.2f} s a timestep",
         f"  landmarks  {summary['landmarks_px']:.2f} pixels root mean square",
         f"  colours    {summary['colour_levels']:.2f} levels of 255, median",
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import cv2
@@ -42,12 +43,16 @@ class Level(NamedTuple):
     """Weight of the landmarks."""
 
 
-LEVELS = (Level(3.0, 4, 0.3), Level(1.5, 5, 0.1), Level(0.8, 8, 0.05))
+LEVELS = (Level(5.0, 4, 0.3), Level(2.5, 4, 0.1), Level(1.2, 4, 0.05), Level(0.7, 6, 0.05))
 SHARPEST = 0.7
+"""Least blur, pixels."""
 WIDE_MM = 6.0
 """Blur that is subtracted from the images."""
-COLOUR_WEIGHT = 0.2
-"""Weight of an observation beside landmarks; those of neighbouring points share their error."""
+LANDMARK_WEIGHT, COLOUR_WEIGHT = 0.005, 0.1
+"""Weights of a landmark and of a colour beside the prior. They are small because errors of landmarks are the same at all
+timesteps and those of neighbouring points alike, so that sums over them claim too much."""
+SHAPE_SPREAD = 0.3
+"""Standard deviation of the prior of the identity coefficients; less than 1 for the same reason."""
 
 
 class Samples(NamedTuple):
@@ -108,7 +113,7 @@ class Fitter:
         coefficients = [1.0] * columns.expression_size + [0.5] * columns.eyelid_size
         return Prior(
             np.array([*ANGLE_SPREAD, *free, *coefficients]),
-            np.full(self.head.shape_basis.shape[2], 0.0 if keep_shape else 1.0),
+            np.full(self.head.shape_basis.shape[2], 0.0 if keep_shape else SHAPE_SPREAD),
         )
 
     def start(self, shape: FloatArray | None = None) -> State:
@@ -183,8 +188,8 @@ class Fitter:
         rig, prior = self.landmark_rig(), self._prior(keep_shape)
         still = Prior(np.where(np.isinf(prior.pose), np.inf, 0.0), np.zeros(len(prior.shape)))
         for step in range(rigid + steps):
-            equations = NormalEquations(*state.poses.shape, len(state.shape))
-            self.add_landmarks(equations, rig, state, 1.0)
+            equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
+            self.add_landmarks(equations, rig, state, LANDMARK_WEIGHT)
             state = equations.step(state, still if step < rigid else prior, 1e-3)
         return state
 
@@ -214,8 +219,8 @@ class Fitter:
             samples = self._observations(state, mesh, vertices)
             for _ in range(level.steps):
                 progress(done, total, f"blur of {level.blur:g} mm")
-                equations = NormalEquations(*state.poses.shape, len(state.shape))
-                landmarks = self.add_landmarks(equations, marks, state, level.landmarks)
+                equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
+                landmarks = self.add_landmarks(equations, marks, state, LANDMARK_WEIGHT * level.landmarks)
                 colours = self._add_colours(equations, rig, state, stack, samples)
                 state = equations.step(state, prior)
                 done += 1
@@ -245,7 +250,7 @@ class Fitter:
         bounds = np.searchsorted(samples.frame, np.arange(len(state.poses) + 1) * cameras)
         posed = [rig.points(state.shape, pose) for pose in state.poses]
         sampled = []
-        for row, (start, end) in enumerate(zip(bounds, bounds[1:])):
+        for row, (start, end) in enumerate(pairwise(bounds)):
             frame, point = samples.frame[start:end], samples.point[start:end]
             projected = self.views.project(posed[row][point], frame - row * cameras)
             values, gradients = stack.sample(frame, projected.pixels)
@@ -255,7 +260,7 @@ class Fitter:
         residual = values - texture[samples.point]
         difference = np.zeros(len(state.poses))
         weight = COLOUR_WEIGHT * robust
-        for row, (start, end) in enumerate(zip(bounds, bounds[1:])):
+        for row, (start, end) in enumerate(pairwise(bounds)):
             gap, by_point = residual[start:end], sampled[row][1]  # (n, 3), (n, 3, 3): channel, axis
             weighted = weight[start:end, None, None] * by_point
             curvature = np.einsum("nci,ncj->nij", weighted, by_point).reshape(-1, 9)

@@ -30,7 +30,7 @@ class FrameStack:
         The difference contains less of slow changes such as shading, which turns with the head.
         """
         for start, image in zip(self._starts, self._images):
-            levels = image.astype(np.float32) * np.float32(_LEVELS / 255)
+            levels: FloatArray = image.astype(np.float32) * np.float32(_LEVELS / 255)
             if sigma > 0:
                 levels = cv2.GaussianBlur(levels, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
             if wide > 0:
