@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -21,6 +21,8 @@ ANGLE_SPREAD = (np.inf,) * 3 + (0.15,) * 3 + (0.3, 0.03, 0.02) + (0.2, 0.3, 0.02
 """Standard deviations of the angles: rotation free, neck, jaw (which opens), eyes; radians."""
 LANDMARK_MM = 2.5
 """Expected error of a landmark."""
+ROBUST = 8.0
+"""Multiple of it at which the weight of a landmark is a quarter."""
 MISTAKEN_MM = 25.0
 """Median distance from which the landmarks of an image are left out."""
 PARTS = (
@@ -40,10 +42,18 @@ class Level(NamedTuple):
     """Standard deviation on the head, millimetres; at least `SHARPEST` pixels."""
     steps: int
     landmarks: float
-    """Weight of the landmarks."""
+    """Factor of the weight of the landmarks."""
+    tolerance: float
+    """Squared difference of colours at which a weight is a quarter, relative to the usual one."""
 
 
-LEVELS = (Level(5.0, 4, 0.3), Level(2.5, 4, 0.1), Level(1.2, 4, 0.05), Level(0.7, 6, 0.05))
+LEVELS = (
+    Level(5.0, 4, 0.3, 64.0),
+    Level(2.5, 5, 0.1, 32.0),
+    Level(1.2, 5, 0.05, 16.0),
+    Level(0.7, 6, 0.05, 4.0),
+)
+"""From coarse to fine. A narrow tolerance at the coarse ones would leave out the colours of what moves most."""
 SHARPEST = 0.7
 """Least blur, pixels."""
 WIDE_MM = 6.0
@@ -171,9 +181,9 @@ class Fitter:
             )
             square = (gap**2).sum(axis=2)
             # All landmarks of an image may be wrong, where a network takes something else for a face.
-            apart = np.nanmedian(np.where(found, np.sqrt(square) / sigma, np.nan), axis=1, keepdims=True)
-            found &= apart < MISTAKEN_MM / LANDMARK_MM
-            robust = found * weight / (sigma * (1 + square / (9 * sigma**2))) ** 2
+            apart = np.sqrt(square) / sigma < MISTAKEN_MM / LANDMARK_MM
+            found &= ((found & apart).sum(axis=1) > found.sum(axis=1) / 2)[:, None]
+            robust = found * weight / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
             distance[row] = np.sqrt((found * square).sum() / max(found.sum(), 1))
             weighted = robust[..., None, None] * projected.derivative
             curvature = np.einsum("cpki,cpkj->pij", weighted, projected.derivative)
@@ -213,7 +223,7 @@ class Fitter:
         marks, prior = self.landmark_rig(), self._prior(keep_shape)
         scale = self._pixels_per_millimetre(mesh, state)
         total, done = sum(level.steps for level in LEVELS), 0
-        landmarks = colours = np.zeros(len(state.poses))
+        landmarks = colours = cast(FloatArray, np.zeros(len(state.poses)))
         for level in LEVELS:
             stack.filter(max(SHARPEST, level.blur * scale), WIDE_MM * scale)
             samples = self._observations(state, mesh, vertices)
@@ -221,7 +231,7 @@ class Fitter:
                 progress(done, total, f"blur of {level.blur:g} mm")
                 equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
                 landmarks = self.add_landmarks(equations, marks, state, LANDMARK_WEIGHT * level.landmarks)
-                colours = self._add_colours(equations, rig, state, stack, samples)
+                colours = self._add_colours(equations, rig, state, stack, samples, level.tolerance)
                 state = equations.step(state, prior)
                 done += 1
         return Fitted(state, landmarks, colours)
@@ -243,7 +253,13 @@ class Fitter:
         return Samples(np.concatenate(frames), np.concatenate(points), np.concatenate(weights))
 
     def _add_colours(
-        self, equations: NormalEquations, rig: PointRig, state: State, stack: FrameStack, samples: Samples
+        self,
+        equations: NormalEquations,
+        rig: PointRig,
+        state: State,
+        stack: FrameStack,
+        samples: Samples,
+        tolerance: float,
     ) -> FloatArray:
         """Add the colours to the equations; return their median difference at each timestep, (T,) 8-bit levels."""
         cameras = len(self.views.cameras)
@@ -256,7 +272,7 @@ class Fitter:
             values, gradients = stack.sample(frame, projected.pixels)
             sampled.append((values, gradients @ projected.derivative.astype(np.float32)))
         values = np.concatenate([part[0] for part in sampled])
-        texture, robust = _texture(values, samples, len(posed[0]))
+        texture, robust = _texture(values, samples, len(posed[0]), tolerance)
         residual = values - texture[samples.point]
         difference = np.zeros(len(state.poses))
         weight = COLOUR_WEIGHT * robust
@@ -274,10 +290,9 @@ class Fitter:
         return difference
 
 
-_SPREAD = 4.0  # squared difference at which a weight is a quarter, relative to the usual one
-
-
-def _texture(values: FloatArray, samples: Samples, points: int) -> tuple[FloatArray, FloatArray]:
+def _texture(
+    values: FloatArray, samples: Samples, points: int, tolerance: float
+) -> tuple[FloatArray, FloatArray]:
     """Robust colour of every point (P, 3) and the Geman-McClure weight of every observation (n,), over its variance."""
     weight = samples.weight.astype(np.float32)
     robust = weight
@@ -288,6 +303,6 @@ def _texture(values: FloatArray, samples: Samples, points: int) -> tuple[FloatAr
         square = ((values - texture[samples.point]) ** 2).sum(axis=1)
         # Points whose colour changes with light or expression count less than those whose colour stays.
         own = np.bincount(samples.point, robust * square, points) / total
-        scale = _SPREAD * np.maximum(own, max(float(np.median(square)), 1e-5))[samples.point]
+        scale = tolerance * np.maximum(own, max(float(np.median(square)), 1e-5))[samples.point]
         robust = weight / (1 + square / scale) ** 2
     return texture.astype(np.float32), (3 * robust / scale).astype(np.float32)

@@ -30,11 +30,11 @@ class FrameStack:
         The difference contains less of slow changes such as shading, which turns with the head.
         """
         for start, image in zip(self._starts, self._images):
-            levels: FloatArray = image.astype(np.float32) * np.float32(_LEVELS / 255)
+            levels = np.asarray(image * np.float32(_LEVELS / 255), np.float32)
             if sigma > 0:
-                levels = cv2.GaussianBlur(levels, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+                levels = _blurred(levels, sigma)
             if wide > 0:
-                levels = levels - cv2.GaussianBlur(levels, (0, 0), wide, borderType=cv2.BORDER_REPLICATE)
+                levels = levels - _blurred(levels, wide)
             flat = levels.reshape(-1, 3)
             self._pixels[start : start + len(flat)] = np.round(flat)
 
@@ -60,3 +60,7 @@ class FrameStack:
 
 
 _LEVELS = 16384.0  # of stored values, so that blurred images are not rounded to 8 bits
+
+
+def _blurred(levels: FloatArray, sigma: float) -> FloatArray:
+    return np.asarray(cv2.GaussianBlur(levels, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE))

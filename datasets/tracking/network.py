@@ -225,7 +225,8 @@ class NetworkLandmarks:
             near = None
             for row, timestep in enumerate(timesteps):
                 image = self._clip.image(self._keys[timestep, name])
-                for tried in (near, None) if near is not None else (None,):
+                trials: list[FloatArray | None] = [None] if near is None else [near, None]
+                for tried in trials:
                     near = self._network.find(image, tried)
                     facing = None if near is None else self._facing(near[self._embedding.landmarks], column)
                     if near is not None and facing is not None:
