@@ -30,7 +30,7 @@ class FrameStack:
         The difference contains less of slow changes such as shading, which turns with the head.
         """
         for start, image in zip(self._starts, self._images):
-            levels = np.asarray(image * np.float32(_LEVELS / 255), np.float32)
+            levels: FloatArray = np.asarray(image * np.float32(_LEVELS / 255), np.float32)
             if sigma > 0:
                 levels = _blurred(levels, sigma)
             if wide > 0:

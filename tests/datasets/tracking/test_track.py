@@ -1,0 +1,136 @@
+"""The tracker on pictures of a known mesh: how near it comes, and what it refuses."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.tracking.errors import mesh_errors
+from headbench.datasets.tracking.fit import Fitter
+from headbench.datasets.tracking.landmarks import known_rig_landmarks, spread_vertices
+from headbench.datasets.tracking.rig import PoseColumns
+from headbench.datasets.tracking.track import track
+from headbench.datasets.tracking.views import Views
+
+
+@pytest.fixture(scope="module")
+def clip(patterned_capture):
+    return read_capture(patterned_capture.union)
+
+
+def source(clip, cameras, seed=0):
+    return partial(known_rig_landmarks, clip, cameras, seed=seed)
+
+
+def skin_errors(tracked, exact):
+    """Errors of the vertices that face the cameras, found by height and depth on the template."""
+    template = np.asarray(exact.head.template)
+    front = np.flatnonzero((template[:, 2] > 0.03) & (np.abs(template[:, 1]) < 0.07))
+    front = np.setdiff1d(front, exact.head.regions["teeth"])
+    poses = sorted(exact.poses)
+    found, wanted = (PosedSubject.of(one).meshes([one.poses[t] for t in poses]) for one in (tracked, exact))
+    turns = PosedSubject.of(exact).motions([exact.poses[t] for t in poses])[:, :3, :3]
+    return mesh_errors(found[:, front], wanted[:, front], turns)
+
+
+def by_landmarks(clip, cameras):
+    """The clip as landmarks alone track it."""
+    timesteps = sorted(clip.poses)
+    fitter = Fitter(
+        clip.head, Views([clip.cameras[name] for name in cameras]), source(clip, cameras)(timesteps)
+    )
+    state = fitter.fit_landmarks(fitter.start())
+    poses = PoseColumns.of(clip.head).poses(state.poses, clip.head, clip.subject, timesteps)
+    zeros = np.zeros_like(clip.static_offset)
+    return replace(clip, shape=state.shape, static_offset=zeros, poses=dict(zip(timesteps, poses)))
+
+
+def test_colours_correct_landmarks(clip):
+    cameras = [*clip.cameras]
+    before = skin_errors(by_landmarks(clip, cameras), clip)
+    tracked, report = track(clip, cameras, source(clip, cameras))
+    after = skin_errors(tracked, clip)
+    assert after.motion < 0.5 * before.motion
+    assert after.absolute < before.absolute
+    assert not tracked.static_offset.any()
+    assert [residual.timestep for residual in report.residuals] == sorted(clip.poses)
+    assert tracked.steps[-1].name == "track"
+
+
+def test_the_clips_own_tracking_is_not_used(clip):
+    cameras = [*clip.cameras]
+    landmarks = source(clip, cameras)(sorted(clip.poses))
+    wrong = {t: replace(p, jaw=np.ones(3), translation=np.full(3, 9.0)) for t, p in clip.poses.items()}
+    other = replace(clip, poses=wrong, shape=clip.shape + 5, static_offset=clip.static_offset + 1)
+    one, two = (track(each, cameras, lambda timesteps: landmarks).clip for each in (clip, other))
+    np.testing.assert_array_equal(one.shape, two.shape)
+    for timestep, pose in one.poses.items():
+        np.testing.assert_array_equal(pose.jaw, two.poses[timestep].jaw)
+
+
+def test_one_camera_is_enough(clip):
+    frontal = next(name for name in clip.cameras if name.endswith("37"))
+    views = Views([clip.cameras[frontal]])
+    timesteps, face = sorted(clip.poses), np.asarray(clip.head.regions["face"])
+
+    def places(one):
+        meshes = PosedSubject.of(one).meshes([one.poses[timestep] for timestep in timesteps])
+        return np.array([views.place(mesh[face])[0][0] for mesh in meshes])
+
+    tracked, landmarks = track(clip, [frontal], source(clip, [frontal])).clip, by_landmarks(clip, [frontal])
+    after, before = (np.linalg.norm(places(one) - places(clip), axis=2) for one in (tracked, landmarks))
+    assert after.mean() < 0.8 * before.mean()
+
+
+def test_blocks_share_the_shape(clip, monkeypatch):
+    monkeypatch.setattr("headbench.datasets.tracking.track.MOST_TIMESTEPS", 3)
+    cameras, asked = [*clip.cameras], []
+
+    def noted(timesteps):
+        asked.append([*timesteps])
+        return source(clip, cameras)(timesteps)
+
+    tracked, report = track(clip, cameras, noted)
+    assert [len(part) for part in asked] == [3, 2]
+    assert sorted(asked[0] + asked[1]) == sorted(tracked.poses) == [one.timestep for one in report.residuals]
+
+
+@pytest.mark.parametrize(("cameras", "found"), [([], "none"), (["nowhere"], "nowhere")])
+def test_cameras_that_are_missing_are_refused(clip, cameras, found):
+    with pytest.raises(InputError, match=f"cameras.*{found}"):
+        track(clip, cameras, source(clip, [*clip.cameras]))
+
+
+def test_no_landmarks_are_refused(clip):
+    def nothing(timesteps):
+        landmarks = source(clip, [*clip.cameras])(timesteps)
+        return landmarks._replace(pixels=np.full_like(landmarks.pixels, np.nan))
+
+    with pytest.raises(InputError, match="landmarks"):
+        track(clip, [*clip.cameras], nothing)
+
+
+def test_a_missing_frame_is_refused(clip):
+    key = min(clip.files)
+    files = {one: file for one, file in clip.files.items() if one != key}
+    with pytest.raises(InputError, match=f"timestep {key.timestep} of camera {key.camera}"):
+        track(replace(clip, files=files), [*clip.cameras], source(clip, [*clip.cameras]))
+
+
+def test_landmarks_are_seeded_and_wrong(clip):
+    cameras = [*clip.cameras]
+    one, two, other = (source(clip, cameras, seed)([0]).pixels for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one, two)
+    assert np.nanmedian(np.abs(one - other)) > 0.3
+
+
+def test_spread_points_are_far_apart():
+    points = np.random.default_rng(0).random((300, 3))
+    chosen = points[spread_vertices(points, 20)]
+    gaps = np.linalg.norm(chosen[:, None] - chosen, axis=2) + np.eye(20)
+    random = np.linalg.norm(points[:20, None] - points[:20], axis=2) + np.eye(20)
+    assert gaps.min() > 2 * random.min()
