@@ -167,7 +167,13 @@ class Fitter:
         return PointRig(self.head, self.landmarks.corners, self.landmarks.weights)
 
     def add_landmarks(
-        self, equations: NormalEquations, rig: PointRig, state: State, weight: float
+        self,
+        equations: NormalEquations,
+        rig: PointRig,
+        state: State,
+        weight: float,
+        *,
+        leave_out: bool = True,
     ) -> FloatArray:
         """Add the landmarks to the equations; return their root mean square distance at each timestep, (T,) pixels."""
         distance = np.zeros(len(state.poses))
@@ -181,8 +187,9 @@ class Fitter:
             )
             square = (gap**2).sum(axis=2)
             # All landmarks of an image may be wrong, where a network takes something else for a face.
-            apart = np.sqrt(square) / sigma < MISTAKEN_MM / LANDMARK_MM
-            found &= ((found & apart).sum(axis=1) > found.sum(axis=1) / 2)[:, None]
+            if leave_out:
+                near = np.sqrt(square) / sigma < MISTAKEN_MM / LANDMARK_MM
+                found &= ((found & near).sum(axis=1) > found.sum(axis=1) / 2)[:, None]
             robust = found * weight / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
             distance[row] = np.sqrt((found * square).sum() / max(found.sum(), 1))
             weighted = robust[..., None, None] * projected.derivative
@@ -192,14 +199,14 @@ class Fitter:
         return distance
 
     def fit_landmarks(
-        self, state: State, *, keep_shape: bool = False, steps: int = 10, rigid: int = 4
+        self, state: State, *, keep_shape: bool = False, steps: int = 10, rigid: int = 8
     ) -> State:
         """Steps on the landmarks alone, the first of the rigid pose only."""
         rig, prior = self.landmark_rig(), self._prior(keep_shape)
         still = Prior(np.where(np.isinf(prior.pose), np.inf, 0.0), np.zeros(len(prior.shape)))
         for step in range(rigid + steps):
             equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
-            self.add_landmarks(equations, rig, state, LANDMARK_WEIGHT)
+            self.add_landmarks(equations, rig, state, LANDMARK_WEIGHT, leave_out=step >= rigid)
             state = equations.step(state, still if step < rigid else prior, 1e-3)
         return state
 
