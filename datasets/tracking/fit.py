@@ -11,6 +11,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from ...bench.contracts import FloatArray, HeadAsset, IntArray, Progress, no_progress
+from ...bench.errors import InputError
 from .images import FrameStack
 from .landmarks import Landmarks, spread_vertices
 from .rig import PointRig, PoseColumns
@@ -74,7 +75,7 @@ class Samples(NamedTuple):
 
 
 def sampled_vertices(head: HeadAsset) -> IntArray:
-    """Vertices whose colours are compared, spread over the regions `PARTS` that the head has."""
+    """Vertices whose colours are compared, spread over the regions `PARTS`. Raises `InputError` if the head has none of them."""
     hidden = [
         np.asarray(head.regions.get(name, ()), np.int64) for name in ("mouth_socket", "teeth", "boundary")
     ]
@@ -85,6 +86,9 @@ def sampled_vertices(head: HeadAsset) -> IntArray:
         if len(members):
             chosen.append(members[spread_vertices(np.asarray(head.template)[members], count)])
             taken = np.concatenate([taken, members])
+    if not chosen:
+        names = ", ".join(name for name, _ in PARTS)
+        raise InputError(f"head model {head.version!r}", "regions", f"one of {names}", "none")
     return np.unique(np.concatenate(chosen))
 
 

@@ -109,11 +109,7 @@ class LandmarkNetwork:
 
     def _run(self, image: ByteArray, crop: _Crop) -> tuple[FloatArray, float]:
         """Landmarks, and the logit of the probability that the crop shows a face."""
-        turn = (
-            crop.side
-            / self._side
-            * np.array([[np.cos(crop.angle), -np.sin(crop.angle)], [np.sin(crop.angle), np.cos(crop.angle)]])
-        )
+        turn = crop.side / self._side * _turn(crop.angle)
         to_image = np.concatenate([turn, (crop.middle - turn @ np.full(2, self._side / 2))[:, None]], axis=1)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         shift = to_image.copy()
@@ -144,12 +140,15 @@ def _candidates(image: ByteArray) -> list[_Crop]:
 
 
 def _crop_around(landmarks: FloatArray) -> _Crop:
-    left, right = landmarks[CORNERS[0]], landmarks[CORNERS[1]]
-    angle = float(np.arctan2(*(right - left)[::-1]))
-    level = landmarks @ np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    along = landmarks[CORNERS[1]] - landmarks[CORNERS[0]]
+    angle = float(np.arctan2(along[1], along[0]))
+    level = landmarks @ _turn(angle)
     low, high = level.min(axis=0), level.max(axis=0)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    return _Crop(turn @ ((low + high) / 2), CROP * float((high - low).max()), angle)
+    return _Crop(_turn(angle) @ ((low + high) / 2), CROP * float((high - low).max()), angle)
+
+
+def _turn(angle: float) -> FloatArray:
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 class Embedding(NamedTuple):

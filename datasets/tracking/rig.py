@@ -90,6 +90,14 @@ class _Joints:
     shifts_by_coefficient: FloatArray  # (J, 3, E + S)
 
 
+class _Posed(NamedTuple):
+    points: FloatArray
+    unposed: FloatArray  # (P, 3)
+    turns: FloatArray  # (P, 3, 3) mixed rotations
+    joints: _Joints
+    derivatives: FloatArray  # (J, 3, 3, 3) of the local rotations
+
+
 class PointRig:
     """P points on a head model.
 
@@ -135,20 +143,12 @@ class PointRig:
 
     def points(self, shape: FloatArray, pose: FloatArray) -> FloatArray:
         """(P, 3) points in the world, metres, of shape (S,) and pose (D,)."""
-        coefficients = self._coefficients(shape, pose)
-        joints, rotations, _ = self._motions(coefficients, pose)
-        unposed = self._unposed(coefficients, rotations)
-        turns, shifts = self._blended(joints)
-        return self._moved(unposed, turns, shifts, joints, pose)
+        return self._posed(shape, pose).points
 
     def linearised(self, shape: FloatArray, pose: FloatArray) -> PosedPoints:
         """Points and their derivatives for shape (S,) and pose (D,)."""
         columns, expressions = self.columns, self.columns.expression_size
-        coefficients = self._coefficients(shape, pose)
-        joints, rotations, derivatives = self._motions(coefficients, pose)
-        unposed = self._unposed(coefficients, rotations)
-        turns, shifts = self._blended(joints)
-        points = self._moved(unposed, turns, shifts, joints, pose)
+        points, unposed, turns, joints, derivatives = self._posed(shape, pose)
         count = len(points)
 
         linear = turns @ self._basis
@@ -179,29 +179,20 @@ class PointRig:
             by_pose[:, :, :6] += np.einsum("kij,pj->pik", turned, closed)
         return PosedPoints(points, by_pose, linear[:, :, expressions:])
 
-    def _coefficients(self, shape: FloatArray, pose: FloatArray) -> FloatArray:
-        start = ANGLES + 3
-        return np.concatenate([pose[start : start + self.columns.expression_size], shape])
-
-    def _unposed(self, coefficients: FloatArray, rotations: FloatArray) -> FloatArray:
-        feature = (rotations[1:] - np.eye(3)).ravel().astype(self._dtype)
-        blend = self._basis @ coefficients.astype(self._dtype) + self._correctives @ feature
-        return self._template.astype(self._dtype) + blend
-
-    def _blended(self, joints: _Joints) -> tuple[FloatArray, FloatArray]:
-        turns = (self._skin @ joints.turns.reshape(JOINTS, 9).astype(self._dtype)).reshape(-1, 3, 3)
-        return turns, self._skin @ joints.shifts.astype(self._dtype)
-
-    def _moved(
-        self, unposed: FloatArray, turns: FloatArray, shifts: FloatArray, joints: _Joints, pose: FloatArray
-    ) -> FloatArray:
-        moved = (
-            (turns @ unposed[..., None])[..., 0] + shifts + pose[self.columns.translation].astype(self._dtype)
-        )
+    def _posed(self, shape: FloatArray, pose: FloatArray) -> _Posed:
+        start, kind = ANGLES + 3, self._dtype
+        coefficients = np.concatenate([pose[start : start + self.columns.expression_size], shape])
+        joints, rotations, derivatives = self._motions(coefficients, pose)
+        feature = (rotations[1:] - np.eye(3)).ravel().astype(kind)
+        blend = self._basis @ coefficients.astype(kind) + self._correctives @ feature
+        unposed = self._template.astype(kind) + blend
+        turns = (self._skin @ joints.turns.reshape(JOINTS, 9).astype(kind)).reshape(-1, 3, 3)
+        shifts = self._skin @ joints.shifts.astype(kind) + pose[self.columns.translation].astype(kind)
+        points = (turns @ unposed[..., None])[..., 0] + shifts
         if self._lids is not None:
-            closed = self._lids @ pose[self.columns.size - self.columns.eyelid_size :].astype(self._dtype)
-            moved = moved + closed @ joints.turns[1].T.astype(self._dtype)
-        return moved
+            closed = self._lids @ pose[self.columns.size - self.columns.eyelid_size :].astype(kind)
+            points = points + closed @ joints.turns[1].T.astype(kind)
+        return _Posed(points, unposed, turns, joints, derivatives)
 
     def _motions(self, coefficients: FloatArray, pose: FloatArray) -> tuple[_Joints, FloatArray, FloatArray]:
         """Motions of the joints, their local rotations (J, 3, 3) and the derivatives of these (J, 3, 3, 3)."""

@@ -48,8 +48,7 @@ class TrackingReport:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values: the summary, and every timestep."""
-        rows = [residual._asdict() for residual in self.residuals]
-        return {**asdict(self), "residuals": rows, **self.summary()}
+        return {**asdict(self), "residuals": [one._asdict() for one in self.residuals], **self.summary()}
 
     def summary(self) -> dict[str, float]:
         """Means over the timesteps."""
