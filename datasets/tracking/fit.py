@@ -42,8 +42,6 @@ class Level(NamedTuple):
     blur: float
     """Standard deviation on the head, millimetres; at least `SHARPEST` pixels."""
     steps: int
-    landmarks: float
-    """Factor of the weight of the landmarks."""
     tolerance: float
     """Squared difference of colours at which a weight is a quarter, relative to the usual one."""
 
@@ -175,7 +173,6 @@ class Fitter:
         equations: NormalEquations,
         rig: PointRig,
         state: State,
-        weight: float,
         *,
         leave_out: bool = True,
     ) -> FloatArray:
@@ -194,7 +191,7 @@ class Fitter:
             if leave_out:
                 near = np.sqrt(square) / sigma < MISTAKEN_MM / LANDMARK_MM
                 found &= ((found & near).sum(axis=1) > found.sum(axis=1) / 2)[:, None]
-            robust = found * weight / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
+            robust = found * LANDMARK_WEIGHT / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
             distance[row] = np.sqrt((found * square).sum() / max(found.sum(), 1))
             weighted = robust[..., None, None] * projected.derivative
             curvature = np.einsum("cpki,cpkj->pij", weighted, projected.derivative)
@@ -210,7 +207,7 @@ class Fitter:
         still = Prior(np.where(np.isinf(prior.pose), np.inf, 0.0), np.zeros(len(prior.shape)))
         for step in range(rigid + steps):
             equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
-            self.add_landmarks(equations, rig, state, LANDMARK_WEIGHT, leave_out=step >= rigid)
+            self.add_landmarks(equations, rig, state, leave_out=step >= rigid)
             state = equations.step(state, still if step < rigid else prior, 1e-3)
         return state
 
@@ -241,7 +238,7 @@ class Fitter:
             for _ in range(level.steps):
                 progress(done, total, f"blur of {level.blur:g} mm")
                 equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
-                landmarks = self.add_landmarks(equations, marks, state, LANDMARK_WEIGHT * level.landmarks)
+                landmarks = self.add_landmarks(equations, marks, state)
                 colours = self._add_colours(equations, rig, state, stack, samples, level.tolerance)
                 state = equations.step(state, prior)
                 done += 1
