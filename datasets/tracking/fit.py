@@ -47,10 +47,10 @@ class Level(NamedTuple):
 
 
 LEVELS = (
-    Level(5.0, 4, 0.3, 64.0),
-    Level(2.5, 5, 0.1, 32.0),
-    Level(1.2, 5, 0.05, 16.0),
-    Level(0.7, 6, 0.05, 4.0),
+    Level(5.0, 4, 64.0),
+    Level(2.5, 5, 32.0),
+    Level(1.2, 5, 16.0),
+    Level(0.7, 6, 4.0),
 )
 """From coarse to fine. A narrow tolerance at the coarse ones would leave out the colours of what moves most."""
 SHARPEST = 0.7
