@@ -17,7 +17,7 @@ from .settings import TrackSettings
 
 if TYPE_CHECKING:
     from ..clip import CaptureClip
-    from .errors import RegionError
+    from ..tracking_errors import RegionError
     from .track import LandmarkSource, Tracked
 
 REPORT, PICTURE = "track.json", "overlay.png"
@@ -34,7 +34,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     from ..clip import check_apart
     from ..head.refit.rewrite import capture_plan, write_capture
     from ..images import write_image
-    from .errors import tracking_errors
+    from ..tracking_errors import tracking_errors
     from .track import track
 
     if bool(settings.landmarks) != bool(settings.embedding):

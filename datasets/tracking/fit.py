@@ -74,10 +74,8 @@ class Samples(NamedTuple):
 
 def sampled_vertices(head: HeadAsset) -> IntArray:
     """Vertices whose colours are compared, spread over the regions `PARTS`. Raises `InputError` if the head has none of them."""
-    hidden = [
-        np.asarray(head.regions.get(name, ()), np.int64) for name in ("mouth_socket", "teeth", "boundary")
-    ]
-    taken = np.concatenate(hidden)
+    inner = ("mouth_socket", "teeth", "boundary")
+    taken = np.concatenate([np.asarray(head.regions.get(name, ()), np.int64) for name in inner])
     chosen = []
     for name, count in PARTS:
         members = np.setdiff1d(head.regions.get(name, ()), taken).astype(np.int64)
@@ -102,31 +100,21 @@ class Fitted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Fitter:
-    """Data of a fit that does not change.
-
-    Attributes
-    ----------
-    head : HeadAsset
-        Head model.
-    views : Views
-        C cameras.
-    landmarks : Landmarks
-        Landmarks of T timesteps.
-    """
+    """Data of a fit that does not change."""
 
     head: HeadAsset
     views: Views
+    """C cameras."""
     landmarks: Landmarks
+    """Landmarks of T timesteps."""
 
     def _prior(self, keep_shape: bool) -> Prior:
         """Weak prior of all parameters."""
         columns = PoseColumns.of(self.head)
         free = [np.inf] * 3
         coefficients = [1.0] * columns.expression_size + [0.5] * columns.eyelid_size
-        return Prior(
-            np.array([*ANGLE_SPREAD, *free, *coefficients]),
-            np.full(self.head.shape_basis.shape[2], 0.0 if keep_shape else SHAPE_SPREAD),
-        )
+        shape = np.full(self.head.shape_basis.shape[2], 0.0 if keep_shape else SHAPE_SPREAD)
+        return Prior(np.array([*ANGLE_SPREAD, *free, *coefficients]), shape)
 
     def start(self, shape: FloatArray | None = None) -> State:
         """A shape, by default the mean, in the rigid pose of the landmarks of one camera at each timestep.
@@ -158,9 +146,8 @@ class Fitter:
 
     def _rigid(self, rest: FloatArray, pixels: FloatArray, camera: int) -> tuple[FloatArray, FloatArray]:
         """Rotation (3, 3) and shift (3,) that take points to the world such that they project onto pixels."""
-        _, turn, shift = cv2.solvePnP(
-            rest, pixels, self.views.intrinsics[camera], None, flags=cv2.SOLVEPNP_SQPNP
-        )
+        K = self.views.intrinsics[camera]
+        _, turn, shift = cv2.solvePnP(rest, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
         back = self.views.rotations[camera].T
         return back @ cv2.Rodrigues(turn)[0], back @ (shift[:, 0] - self.views.shifts[camera])
 
@@ -169,12 +156,7 @@ class Fitter:
         return PointRig(self.head, self.landmarks.corners, self.landmarks.weights)
 
     def add_landmarks(
-        self,
-        equations: NormalEquations,
-        rig: PointRig,
-        state: State,
-        *,
-        leave_out: bool = True,
+        self, equations: NormalEquations, rig: PointRig, state: State, leave_out: bool = True
     ) -> FloatArray:
         """Add the landmarks to the equations; return their root mean square distance at each timestep, (T,) pixels."""
         distance = np.zeros(len(state.poses))
@@ -183,9 +165,8 @@ class Fitter:
             projected = self.views.project(posed.points)
             found = np.isfinite(pixels[..., 0])
             gap = np.where(found[..., None], pixels - projected.pixels, 0.0)
-            sigma = (
-                1e-3 * LANDMARK_MM * self.views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
-            )
+            per_metre = self.views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
+            sigma = 1e-3 * LANDMARK_MM * per_metre
             square = (gap**2).sum(axis=2)
             # All landmarks of an image may be wrong, where a network takes something else for a face.
             if leave_out:

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...bench.contracts import FloatArray, HeadAsset, IntArray
-from ...bench.errors import InputError
 from ..clip import CaptureClip
+from ..head.arrays import region
 from ..head.subject import PosedSubject
 from .views import Occlusion, Views
 
@@ -20,7 +20,6 @@ COMMON = 0.5
 """Part of the variance of the bias that is the same in all cameras, as of a network that places a landmark wrongly on the face."""
 COUNT = 160
 """Landmarks of a known rig."""
-_RAYS = 4  # a landmark is fitted where its normal is within 60 degrees of the direction to the camera
 _SHARES = (("lips", 0.2), ("eye_region", 0.3), ("face", 0.5))
 
 
@@ -50,19 +49,11 @@ def rig_vertices(head: HeadAsset) -> IntArray:
 
     Raises `InputError` if the head model has no face region.
     """
-    if not len(head.regions.get("face", ())):
-        raise InputError(
-            f"head model {head.version!r}",
-            "regions",
-            "a region face",
-            ", ".join(sorted(head.regions)) or "none",
-        )
+    region(head, "face")
     taken: list[IntArray] = []
-    inner = np.concatenate(
-        [np.asarray(head.regions.get(name, ()), np.int64) for name in ("mouth_socket", "teeth")]
-    )
+    hidden = [np.asarray(head.regions.get(name, ()), np.int64) for name in ("mouth_socket", "teeth")]
     for name, share in _SHARES:
-        members = np.setdiff1d(head.regions.get(name, ()), np.concatenate([inner, *taken])).astype(np.int64)
+        members = np.setdiff1d(head.regions.get(name, ()), np.concatenate([*hidden, *taken])).astype(np.int64)
         if len(members):
             taken.append(members[spread_vertices(np.asarray(head.template)[members], round(share * COUNT))])
     return np.unique(np.concatenate(taken))

@@ -119,9 +119,8 @@ class LandmarkNetwork:
         self._network.set_tensor(self._input["index"], pixels[None].astype(np.float32) / 255)
         self._network.invoke()
         found = self._network.get_tensor(self._landmarks["index"]).reshape(COUNT, 3)[:, :2].astype(np.float64)
-        return found @ turn.T + to_image[:, 2], float(
-            self._network.get_tensor(self._score["index"]).ravel()[0]
-        )
+        score = float(self._network.get_tensor(self._score["index"]).ravel()[0])
+        return found @ turn.T + to_image[:, 2], score
 
 
 COUNT = 468

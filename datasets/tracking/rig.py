@@ -43,11 +43,6 @@ class PoseColumns(NamedTuple):
         """Columns of the translation, metres."""
         return slice(ANGLES, ANGLES + 3)
 
-    @property
-    def coefficients(self) -> slice:
-        """Columns of expression and eyelids."""
-        return slice(ANGLES + 3, self.size)
-
     def poses(
         self, values: FloatArray, head: HeadAsset, subject: str, timesteps: Sequence[int]
     ) -> list[HeadPose]:

@@ -9,17 +9,23 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.subject import PosedSubject
-from headbench.datasets.tracking.errors import mesh_errors
 from headbench.datasets.tracking.fit import Fitter
 from headbench.datasets.tracking.landmarks import known_rig_landmarks, spread_vertices
 from headbench.datasets.tracking.rig import PoseColumns
 from headbench.datasets.tracking.track import track
 from headbench.datasets.tracking.views import Views
+from headbench.datasets.tracking_errors import mesh_errors
 
 
 @pytest.fixture(scope="module")
 def clip(patterned_capture):
     return read_capture(patterned_capture.union)
+
+
+@pytest.fixture(scope="module")
+def tracked(clip):
+    """The clip as the tracker sees it with all cameras."""
+    return track(clip, [*clip.cameras], source(clip, [*clip.cameras]))
 
 
 def source(clip, cameras, seed=0):
@@ -47,27 +53,24 @@ def by_landmarks(clip, cameras):
     return replace(clip, shape=state.shape, static_offset=zeros, poses=dict(zip(timesteps, poses)))
 
 
-def test_colours_correct_landmarks(clip):
-    cameras = [*clip.cameras]
-    before = skin_errors(by_landmarks(clip, cameras), clip)
-    tracked, report = track(clip, cameras, source(clip, cameras))
-    after = skin_errors(tracked, clip)
+def test_colours_correct_landmarks(clip, tracked):
+    before, after = skin_errors(by_landmarks(clip, [*clip.cameras]), clip), skin_errors(tracked.clip, clip)
     assert after.motion < 0.5 * before.motion
     assert after.absolute < before.absolute
-    assert not tracked.static_offset.any()
-    assert [residual.timestep for residual in report.residuals] == sorted(clip.poses)
-    assert tracked.steps[-1].name == "track"
+    assert not tracked.clip.static_offset.any()
+    assert [residual.timestep for residual in tracked.report.residuals] == sorted(clip.poses)
+    assert tracked.clip.steps[-1].name == "track"
 
 
-def test_the_clips_own_tracking_is_not_used(clip):
+def test_the_clips_own_tracking_is_not_used(clip, tracked):
     cameras = [*clip.cameras]
     landmarks = source(clip, cameras)(sorted(clip.poses))
     wrong = {t: replace(p, jaw=np.ones(3), translation=np.full(3, 9.0)) for t, p in clip.poses.items()}
     other = replace(clip, poses=wrong, shape=clip.shape + 5, static_offset=clip.static_offset + 1)
-    one, two = (track(each, cameras, lambda timesteps: landmarks).clip for each in (clip, other))
-    np.testing.assert_array_equal(one.shape, two.shape)
-    for timestep, pose in one.poses.items():
-        np.testing.assert_array_equal(pose.jaw, two.poses[timestep].jaw)
+    found = track(other, cameras, lambda timesteps: landmarks).clip
+    np.testing.assert_array_equal(found.shape, tracked.clip.shape)
+    for timestep, pose in found.poses.items():
+        np.testing.assert_array_equal(pose.jaw, tracked.clip.poses[timestep].jaw)
 
 
 def test_one_camera_is_enough(clip):
@@ -79,8 +82,8 @@ def test_one_camera_is_enough(clip):
         meshes = PosedSubject.of(one).meshes([one.poses[timestep] for timestep in timesteps])
         return np.array([views.place(mesh[face])[0][0] for mesh in meshes])
 
-    tracked, landmarks = track(clip, [frontal], source(clip, [frontal])).clip, by_landmarks(clip, [frontal])
-    gaps = [places(one) - places(clip) for one in (tracked, landmarks)]
+    single = track(clip, [frontal], source(clip, [frontal])).clip
+    gaps = [places(one) - places(clip) for one in (single, by_landmarks(clip, [frontal]))]
     after, before = (np.linalg.norm(gap - gap.mean(axis=0), axis=2).mean() for gap in gaps)
     assert after < 0.7 * before
 

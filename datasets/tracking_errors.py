@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...bench.contracts import Clip, FloatArray, HeadAsset, IntArray
-from ...bench.errors import InputError
-from ..head.geometry import fit_sphere
-from ..head.subject import PosedSubject
+from ..bench.contracts import Clip, FloatArray, HeadAsset, IntArray
+from ..bench.errors import InputError
+from .head.geometry import fit_sphere
+from .head.subject import PosedSubject
 
 LID_REACH = 1.25
 """Lids are the skin within this many radii of an eyeball's centre."""

@@ -7,9 +7,9 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.tracking.errors import error_regions, mesh_errors, tracking_errors
+from headbench.datasets.tracking_errors import error_regions, mesh_errors, tracking_errors
 
-from ..head.toy import toy_head
+from .head.toy import toy_head
 
 
 def test_a_shift_is_absolute_only():
