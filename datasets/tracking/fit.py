@@ -13,9 +13,9 @@ from scipy.sparse import csr_array
 from ...bench.contracts import FloatArray, HeadAsset, IntArray, Progress, no_progress
 from ...bench.errors import InputError
 from .images import FrameStack
-from .landmarks import Landmarks, spread_vertices
+from .landmarks import ImageLandmarks, spread_vertices
 from .rig import PointRig, PoseColumns
-from .solve import NormalEquations, Prior, State
+from .solve import HeadPrior, HeadState, NormalEquations
 from .views import Occlusion, Views
 
 ANGLE_SPREAD = (np.inf,) * 3 + (0.15,) * 3 + (0.3, 0.03, 0.02) + (0.2, 0.3, 0.02) * 2
@@ -36,7 +36,7 @@ PARTS = (
 _TRIED, _FEWEST = 4, 6  # cameras for the rigid pose, and landmarks of one
 
 
-class Level(NamedTuple):
+class BlurLevel(NamedTuple):
     """Steps at one blur of the images."""
 
     blur: float
@@ -47,10 +47,10 @@ class Level(NamedTuple):
 
 
 LEVELS = (
-    Level(5.0, 4, 64.0),
-    Level(2.5, 5, 32.0),
-    Level(1.2, 5, 16.0),
-    Level(0.7, 6, 4.0),
+    BlurLevel(5.0, 4, 64.0),
+    BlurLevel(2.5, 5, 32.0),
+    BlurLevel(1.2, 5, 16.0),
+    BlurLevel(0.7, 6, 4.0),
 )
 """From coarse to fine. A narrow tolerance at the coarse ones would leave out the colours of what moves most."""
 SHARPEST = 0.7
@@ -64,7 +64,7 @@ SHAPE_SPREAD = 0.3
 """Standard deviation of the prior of the identity coefficients; less than 1 for the same reason."""
 
 
-class Samples(NamedTuple):
+class Observations(NamedTuple):
     """Observed colours of points: n observations of all timesteps, in order."""
 
     frame: IntArray  # (n,) timestep x cameras + camera
@@ -91,7 +91,7 @@ def sampled_vertices(head: HeadAsset) -> IntArray:
 class Fitted(NamedTuple):
     """Result of a fit."""
 
-    state: State
+    state: HeadState
     landmarks: FloatArray
     """(T,) root mean square distance of the landmarks before the last step, pixels."""
     colours: FloatArray
@@ -105,18 +105,18 @@ class Fitter:
     head: HeadAsset
     views: Views
     """C cameras."""
-    landmarks: Landmarks
+    landmarks: ImageLandmarks
     """Landmarks of T timesteps."""
 
-    def _prior(self, keep_shape: bool) -> Prior:
+    def _prior(self, keep_shape: bool) -> HeadPrior:
         """Weak prior of all parameters."""
         columns = PoseColumns.of(self.head)
         free = [np.inf] * 3
         coefficients = [1.0] * columns.expression_size + [0.5] * columns.eyelid_size
         shape = np.full(self.head.shape_basis.shape[2], 0.0 if keep_shape else SHAPE_SPREAD)
-        return Prior(np.array([*ANGLE_SPREAD, *free, *coefficients]), shape)
+        return HeadPrior(np.array([*ANGLE_SPREAD, *free, *coefficients]), shape)
 
-    def start(self, shape: FloatArray | None = None) -> State:
+    def start(self, shape: FloatArray | None = None) -> HeadState:
         """A shape, by default the mean, in the rigid pose of the landmarks of one camera at each timestep.
 
         Of the cameras that saw most landmarks it is the one whose pose fits the landmarks of all cameras best.
@@ -142,7 +142,7 @@ class Fitter:
                     least = float(np.median(gaps[found]))
                     last = np.concatenate([cv2.Rodrigues(turn)[0][:, 0], moved - root + turn @ root])
             poses[row, :3], poses[row, columns.translation] = last[:3], last[3:]
-        return State(shape, poses)
+        return HeadState(shape, poses)
 
     def _rigid(self, rest: FloatArray, pixels: FloatArray, camera: int) -> tuple[FloatArray, FloatArray]:
         """Rotation (3, 3) and shift (3,) that take points to the world such that they project onto pixels."""
@@ -156,7 +156,7 @@ class Fitter:
         return PointRig(self.head, self.landmarks.corners, self.landmarks.weights)
 
     def add_landmarks(
-        self, equations: NormalEquations, rig: PointRig, state: State, leave_out: bool = True
+        self, equations: NormalEquations, rig: PointRig, state: HeadState, leave_out: bool = True
     ) -> FloatArray:
         """Add the landmarks to the equations; return their root mean square distance at each timestep, (T,) pixels."""
         distance = np.zeros(len(state.poses))
@@ -181,11 +181,11 @@ class Fitter:
         return distance
 
     def fit_landmarks(
-        self, state: State, *, keep_shape: bool = False, steps: int = 10, rigid: int = 8
-    ) -> State:
+        self, state: HeadState, *, keep_shape: bool = False, steps: int = 10, rigid: int = 8
+    ) -> HeadState:
         """Steps on the landmarks alone, the first of the rigid pose only."""
         rig, prior = self.landmark_rig(), self._prior(keep_shape)
-        still = Prior(np.where(np.isinf(prior.pose), np.inf, 0.0), np.zeros(len(prior.shape)))
+        still = HeadPrior(np.where(np.isinf(prior.pose), np.inf, 0.0), np.zeros(len(prior.shape)))
         for step in range(rigid + steps):
             equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
             self.add_landmarks(equations, rig, state, leave_out=step >= rigid)
@@ -193,13 +193,18 @@ class Fitter:
         return state
 
     def fit_colours(
-        self, state: State, stack: FrameStack, *, keep_shape: bool = False, progress: Progress = no_progress
+        self,
+        state: HeadState,
+        stack: FrameStack,
+        *,
+        keep_shape: bool = False,
+        progress: Progress = no_progress,
     ) -> Fitted:
         """Steps on colours of points and landmarks, at the blurs of `LEVELS`.
 
         Parameters
         ----------
-        state : State
+        state : HeadState
             Estimate from landmarks.
         stack : FrameStack
             Images of all timesteps, the cameras of each together.
@@ -225,11 +230,11 @@ class Fitter:
                 done += 1
         return Fitted(state, landmarks, colours)
 
-    def _pixels_per_millimetre(self, mesh: PointRig, state: State) -> float:
+    def _pixels_per_millimetre(self, mesh: PointRig, state: HeadState) -> float:
         depth = self.views.place(mesh.points(state.shape, state.poses[0]))[1]
         return float(np.median(1e-3 * self.views.intrinsics[:, 0, 0] / np.median(depth, axis=1)))
 
-    def _observations(self, state: State, mesh: PointRig, vertices: IntArray) -> Samples:
+    def _observations(self, state: HeadState, mesh: PointRig, vertices: IntArray) -> Observations:
         """The vertices that each frame sees."""
         occlusion = Occlusion(self.head, mesh.points(state.shape, state.poses[0]), self.views)
         frames, points, weights = [], [], []
@@ -239,15 +244,15 @@ class Fitter:
             frames.append(row * len(cosine) + camera)
             points.append(point)
             weights.append(cosine[camera, point])
-        return Samples(np.concatenate(frames), np.concatenate(points), np.concatenate(weights))
+        return Observations(np.concatenate(frames), np.concatenate(points), np.concatenate(weights))
 
     def _add_colours(
         self,
         equations: NormalEquations,
         rig: PointRig,
-        state: State,
+        state: HeadState,
         stack: FrameStack,
-        samples: Samples,
+        samples: Observations,
         tolerance: float,
     ) -> FloatArray:
         """Add the colours to the equations; return their median difference at each timestep, (T,) 8-bit levels."""
@@ -280,7 +285,7 @@ class Fitter:
 
 
 def _texture(
-    values: FloatArray, samples: Samples, points: int, tolerance: float
+    values: FloatArray, samples: Observations, points: int, tolerance: float
 ) -> tuple[FloatArray, FloatArray]:
     """Robust colour of every point (P, 3) and the Geman-McClure weight of every observation (n,), over its variance."""
     weight = samples.weight.astype(np.float32)

@@ -23,7 +23,7 @@ COUNT = 160
 _SHARES = (("lips", 0.2), ("eye_region", 0.3), ("face", 0.5))
 
 
-class Landmarks(NamedTuple):
+class ImageLandmarks(NamedTuple):
     """Landmarks of a clip: points of the mesh, and where cameras saw them."""
 
     corners: IntArray
@@ -61,7 +61,7 @@ def rig_vertices(head: HeadAsset) -> IntArray:
 
 def known_rig_landmarks(
     clip: CaptureClip, cameras: Sequence[str], timesteps: Sequence[int], seed: int
-) -> Landmarks:
+) -> ImageLandmarks:
     """Projections of vertices of the clip's own tracked mesh with the error of a landmark network, seeded.
 
     They stand in for a network where its file is missing; only their error makes them a start that has to be refined. A
@@ -83,4 +83,4 @@ def known_rig_landmarks(
         found = projected.pixels + error * per_metre[..., None]
         pixels[row] = np.where(cosine[..., None] > 0.5, found, np.nan)
     corners = np.repeat(vertices[:, None], 3, axis=1)
-    return Landmarks(corners, np.tile([1.0, 0.0, 0.0], (len(vertices), 1)), pixels)
+    return ImageLandmarks(corners, np.tile([1.0, 0.0, 0.0], (len(vertices), 1)), pixels)

@@ -20,7 +20,7 @@ from ..head.geometry import vertex_normals
 from ..head.refit.identity import closest_points
 from ..head.subject import PosedSubject
 from ..mesh_pictures import rasterize_mesh
-from .landmarks import Landmarks
+from .landmarks import ImageLandmarks
 from .views import Views
 
 CORNERS = (33, 263)
@@ -216,7 +216,7 @@ class NetworkLandmarks:
         self._views = Views([clip.cameras[name] for name in cameras])
         self._rest, self._normals = _rest(clip.head, embedding)
 
-    def __call__(self, timesteps: Sequence[int]) -> Landmarks:
+    def __call__(self, timesteps: Sequence[int]) -> ImageLandmarks:
         """Landmarks that face their camera, by the pose that fits the landmarks of the image."""
         pixels = np.full((len(timesteps), len(self._cameras), len(self._rest), 2), np.nan)
         for column, name in enumerate(self._cameras):
@@ -232,7 +232,7 @@ class NetworkLandmarks:
                         pixels[row, column] = np.where(facing[:, None], found, np.nan)
                         break
                     near = None
-        return Landmarks(self._embedding.corners, self._embedding.weights, pixels)
+        return ImageLandmarks(self._embedding.corners, self._embedding.weights, pixels)
 
     def _facing(self, found: FloatArray, camera: int) -> BoolArray | None:
         """(L,) which landmarks face the camera; None if they do not form a face."""

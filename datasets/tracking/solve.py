@@ -10,7 +10,7 @@ from ...bench.contracts import FloatArray
 from .rig import PosedPoints
 
 
-class State(NamedTuple):
+class HeadState(NamedTuple):
     """Estimate of a tracker."""
 
     shape: FloatArray
@@ -19,7 +19,7 @@ class State(NamedTuple):
     """(T, D) columns of `PoseColumns`."""
 
 
-class Prior(NamedTuple):
+class HeadPrior(NamedTuple):
     """Expected magnitudes of the parameters; infinity leaves one free, 0 keeps it as it is."""
 
     pose: FloatArray
@@ -56,7 +56,7 @@ class NormalEquations:
         self._matrices[timestep] += flat.T @ bent.reshape(-1, width)
         self._rights[timestep] += flat.T @ slope.astype(jacobian.dtype).reshape(-1)
 
-    def step(self, state: State, prior: Prior, damping: float = 1e-6) -> State:
+    def step(self, state: HeadState, prior: HeadPrior, damping: float = 1e-6) -> HeadState:
         """The state after a step with the prior.
 
         Parameters
@@ -91,4 +91,4 @@ class NormalEquations:
         schur = corner.sum(axis=0) - np.einsum("tds,tdr->sr", shared, solved[:, :, 1:])
         right = rights[:, split:].sum(axis=0) - np.einsum("tds,td->s", shared, solved[:, :, 0])
         change = np.linalg.solve(schur, right) if len(right) else right
-        return State(state.shape + change, state.poses + solved[:, :, 0] - solved[:, :, 1:] @ change)
+        return HeadState(state.shape + change, state.poses + solved[:, :, 0] - solved[:, :, 1:] @ change)

@@ -15,15 +15,15 @@ from ...bench.errors import InputError
 from ..clip import CaptureClip
 from .fit import Fitter
 from .images import FrameStack
-from .landmarks import Landmarks
+from .landmarks import ImageLandmarks
 from .rig import PoseColumns
-from .solve import State
+from .solve import HeadState
 from .views import Views
 
 MOST_TIMESTEPS, MOST_PIXELS = 64, 2.5e8
 """Timesteps, and pixels of all cameras, that are fitted together; this bounds the memory."""
 
-LandmarkSource = Callable[[Sequence[int]], Landmarks]
+LandmarkSource = Callable[[Sequence[int]], ImageLandmarks]
 """Finds the landmarks of some timesteps in all cameras."""
 
 
@@ -141,7 +141,7 @@ def track(
         residuals += [TimestepResidual(*row) for row in zip(part, *rows)]
         poses |= dict(zip(part, fitted.state.poses))
     assert shape is not None
-    state = State(np.asarray(shape, np.float32), np.stack([poses[timestep] for timestep in timesteps]))
+    state = HeadState(np.asarray(shape, np.float32), np.stack([poses[timestep] for timestep in timesteps]))
     report = TrackingReport(tuple(cameras), tuple(sorted(residuals)), seconds)
     tracked = PoseColumns.of(clip.head).poses(state.poses, clip.head, clip.subject, timesteps)
     parameters = {"cameras": [*cameras], **(notes or {}), "residual": report.summary()}

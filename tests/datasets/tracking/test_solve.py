@@ -3,14 +3,14 @@
 import numpy as np
 
 from headbench.datasets.tracking.rig import PosedPoints
-from headbench.datasets.tracking.solve import NormalEquations, Prior, State
+from headbench.datasets.tracking.solve import HeadPrior, HeadState, NormalEquations
 
 
 def test_the_step_solves_the_whole_system():
     rng = np.random.default_rng(1)
     timesteps, poses, shapes, points = 3, 4, 2, 6
-    state = State(rng.standard_normal(shapes), rng.standard_normal((timesteps, poses)))
-    prior = Prior(np.array([np.inf, 0.5, 1.0, 2.0]), np.array([0.3, 3.0]))
+    state = HeadState(rng.standard_normal(shapes), rng.standard_normal((timesteps, poses)))
+    prior = HeadPrior(np.array([np.inf, 0.5, 1.0, 2.0]), np.array([0.3, 3.0]))
     equations = NormalEquations(timesteps, poses, shapes)
     size = timesteps * poses + shapes
     whole, right = np.zeros((size, size)), np.zeros(size)
@@ -41,8 +41,8 @@ def test_a_prior_of_0_keeps_a_parameter():
     equations = NormalEquations(1, 2, 1)
     posed = PosedPoints(*(rng.standard_normal(size) for size in ((4, 3), (4, 3, 2), (4, 3, 1))))
     equations.add(0, posed, np.tile(np.eye(3), (4, 1, 1)), rng.standard_normal((4, 3)))
-    state = State(np.array([0.7]), np.array([[0.2, 0.3]]))
-    found = equations.step(state, Prior(np.array([np.inf, 0.0]), np.zeros(1)))
+    state = HeadState(np.array([0.7]), np.array([[0.2, 0.3]]))
+    found = equations.step(state, HeadPrior(np.array([np.inf, 0.0]), np.zeros(1)))
     assert found.shape[0] == 0.7
     assert found.poses[0, 1] == 0.3
     assert found.poses[0, 0] != 0.2
