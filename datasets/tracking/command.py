@@ -35,7 +35,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     from ..head.refit.rewrite import capture_plan, write_capture
     from ..images import write_image
     from ..tracking_errors import tracking_errors
-    from .track import track
+    from .track import check_cameras, track
 
     if bool(settings.landmarks) != bool(settings.embedding):
         given, other = (
@@ -48,10 +48,9 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     capture_plan(clip, settings.capture)  # Captures that cannot be rewritten are detected before the fit.
     check_apart(clip, out)
     cameras = [*settings.cameras] or [*clip.cameras]
-    notes = {
-        "landmarks": Path(settings.landmarks).name or "vertices of the tracked mesh",
-        "seed": settings.seed,
-    }
+    check_cameras(clip, cameras)
+    kind = Path(settings.landmarks).name or "vertices of the tracked mesh"
+    notes = {"landmarks": kind, "seed": settings.seed}
     source = _source(settings, clip, cameras, progress)
     tracked = track(clip, cameras, source, notes=notes, progress=progress)
     write_image(out / PICTURE, draw_overlay(tracked, cameras))

@@ -67,6 +67,14 @@ class Tracked(NamedTuple):
     report: TrackingReport
 
 
+def check_cameras(clip: CaptureClip, cameras: Sequence[str]) -> None:
+    """Raise `InputError` if there is no camera or one is unknown."""
+    unknown = [name for name in cameras if name not in clip.cameras]
+    if unknown or not cameras:
+        expected = f"at least one of {', '.join(clip.cameras) or 'none'}"
+        raise InputError(f"clip of {clip.subject}", "cameras", expected, ", ".join(unknown) or "none")
+
+
 # The linear algebra is in many small matrices, for which threads cost more than they give.
 @threadpool_limits.wrap(limits=1)
 def track(
@@ -97,10 +105,7 @@ def track(
         A camera is unknown, there is none or no timestep, a frame of a camera is missing, or there are no landmarks.
     """
     where = f"clip of {clip.subject}"
-    unknown = [name for name in cameras if name not in clip.cameras]
-    if unknown or not cameras:
-        known = ", ".join(clip.cameras) or "none"
-        raise InputError(where, "cameras", f"at least one of {known}", ", ".join(unknown) or "none")
+    check_cameras(clip, cameras)
     keys = {(key.timestep, key.camera): key for key in clip.files}
     timesteps = sorted({timestep for timestep, _ in keys})
     if not timesteps:
