@@ -200,16 +200,9 @@ class Fitter:
         keep_shape: bool = False,
         progress: Progress = no_progress,
     ) -> Fitted:
-        """Steps on colours of points and landmarks, at the blurs of `LEVELS`.
+        """Steps on colours of points and on landmarks, at the blurs of `LEVELS`, with or without the shape.
 
-        Parameters
-        ----------
-        state : HeadState
-            Estimate from landmarks.
-        stack : FrameStack
-            Images of all timesteps, the cameras of each together.
-        keep_shape : bool
-            Whether the shape stays as it is.
+        ``stack`` holds the images of all timesteps, the cameras of each together.
         """
         vertices = sampled_vertices(self.head)
         rig = PointRig.at_vertices(self.head, vertices)
