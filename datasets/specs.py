@@ -1,7 +1,7 @@
 """Specs of readers, synthetic captures, commands and benchmarks. Light to import: implementations are named, not
 loaded."""
 
-from ..bench.specs import BenchmarkSpec, CommandSpec, DatasetSpec
+from ..bench.specs import BenchmarkSpec, CommandSpec, ConditionSpec, DatasetSpec
 
 ERRORS = "headbench.datasets.lint.before_run:errors"
 
@@ -114,6 +114,13 @@ TRACK = CommandSpec(
     function="headbench.datasets.tracking.command:track_capture",
     writes="out",
     kinds=("captures",),
+)
+
+TRACKED = ConditionSpec(
+    name="tracked",
+    summary="Clip: tracking estimated from images, as by `track`; parameters landmarks, embedding, seed.",
+    kind="clip",
+    implementation="headbench.datasets.tracked_clip:with_tracking",
 )
 
 INSPECT = CommandSpec(

@@ -43,6 +43,12 @@ class PoseColumns(NamedTuple):
         """Columns of the translation, metres."""
         return slice(ANGLES, ANGLES + 3)
 
+    def rows(self, poses: Sequence[HeadPose]) -> FloatArray:
+        """Poses as rows (T, D)."""
+        names = ("rotation", "neck", "jaw", "eyes", "translation", "expression", "eyelids")
+        used = names if self.eyelid_size else names[:-1]
+        return np.stack([np.concatenate([getattr(pose, name) for name in used]) for pose in poses])
+
     def poses(
         self, values: FloatArray, head: HeadAsset, subject: str, timesteps: Sequence[int]
     ) -> list[HeadPose]:
@@ -132,9 +138,8 @@ class PointRig:
     @classmethod
     def at_vertices(cls, head: HeadAsset, vertices: IntArray, dtype: Any = np.float32) -> PointRig:
         """The points are vertices."""
-        return cls(
-            head, np.repeat(vertices[:, None], 3, axis=1), np.tile([1.0, 0.0, 0.0], (len(vertices), 1)), dtype
-        )
+        weights = np.tile([1.0, 0.0, 0.0], (len(vertices), 1))
+        return cls(head, np.repeat(vertices[:, None], 3, axis=1), weights, dtype)
 
     def points(self, shape: FloatArray, pose: FloatArray) -> FloatArray:
         """(P, 3) points in the world, metres, of shape (S,) and pose (D,)."""
@@ -147,9 +152,8 @@ class PointRig:
         count = len(points)
 
         linear = turns @ self._basis
-        linear += (self._skin @ joints.shifts_by_coefficient.reshape(JOINTS, -1).astype(self._dtype)).reshape(
-            linear.shape
-        )
+        by_coefficient = joints.shifts_by_coefficient.reshape(JOINTS, -1).astype(self._dtype)
+        linear += (self._skin @ by_coefficient).reshape(linear.shape)
         by_pose = np.zeros((count, 3, columns.size), self._dtype)
         by_pose[:, 0, ANGLES] = by_pose[:, 1, ANGLES + 1] = by_pose[:, 2, ANGLES + 2] = 1
         by_pose[:, :, ANGLES + 3 : ANGLES + 3 + expressions] = linear[:, :, :expressions]

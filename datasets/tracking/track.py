@@ -47,7 +47,7 @@ class TrackingReport:
     """Time of the fit, with reading images and without finding landmarks."""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values: the summary, and every timestep."""
+        """The summary and every timestep as plain values."""
         return {**asdict(self), "residuals": [one._asdict() for one in self.residuals], **self.summary()}
 
     def summary(self) -> dict[str, float]:
@@ -130,16 +130,13 @@ def track(
         begin = time.perf_counter()
         fitter = Fitter(clip.head, views, landmarks)
         stack = FrameStack([clip.image(keys[timestep, name]) for timestep in part for name in cameras])
-        state = fitter.start(shape)
-        state = fitter.fit_landmarks(state, keep_shape=shape is not None)
-        fitted = fitter.fit_colours(
-            state,
-            stack,
-            keep_shape=shape is not None,
-            progress=lambda done, total, text="", block=block: progress(
-                block * total + done, blocks * total, f"tracking, {text}"
-            ),
-        )
+        keep = shape is not None
+        state = fitter.fit_landmarks(fitter.start(shape), keep_shape=keep)
+
+        def report_block(done: int, total: int, text: str = "", block: int = block) -> None:
+            progress(block * total + done, blocks * total, f"tracking, {text}")
+
+        fitted = fitter.fit_colours(state, stack, keep_shape=keep, progress=report_block)
         shape = fitted.state.shape
         seconds += time.perf_counter() - begin
         rows = fitted.landmarks.tolist(), fitted.colours.tolist()

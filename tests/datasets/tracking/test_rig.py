@@ -56,3 +56,4 @@ def test_poses_keep_the_columns():
     wanted = vertices_of(head, torch.tensor(pose), torch.tensor(shape))
     np.testing.assert_allclose(head(made, shape), wanted, atol=1e-6)
     assert (made.timestep, made.subject) == (7, "someone")
+    np.testing.assert_allclose(PoseColumns.of(head).rows([made])[0], pose, atol=1e-6)
