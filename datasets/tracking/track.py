@@ -133,8 +133,8 @@ def track(
         keep = shape is not None
         state = fitter.fit_landmarks(fitter.start(shape), keep_shape=keep)
 
-        def report_block(done: int, total: int, text: str = "", block: int = block) -> None:
-            progress(block * total + done, blocks * total, f"tracking, {text}")
+        def report_block(done: int, total: int, note: str = "", block: int = block) -> None:
+            progress(block * total + done, blocks * total, f"tracking, {note}")
 
         fitted = fitter.fit_colours(state, stack, keep_shape=keep, progress=report_block)
         shape = fitted.state.shape
