@@ -1,7 +1,7 @@
 """Specs of readers, synthetic captures, commands and benchmarks. Light to import: implementations are named, not
 loaded."""
 
-from ..bench.specs import BenchmarkSpec, CommandSpec, DatasetSpec
+from ..bench.specs import BenchmarkSpec, CommandSpec, ConditionSpec, DatasetSpec
 
 ERRORS = "headbench.datasets.lint.before_run:errors"
 
@@ -104,6 +104,23 @@ REFIT_COMMAND = CommandSpec(
     function="headbench.datasets.head.refit.command:refit_capture",
     writes="out",
     kinds=("captures",),
+)
+
+TRACK = CommandSpec(
+    name="track",
+    group="data",
+    summary="Track the head model of a capture in its images, without using its tracking.",
+    settings="headbench.datasets.tracking.settings:TrackSettings",
+    function="headbench.datasets.tracking.command:track_capture",
+    writes="out",
+    kinds=("captures",),
+)
+
+TRACKED = ConditionSpec(
+    name="tracked",
+    summary="Clip: tracking estimated from images, as by `track`; parameters landmarks, embedding, seed.",
+    kind="clip",
+    implementation="headbench.datasets.tracked_clip:with_tracking",
 )
 
 INSPECT = CommandSpec(

@@ -345,6 +345,9 @@ CASES = {
     "prepare refit": [
         case("prepare refit {capture} --target 2020 --out refitted", "neutral head", "refitted/heat_map.png")
     ],
+    "track": [
+        case("track {capture} --out tracked", "a timestep", "tracked/overlay.png", "tracked/track.json")
+    ],
     "export nersemble": [case(RECORD, "Prepare it", "recording/head_model.npz")],
     "prepare nersemble": [
         case(

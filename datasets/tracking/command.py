@@ -1,0 +1,126 @@
+"""``headbench track``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...bench.contracts import ByteArray, Progress, no_progress
+from ...bench.errors import InputError
+from ...bench.io.files import write_json
+from ...bench.specs import CommandResult
+from .settings import TrackSettings
+
+if TYPE_CHECKING:
+    from ..clip import CaptureClip
+    from ..tracking_errors import RegionError
+    from .track import LandmarkSource, Tracked
+
+REPORT, PICTURE = "track.json", "overlay.png"
+ROWS, COLUMNS = 3, 4
+"""Timesteps and cameras of the picture."""
+
+
+def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> CommandResult:
+    """Track the head model of a capture in its images and write a capture with this tracking.
+
+    Writes under ``settings.out`` the capture (images linked), ``track.json`` with every timestep's residuals and
+    ``overlay.png``. Raises `InputError` before the fit for a capture that cannot be tracked or written.
+    """
+    from ..clip import check_apart
+    from ..head.refit.rewrite import capture_plan, write_capture
+    from ..images import write_image
+    from ..tracking_errors import tracking_errors
+    from .track import check_cameras, track
+
+    if bool(settings.landmarks) != bool(settings.embedding):
+        given, other = (
+            ("--landmarks", "--embedding") if settings.landmarks else ("--embedding", "--landmarks")
+        )
+        raise InputError("command line", other, f"a value beside {given}", "none")
+    out = Path(settings.out)
+    clip = settings.open(settings.capture, progress)
+    exact = settings.open(settings.against, progress) if settings.against else None
+    capture_plan(clip, settings.capture)  # Captures that cannot be rewritten are detected before the fit.
+    check_apart(clip, out)
+    cameras = [*settings.cameras] or [*clip.cameras]
+    check_cameras(clip, cameras)
+    kind = Path(settings.landmarks).name or "vertices of the tracked mesh"
+    notes = {"landmarks": kind, "seed": settings.seed}
+    source = _source(settings, clip, cameras, progress)
+    tracked = track(clip, cameras, source, notes=notes, progress=progress)
+    write_image(out / PICTURE, draw_overlay(tracked, cameras))
+    union = write_capture(tracked.clip, out, progress)
+    data: dict[str, Any] = {"capture": union.as_posix(), **notes, **tracked.report.to_json()}
+    lines = _text(tracked)
+    if exact is not None:
+        errors = tracking_errors(tracked.clip, exact)
+        data["errors_mm"] = {name: error._asdict() for name, error in errors.items()}
+        lines += _table(errors)
+    write_json(out / REPORT, data)
+    return CommandResult("\n".join([*lines, f"Capture: {union}"]), data)
+
+
+def _source(
+    settings: TrackSettings, clip: CaptureClip, cameras: Sequence[str], progress: Progress
+) -> LandmarkSource:
+    from .landmarks import known_rig_landmarks
+    from .network import LandmarkNetwork, NetworkLandmarks, learn_embedding
+
+    if not settings.landmarks:
+        return partial(known_rig_landmarks, clip, cameras, seed=settings.seed)
+    network = LandmarkNetwork(Path(settings.landmarks))
+    teacher = settings.open(settings.embedding, progress)
+    if teacher.head.version != clip.head.version:
+        remedy = "Landmarks are learnt on another subject of the same head model."
+        raise InputError(settings.embedding, "head_model", clip.head.version, teacher.head.version, remedy)
+    return NetworkLandmarks(network, learn_embedding(network, teacher, progress), clip, cameras)
+
+
+def draw_overlay(tracked: Tracked, cameras: Sequence[str]) -> ByteArray:
+    """Images of a few timesteps and cameras, and beside each one the mesh over it."""
+    from ..head.subject import PosedSubject
+    from ..mesh_pictures import draw_mesh
+
+    clip = tracked.clip
+    keys = {(key.timestep, key.camera): key for key in clip.files}
+    timesteps = _spread([residual.timestep for residual in tracked.report.residuals], ROWS)
+    subject, rows = PosedSubject.of(clip), []
+    shown = _spread(cameras, COLUMNS)
+    height, width = clip.image(keys[timesteps[0], shown[0]]).shape[:2]
+    for timestep, mesh in subject.each(clip, timesteps):
+        row = []
+        for name in shown:
+            camera = clip.cameras[name].resized(width, height)
+            image = clip.image(keys[timestep, name])
+            if image.shape[:2] != (height, width):
+                continue
+            row += [image, draw_mesh(mesh, clip.head.faces, camera, background=image, opacity=0.6)]
+        rows.append(np.concatenate(row, axis=1))
+    return np.concatenate(rows)
+
+
+def _spread(values: Sequence[Any], count: int) -> list[Any]:
+    places = np.linspace(0, len(values) - 1, min(count, len(values))).round().astype(int)
+    return [values[place] for place in places]
+
+
+def _text(tracked: Tracked) -> list[str]:
+    summary = tracked.report.summary()
+    count = f"{summary['timesteps']} timesteps"
+    return [
+        f"{count}, {len(tracked.report.cameras)} cameras, {summary['seconds_per_timestep']:.2f} s a timestep",
+        f"  landmarks  {summary['landmarks_px']:.2f} pixels root mean square",
+        f"  colours    {summary['colour_levels']:.2f} levels of 255, median",
+    ]
+
+
+def _table(errors: Mapping[str, RegionError]) -> list[str]:
+    lines = [f"  {'error, mm rms':14} {'absolute':>9} {'affine':>9} {'motion':>9}"]
+    return lines + [
+        f"  {name:14} {e.absolute:9.2f} {e.affine:9.2f} {e.motion:9.2f}" for name, e in errors.items()
+    ]

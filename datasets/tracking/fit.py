@@ -1,0 +1,295 @@
+"""Fit a head model to images: landmarks first, then colours of surface points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple, cast
+
+import cv2
+import numpy as np
+from scipy.sparse import csr_array
+
+from ...bench.contracts import FloatArray, HeadAsset, IntArray, Progress, no_progress
+from ...bench.errors import InputError
+from .images import FrameStack
+from .landmarks import ImageLandmarks, spread_vertices
+from .rig import PointRig, PoseColumns
+from .solve import HeadPrior, HeadState, NormalEquations
+from .views import Occlusion, Views
+
+ANGLE_SPREAD = (np.inf,) * 3 + (0.15,) * 3 + (0.3, 0.03, 0.02) + (0.2, 0.3, 0.02) * 2
+"""Standard deviations of the angles: rotation free, neck, jaw (which opens), eyes; radians."""
+LANDMARK_MM = 2.5
+"""Expected error of a landmark."""
+ROBUST = 8.0
+"""Multiple of it at which the weight of a landmark is a quarter."""
+MISTAKEN_MM = 25.0
+"""Median distance from which the landmarks of an image are left out."""
+PARTS = (
+    *(("lips", 400), ("eyeballs", 300), ("eye_region", 500), ("face", 900)),
+    *(("ears", 150), ("neck", 200), ("scalp", 200)),
+)
+"""Regions of sampled vertices and their largest numbers; a vertex belongs to the first."""
+
+
+_TRIED, _FEWEST = 4, 6  # cameras for the rigid pose, and landmarks of one
+
+
+class BlurLevel(NamedTuple):
+    """Steps at one blur of the images."""
+
+    blur: float
+    """Standard deviation on the head, millimetres; at least `SHARPEST` pixels."""
+    steps: int
+    tolerance: float
+    """Squared difference of colours at which a weight is a quarter, relative to the usual one."""
+
+
+LEVELS = (
+    BlurLevel(5.0, 4, 64.0),
+    BlurLevel(2.5, 5, 32.0),
+    BlurLevel(1.2, 5, 16.0),
+    BlurLevel(0.7, 6, 4.0),
+)
+"""From coarse to fine. A narrow tolerance at the coarse ones would leave out the colours of what moves most."""
+SHARPEST = 0.7
+"""Least blur, pixels."""
+WIDE_MM = 6.0
+"""Blur that is subtracted from the images."""
+LANDMARK_WEIGHT, COLOUR_WEIGHT = 0.005, 0.1
+"""Weights of a landmark and of a colour beside the prior. They are small because errors of landmarks are the same at all
+timesteps and those of neighbouring points alike, so that sums over them claim too much."""
+SHAPE_SPREAD = 0.3
+"""Standard deviation of the prior of the identity coefficients; less than 1 for the same reason."""
+
+
+class Observations(NamedTuple):
+    """Observed colours of points: n observations of all timesteps, in order."""
+
+    frame: IntArray  # (n,) timestep x cameras + camera
+    point: IntArray  # (n,)
+    weight: FloatArray  # (n,)
+
+
+def sampled_vertices(head: HeadAsset) -> IntArray:
+    """Vertices whose colours are compared, spread over the regions `PARTS`. Raises `InputError` if the head has none of them."""
+    inner = ("mouth_socket", "teeth", "boundary")
+    taken = np.concatenate([np.asarray(head.regions.get(name, ()), np.int64) for name in inner])
+    chosen = []
+    for name, count in PARTS:
+        members = np.setdiff1d(head.regions.get(name, ()), taken).astype(np.int64)
+        if len(members):
+            chosen.append(members[spread_vertices(np.asarray(head.template)[members], count)])
+            taken = np.concatenate([taken, members])
+    if not chosen:
+        names = ", ".join(name for name, _ in PARTS)
+        raise InputError(f"head model {head.version!r}", "regions", f"one of {names}", "none")
+    return np.unique(np.concatenate(chosen))
+
+
+class Fitted(NamedTuple):
+    """Result of a fit."""
+
+    state: HeadState
+    landmarks: FloatArray
+    """(T,) root mean square distance of the landmarks before the last step, pixels."""
+    colours: FloatArray
+    """(T,) median difference of a colour from that of its point, 8-bit levels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fitter:
+    """Data of a fit that does not change."""
+
+    head: HeadAsset
+    views: Views
+    """C cameras."""
+    landmarks: ImageLandmarks
+    """Landmarks of T timesteps."""
+
+    def _prior(self, keep_shape: bool) -> HeadPrior:
+        """Weak prior of all parameters."""
+        columns = PoseColumns.of(self.head)
+        free = [np.inf] * 3
+        coefficients = [1.0] * columns.expression_size + [0.5] * columns.eyelid_size
+        shape = np.full(self.head.shape_basis.shape[2], 0.0 if keep_shape else SHAPE_SPREAD)
+        return HeadPrior(np.array([*ANGLE_SPREAD, *free, *coefficients]), shape)
+
+    def start(self, shape: FloatArray | None = None) -> HeadState:
+        """A shape, by default the mean, in the rigid pose of the landmarks of one camera at each timestep.
+
+        Of the cameras that saw most landmarks it is the one whose pose fits the landmarks of all cameras best.
+        """
+        columns = PoseColumns.of(self.head)
+        poses = np.zeros((len(self.landmarks.pixels), columns.size))
+        shape = np.zeros(self.head.shape_basis.shape[2]) if shape is None else shape
+        rig = self.landmark_rig()
+        rest = rig.points(shape, poses[0]).astype(np.float64)
+        neutral = np.asarray(self.head.template + self.head.shape_basis @ shape, np.float64)
+        root = np.asarray(self.head.joint_regressor[0], np.float64) @ neutral
+        last = np.zeros(6)
+        for row, pixels in enumerate(self.landmarks.pixels):
+            found = np.isfinite(pixels[..., 0])
+            least = np.inf
+            for camera in np.argsort(-found.sum(axis=1), kind="stable")[:_TRIED]:
+                kept = found[camera]
+                if kept.sum() < _FEWEST:
+                    continue
+                turn, moved = self._rigid(rest[kept], pixels[camera, kept], camera)
+                gaps = np.linalg.norm(self.views.place(rest @ turn.T + moved)[0] - pixels, axis=2)
+                if np.median(gaps[found]) < least:
+                    least = float(np.median(gaps[found]))
+                    last = np.concatenate([cv2.Rodrigues(turn)[0][:, 0], moved - root + turn @ root])
+            poses[row, :3], poses[row, columns.translation] = last[:3], last[3:]
+        return HeadState(shape, poses)
+
+    def _rigid(self, rest: FloatArray, pixels: FloatArray, camera: int) -> tuple[FloatArray, FloatArray]:
+        """Rotation (3, 3) and shift (3,) that take points to the world such that they project onto pixels."""
+        K = self.views.intrinsics[camera]
+        _, turn, shift = cv2.solvePnP(rest, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
+        back = self.views.rotations[camera].T
+        return back @ cv2.Rodrigues(turn)[0], back @ (shift[:, 0] - self.views.shifts[camera])
+
+    def landmark_rig(self) -> PointRig:
+        """The landmarks as points of the head."""
+        return PointRig(self.head, self.landmarks.corners, self.landmarks.weights)
+
+    def add_landmarks(
+        self, equations: NormalEquations, rig: PointRig, state: HeadState, leave_out: bool = True
+    ) -> FloatArray:
+        """Add the landmarks to the equations; return their root mean square distance at each timestep, (T,) pixels."""
+        distance = np.zeros(len(state.poses))
+        for row, pixels in enumerate(self.landmarks.pixels):
+            posed = rig.linearised(state.shape, state.poses[row])
+            projected = self.views.project(posed.points)
+            found = np.isfinite(pixels[..., 0])
+            gap = np.where(found[..., None], pixels - projected.pixels, 0.0)
+            per_metre = self.views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
+            sigma = 1e-3 * LANDMARK_MM * per_metre
+            square = (gap**2).sum(axis=2)
+            # All landmarks of an image may be wrong, where a network takes something else for a face.
+            if leave_out:
+                near = np.sqrt(square) / sigma < MISTAKEN_MM / LANDMARK_MM
+                found &= ((found & near).sum(axis=1) > found.sum(axis=1) / 2)[:, None]
+            robust = found * LANDMARK_WEIGHT / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
+            distance[row] = np.sqrt((found * square).sum() / max(found.sum(), 1))
+            weighted = robust[..., None, None] * projected.derivative
+            curvature = np.einsum("cpki,cpkj->pij", weighted, projected.derivative)
+            slope = np.einsum("cpki,cpk->pi", weighted, gap)
+            equations.add(row, posed, curvature, slope)
+        return distance
+
+    def fit_landmarks(
+        self, state: HeadState, *, keep_shape: bool = False, steps: int = 10, rigid: int = 8
+    ) -> HeadState:
+        """Steps on the landmarks alone, the first of the rigid pose only."""
+        rig, prior = self.landmark_rig(), self._prior(keep_shape)
+        still = HeadPrior(np.where(np.isinf(prior.pose), np.inf, 0.0), np.zeros(len(prior.shape)))
+        for step in range(rigid + steps):
+            equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
+            self.add_landmarks(equations, rig, state, leave_out=step >= rigid)
+            state = equations.step(state, still if step < rigid else prior, 1e-3)
+        return state
+
+    def fit_colours(
+        self,
+        state: HeadState,
+        stack: FrameStack,
+        *,
+        keep_shape: bool = False,
+        progress: Progress = no_progress,
+    ) -> Fitted:
+        """Steps on colours of points and on landmarks, at the blurs of `LEVELS`, with or without the shape.
+
+        ``stack`` holds the images of all timesteps, the cameras of each together.
+        """
+        vertices = sampled_vertices(self.head)
+        rig = PointRig.at_vertices(self.head, vertices)
+        mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
+        marks, prior = self.landmark_rig(), self._prior(keep_shape)
+        scale = self._pixels_per_millimetre(mesh, state)
+        total, done = sum(level.steps for level in LEVELS), 0
+        landmarks = colours = cast(FloatArray, np.zeros(len(state.poses)))
+        for level in LEVELS:
+            stack.filter(max(SHARPEST, level.blur * scale), WIDE_MM * scale)
+            samples = self._observations(state, mesh, vertices)
+            for _ in range(level.steps):
+                progress(done, total, f"blur of {level.blur:g} mm")
+                equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
+                landmarks = self.add_landmarks(equations, marks, state)
+                colours = self._add_colours(equations, rig, state, stack, samples, level.tolerance)
+                state = equations.step(state, prior)
+                done += 1
+        return Fitted(state, landmarks, colours)
+
+    def _pixels_per_millimetre(self, mesh: PointRig, state: HeadState) -> float:
+        depth = self.views.place(mesh.points(state.shape, state.poses[0]))[1]
+        return float(np.median(1e-3 * self.views.intrinsics[:, 0, 0] / np.median(depth, axis=1)))
+
+    def _observations(self, state: HeadState, mesh: PointRig, vertices: IntArray) -> Observations:
+        """The vertices that each frame sees."""
+        occlusion = Occlusion(self.head, mesh.points(state.shape, state.poses[0]), self.views)
+        frames, points, weights = [], [], []
+        for row, pose in enumerate(state.poses):
+            cosine = occlusion.visible(mesh.points(state.shape, pose).astype(np.float64), vertices)
+            camera, point = np.nonzero(cosine)
+            frames.append(row * len(cosine) + camera)
+            points.append(point)
+            weights.append(cosine[camera, point])
+        return Observations(np.concatenate(frames), np.concatenate(points), np.concatenate(weights))
+
+    def _add_colours(
+        self,
+        equations: NormalEquations,
+        rig: PointRig,
+        state: HeadState,
+        stack: FrameStack,
+        samples: Observations,
+        tolerance: float,
+    ) -> FloatArray:
+        """Add the colours to the equations; return their median difference at each timestep, (T,) 8-bit levels."""
+        cameras = len(self.views.cameras)
+        bounds = np.searchsorted(samples.frame, np.arange(len(state.poses) + 1) * cameras)
+        posed = [rig.points(state.shape, pose) for pose in state.poses]
+        sampled = []
+        for row, (start, end) in enumerate(pairwise(bounds)):
+            frame, point = samples.frame[start:end], samples.point[start:end]
+            projected = self.views.project(posed[row][point], frame - row * cameras)
+            values, gradients = stack.sample(frame, projected.pixels)
+            sampled.append((values, gradients @ projected.derivative.astype(np.float32)))
+        values = np.concatenate([part[0] for part in sampled])
+        texture, robust = _texture(values, samples, len(posed[0]), tolerance)
+        residual = values - texture[samples.point]
+        difference = np.zeros(len(state.poses))
+        weight = COLOUR_WEIGHT * robust
+        for row, (start, end) in enumerate(pairwise(bounds)):
+            gap, by_point = residual[start:end], sampled[row][1]  # (n, 3), (n, 3, 3): channel, axis
+            weighted = weight[start:end, None, None] * by_point
+            curvature = np.einsum("nci,ncj->nij", weighted, by_point).reshape(-1, 9)
+            slope = -np.einsum("nci,nc->ni", weighted, gap)
+            count = end - start
+            entries = (np.ones(count, np.float32), (samples.point[start:end], np.arange(count)))
+            gather = csr_array(entries, shape=(len(posed[0]), count))
+            linearised = rig.linearised(state.shape, state.poses[row])
+            equations.add(row, linearised, (gather @ curvature).reshape(-1, 3, 3), gather @ slope)
+            difference[row] = 255 * np.median(np.abs(gap)) if count else 0.0
+        return difference
+
+
+def _texture(
+    values: FloatArray, samples: Observations, points: int, tolerance: float
+) -> tuple[FloatArray, FloatArray]:
+    """Robust colour of every point (P, 3) and the Geman-McClure weight of every observation (n,), over its variance."""
+    weight = samples.weight.astype(np.float32)
+    robust = weight
+    for _ in range(4):
+        total = np.maximum(np.bincount(samples.point, robust, points), 1e-9)
+        sums = [np.bincount(samples.point, robust * channel, points) for channel in values.T]
+        texture = np.stack(sums, axis=1) / total[:, None]
+        square = ((values - texture[samples.point]) ** 2).sum(axis=1)
+        # Points whose colour changes with light or expression count less than those whose colour stays.
+        own = np.bincount(samples.point, robust * square, points) / total
+        scale = tolerance * np.maximum(own, max(float(np.median(square)), 1e-5))[samples.point]
+        robust = weight / (1 + square / scale) ** 2
+    return texture.astype(np.float32), (3 * robust / scale).astype(np.float32)

@@ -1,0 +1,260 @@
+"""Landmarks by MediaPipe's face landmark network, and what points of a head model they are.
+
+The network's file is part of the package mediapipe 0.10.21 (``mediapipe/modules/face_landmark/face_landmark.tflite``) and is
+read without that package.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from ...bench.contracts import BoolArray, ByteArray, FloatArray, HeadAsset, IntArray, Progress, no_progress
+from ...bench.errors import InputError, UnavailableError
+from ..clip import CaptureClip
+from ..head.geometry import vertex_normals
+from ..head.refit.identity import closest_points
+from ..head.subject import PosedSubject
+from ..mesh_pictures import rasterize_mesh
+from .landmarks import ImageLandmarks
+from .views import Views
+
+CORNERS = (33, 263)
+"""Landmarks of the outer corners of the eyes, between which the crop is level."""
+CROP = 1.5
+"""Side of the crop, relative to the longer side of the landmarks' box."""
+LEARNING_FRAMES = 120
+"""Images from which an embedding is learnt."""
+MOST_SPREAD = 0.004
+"""Landmarks that slide on the mesh by more than this, median, are left out, metres."""
+MOST_CHANGE = 0.05
+"""Landmarks may move by this part of the face's size when the crop is repeated around them."""
+MOST_MISFIT = 0.04
+"""Largest median distance of landmarks from those of the mean head, relative to the face's size."""
+_TRIED, _ROUNDS = 6, 3
+_FACING = 0.5
+_FEWEST = 0.3  # part of the images in which a landmark has to hit the mesh
+
+
+class _Crop(NamedTuple):
+    """A square of an image."""
+
+    middle: FloatArray  # (2,)
+    side: float
+    angle: float  # radians
+
+
+class LandmarkNetwork:
+    """The network of a file.
+
+    Raises
+    ------
+    UnavailableError
+        The package ai-edge-litert is missing.
+    InputError
+        The file is missing or is not such a network.
+    """
+
+    def __init__(self, path: Path):
+        if not path.exists():
+            remedy = "It is in the wheel of mediapipe 0.10.21, as mediapipe/modules/face_landmark/face_landmark.tflite."
+            raise InputError(path, "", "the file of a landmark network", "no such file", remedy)
+        try:
+            from ai_edge_litert.interpreter import Interpreter
+        except ImportError as error:
+            what = "Landmarks by a network need the package ai-edge-litert; it is not installed."
+            raise UnavailableError(what, "pip install ai-edge-litert") from error
+        try:
+            self._network: Any = Interpreter(model_path=str(path), num_threads=1)
+            self._network.allocate_tensors()
+            (self._input,) = self._network.get_input_details()
+            outputs = self._network.get_output_details()
+            self._landmarks = next(one for one in outputs if np.prod(one["shape"]) == 3 * COUNT)
+            self._score = next(one for one in outputs if np.prod(one["shape"]) == 1)
+        except (ValueError, RuntimeError, StopIteration) as error:
+            raise InputError(
+                path, "", f"a network that finds {COUNT} landmarks", str(error) or "other outputs"
+            ) from error
+        self._side = int(self._input["shape"][1])
+
+    def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:
+        """(COUNT, 2) landmarks, pixels, or None where the network sees no face.
+
+        Parameters
+        ----------
+        image : ByteArray
+            (H, W, 3) 8-bit RGB.
+        near : FloatArray | None
+            Landmarks of a similar image of the camera; without them, squares of several sizes are tried.
+        """
+        if near is not None:
+            found, score = self._run(image, _crop_around(near))
+            return found if score > 0 else self.find(image)
+        scored = sorted((self._run(image, crop) for crop in _candidates(image)), key=lambda one: -one[1])
+        best, least = None, MOST_CHANGE
+        for found, score in scored[:_TRIED]:
+            change = np.inf
+            for _ in range(_ROUNDS):
+                if score > 0:
+                    before, (found, score) = found, self._run(image, _crop_around(found))
+                    change = float(np.abs(found - before).mean() / np.ptp(found, axis=0).max())
+            # Where the network sees a whole face, the landmarks of a crop around them are the same.
+            if score > 0 and change < least:
+                best, least = found, change
+        return best
+
+    def _run(self, image: ByteArray, crop: _Crop) -> tuple[FloatArray, float]:
+        """Landmarks, and the logit of the probability that the crop shows a face."""
+        turn = crop.side / self._side * _turn(crop.angle)
+        to_image = np.concatenate([turn, (crop.middle - turn @ np.full(2, self._side / 2))[:, None]], axis=1)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        shift = to_image.copy()
+        shift[:, 2] += turn @ np.full(2, 0.5) - 0.5  # OpenCV's pixel centres are whole numbers
+        size = (self._side, self._side)
+        pixels = cv2.warpAffine(image, shift, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        self._network.set_tensor(self._input["index"], pixels[None].astype(np.float32) / 255)
+        self._network.invoke()
+        found = self._network.get_tensor(self._landmarks["index"]).reshape(COUNT, 3)[:, :2].astype(np.float64)
+        score = float(self._network.get_tensor(self._score["index"]).ravel()[0])
+        return found @ turn.T + to_image[:, 2], score
+
+
+COUNT = 468
+"""Landmarks of the network."""
+
+
+def _candidates(image: ByteArray) -> list[_Crop]:
+    height, width = image.shape[:2]
+    shorter = min(height, width)
+    return [
+        _Crop(np.array([x * width, y * height]), side * shorter, 0.0)
+        for side in (0.6, 0.9)
+        for x in (0.35, 0.5, 0.65)
+        for y in (0.35, 0.5, 0.65)
+    ]
+
+
+def _crop_around(landmarks: FloatArray) -> _Crop:
+    along = landmarks[CORNERS[1]] - landmarks[CORNERS[0]]
+    angle = float(np.arctan2(along[1], along[0]))
+    level = landmarks @ _turn(angle)
+    low, high = level.min(axis=0), level.max(axis=0)
+    return _Crop(_turn(angle) @ ((low + high) / 2), CROP * float((high - low).max()), angle)
+
+
+def _turn(angle: float) -> FloatArray:
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+class Embedding(NamedTuple):
+    """Points of a head model that landmarks are."""
+
+    landmarks: IntArray
+    """(L,) indices of the network's landmarks."""
+    corners: IntArray
+    """(L, 3) vertices."""
+    weights: FloatArray
+    """(L, 3) barycentric weights."""
+
+
+def learn_embedding(
+    network: LandmarkNetwork, clip: CaptureClip, progress: Progress = no_progress
+) -> Embedding:
+    """Where the network's landmarks are on the mesh of a clip with exact tracking: medians over images.
+
+    Raises `InputError` if the network finds hardly any landmark in the images.
+    """
+    head, subject = clip.head, PosedSubject.of(clip)
+    keys = sorted(clip.files, key=lambda key: (key.camera, key.timestep))
+    keys = [keys[place] for place in np.unique(np.linspace(0, len(keys) - 1, LEARNING_FRAMES).astype(int))]
+    template = np.asarray(head.template, np.float64)
+    places = np.full((len(keys), COUNT, 3), np.nan)
+    found: FloatArray | None = None
+    for row, key in enumerate(keys):
+        progress(row, len(keys), "learning landmarks")
+        camera = clip.cameras[key.camera]
+        near = found if row and keys[row - 1].camera == key.camera else None
+        found = network.find(clip.image(key), near)
+        if found is None:
+            continue
+        mesh = subject.meshes([clip.poses[key.timestep]])[0]
+        fragments = rasterize_mesh(mesh, head.faces, camera)
+        column, line = np.floor(found).astype(int).T
+        inside = (column >= 0) & (line >= 0) & (column < camera.width) & (line < camera.height)
+        column, line = np.where(inside, column, 0), np.where(inside, line, 0)
+        face, weights = fragments.face[line, column], fragments.weights[line, column]
+        corners = head.faces[face]
+        normals = np.einsum("lk,lki->li", weights, vertex_normals(mesh, head.faces)[corners])
+        toward = camera.center - np.einsum("lk,lki->li", weights, mesh[corners])
+        facing = (normals * toward).sum(axis=1) > _FACING * np.linalg.norm(toward, axis=1)
+        hit = inside & (face >= 0) & facing
+        places[row, hit] = np.einsum("lk,lki->li", weights, template[corners])[hit]
+    enough = np.flatnonzero(np.isfinite(places[..., 0]).sum(axis=0) > _FEWEST * len(keys) / 2)
+    if len(enough) < 10:
+        raise InputError(
+            f"clip of {clip.subject}", "images", "faces that the network finds", f"{len(enough)} landmarks"
+        )
+    middle = np.nanmedian(places[:, enough], axis=0)
+    spread = np.nanmedian(np.linalg.norm(places[:, enough] - middle, axis=2), axis=0)
+    kept = spread < MOST_SPREAD
+    on_mesh = closest_points(middle[kept], template, np.asarray(head.faces))
+    return Embedding(enough[kept], np.asarray(head.faces)[on_mesh.face], on_mesh.weights)
+
+
+class NetworkLandmarks:
+    """A source of landmarks: the network on the images of some cameras of a clip."""
+
+    def __init__(
+        self, network: LandmarkNetwork, embedding: Embedding, clip: CaptureClip, cameras: Sequence[str]
+    ):
+        self._network, self._embedding, self._clip, self._cameras = network, embedding, clip, [*cameras]
+        self._keys = {(key.timestep, key.camera): key for key in clip.files}
+        self._views = Views([clip.cameras[name] for name in cameras])
+        self._rest, self._normals = _rest(clip.head, embedding)
+
+    def __call__(self, timesteps: Sequence[int]) -> ImageLandmarks:
+        """Landmarks that face their camera, by the pose that fits the landmarks of the image."""
+        pixels = np.full((len(timesteps), len(self._cameras), len(self._rest), 2), np.nan)
+        for column, name in enumerate(self._cameras):
+            near = None
+            for row, timestep in enumerate(timesteps):
+                image = self._clip.image(self._keys[timestep, name])
+                trials: list[FloatArray | None] = [None] if near is None else [near, None]
+                for tried in trials:
+                    near = self._network.find(image, tried)
+                    facing = None if near is None else self._facing(near[self._embedding.landmarks], column)
+                    if near is not None and facing is not None:
+                        found = near[self._embedding.landmarks]
+                        pixels[row, column] = np.where(facing[:, None], found, np.nan)
+                        break
+                    near = None
+        return ImageLandmarks(self._embedding.corners, self._embedding.weights, pixels)
+
+    def _facing(self, found: FloatArray, camera: int) -> BoolArray | None:
+        """(L,) which landmarks face the camera; None if they do not form a face."""
+        K = self._views.intrinsics[camera]
+        _, turn, shift = cv2.solvePnP(self._rest, found, K, None, flags=cv2.SOLVEPNP_SQPNP)
+        rotation = cv2.Rodrigues(turn)[0]
+        seen = self._rest @ rotation.T + shift[:, 0]
+        cosine = -(seen * (self._normals @ rotation.T)).sum(axis=1) / np.linalg.norm(seen, axis=1)
+        projected = seen @ K.T
+        gaps = np.linalg.norm(projected[:, :2] / projected[:, 2:] - found, axis=1)
+        upright = -rotation[1, 1] > 0  # the head's y points up, the image's down
+        if not upright or np.median(gaps) > MOST_MISFIT * np.ptp(found, axis=0).max():
+            return None
+        return cosine > _FACING
+
+
+def _rest(head: HeadAsset, embedding: Embedding) -> tuple[FloatArray, FloatArray]:
+    """Landmarks on the mean head, (L, 3) metres, and their normals."""
+    template = np.asarray(head.template, np.float64)
+    normals = vertex_normals(template, np.asarray(head.faces))
+    mixed = [
+        np.einsum("lk,lki->li", embedding.weights, values[embedding.corners])
+        for values in (template, normals)
+    ]
+    return mixed[0], mixed[1]

@@ -1,0 +1,38 @@
+"""Settings of the head tracker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from ..options import CaptureOptions
+
+
+@dataclass(frozen=True)
+class TrackSettings(CaptureOptions):
+    """Settings of ``headbench track``."""
+
+    capture: Annotated[str, tyro.conf.Positional]
+    """Capture, in a layout that a reader knows; images, cameras and head model are used."""
+
+    out: str
+    """Folder for the tracked capture, track.json and overlay.png."""
+
+    cameras: tuple[str, ...] = ()
+    """Ids of the cameras whose images are used; default: all. One is enough."""
+
+    landmarks: str = ""
+    """MediaPipe's face_landmark.tflite, which needs ai-edge-litert; default: vertices of the capture's own tracked mesh with
+    the error of such a network."""
+
+    embedding: str = ""
+    """Capture of another subject with exact tracking in the same head model, from which the places of the network's landmarks
+    on the mesh are learnt; only with --landmarks."""
+
+    against: str = ""
+    """Capture with the exact tracking, to print errors in millimetres by region."""
+
+    seed: int = 0
+    """Seed of the error of landmarks that are not a network's."""

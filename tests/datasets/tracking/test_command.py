@@ -1,0 +1,62 @@
+"""``headbench track`` on a capture on disk: what it writes reads back, and what it refuses."""
+
+import json
+import os
+
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.images import read_image
+from headbench.datasets.tracking.command import track_capture
+from headbench.datasets.tracking.settings import TrackSettings
+
+
+@pytest.fixture(scope="module")
+def finished(patterned_capture, tmp_path_factory):
+    out = tmp_path_factory.mktemp("tracked") / "out"
+    capture = str(patterned_capture.union)
+    return out, track_capture(TrackSettings(capture, str(out), against=capture))
+
+
+def test_the_tracked_capture_reads_back(finished, patterned_capture):
+    old, new = read_capture(patterned_capture.union), read_capture(finished[1].data["capture"])
+    assert {name: set(keys) for name, keys in new.splits.items()} == {
+        n: set(k) for n, k in old.splits.items()
+    }
+    assert all(os.path.samefile(file.image, new.files[key].image) for key, file in old.files.items())
+    assert not new.static_offset.any()
+    assert any(abs(new.poses[t].translation - old.poses[t].translation).max() > 1e-5 for t in old.poses)
+
+
+def test_report_and_picture(finished):
+    out, result = finished
+    stored = json.loads((out / "track.json").read_text())
+    assert stored["timesteps"] == len(stored["residuals"]) == 5
+    assert f"{stored['errors_mm']['face']['absolute']:.2f}" in result.text
+    height, width, _ = read_image(out / "overlay.png", (1, 1, 1)).shape
+    assert (height, width) == (3 * 160, 2 * 3 * 120)
+
+
+def test_a_network_needs_an_embedding(patterned_capture, tmp_path):
+    settings = TrackSettings(str(patterned_capture.union), str(tmp_path / "out"), landmarks="network.tflite")
+    with pytest.raises(InputError, match="--embedding"):
+        track_capture(settings)
+
+
+def test_a_missing_network_is_refused(patterned_capture, tmp_path):
+    capture, file = str(patterned_capture.union), str(tmp_path / "network.tflite")
+    with pytest.raises(InputError, match="no such file"):
+        track_capture(TrackSettings(capture, str(tmp_path / "out"), landmarks=file, embedding=capture))
+
+
+def test_a_missing_head_model_is_refused(patterned_capture, tmp_path):
+    capture = patterned_capture.copied(tmp_path / "capture")
+    (capture.union / "head_model.npz").unlink()
+    with pytest.raises(InputError, match="head model"):
+        track_capture(TrackSettings(str(capture.union), str(tmp_path / "out")))
+
+
+def test_the_capture_itself_is_not_overwritten(patterned_capture):
+    with pytest.raises(InputError, match="outside the capture"):
+        track_capture(TrackSettings(str(patterned_capture.union), str(patterned_capture.writer.root)))

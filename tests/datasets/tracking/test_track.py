@@ -1,0 +1,138 @@
+"""The tracker on pictures of a known mesh: how near it comes, and what it refuses."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.tracking.fit import Fitter
+from headbench.datasets.tracking.landmarks import known_rig_landmarks, spread_vertices
+from headbench.datasets.tracking.rig import PoseColumns
+from headbench.datasets.tracking.track import track
+from headbench.datasets.tracking.views import Views
+from headbench.datasets.tracking_errors import mesh_errors
+
+
+@pytest.fixture(scope="module")
+def clip(patterned_capture):
+    return read_capture(patterned_capture.union)
+
+
+@pytest.fixture(scope="module")
+def tracked(clip):
+    """The clip as the tracker sees it with all cameras."""
+    return track(clip, [*clip.cameras], source(clip, [*clip.cameras]))
+
+
+def source(clip, cameras, seed=0):
+    return partial(known_rig_landmarks, clip, cameras, seed=seed)
+
+
+def skin_errors(tracked, exact):
+    """Errors of the face, lips and lids included."""
+    front = np.asarray(exact.head.regions["face"])
+    poses = sorted(exact.poses)
+    found, wanted = (PosedSubject.of(one).meshes([one.poses[t] for t in poses]) for one in (tracked, exact))
+    turns = PosedSubject.of(exact).motions([exact.poses[t] for t in poses])[:, :3, :3]
+    return mesh_errors(found[:, front], wanted[:, front], turns)
+
+
+def by_landmarks(clip, cameras):
+    """The clip as landmarks alone track it."""
+    timesteps = sorted(clip.poses)
+    fitter = Fitter(
+        clip.head, Views([clip.cameras[name] for name in cameras]), source(clip, cameras)(timesteps)
+    )
+    state = fitter.fit_landmarks(fitter.start())
+    poses = PoseColumns.of(clip.head).poses(state.poses, clip.head, clip.subject, timesteps)
+    zeros = np.zeros_like(clip.static_offset)
+    return replace(clip, shape=state.shape, static_offset=zeros, poses=dict(zip(timesteps, poses)))
+
+
+def test_colours_correct_landmarks(clip, tracked):
+    before, after = skin_errors(by_landmarks(clip, [*clip.cameras]), clip), skin_errors(tracked.clip, clip)
+    assert after.motion < 0.5 * before.motion
+    assert after.absolute < before.absolute
+    assert not tracked.clip.static_offset.any()
+    assert [residual.timestep for residual in tracked.report.residuals] == sorted(clip.poses)
+    assert tracked.clip.steps[-1].name == "track"
+
+
+def test_the_clips_own_tracking_is_not_used(clip, tracked):
+    cameras = [*clip.cameras]
+    landmarks = source(clip, cameras)(sorted(clip.poses))
+    wrong = {t: replace(p, jaw=np.ones(3), translation=np.full(3, 9.0)) for t, p in clip.poses.items()}
+    other = replace(clip, poses=wrong, shape=clip.shape + 5, static_offset=clip.static_offset + 1)
+    found = track(other, cameras, lambda timesteps: landmarks).clip
+    np.testing.assert_array_equal(found.shape, tracked.clip.shape)
+    for timestep, pose in found.poses.items():
+        np.testing.assert_array_equal(pose.jaw, tracked.clip.poses[timestep].jaw)
+
+
+def test_one_camera_is_enough(clip):
+    frontal = next(name for name in clip.cameras if name.endswith("37"))
+    views = Views([clip.cameras[frontal]])
+    timesteps, face = sorted(clip.poses), np.asarray(clip.head.regions["face"])
+
+    def places(one):
+        meshes = PosedSubject.of(one).meshes([one.poses[timestep] for timestep in timesteps])
+        return np.array([views.place(mesh[face])[0][0] for mesh in meshes])
+
+    single = track(clip, [frontal], source(clip, [frontal])).clip
+    gaps = [places(one) - places(clip) for one in (single, by_landmarks(clip, [frontal]))]
+    after, before = (np.linalg.norm(gap - gap.mean(axis=0), axis=2).mean() for gap in gaps)
+    assert after < 0.7 * before
+
+
+def test_blocks_share_the_shape(clip, monkeypatch):
+    monkeypatch.setattr("headbench.datasets.tracking.track.MOST_TIMESTEPS", 3)
+    cameras, asked = [*clip.cameras], []
+
+    def noted(timesteps):
+        asked.append([*timesteps])
+        return source(clip, cameras)(timesteps)
+
+    tracked, report = track(clip, cameras, noted)
+    assert [len(part) for part in asked] == [3, 2]
+    assert sorted(asked[0] + asked[1]) == sorted(tracked.poses) == [one.timestep for one in report.residuals]
+
+
+@pytest.mark.parametrize(("cameras", "found"), [([], "none"), (["nowhere"], "nowhere")])
+def test_cameras_that_are_missing_are_refused(clip, cameras, found):
+    with pytest.raises(InputError, match=f"cameras.*{found}"):
+        track(clip, cameras, source(clip, [*clip.cameras]))
+
+
+def test_no_landmarks_are_refused(clip):
+    def nothing(timesteps):
+        landmarks = source(clip, [*clip.cameras])(timesteps)
+        return landmarks._replace(pixels=np.full_like(landmarks.pixels, np.nan))
+
+    with pytest.raises(InputError, match="landmarks"):
+        track(clip, [*clip.cameras], nothing)
+
+
+def test_a_missing_frame_is_refused(clip):
+    key = min(clip.files)
+    files = {one: file for one, file in clip.files.items() if one != key}
+    with pytest.raises(InputError, match=f"timestep {key.timestep} of camera {key.camera}"):
+        track(replace(clip, files=files), [*clip.cameras], source(clip, [*clip.cameras]))
+
+
+def test_landmarks_are_seeded_and_wrong(clip):
+    cameras = [*clip.cameras]
+    one, two, other = (source(clip, cameras, seed)([0]).pixels for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one, two)
+    assert np.nanmedian(np.abs(one - other)) > 0.3
+
+
+def test_spread_points_are_far_apart():
+    points = np.random.default_rng(0).random((300, 3))
+    chosen = points[spread_vertices(points, 20)]
+    gaps = np.linalg.norm(chosen[:, None] - chosen, axis=2) + np.eye(20)
+    random = np.linalg.norm(points[:20, None] - points[:20], axis=2) + np.eye(20)
+    assert gaps.min() > 2 * random.min()
