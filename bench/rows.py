@@ -418,7 +418,7 @@ class Rows:
         return self.select(method=method, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
 
 
-DISCARD = "Choose another --out. To discard the results in this file, delete it: trained avatars are kept."
+DISCARD = "Choose another --out. To discard the results, delete run.json and rows.parquet: trained avatars are kept."
 """Remedy for rows that would be lost."""
 
 

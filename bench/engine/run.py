@@ -353,7 +353,7 @@ def check_capture(config: RunConfig, clip: Clip) -> None:
             config.data,
             f"capture of {clip.subject}",
             "a capture on which avatars can be trained",
-            " ".join(found),
+            " ".join(found).rstrip("."),
             "`headbench lint` shows more; `headbench run --unchecked` trains all the same.",
         )
 

@@ -202,9 +202,9 @@ class _DeclarationFile:
     format_version: int
     subject: str
     head_model: str
+    cy: CyConvention
     head_file: str = HEAD_FILE
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    cy: CyConvention = "bottom"
     sequences: dict[str, str] = field(default_factory=dict)
     excluded: tuple[_Exclusion, ...] = ()
     synthetic: dict[str, Any] = field(default_factory=dict)

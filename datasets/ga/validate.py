@@ -15,6 +15,7 @@ from typing import Literal
 from ...bench.contracts import FrameKey, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.images import ImageInfo, probe_image
+from ...bench.progress import counted
 from ..clip import CaptureClip
 from .content_digests import content_digests
 from .layout import parse_sequence_folder
@@ -123,7 +124,7 @@ def find_leaks(
         if equal:
             first = by_content[contents[images[equal[0]]]]
             found.append(
-                f"{len(equal)} images have the same content in {names}, such as {first} and {equal[0]}"
+                f"{counted(len(equal), 'image')} of the same content in {names}, such as {first} and {equal[0]}"
             )
     train = splits.get("train", ())
     timesteps = sorted({k.timestep for k in train} & {k.timestep for k in splits.get("self_reenactment", ())})

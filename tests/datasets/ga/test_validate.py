@@ -221,7 +221,7 @@ FAULTS = {
     ),
     "image copied into the test": (
         lambda c: shutil.copy(image(c, "EMO-1-shout+laugh", 0, SERIALS[0]), image(c, camera=SERIALS[0])),
-        {"found": "1 images have the same content in train and self_reenactment"},
+        {"found": "1 image of the same content in train and self_reenactment"},
     ),
 }
 
