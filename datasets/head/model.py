@@ -57,7 +57,7 @@ class HeadModel(torch.nn.Module):
 
         def basis(name: str, values: Any) -> None:
             # (V, 3, K) to (K, 3V), so that the product with coefficients is one matrix multiplication.
-            buffer(name, np.asarray(values).reshape(-1, np.shape(values)[2]).T)
+            buffer(name, np.asarray(values).reshape(3 * len(values), -1).T)  # K may be 0
 
         buffer("template", asset.template)
         basis("shape_matrix", asset.shape_basis)
