@@ -206,6 +206,7 @@ class _Process:
                 pass_fds=[other.fileno()],
                 env=environment,
                 stdin=subprocess.DEVNULL,
+                stdout=2,  # what a plug-in prints is not part of the output of the command
                 start_new_session=True,
             )
         other.close()
