@@ -204,7 +204,8 @@ def _untrained_expressions(evidence: Evidence) -> Iterator[Hit]:
     for entry in evidence.splits.get("self_reenactment", ()):
         test[evidence.names[entry.sequence_folder]].add(entry.timestep)
     train = {entry.timestep for entry in evidence.splits.get("train", ())}
-    poses = {p.timestep: p.pose.expression for p in evidence.posed if p.pose}
+    excluded = evidence.declaration.excluded if evidence.declaration else {}
+    poses = {p.timestep: p.pose.expression for p in evidence.posed if p.pose and p.timestep not in excluded}
     head = evidence.subject.head
     metric = displacement_metric(head.expression_basis[head.regions.get("face", slice(None))])
     known = [poses[t] for t in sorted(train & poses.keys())]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
+from headbench.bench.io.documents import read_json
 from headbench.bench.io.images import ImageInfo
 from headbench.datasets.ga.layout import Declaration
 from headbench.datasets.ga.writer import SequencePlan
@@ -67,6 +69,21 @@ def test_every_rule_is_tried_explained_and_of_a_group():
         assert rule.code[2] in GROUPS
         assert rule.title
         assert rule.remedy.endswith((".", "?"))
+
+
+def test_excluded_timesteps_are_no_untrained_expressions(good):
+    (fault,) = (fault for fault in FAULTS if fault.code == "HB616")
+    fault.plant(good)
+    assert "HB616" in codes(good)
+    declaration = Declaration.read(good.union)
+    assert declaration is not None
+    document = read_json(good.union / "transforms_test.json")
+    tested = {frame["timestep_index"] for frame in document["frames"]}
+    replace(declaration, excluded=dict.fromkeys(sorted(tested)[1:], "tongue out")).write(good.union)
+    kept = read_json(good.union / "transforms_train.json")["frames"][0]["flame_param_path"]
+    first = min(frame["flame_param_path"] for frame in document["frames"])
+    shutil.copyfile(good.union / kept, good.union / first)  # the expression of a training frame
+    assert "HB616" not in codes(good)
 
 
 def test_an_off_centre_principal_point_is_noted(tmp_path):
