@@ -107,8 +107,9 @@ def test_ctrl_c_while_modules_are_imported_is_a_line(start, module):
         assert process.poll() is None
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate()
-    said = [line for line in errors.splitlines() if not line.startswith("import time:")]
-    assert (process.returncode, output, said) == (130, "", [LINES[signal.SIGINT]])
+    # A line of importtime may be cut in two.
+    assert (process.returncode, output, errors.splitlines()[-1]) == (130, "", LINES[signal.SIGINT])
+    assert "Traceback" not in errors
 
 
 @pytest.fixture

@@ -105,5 +105,5 @@ def test_a_bundle_decides_nothing_but_what_is_captured(name):
     assert synthesis_arguments(steps, "a")["seed"] == 3
     # What a stranger's bundle says of an executor would be run as a script of the shell.
     recorded[name] = {"executor": "slurm", "slurm": {"setup": ["touch owned"]}}
-    with pytest.raises(InputError, match=rf"{name}: expected one of cameras, .*, found '{name}'"):
+    with pytest.raises(InputError, match=rf"{name}: expected one of .*, seed, .*, found '{name}'"):
         synthesis_arguments(steps, "a")
