@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...bench.contracts import ByteArray, Progress, no_progress
-from ...bench.errors import InputError
 from ...bench.io.files import write_json
 from ...bench.specs import CommandResult
 from .settings import TrackSettings
 
 if TYPE_CHECKING:
-    from ..clip import CaptureClip
     from ..tracking_errors import RegionError
-    from .track import LandmarkSource, Tracked
+    from .track import Tracked
 
 REPORT, PICTURE = "track.json", "overlay.png"
 ROWS, COLUMNS = 3, 4
@@ -35,15 +32,12 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     from ..head.refit.rewrite import capture_plan, write_capture
     from ..images import write_image
     from ..tracking_errors import tracking_errors
+    from .network import landmark_source
     from .track import check_cameras, track
 
-    if bool(settings.landmarks) != bool(settings.embedding):
-        given, other = (
-            ("--landmarks", "--embedding") if settings.landmarks else ("--embedding", "--landmarks")
-        )
-        raise InputError("command line", other, f"a value beside {given}", "none")
     out = Path(settings.out)
     clip = settings.open(settings.capture, progress)
+    teacher = settings.open(settings.embedding, progress) if settings.embedding else None
     exact = settings.open(settings.against, progress) if settings.against else None
     capture_plan(clip, settings.capture)  # Captures that cannot be rewritten are detected before the fit.
     check_apart(clip, out)
@@ -51,7 +45,9 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     check_cameras(clip, cameras)
     kind = Path(settings.landmarks).name or "vertices of the tracked mesh"
     notes = {"landmarks": kind, "seed": settings.seed}
-    source = _source(settings, clip, cameras, progress)
+    source = landmark_source(
+        clip, cameras, settings.landmarks, teacher, seed=settings.seed, progress=progress
+    )
     tracked = track(clip, cameras, source, notes=notes, progress=progress)
     write_image(out / PICTURE, draw_overlay(tracked, cameras))
     union = write_capture(tracked.clip, out, progress)
@@ -63,22 +59,6 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
         lines += _table(errors)
     write_json(out / REPORT, data)
     return CommandResult("\n".join([*lines, f"Capture: {union}"]), data)
-
-
-def _source(
-    settings: TrackSettings, clip: CaptureClip, cameras: Sequence[str], progress: Progress
-) -> LandmarkSource:
-    from .landmarks import known_rig_landmarks
-    from .network import LandmarkNetwork, NetworkLandmarks, learn_embedding
-
-    if not settings.landmarks:
-        return partial(known_rig_landmarks, clip, cameras, seed=settings.seed)
-    network = LandmarkNetwork(Path(settings.landmarks))
-    teacher = settings.open(settings.embedding, progress)
-    if teacher.head.version != clip.head.version:
-        remedy = "Landmarks are learnt on another subject of the same head model."
-        raise InputError(settings.embedding, "head_model", clip.head.version, teacher.head.version, remedy)
-    return NetworkLandmarks(network, learn_embedding(network, teacher, progress), clip, cameras)
 
 
 def draw_overlay(tracked: Tracked, cameras: Sequence[str]) -> ByteArray:

@@ -6,7 +6,8 @@ read without that package.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from ..head.geometry import vertex_normals
 from ..head.refit.identity import closest_points
 from ..head.subject import PosedSubject
 from ..mesh_pictures import rasterize_mesh
-from .landmarks import ImageLandmarks
+from .landmarks import ImageLandmarks, known_rig_landmarks
 from .views import Views
 
 CORNERS = (33, 263)
@@ -258,3 +259,29 @@ def _rest(head: HeadAsset, embedding: Embedding) -> tuple[FloatArray, FloatArray
         for values in (template, normals)
     ]
     return mixed[0], mixed[1]
+
+
+def landmark_source(
+    clip: CaptureClip,
+    cameras: Sequence[str],
+    landmarks: str,
+    teacher: CaptureClip | None,
+    *,
+    seed: int = 0,
+    progress: Progress = no_progress,
+) -> Callable[[Sequence[int]], ImageLandmarks]:
+    """Landmarks of a clip by timesteps: those of the network in the file ``landmarks``, else of a known rig with an error of
+    ``seed``. The network needs a ``teacher``: a clip of another subject with exact tracking in the same head model.
+
+    Raises `InputError` if only one of file and teacher is given, or if the head models differ.
+    """
+    if bool(landmarks) != (teacher is not None):
+        given, other = ("landmarks", "embedding") if landmarks else ("embedding", "landmarks")
+        raise InputError("settings of the tracker", other, f"a value beside {given}", "none")
+    if teacher is None:
+        return partial(known_rig_landmarks, clip, cameras, seed=seed)
+    if teacher.head.version != clip.head.version:
+        remedy = "Landmarks are learnt on another subject of the same head model."
+        raise InputError("embedding", "head_model", clip.head.version, teacher.head.version, remedy)
+    network = LandmarkNetwork(Path(landmarks))
+    return NetworkLandmarks(network, learn_embedding(network, teacher, progress), clip, cameras)

@@ -40,7 +40,7 @@ def test_report_and_picture(finished):
 
 def test_a_network_needs_an_embedding(patterned_capture, tmp_path):
     settings = TrackSettings(str(patterned_capture.union), str(tmp_path / "out"), landmarks="network.tflite")
-    with pytest.raises(InputError, match="--embedding"):
+    with pytest.raises(InputError, match="embedding: expected a value beside landmarks"):
         track_capture(settings)
 
 
