@@ -49,7 +49,7 @@ def with_tracking(
     if not place.exists():
         with progress(f"tracking {capture.subject}") as report:
             cameras = [*capture.cameras]
-            source = landmark_source(capture, cameras, landmarks, teacher, seed=seed)
+            source = landmark_source(capture, cameras, landmarks, teacher, seed)
             found = track(capture, cameras, source, progress=report).clip
         rows = columns.rows([found.poses[timestep] for timestep in timesteps])
         save_npz(place, {"shape": np.asarray(found.shape), "poses": rows})

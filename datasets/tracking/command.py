@@ -41,10 +41,11 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     exact = settings.open(settings.against, progress) if settings.against else None
     capture_plan(clip, settings.capture)  # Captures that cannot be rewritten are detected before the fit.
     check_apart(clip, out)
-    cameras = [*settings.cameras] or [*clip.cameras]
-    check_cameras(clip, cameras)
-    kind = Path(settings.landmarks).name or "vertices of the tracked mesh"
-    notes = {"landmarks": kind, "seed": settings.seed}
+    check_cameras(clip, cameras := [*settings.cameras] or [*clip.cameras])
+    notes = {
+        "landmarks": Path(settings.landmarks).name or "vertices of the tracked mesh",
+        "seed": settings.seed,
+    }
     source = landmark_source(
         clip, cameras, settings.landmarks, teacher, seed=settings.seed, progress=progress
     )
@@ -91,16 +92,16 @@ def _spread(values: Sequence[Any], count: int) -> list[Any]:
 
 def _text(tracked: Tracked) -> list[str]:
     summary = tracked.report.summary()
-    count = f"{summary['timesteps']} timesteps"
     return [
-        f"{count}, {len(tracked.report.cameras)} cameras, {summary['seconds_per_timestep']:.2f} s a timestep",
+        f"{summary['timesteps']} timesteps, {len(tracked.report.cameras)} cameras, {summary['seconds_per_timestep']:.2f} s a timestep",
         f"  landmarks  {summary['landmarks_px']:.2f} pixels root mean square",
         f"  colours    {summary['colour_levels']:.2f} levels of 255, median",
     ]
 
 
 def _table(errors: Mapping[str, RegionError]) -> list[str]:
-    lines = [f"  {'error, mm rms':14} {'absolute':>9} {'affine':>9} {'motion':>9}"]
-    return lines + [
-        f"  {name:14} {e.absolute:9.2f} {e.affine:9.2f} {e.motion:9.2f}" for name, e in errors.items()
+    rows = [(name, *(f"{value:.2f}" for value in error)) for name, error in errors.items()]
+    return [
+        f"  {a:14} {b:>9} {c:>9} {d:>9}"
+        for a, b, c, d in [("error, mm rms", "absolute", "affine", "motion"), *rows]
     ]

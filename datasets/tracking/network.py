@@ -266,8 +266,7 @@ def landmark_source(
     cameras: Sequence[str],
     landmarks: str,
     teacher: CaptureClip | None,
-    *,
-    seed: int = 0,
+    seed: int,
     progress: Progress = no_progress,
 ) -> Callable[[Sequence[int]], ImageLandmarks]:
     """Landmarks of a clip by timesteps: those of the network in the file ``landmarks``, else of a known rig with an error of
@@ -281,7 +280,6 @@ def landmark_source(
     if teacher is None:
         return partial(known_rig_landmarks, clip, cameras, seed=seed)
     if teacher.head.version != clip.head.version:
-        remedy = "Landmarks are learnt on another subject of the same head model."
-        raise InputError("embedding", "head_model", clip.head.version, teacher.head.version, remedy)
+        raise InputError("embedding", "head_model", clip.head.version, teacher.head.version)
     network = LandmarkNetwork(Path(landmarks))
     return NetworkLandmarks(network, learn_embedding(network, teacher, progress), clip, cameras)
