@@ -593,11 +593,19 @@ def of_another_capture(files):
     return rows(lambda t: t.assign(protocol=t["protocol"].replace(hashes)))(change(forged))
 
 
-def test_a_training_on_another_capture_supports_nothing(honest, make_board):
-    forged = of_another_capture(together(only("nearest-camera"), one_seed, without_renders)(honest))
-    _, bundles, _ = make_board(words=["f.zip"], f=forged)
-    assert bundles["f.zip"]["state"] == "claimed"
-    assert re.search("Not trained again: .*protocol of", " ".join(bundles["f.zip"]["remarks"]))
+def test_a_training_that_differs_supports_nothing(honest, make_board):
+    baseline = together(only("nearest-camera"), one_seed, without_renders)(honest)
+    forged = {
+        "protocol of": of_another_capture(baseline),
+        "nearest-camera.budget": record(lambda r: r["methods"][0]["budget"].update(iterations=1_000_000))(
+            baseline
+        ),
+    }
+    files = {f"f{index}": files for index, files in enumerate(forged.values())}
+    _, bundles, _ = make_board(words=[f"{name}.zip" for name in files], **files)
+    for name, said in zip(files, forged, strict=True):
+        assert bundles[f"{name}.zip"]["state"] == "claimed"
+        assert re.search(f"Not trained again: .*{said}", " ".join(bundles[f"{name}.zip"]["remarks"]))
 
 
 def without_metric(name):

@@ -128,7 +128,8 @@ def agreements(rows: Rows, again: Rows, metrics: Mapping[str, MetricSpec]) -> li
 def results_again(out: Path, manifest: Manifest) -> Rows | None:
     """Rows of a finished training of `train_again` into ``out``; None if there is none.
 
-    Raises `InputError` for a damaged run, and one that scored others than the frames and captures of the bundle's protocols.
+    Raises `InputError` for a damaged run, and one of other settings than the bundle's methods, or that scored others than
+    the frames and captures of its protocols.
     """
     folder = RunFolder(out / "run")
     if not folder.manifest.is_file():
@@ -141,4 +142,9 @@ def results_again(out: Path, manifest: Manifest) -> Rows | None:
         task = min(task for task in {*claimed, *made} if claimed.get(task) != made.get(task))
         hashes = (str(each.get(task, "none")) for each in (claimed, made))
         raise InputError(folder.manifest, f"protocol of {task}", *hashes)
+    for claim, trained in zip(manifest.methods, again.methods, strict=True):
+        for name in ("config", "budget"):
+            values = str(getattr(claim, name)), str(getattr(trained, name))
+            if values[0] != values[1]:
+                raise InputError(folder.manifest, f"methods.{claim.label}.{name}", *values)
     return folder.rows_by_condition(again)
