@@ -10,6 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from ...bench.contracts import FloatArray
+from ...bench.progress import counted
 from ..ga import layout
 from ..ga.cameras import ROTATION_TOLERANCE, contradicted_focal, same_intrinsics
 from ..ga.principal_point import OutlineView, weigh_cy
@@ -17,7 +18,7 @@ from ..ga.transforms import FrameEntry
 from ..images import read_mask
 from .checks_images import sound_mask
 from .evidence import Evidence, first_entries
-from .rules import Hit, at, rule, several, some
+from .rules import Hit, at, rule, some
 
 SAME_PLACE_M = 1e-3
 SAME_TURN = 2e-3
@@ -48,7 +49,7 @@ def _not_rigid(evidence: Evidence) -> Iterator[Hit]:
     broken = [error for error in evidence.frame_faults if error.key.endswith(".transform_matrix")]
     if broken:
         text = (
-            f"{several(len(broken), 'frame')} with a transform_matrix that is not a rigid motion: "
+            f"{counted(len(broken), 'frame')} with a transform_matrix that is not a rigid motion: "
             f"{broken[0].found}"
         )
         yield Hit(text, broken[0].file, broken[0].key)
@@ -133,7 +134,7 @@ def _cameras(evidence: Evidence, cameras: Iterable[str], what: str) -> Iterator[
     if names:
         entry = first_entries(evidence)[names[0]]
         key = f"{entry.where}.transform_matrix"
-        yield Hit(f"{several(len(names), 'camera')} {what}: {some(names)}", entry.file, key)
+        yield Hit(f"{counted(len(names), 'camera')} {what}: {some(names)}", entry.file, key)
 
 
 def implausible_distance(evidence: Evidence) -> float | None:
@@ -186,7 +187,7 @@ def _focal(evidence: Evidence) -> Iterator[Hit]:
     if wrong:
         camera, entry, implied = wrong[0]
         yield Hit(
-            f"in {several(len(wrong), 'camera')} fl_x and camera_angle_x disagree: {camera} has fl_x "
+            f"in {counted(len(wrong), 'camera')} fl_x and camera_angle_x disagree: {camera} has fl_x "
             f"{entry.intrinsics['fl_x']:.6g} px where its angle and the image's width imply {implied:.6g}",
             *at(entry, "fl_x"),
         )

@@ -9,12 +9,13 @@ from itertools import combinations, pairwise
 
 from ...bench.errors import InputError
 from ...bench.io.files import entries
+from ...bench.progress import counted
 from ..ga import layout
 from ..ga.transforms import FrameEntry
 from .checks_images import unit_range
 from .checks_rig import dead_cameras
 from .evidence import Evidence, Slot
-from .rules import Hit, at, rule, several, some, spans
+from .rules import Hit, at, rule, some, spans
 from .views import Thumbnail, near_duplicates
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -30,7 +31,7 @@ def _faults(errors: Iterable[InputError], noun: str) -> Iterator[Hit]:
         groups[(error.key.rpartition(".")[2], error.expected)].append(error)
     for (_, expected), group in groups.items():
         first = group[0]
-        more = f" ({several(len(group), noun)} like it)" if len(group) > 1 else ""
+        more = f" ({counted(len(group), noun)} like it)" if len(group) > 1 else ""
         yield Hit(f"expected {expected}, found {first.found}{more}", first.file, first.key)
 
 
@@ -81,11 +82,11 @@ def _missing_file(evidence: Evidence) -> Iterator[Hit]:
         if str(error.file) not in elsewhere:
             groups[(error.expected, error.found)].append(error)
     for (expected, found), group in groups.items():
-        count = f" ({several(len(group), 'file')})" if len(group) > 1 else ""
+        count = f" ({counted(len(group), 'file')})" if len(group) > 1 else ""
         yield Hit(f"expected {expected}, found {found}{count}", group[0].file)
     damaged = [view.error for view in evidence.views if view.error is not None]
     if damaged:
-        yield Hit(f"{several(len(damaged), 'image')} do not decode: {damaged[0].found}", damaged[0].file)
+        yield Hit(f"{counted(len(damaged), 'image')} do not decode: {damaged[0].found}", damaged[0].file)
     paths = {
         p.path: p.error
         for p in evidence.parameters.values()
@@ -93,7 +94,7 @@ def _missing_file(evidence: Evidence) -> Iterator[Hit]:
     }
     for error in list(paths.values())[:1]:
         yield Hit(
-            f"expected {error.expected}, found {error.found} ({several(len(paths), 'file')})", error.file
+            f"expected {error.expected}, found {error.found} ({counted(len(paths), 'file')})", error.file
         )
 
 
@@ -119,7 +120,7 @@ def _absolute_paths(evidence: Evidence) -> Iterator[Hit]:
     if found:
         path, (entry, key) = next(iter(found.items()))
         yield Hit(
-            f"{several(len(found), 'file')} named by absolute paths that this machine does not have, such as {path}",
+            f"{counted(len(found), 'file')} named by absolute paths that this machine does not have, such as {path}",
             *at(entry, key),
         )
 
@@ -143,7 +144,7 @@ def _wrong_size(evidence: Evidence) -> Iterator[Hit]:
     if wrong:
         path, found, expected, entry = wrong[0]
         yield Hit(
-            f"{several(len(wrong), 'file')} of another size than stated: {found[0]}x{found[1]} pixels where "
+            f"{counted(len(wrong), 'file')} of another size than stated: {found[0]}x{found[1]} pixels where "
             f"{entry.where} of {entry.file.name} says {expected[0]}x{expected[1]}",
             path or "",
         )
@@ -163,7 +164,7 @@ def _holes(evidence: Evidence) -> Iterator[Hit]:
             worst = Counter(camera for _, camera in missing).most_common(1)[0][0]
             where = spans(t for t, camera in missing if camera == worst)
             text = (
-                f"{several(len(missing), 'frame')} of sequence {evidence.names[folder]} missing from the grid of "
+                f"{counted(len(missing), 'frame')} of sequence {evidence.names[folder]} missing from the grid of "
                 f"{len(timesteps)} timesteps and {len(cameras)} cameras, such as camera {worst} at {where}"
             )
             yield Hit(text, evidence.folder, "frames")
@@ -199,7 +200,7 @@ def _frozen(evidence: Evidence) -> Iterator[Hit]:
             if shared and all(images[before][camera] == images[after][camera] for camera in shared):
                 frozen.append(after)
     if frozen:
-        text = f"{several(len(frozen), 'timestep')} with the images of the timestep before: {spans(frozen)}"
+        text = f"{counted(len(frozen), 'timestep')} with the images of the timestep before: {spans(frozen)}"
         yield Hit(text, evidence.folder, "timestep_index")
 
 
@@ -249,7 +250,7 @@ def _short_test(evidence: Evidence) -> Iterator[Hit]:
         if kept < least:
             left_out = f" ({len(present & excluded)} excluded)" if present & excluded else ""
             yield Hit(
-                f"test sequence {evidence.names[folder]} has {several(kept, 'timestep')}{left_out}, "
+                f"test sequence {evidence.names[folder]} has {counted(kept, 'timestep')}{left_out}, "
                 f"fewer than {least}",
                 evidence.split_file("self_reenactment"),
             )
@@ -277,7 +278,8 @@ def _empty_split(evidence: Evidence) -> Iterator[Hit]:
 def _undeclared(evidence: Evidence) -> Iterator[Hit]:
     """The capture does not declare its conventions.
 
-    Write headbench.json beside the JSONs (its keys are listed in the documentation under "Captures and head models"), so that nothing has to be inferred.
+    Write headbench.json beside the JSONs (its keys are listed in the documentation under "Captures and head models"), so that
+    nothing has to be inferred.
     """
     if evidence.declaration is None and not evidence.declaration_faults:
         yield Hit(
@@ -307,7 +309,7 @@ def _orphans(evidence: Evidence) -> Iterator[Hit]:
         if path.suffix.lower() in IMAGE_SUFFIXES and path.resolve() not in known
     )
     if orphans:
-        yield Hit(f"{several(len(orphans), 'image')} that no split names", orphans[0])
+        yield Hit(f"{counted(len(orphans), 'image')} that no split names", orphans[0])
 
 
 @rule("HB114", "warning")
@@ -319,7 +321,7 @@ def _uneven_masks(evidence: Evidence) -> Iterator[Hit]:
     bare = [entry for entry in evidence.entries if entry.mask is None]
     share = len(bare) / max(1, len(evidence.entries))
     if 0 < share < 1:
-        text = f"{several(len(bare), 'frame')} of {len(evidence.entries)} name no mask, the others do"
+        text = f"{counted(len(bare), 'frame')} of {len(evidence.entries)} name no mask, the others do"
         yield Hit(text, *at(bare[0], "fg_mask_path"))
 
 
@@ -333,7 +335,7 @@ def _size_limit(evidence: Evidence) -> Iterator[Hit]:
     if wide:
         info = evidence.headers[wide[0]]
         yield Hit(
-            f"{several(len(wide), 'file')} wider than {GA_WIDTH} pixels, such as {info.width}x{info.height}",
+            f"{counted(len(wide), 'file')} wider than {GA_WIDTH} pixels, such as {info.width}x{info.height}",
             wide[0],
         )
 
@@ -357,7 +359,7 @@ def _same_images(evidence: Evidence) -> Iterator[Hit]:
         if shared:
             first, second = contents[one][shared[0]], contents[other][shared[0]]
             text = (
-                f"{several(len(shared), 'image')} in both {one} and {other}, such as {first.image.name} of "
+                f"{counted(len(shared), 'image')} in both {one} and {other}, such as {first.image.name} of "
                 f"{evidence.names[first.sequence_folder]} ({first.where} of {first.file.name})"
             )
             yield Hit(text, second.file, second.where)
@@ -385,7 +387,7 @@ def _near_images(evidence: Evidence) -> Iterator[Hit]:
         if pairs:
             a, b = (thumbnail.entry for thumbnail in pairs[0])
             yield Hit(
-                f"{several(len({second.entry.image for _, second in pairs}), 'image')} of {other} look the same "
+                f"{counted(len({second.entry.image for _, second in pairs}), 'image')} of {other} look the same "
                 f"as one of {one}, such as {b.image.name} of {evidence.names[b.sequence_folder]} and "
                 f"{a.image.name} of {evidence.names[a.sequence_folder]}",
                 b.image,
@@ -438,7 +440,7 @@ def _twice(evidence: Evidence) -> Iterator[Hit]:
             seen.add(slot)
         if twice:
             text = (
-                f"{several(len(twice), 'frame')} of {split} occur twice, such as timestep "
+                f"{counted(len(twice), 'frame')} of {split} occur twice, such as timestep "
                 f"{twice[0].timestep} of camera {twice[0].camera_id}"
             )
             yield Hit(text, twice[0].file, twice[0].where)

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ...bench.progress import counted
 from .checks_rig import blank_cameras, faulty_cameras
 from .evidence import Evidence, first_entries
-from .rules import Hit, rule, several, some
+from .rules import Hit, rule, some
 from .views import BACKGROUND_LEVELS, MaskFacts, ViewFacts
 
 MOST = 0.5
@@ -73,7 +74,7 @@ def _faulty_masks(evidence: Evidence, is_faulty: Callable[[MaskFacts], bool], wh
     faulty = [view for view, mask in _masks(evidence) if is_faulty(mask)]
     if faulty:
         path = faulty[0].entry.mask or faulty[0].entry.image
-        yield Hit(f"{what} in {len(faulty)} of {several(len(evidence.views), 'frame')} looked at", path)
+        yield Hit(f"{what} in {len(faulty)} of {counted(len(evidence.views), 'frame')} looked at", path)
 
 
 @rule("HB307", "error")
@@ -124,14 +125,14 @@ def _blank_images(evidence: Evidence) -> Iterator[Hit]:
     cameras = blank_cameras(evidence)
     if cameras:
         yield Hit(
-            f"every image looked at of {several(len(cameras), 'camera')} is of one colour: "
+            f"every image looked at of {counted(len(cameras), 'camera')} is of one colour: "
             + some(f"{camera} (level {_level(evidence, camera):.0f})" for camera in cameras),
             first_entries(evidence)[cameras[0]].image,
         )
     single = [view for view in faulty if view.entry.camera_id not in cameras]
     if single:
         yield Hit(
-            f"{len(single)} of {several(len(evidence.views), 'frame')} looked at are of one colour, level "
+            f"{len(single)} of {counted(len(evidence.views), 'frame')} looked at are of one colour, level "
             f"{single[0].low}",
             single[0].entry.image,
         )
@@ -180,7 +181,7 @@ def _wrong_background(evidence: Evidence) -> Iterator[Hit]:
         shown = f"level {tuple(found.tolist())}" if uniform else "no one colour"
         yield Hit(
             f"declared background is level {tuple(stated.tolist())}, outside the subject there is {shown} in "
-            f"{len(wrong)} of {several(len(seen), 'frame')} looked at",
+            f"{len(wrong)} of {counted(len(seen), 'frame')} looked at",
             wrong[0][0].entry.image,
         )
 
@@ -200,7 +201,7 @@ def _dirty_background(evidence: Evidence) -> Iterator[Hit]:
         typical = float(np.median([share for _, share in dirty]))
         yield Hit(
             f"{typical:.0%} of the pixels outside the mask differ from the background, in {len(dirty)} of "
-            f"{several(len(seen), 'frame')} looked at",
+            f"{counted(len(seen), 'frame')} looked at",
             dirty[0][0].entry.image,
         )
 
@@ -229,7 +230,7 @@ def _fringes(evidence: Evidence) -> Iterator[Hit]:
         )
         yield Hit(
             f"{what}: where the mask is soft, the subject adds {typical:.2f} times the light it should (median "
-            f"over {several(len(told), 'frame')})",
+            f"over {counted(len(told), 'frame')})",
             told[0][0].entry.image,
         )
 
@@ -303,7 +304,7 @@ def _grey(evidence: Evidence) -> Iterator[Hit]:
     grey = [view for view in views if view.grey]
     if grey:
         yield Hit(
-            f"{len(grey)} of {several(len(views), 'frame')} looked at have no colour", grey[0].entry.image
+            f"{len(grey)} of {counted(len(views), 'frame')} looked at have no colour", grey[0].entry.image
         )
 
 
@@ -334,7 +335,7 @@ def _swapped(evidence: Evidence) -> Iterator[Hit]:
         red, _, blue = skin_by_camera(evidence)[cameras[0]].round().astype(int)
         first = next(view for view in evidence.views if view.entry.camera_id == cameras[0])
         yield Hit(
-            f"skin is bluer than red in {several(len(cameras), 'camera')} ({some(cameras)}): red {red}, blue {blue}",
+            f"skin is bluer than red in {counted(len(cameras), 'camera')} ({some(cameras)}): red {red}, blue {blue}",
             first.entry.image,
         )
 
@@ -373,7 +374,7 @@ def _lossy(evidence: Evidence) -> Iterator[Hit]:
         named = [path for path in lossy if path.suffix.lower() == ".png"]
         more = f"; {len(named)} of them are named .png" if named else ""
         yield Hit(
-            f"{len(lossy)} of {several(len(evidence.digests), 'image')} are JPEG{more}", (named or lossy)[0]
+            f"{len(lossy)} of {counted(len(evidence.digests), 'image')} are JPEG{more}", (named or lossy)[0]
         )
 
 

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ...bench.progress import counted
 from .camera_table import FEWEST_CAMERAS, STILL_SHARE, CameraFacts, frozen
 from .evidence import Evidence, first_entries
-from .rules import Hit, at, rule, several, some
+from .rules import Hit, at, rule, some
 from .views import BLANK_LEVELS
 
 TELLING_MATCH = 0.4
@@ -229,7 +230,7 @@ def _late(evidence: Evidence) -> Iterator[Hit]:
     facts, found = _compared(evidence), late_cameras(evidence)
     if found:
         texts = [
-            f"camera {c} is {several(abs(facts[c].lag), 'frame')} {'late' if facts[c].lag > 0 else 'early'}: between "
+            f"camera {c} is {counted(abs(facts[c].lag), 'frame')} {'late' if facts[c].lag > 0 else 'early'}: between "
             f"image and tracked mesh the offset changes by {facts[c].unsteady:.1f} px over time, by "
             f"{facts[c].unsteady_at_lag:.1f} px with that lag (limit {limit:.1f} px)"
             for c, limit in found.items()
@@ -250,7 +251,7 @@ def _frozen_camera(evidence: Evidence) -> Iterator[Hit]:
         live = {c: levels for c, levels in motion.items() if c not in dead_cameras(evidence)}
         limit = STILL_SHARE * float(np.median([*live.values(), *(motion[c] for c in found)]))
         yield Hit(
-            f"the picture of {several(len(found), 'camera')} never changes: {some(found)} (largest change "
+            f"the picture of {counted(len(found), 'camera')} never changes: {some(found)} (largest change "
             f"{max(motion[c] for c in found):.2f} levels, other cameras {_range(live, {}, 1)}, limit {limit:.1f})",
             _first_image(evidence, found[0]),
         )

@@ -11,6 +11,7 @@ import numpy as np
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
+from ...bench.progress import counted
 from ..ga import layout
 from ..novelty import displacement_metric, novelty
 from .checks_cameras import misplaced
@@ -18,7 +19,7 @@ from .checks_images import sound_mask
 from .checks_rig import faulty_cameras
 from .evidence import Evidence
 from .mesh import MeshFacts
-from .rules import Hit, rule, several, some, spans
+from .rules import Hit, rule, some, spans
 from .views import ViewFacts
 
 STILL = 1e-4
@@ -104,7 +105,7 @@ def _unfit(evidence: Evidence) -> Iterator[Hit]:
     if wrong and wrong[0].error is not None:
         error = wrong[0].error
         text = (
-            f"{several(len(wrong), 'parameter file')} do not fit the head model: expected {error.expected}, found "
+            f"{counted(len(wrong), 'parameter file')} do not fit the head model: expected {error.expected}, found "
             f"{error.found}"
         )
         yield Hit(text, error.file, error.key)
@@ -119,7 +120,7 @@ def _not_finite(evidence: Evidence) -> Iterator[Hit]:
     wrong = [p for p in evidence.parameters.values() if p.not_finite]
     if wrong:
         text = (
-            f"{some(wrong[0].not_finite)} not finite in {several(len(wrong), 'parameter file')}, timesteps "
+            f"{some(wrong[0].not_finite)} not finite in {counted(len(wrong), 'parameter file')}, timesteps "
             f"{spans(p.timestep for p in wrong)}"
         )
         yield Hit(text, wrong[0].path, wrong[0].not_finite[0])
@@ -155,7 +156,7 @@ def _eyelids(evidence: Evidence) -> Iterator[Hit]:
     used = [p for p in evidence.parameters.values() if np.any(p.arrays.get("eyelids", 0))]
     if used:
         text = (
-            f"eyelids are tracked in {several(len(used), 'timestep')}, head model "
+            f"eyelids are tracked in {counted(len(used), 'timestep')}, head model "
             f"{evidence.subject.head.version} has no eyelid basis"
         )
         yield Hit(text, used[0].path, "eyelids")
@@ -174,7 +175,7 @@ def _still_jaw(evidence: Evidence) -> Iterator[Hit]:
     jaws = np.array([p.pose.jaw for p in poses if p.pose])
     if len(poses) >= FEW and np.ptp(jaws, axis=0).max() < STILL:
         yield Hit(
-            f"the jaw never rotates over {several(len(poses), 'timestep')}", poses[0].path.parent, "jaw_pose"
+            f"the jaw never rotates over {counted(len(poses), 'timestep')}", poses[0].path.parent, "jaw_pose"
         )
 
 
@@ -187,7 +188,7 @@ def _still_expression(evidence: Evidence) -> Iterator[Hit]:
     poses = evidence.posed
     expressions = np.array([p.pose.expression for p in poses if p.pose])
     if len(poses) >= FEW and np.ptp(expressions, axis=0).max(initial=0.0) < STILL:
-        text = f"the expression never changes over {several(len(poses), 'timestep')}"
+        text = f"the expression never changes over {counted(len(poses), 'timestep')}"
         yield Hit(text, poses[0].path.parent, "expr")
 
 
@@ -233,7 +234,7 @@ def _far_expression(evidence: Evidence) -> Iterator[Hit]:
         worst = max(far, key=lambda t: far[t])
         text = (
             f"the expression moves vertices by up to {1000 * far[worst]:.0f} mm (timestep {worst}; more than "
-            f"{1000 * REACH_M:.0f} mm in {several(len(far), 'timestep')})"
+            f"{1000 * REACH_M:.0f} mm in {counted(len(far), 'timestep')})"
         )
         yield Hit(text, evidence.parameters[worst].path, "expr")
 
@@ -287,7 +288,7 @@ def _repeated(evidence: Evidence) -> Iterator[Hit]:
                 repeated.append(after)
     if repeated:
         yield Hit(
-            f"{several(len(repeated), 'timestep')} with the parameters of the one before and other images: "
+            f"{counted(len(repeated), 'timestep')} with the parameters of the one before and other images: "
             f"{spans(repeated)}",
             evidence.parameters[repeated[0]].path,
         )
@@ -325,7 +326,7 @@ def _unexplained(evidence: Evidence) -> Iterator[Hit]:
     if fit.ratio > WORSE:
         text = (
             f"the skin's colours at the mesh's vertices vary {fit.ratio:.2f} times as much over time as with a face at "
-            f"rest ({fit.vertices} vertices, {several(fit.frames, 'frame')} of camera {fit.camera})"
+            f"rest ({fit.vertices} vertices, {counted(fit.frames, 'frame')} of camera {fit.camera})"
         )
         yield Hit(text, evidence.folder, "expr")
 
@@ -371,7 +372,7 @@ def _missed(evidence: Evidence) -> Iterator[Hit]:
         overlap = float(np.median([mesh.overlap or 0.0 for _, mesh, _ in laid]))
         yield Hit(
             f"{outside:.0%} of the face's vertices fall outside the foreground (median over "
-            f"{several(len(laid), 'frame')}; mesh and foreground overlap by {overlap:.2f})",
+            f"{counted(len(laid), 'frame')}; mesh and foreground overlap by {overlap:.2f})",
             evidence.folder,
         )
 
@@ -391,7 +392,7 @@ def _missed_once(evidence: Evidence) -> Iterator[Hit]:
         cameras = sorted({view.entry.camera_id for view, _ in lost})
         where = f"camera {cameras[0]}, " if len(cameras) == 1 else ""
         yield Hit(
-            f"the mesh misses the face in {len(lost)} of {several(len(laid), 'frame')} looked at ({where}"
+            f"the mesh misses the face in {len(lost)} of {counted(len(laid), 'frame')} looked at ({where}"
             f"timesteps {spans(timesteps)})",
             lost[0][0].entry.image,
         )
@@ -407,7 +408,7 @@ def _small(evidence: Evidence) -> Iterator[Hit]:
     if sizes and np.median(sizes) < SMALL:
         yield Hit(
             f"the mesh covers {np.median(sizes):.0%} of the foreground's area (median over "
-            f"{several(len(sizes), 'frame')})",
+            f"{counted(len(sizes), 'frame')})",
             evidence.folder,
         )
 

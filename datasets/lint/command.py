@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.progress import counted
 from ...bench.specs import CommandResult
-from .rules import SEVERITIES, Finding, apply, several
+from .rules import SEVERITIES, Finding, apply
 from .settings import LintSettings
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def _report(evidence: Evidence, findings: Sequence[Finding], passed: bool) -> st
         lines += _filled("", place) if place else []
         lines += [*_filled("", finding.remedy), ""]
     counts = Counter(finding.severity for finding in findings)
-    found = ", ".join(several(counts[severity], severity) for severity in SEVERITIES)
+    found = ", ".join(counted(counts[severity], severity) for severity in SEVERITIES)
     seen = _looked_at(evidence)
     lines += [
         f"{Path(evidence.folder).name}: {found}.",
@@ -124,7 +125,7 @@ def _report(evidence: Evidence, findings: Sequence[Finding], passed: bool) -> st
     ]
     if skipped := _skipped(evidence):
         text = "They look at files of the GaussianAvatars/VHAP layout, and another reader read this capture."
-        lines += _filled("", f"Skipped {several(len(skipped), 'check')}: {', '.join(skipped)}. {text}")
+        lines += _filled("", f"Skipped {counted(len(skipped), 'check')}: {', '.join(skipped)}. {text}")
     if not passed:
         lines.append("Not suitable for a comparison without changes.")
     return "\n".join(lines)

@@ -115,11 +115,6 @@ def _said_again(finding: Finding, findings: Sequence[Finding]) -> bool:
     )
 
 
-def several(count: int, noun: str) -> str:
-    """ "1 image", "7 images"."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
-
-
 def some(names: Iterable[Any], limit: int = 4) -> str:
     """The first few names, and the number of others."""
     names = [str(name) for name in names]

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from headbench.bench.progress import counted
 from headbench.datasets.ga.transforms import read_transforms
 from headbench.datasets.images import write_image
-from headbench.datasets.lint.rules import several, spans
+from headbench.datasets.lint.rules import spans
 from headbench.datasets.lint.views import (
     _fringe,
     make_thumbnails,
@@ -33,7 +34,7 @@ def test_spans_name_every_number_once(numbers):
 
 def test_long_lists_are_cut_and_counted():
     assert spans([0, 2, 4, 6, 8, 10]) == "0, 2, 4, 6 and 2 more"
-    assert (several(1, "image"), several(0, "image")) == ("1 image", "0 images")
+    assert (counted(1, "image"), counted(0, "image")) == ("1 image", "0 images")
 
 
 @given(st.floats(0.2, 1.0), st.floats(0.0, 1.0), st.floats(0.5, 2.0))
