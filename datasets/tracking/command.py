@@ -10,6 +10,7 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Progress, no_progress
 from ...bench.io.files import write_json
+from ...bench.progress import counted
 from ...bench.specs import CommandResult
 from .settings import TrackSettings
 
@@ -92,8 +93,10 @@ def _spread(values: Sequence[Any], count: int) -> list[Any]:
 
 def _text(tracked: Tracked) -> list[str]:
     summary = tracked.report.summary()
+    timesteps = counted(len(tracked.report.residuals), "timestep")
+    cameras = counted(len(tracked.report.cameras), "camera")
     return [
-        f"{summary['timesteps']} timesteps, {len(tracked.report.cameras)} cameras, {summary['seconds_per_timestep']:.2f} s a timestep",
+        f"{timesteps}, {cameras}, {summary['seconds_per_timestep']:.2f} s a timestep",
         f"  landmarks  {summary['landmarks_px']:.2f} pixels root mean square",
         f"  colours    {summary['colour_levels']:.2f} levels of 255, median",
     ]
