@@ -105,8 +105,7 @@ def synthesize(
         Standard deviation of the error of each stored parameter, as a fraction of that parameter's
         own standard deviation over the subject's timesteps. Images show the exact poses.
     samples_per_pixel : int | None
-        Rounded up to a count that the sampler supports; the default gives 40 dB between two renders
-        of a frame.
+        Rounded up to a count that the sampler supports; the default gives at least 43 dB between two renders of a frame.
     tracking_error : float
         Level of simulated tracking errors, 0 to 4; 1 is 0.5 to 1 mm on the face.
     tracker : Tracker
