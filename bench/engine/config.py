@@ -441,6 +441,7 @@ class DemoConfig:
             "head": self.head,
             "seed": self.subject_seed,
             "tracking_noise": self.tracking_noise,
+            "performance": "full",  # which shows most in few timesteps
         }
 
     @property

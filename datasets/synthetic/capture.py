@@ -35,6 +35,7 @@ from ..images import is_whole
 from .panels import KERNEL, default_samples, sample_count
 from .performance import KINDS, Kind, share_out
 from .plan import (
+    EDITION,
     MOST_RESIDUAL,
     RESIDUALS,
     SERIALS,
@@ -70,15 +71,16 @@ def synthesize(
     seed: int = 0,
     tracking_noise: float = 0.0,
     samples_per_pixel: int | None = None,
-    performance: Kind = "full",
+    performance: Kind = "natural",
     dynamics: float = 1.0,
     tracking_error: float = 0.0,
-    tracker: Tracker = "per-frame",
+    tracker: Tracker = "video",
     hair_lag: float = 0.0,
     camera_colour: float = 0.0,
     motion_blur: float = 0.0,
     mask_error: float = 0.0,
     correctives: float = 0.0,
+    edition: int = EDITION,
     pictures: str | Path | None = None,
     workers: int | None = None,
     execution: Execution | None = None,
@@ -113,9 +115,11 @@ def synthesize(
     hair_lag, camera_colour, motion_blur, mask_error, correctives : float
         Levels, 0 to 4, of what recordings have beside tracking errors.
     performance : Kind
-        What the subject does: "full", "parts", "natural", "expressions" or "still". `headbench synth --help` describes them.
+        What the subject does: "natural", "full", "parts", "expressions" or "still". `headbench synth --help` describes them.
     dynamics : float
         Scale of wrinkles and blush, 0 to 3: with 0 the skin has its colour at rest everywhere.
+    edition : int
+        Edition of a capture that is made again; others than the present one are refused.
     pictures : str | Path | None
         Folder of an earlier capture that differs only in its tracking. Its pictures are linked, or
         copied if links are not supported, instead of rendered.
@@ -156,6 +160,9 @@ def synthesize(
         mask_error,
         correctives,
     )
+    if edition != EDITION:
+        remedy = "Use the version of headbench that made it, or name the folder of the capture."
+        raise InputError("synthetic capture", "edition", f"{EDITION}, which this version makes", str(edition), remedy)
     _check(settings)
     KERNEL.load()
     geometry = load_geometry(head)

@@ -43,19 +43,19 @@ class SynthSettings(ExecutionOptions):
     """Decides subjects and performances."""
     tracking_noise: float = 0.0
     """Noise on the tracked parameters, as a fraction of their standard deviation."""
-    performance: Literal["full", "parts", "natural", "expressions", "still"] = "full"
-    """`parts` plays every sequence and holds out three parts of FREE, each scored as a sequence: seen, recombined and
-    beyond the range of training. `natural` has these and speech, with the speeds, blinks, gaze and correlations of tracked
-    recordings, at every n-th frame of a video. `expressions` has no jaw and tongue motion, `still` moves only head, neck and
-    eyes."""
+    performance: Literal["natural", "full", "parts", "expressions", "still"] = "natural"
+    """`natural` has the speeds, blinks, gaze and correlations of tracked recordings, at every n-th frame of a video; from 59
+    timesteps it plays every sequence and holds out speech and three parts of FREE, each scored as a sequence: seen, recombined
+    and beyond the range of training. `full` and `parts` are the smooth performances of earlier editions, without and with these
+    parts. Of them `expressions` has no jaw and tongue motion, and `still` moves only head, neck and eyes."""
     dynamics: float = 1.0
     """Scale of wrinkles and blush, 0 to 3."""
     tracking_error: float = 0.0
     """Level of simulated tracking errors: shrunk and mixed expressions, drift; 1 is 0.5 to 1 mm on the face, 2 to 3 mm
     on lips and lids. 0 to 4."""
-    tracker: Literal["per-frame", "video"] = "per-frame"
-    """Kind of tracker that errs so: drift from frame to frame; or an error that lasts for a sequence, slow drift, jitter and
-    1.2 mm on lips and lids, as trackers of videos have."""
+    tracker: Literal["video", "per-frame"] = "video"
+    """Kind of tracker that errs so. A tracker of videos has an error that lasts for a sequence, slow drift, jitter, and 1.2 mm on
+    lips and lids; one of single frames drifts from each timestep to the next."""
     hair_lag: float = 0.0
     """Lag of hair and of the skin of the neck behind the head, which the tracked mesh does not have; 1 is as a rod of the
     hair's length swings. 0 to 4."""

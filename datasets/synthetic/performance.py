@@ -6,7 +6,7 @@ monotone cubics, so nothing overshoots and a held face stays held. Blinks, gaze 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -292,8 +292,9 @@ def at_moments(curves: Curves) -> list[Activations]:
 def share_out(timesteps: int, kind: Kind = "full") -> dict[str, int]:
     """Timesteps of each sequence, in NeRSemble's order; they sum to ``timesteps``.
 
-    FREE gets a double share. Few timesteps make few sequences, two at least. A performance in parts or a natural one has all
-    sequences, each with as many timesteps as it has phrases to show, and a quarter of them for FREE.
+    A natural performance, or one in parts, has all sequences, each with as many timesteps as it has phrases to show, and a
+    quarter of them for the held-out ones. Others, and natural ones of few timesteps, have as many sequences as the timesteps
+    allow, two at least, of which FREE gets a double share.
     """
     if kind in ("parts", "natural"):
         train = {name: len(phrases) for name, phrases in SEQUENCES.items() if name != HELD_OUT}
@@ -301,12 +302,12 @@ def share_out(timesteps: int, kind: Kind = "full") -> dict[str, int]:
         held_out = (*FREE_PARTS, SPEECH) if kind == "natural" else tuple(FREE_PARTS)
         shares |= dict.fromkeys(held_out, _HELD_OUT_SHARE / len(held_out))
         least = int(np.ceil(2.5 / min(shares.values())))
-        if timesteps < least:
-            raise InputError(
-                "--timesteps", "", f"at least {least} for a performance in parts", str(timesteps)
-            )
-        ends = np.round(np.cumsum([*shares.values()]) * timesteps).astype(int)
-        return {name: int(n) for name, n in zip(shares, np.diff(ends, prepend=0))}
+        if timesteps >= least:
+            ends = np.round(np.cumsum([*shares.values()]) * timesteps).astype(int)
+            return {name: int(n) for name, n in zip(shares, np.diff(ends, prepend=0))}
+        if kind == "parts":
+            expected = f"at least {least} for a performance in parts"
+            raise InputError("--timesteps", "", expected, str(timesteps))
     if timesteps < 4:
         raise InputError("--timesteps", "", "at least 4 (two sequences)", str(timesteps))
     count = int(np.clip(timesteps // _MINIMUM, 2, len(_PRIORITY)))
@@ -316,9 +317,10 @@ def share_out(timesteps: int, kind: Kind = "full") -> dict[str, int]:
     return {name: int(n) for name, n in zip(chosen, np.diff(ends, prepend=0))}
 
 
-def frames_kept(timesteps: int) -> int:
-    """n, where a natural performance of ``timesteps`` keeps every n-th frame, so that it has time for its phrases."""
-    phrases = sum(map(len, (*SEQUENCES.values(), *FREE_PARTS.values())))
+def frames_kept(timesteps: int, sequences: Iterable[str]) -> int:
+    """n, where a natural performance of ``timesteps`` keeps every n-th frame, so that it has time for the phrases of its
+    ``sequences``."""
+    phrases = sum(len({**SEQUENCES, **FREE_PARTS}.get(name, SEQUENCES[HELD_OUT])) for name in sequences)
     return max(1, round(natural.PHRASE_SECONDS * phrases * natural.FRAME_RATE / timesteps))
 
 

@@ -68,10 +68,10 @@ class SyntheticSettings:
     seed: int
     tracking_noise: float
     samples_per_pixel: int
-    performance: Kind = "full"
+    performance: Kind = "natural"
     dynamics: float = 1.0
     tracking_error: float = 0.0
-    tracker: Tracker = "per-frame"
+    tracker: Tracker = "video"
     hair_lag: float = 0.0
     camera_colour: float = 0.0
     motion_blur: float = 0.0
@@ -79,14 +79,8 @@ class SyntheticSettings:
     correctives: float = 0.0
 
     def described(self) -> dict[str, Any]:
-        """The settings for records; those that came later are left out where they have their default."""
-        described = {**asdict(self), "edition": EDITION}
-        usual = {"performance": "full", "dynamics": 1.0, "tracking_error": 0.0, "tracker": "per-frame"}
-        usual |= dict.fromkeys(RESIDUALS, 0.0)
-        for name, value in usual.items():
-            if described[name] == value:
-                del described[name]
-        return described
+        """The settings for records, and the edition."""
+        return {**asdict(self), "edition": EDITION}
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +123,9 @@ def plan_subject(out: Path, index: int, geometry: Geometry, settings: SyntheticS
     tongue_shows = share_that_shows(geometry.mouth(who, anatomy, shape), anatomy, neutral)
     views = cameras(settings.cameras, width, height, target, seed=settings.seed + 101 * index)
     performed, poses = {}, {}
-    interval = frames_kept(settings.timesteps)
-    for sequence, count in share_out(settings.timesteps, settings.performance).items():
+    counts = share_out(settings.timesteps, settings.performance)
+    interval = frames_kept(settings.timesteps, counts)
+    for sequence, count in counts.items():
         performed[sequence] = perform(
             sequence, count, settings.seed + 101 * index, tongue_shows, settings.performance, interval
         )

@@ -12,9 +12,9 @@ from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.executors.settings import Execution
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
-from headbench.datasets.synthetic.plan import FRONTAL
+from headbench.datasets.synthetic.plan import EDITION, FRONTAL
 
-SMALL = {"cameras": 2, "timesteps": 8, "size": (32, 46), "samples_per_pixel": 9, "workers": 1}
+SMALL = {"cameras": 2, "timesteps": 8, "size": (32, 46), "samples_per_pixel": 9, "workers": 1, "performance": "full"}
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +64,9 @@ def test_other_settings_are_refused(capture, tmp_path):
     with pytest.raises(InputError, match="seed"):
         synthesize(capture[0], **SMALL, seed=5)
     with pytest.raises(InputError, match="performance"):
-        synthesize(capture[0], **SMALL, performance="still")
+        synthesize(capture[0], **{**SMALL, "performance": "still"})
     settings = json.loads((capture[0] / "synthesis.json").read_text())
-    assert "performance" not in settings  # as captures were recorded before there was a choice
-    assert settings["edition"] == 2
+    assert (settings["performance"], settings["tracker"], settings["edition"]) == ("full", "video", EDITION)
     (tmp_path / "synthesis.json").write_text(json.dumps({**settings, "performance": "still"}))
     with pytest.raises(InputError, match="performance"):
         synthesize(tmp_path, **SMALL)
@@ -153,6 +152,7 @@ def test_foreign_folder_is_refused(tmp_path, name):
         {"mask_error": float("inf")},
         {"correctives": -1.0},
         {"head": "no-such-file.npz"},
+        {"edition": EDITION - 1},
     ],
 )
 def test_bad_settings_are_refused_before_anything_is_written(tmp_path, change):

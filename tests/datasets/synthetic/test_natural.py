@@ -59,7 +59,7 @@ RECORDED = {
 def played(seed):
     """A performance at a video's rate, every sequence for as long as its phrases take."""
     geometry = load_geometry("procedural")
-    counts = share_out(frames_kept(1) * 5 // 4, "natural")
+    counts = share_out(frames_kept(1, share_out(1000, "natural")) * 5 // 4, "natural")
     sequences = {name: perform(name, counts[name], seed, kind="natural").activations for name in NAMES}
     poses = {
         name: [geometry.translation.pose(controls, "900", t) for t, controls in enumerate(each)]
@@ -127,6 +127,6 @@ def test_the_tongue_is_labelled_in_free_alone(timesteps):
     assert sum(counts.values()) == timesteps
     assert set(counts) == set(NAMES)
     excluded = {
-        n: perform(n, c, 5, kind="natural", every=frames_kept(timesteps)).excluded for n, c in counts.items()
+        n: perform(n, c, 5, kind="natural", every=frames_kept(timesteps, counts)).excluded for n, c in counts.items()
     }
     assert {name for name, frames in excluded.items() if frames} <= {"FREE-2-recombined"}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from headbench.datasets.synthetic.performance import CONTROLS, Performed
-from headbench.datasets.synthetic.plan import FRONTAL, RESIDUALS, SyntheticSettings
+from headbench.datasets.synthetic.plan import FRONTAL
 from headbench.datasets.synthetic.recording import (
     APART_PIXELS,
     BALANCE,
@@ -54,14 +54,6 @@ def recorded(plan, rendered):
         return made
 
     return recorded
-
-
-def test_records_name_only_what_is_on(plan):
-    assert not set(RESIDUALS) & set(plan.settings.described())
-    for name in RESIDUALS:
-        assert replace(plan.settings, **{name: 0.5}).described()[name] == 0.5
-    usual = SyntheticSettings(1, 2, 8, (32, 46), "procedural", 0, 0.0, 9)
-    assert all(getattr(usual, name) == 0.0 for name in RESIDUALS)
 
 
 def test_responses_have_the_spreads_stated():
