@@ -16,6 +16,7 @@ from ..bench.audit.bundle import without_paths
 from ..bench.engine.scoring import FULL
 from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
+from ..bench.experiments.suite_settings import LARGE_RUN, RUN
 from ..bench.io.files import write_bytes, write_text
 from ..bench.io.images import encode_image, read_png
 from ..bench.protocol import TASK_TITLES
@@ -48,7 +49,8 @@ def publish_demo(out: Path, root: Path) -> None:
 def publish_suite(out: Path, root: Path) -> None:
     """Copy manifest and rows of a suite's run to the repository ``root``, and write its tables and block."""
     target = root / SUITE
-    _copy(RunFolder(out / "run"), RunFolder(target / "run"))
+    for run in _suite_runs(out):
+        _copy(RunFolder(run), RunFolder(target / run.name))
     write_text(target / RESULTS, suite_results(target))
     _write(root / PAGES["suite"], "suite", suite_block(target))
 
@@ -108,15 +110,21 @@ def _minutes(run_folder: Path) -> list[tuple[str, float | None]]:
     ]
 
 
+def _suite_runs(folder: Path) -> list[Path]:
+    """Runs of a suite; images of twice the size are optional."""
+    large = folder / LARGE_RUN
+    return [folder / RUN, *([large] if large.exists() else [])]
+
+
 def suite_results(folder: Path) -> str:
     """All tables of the stored run of the suite."""
-    return suite_report(folder / "run", OURS)
+    return suite_report(_suite_runs(folder), OURS)
 
 
 def suite_block(folder: Path) -> str:
     """Return the block for the stored results of the suite: Markdown."""
-    runs = RunSet.read([folder / "run"])
-    minutes = [value for _, value in _minutes(folder / "run")]
+    runs = RunSet.read([folder / RUN])
+    minutes = [value for _, value in _minutes(folder / RUN)]
     hours = sum(value for value in minutes if value is not None) / 60
     interrupted = (
         f", not counting {minutes.count(None)} that were interrupted and continued" if None in minutes else ""
