@@ -16,9 +16,10 @@ from ..bench.audit.bundle import without_paths
 from ..bench.engine.scoring import FULL
 from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
-from ..bench.experiments.suite_settings import LARGE_RUN, RUN
+from ..bench.experiments.suite_settings import LARGE_RUN, NONE, RUN, TRACKED
 from ..bench.io.files import write_bytes, write_text
 from ..bench.io.images import encode_image, read_png
+from ..bench.manifest import Manifest
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from .runs import RunSet
@@ -121,9 +122,22 @@ def suite_results(folder: Path) -> str:
     return suite_report(_suite_runs(folder), OURS)
 
 
+def suite_options(manifest: Manifest) -> tuple[str, ...]:
+    """Options of ``headbench run suite`` that make the captures of a stored run, as it records them."""
+    made = manifest.clips[0].steps[0]["parameters"]["synthetic"]  # of all subjects alike
+    given = {"tracker": "per-frame", **made}
+    given["size"] = "x".join(map(str, given["size"]))
+    names = ("performance", "tracker", "tracking_error", "cameras", "timesteps", "size", "subjects")
+    options = [(f"--{name.replace('_', '-')}", str(given[name])) for name in names]
+    tracked = [each for each in manifest.methods if each.condition == TRACKED]
+    named = [each.name for each in tracked] or [NONE]
+    return tuple(word for option in options for word in option) + ("--tracked", *named)
+
+
 def suite_block(folder: Path) -> str:
     """Return the block for the stored results of the suite: Markdown."""
     runs = RunSet.read([folder / RUN])
+    options = " ".join(suite_options(RunFolder(folder / RUN).read_manifest()))
     minutes = [value for _, value in _minutes(folder / RUN)]
     hours = sum(value for value in minutes if value is not None) / 60
     interrupted = (
@@ -133,6 +147,7 @@ def suite_block(folder: Path) -> str:
     return (
         f"{to_markdown(table_of(shown)).strip()}\n\n{conclusions(shown)}\n\n"
         f"[Tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
+        f"The captures are those of `headbench run suite {options}`. "
         f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{interrupted}."
     )
 

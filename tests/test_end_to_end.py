@@ -174,7 +174,7 @@ def cell(method):
 
 OTHERS = "synth --out others --subjects 2 --cameras 2 --timesteps 4 --size 24x32"
 PLAIN = "run --data {capture} --out plain --methods mean-image,nearest-camera --preset smoke --set metrics=psnr,ssim,fps --set frames_per_task=3"
-SUITE = "run suite --out suite --methods mean-image --preset smoke --subjects 1 --cameras 2 --timesteps 60 --size 32x32"
+SUITE = "run suite --out suite --methods mean-image --preset smoke --subjects 1 --cameras 2 --timesteps 60 --size 32x32 --large 1"
 GATE = "compare plain --baseline baseline.json"
 RECORD = "export nersemble {capture} --out recording"
 PREPARE = "prepare nersemble --root recording/recording --tracking recording/tracking --head recording/head_model.npz"
@@ -188,7 +188,14 @@ CASES = {
     "run": [case(PLAIN, r"\| nearest-camera", "plain/rows.parquet", "plain/tables/comparison.md")],
     "run speed": [case("run speed plain --methods mean-image", "speed measured again, avatars: 1")],
     "status": [case("status plain", "2 cells: 0 waiting, 0 running, 2 done, 0 failed")],
-    "run suite": [case(SUITE, "Sequence FREE-3-beyond", "suite/results.md", "suite/run/rows.parquet")],
+    "run suite": [
+        case(
+            SUITE,
+            "(?s)FREE-4-speech.*Images of twice the size",
+            "suite/results.md",
+            "suite/run-large/rows.parquet",
+        )
+    ],
     "list": [case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets")],
     "table": [
         *(case(f"table {{demo}} --format {name}", mark) for name, mark in FORMATS.items()),

@@ -13,9 +13,13 @@ from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import table_of
 from ..writers import to_markdown
 from .ablations import ablation_table
-from .tracked import drop_table, tracked_table
+from .tracked import DROP, drop_table, tracked_table
 
 LARGE = "Images of twice the size"
+MEANING = (
+    f"Under the condition `{TRACKED}`, methods are trained and driven with tracking that was estimated from the images, otherwise "
+    f"with the capture's own. {DROP}: novel view minus self-reenactment."
+)
 
 
 def suite_report(runs: Sequence[Path], method: str) -> str:
@@ -44,26 +48,31 @@ def _tables(whole: RunSet, method: str) -> str:
     parts |= {f"Region {region}": FrameSelection(region) for region in sorted(runs.rows.regions - {FULL})}
     parts |= {f"Sequence {name}": FrameSelection(sequences=(name,)) for name in tested}
     sections = [_section(title, runs.of(part), method) for title, part in parts.items()]
+    regions = (FULL, *({"face"} & runs.rows.regions))
     tracked = {whole.records[label].name: label for label in changed if _is_tracked(whole, label)}
     if tracked:
         runs = whole.only([*tracked, *tracked.values()])
-        for region in (FULL, *({"face"} & runs.rows.regions)):
-            title = ", ".join(["Tracked from images", *([] if region == FULL else [region])])
+        for region in regions:
             of_region = runs.of(FrameSelection(region))
             tables = (drop_table(of_region), tracked_table(of_region, tracked))
-            sections.append("\n\n".join([f"## {title}", *(to_markdown(table).strip() for table in tables)]))
+            texts = [f"## {_title('Tracked from images', region)}", MEANING, *map(to_markdown, tables)]
+            sections.append("\n\n".join(map(str.strip, texts)))
     ablations = [label for label in changed if not _is_tracked(whole, label)]
     if ablations:
         runs = whole.only([method, *ablations])
-        for region, chosen in product((FULL, "face"), ((), *((name,) for name in tested))):
-            title = ", ".join([f"Ablations of {method}", *([] if region == FULL else [region]), *chosen])
+        for region, chosen in product(regions, ((), *((name,) for name in tested))):
             table = ablation_table(runs.of(FrameSelection(region, chosen)), method)
+            title = _title(f"Ablations of {method}", region, *chosen)
             sections.append(f"## {title}\n\n{to_markdown(table).strip()}")
     return "\n\n".join(sections) + "\n"
 
 
 def _is_tracked(runs: RunSet, label: str) -> bool:
     return runs.records[label].condition == TRACKED
+
+
+def _title(text: str, region: str, *chosen: str) -> str:
+    return ", ".join([text, *([] if region == FULL else [region]), *chosen])
 
 
 def _section(title: str, runs: RunSet, method: str) -> str:
