@@ -47,8 +47,8 @@ RUN, LARGE_RUN = "run", "run-large"
 class SuiteSettings(ExecutionOptions):
     """The whole benchmark: makes the suite's synthetic subjects, trains and measures methods on all, writes result tables.
 
-    Subjects differ in shape, skin, hair and performance; their tracking has errors, and their held-out sequence three parts:
-    seen, recombined and beyond training. Started again after a kill it continues. Takes hours.
+    Subjects differ in shape, skin, hair and performance; their tracking has errors, and their held-out sequence parts: seen,
+    recombined and beyond training, and speech. Started again after a kill it continues. Takes hours.
     """
 
     out: str
