@@ -89,7 +89,7 @@ class SuiteSettings(ExecutionOptions):
     """Width x height of the images in pixels."""
 
     performance: Literal["parts", "natural"] = "natural"
-    """As for `headbench synth`. Each subject has another choreography."""
+    """As for `headbench synth`; with `natural` each subject has another choreography."""
 
     tracking_error: float = 1.0
     """As for `headbench synth`."""
