@@ -16,8 +16,10 @@ from ..bench.audit.bundle import without_paths
 from ..bench.engine.scoring import FULL
 from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
+from ..bench.experiments.suite_settings import LARGE_RUN, NONE, RUN, TRACKED
 from ..bench.io.files import write_bytes, write_text
 from ..bench.io.images import encode_image, read_png
+from ..bench.manifest import Manifest
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from .runs import RunSet
@@ -48,7 +50,8 @@ def publish_demo(out: Path, root: Path) -> None:
 def publish_suite(out: Path, root: Path) -> None:
     """Copy manifest and rows of a suite's run to the repository ``root``, and write its tables and block."""
     target = root / SUITE
-    _copy(RunFolder(out / "run"), RunFolder(target / "run"))
+    for run in _suite_runs(out):
+        _copy(RunFolder(run), RunFolder(target / run.name))
     write_text(target / RESULTS, suite_results(target))
     _write(root / PAGES["suite"], "suite", suite_block(target))
 
@@ -108,15 +111,34 @@ def _minutes(run_folder: Path) -> list[tuple[str, float | None]]:
     ]
 
 
+def _suite_runs(folder: Path) -> list[Path]:
+    """Runs of a suite; images of twice the size are optional."""
+    large = folder / LARGE_RUN
+    return [folder / RUN, *([large] if large.exists() else [])]
+
+
 def suite_results(folder: Path) -> str:
     """All tables of the stored run of the suite."""
-    return suite_report(folder / "run", OURS)
+    return suite_report(_suite_runs(folder), OURS)
+
+
+def suite_options(manifest: Manifest) -> tuple[str, ...]:
+    """Options of ``headbench run suite`` that make the captures of a stored run, as it records them."""
+    made = manifest.clips[0].steps[0]["parameters"]["synthetic"]  # of all subjects alike
+    given = {"tracker": "per-frame", **made}
+    given["size"] = "x".join(map(str, given["size"]))
+    names = ("performance", "tracker", "tracking_error", "cameras", "timesteps", "size", "subjects")
+    options = [(f"--{name.replace('_', '-')}", str(given[name])) for name in names]
+    tracked = [each for each in manifest.methods if each.condition == TRACKED]
+    named = [each.name for each in tracked] or [NONE]
+    return tuple(word for option in options for word in option) + ("--tracked", *named)
 
 
 def suite_block(folder: Path) -> str:
     """Return the block for the stored results of the suite: Markdown."""
-    runs = RunSet.read([folder / "run"])
-    minutes = [value for _, value in _minutes(folder / "run")]
+    runs = RunSet.read([folder / RUN])
+    options = " ".join(suite_options(RunFolder(folder / RUN).read_manifest()))
+    minutes = [value for _, value in _minutes(folder / RUN)]
     hours = sum(value for value in minutes if value is not None) / 60
     interrupted = (
         f", not counting {minutes.count(None)} that were interrupted and continued" if None in minutes else ""
@@ -125,6 +147,7 @@ def suite_block(folder: Path) -> str:
     return (
         f"{to_markdown(table_of(shown)).strip()}\n\n{conclusions(shown)}\n\n"
         f"[Tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
+        f"The captures are those of `headbench run suite {options}`. "
         f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{interrupted}."
     )
 

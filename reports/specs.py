@@ -45,7 +45,7 @@ PARETO_REPORT = ReportSpec(
 
 SUITE_REPORT = ReportSpec(
     name="suite",
-    summary="Results of the suite by region and sequence, with differences from a method and ablations.",
+    summary="Results of the suite by region and sequence, with differences from a method, tracking from images and ablations.",
     implementation="headbench.reports.suite.suite:suite_report",
     writes=False,
 )

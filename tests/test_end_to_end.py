@@ -188,7 +188,14 @@ CASES = {
     "run": [case(PLAIN, r"\| nearest-camera", "plain/rows.parquet", "plain/tables/comparison.md")],
     "run speed": [case("run speed plain --methods mean-image", "speed measured again, avatars: 1")],
     "status": [case("status plain", "2 cells: 0 waiting, 0 running, 2 done, 0 failed")],
-    "run suite": [case(SUITE, "Sequence FREE-3-beyond", "suite/results.md", "suite/run/rows.parquet")],
+    "run suite": [
+        case(
+            SUITE,
+            "(?s)FREE-4-speech.*Images of twice the size",
+            "suite/results.md",
+            "suite/run-large/rows.parquet",
+        )
+    ],
     "list": [case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets")],
     "table": [
         *(case(f"table {{demo}} --format {name}", mark) for name, mark in FORMATS.items()),

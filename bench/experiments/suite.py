@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from ..comparison import closing
-from ..condition import PLAIN, Condition
+from ..condition import PLAIN, Condition, Named
 from ..contracts import Progress, no_progress
 from ..engine.config import RunConfig, parse_size, resolve_cells, resolve_metrics
 from ..engine.run import check_settings, run
@@ -14,7 +15,7 @@ from ..executors.settings import check_executor
 from ..io.files import write_text
 from ..registry import discover, get, resolve
 from ..specs import CommandResult
-from .suite_settings import ABLATIONS, SEED, SuiteSettings
+from .suite_settings import ABLATIONS, LARGE_RUN, RUN, SEED, TRACKED, SuiteSettings
 
 OURS = "ours"
 REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
@@ -24,7 +25,8 @@ REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
 def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandResult:
     """Run the benchmark suite: ten synthetic subjects, all methods, tables by region and part.
 
-    Ablations are conditions of the same run. Writes ``results.md`` into ``out``.
+    Ablations and tracking from images are conditions of the same run. Images of twice the size have captures and a run of their
+    own, since a mean over subjects has one size. Writes ``results.md`` into ``out``.
 
     Raises
     ------
@@ -39,14 +41,17 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
         expected = f"{OURS} among them, which --ablations are compared with"
         raise InputError("command line", "--methods", expected, ", ".join(methods))
     ablations = [Condition(name, (OURS,), dict(ABLATIONS[name])) for name in settings.chosen]
+    tracked = settings.tracked_of(methods)
+    # A condition without methods would be one of all methods.
+    conditions = [Condition(TRACKED, tracked, clip=Named(TRACKED))] if tracked else []
     config = RunConfig(
         data=str(out / "capture"),
-        out=str(out / "run"),
+        out=str(out / RUN),
         methods=methods,
         preset=settings.preset,
         seeds=settings.seeds,
         regions=REGIONS,
-        conditions=(PLAIN, *ablations),
+        conditions=(PLAIN, *conditions, *ablations),
         isolation=settings.isolation,
     )
     cells = resolve_cells(config)
@@ -55,25 +60,38 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
     check_settings(cell for cell in cells if not cell[0].is_isolated(config.isolation))
     plain = next((m.record() for m, c in cells if m.spec.name == OURS and c == PLAIN), None)
     for method, condition in cells:
-        if condition.name and method.record() == plain:
+        if condition.settings and method.record() == plain:
             expected = f"ablations that change {OURS} of preset {settings.preset}"
             raise InputError("command line", "--ablations", expected, condition.name)
-    resolve(get("datasets", "synthetic").implementation)(
-        out / "capture",
-        subjects=settings.subjects,
-        cameras=settings.cameras,
-        timesteps=settings.timesteps,
-        size=parse_size(settings.size),
-        seed=SEED,
-        performance="parts",
-        tracking_error=settings.tracking_error,
-        execution=execution,
-        progress=progress,
-    )
-    rows = run(config, execution)
-    text = resolve(get("reports", "suite").implementation)(out / "run", OURS)
-    write_text(out / "results.md", text)
-    data = {"out": out, "run": out / "run", "failed": rows.failed}
-    return CommandResult(
-        f"{text}\n{out / 'results.md'}\n\n{closing(out / 'run', rows)}", data, not rows.failed
-    )
+    width, height = parse_size(settings.size)
+    parts = [(config, settings.subjects, (width, height))]
+    if settings.large:
+        large = replace(
+            config, data=str(out / "capture-large"), out=str(out / LARGE_RUN), conditions=(PLAIN,)
+        )
+        parts.append((large, settings.large, (2 * width, 2 * height)))
+    runs: list[Path] = []
+    failed: list[str] = []
+    ends = []
+    for part, subjects, size in parts:
+        resolve(get("datasets", "synthetic").implementation)(
+            part.data,
+            subjects=subjects,
+            cameras=settings.cameras,
+            timesteps=settings.timesteps,
+            size=size,
+            seed=SEED,
+            performance=settings.performance,
+            tracking_error=settings.tracking_error,
+            tracker=settings.tracker,
+            execution=execution,
+            progress=progress,
+        )
+        rows = run(part, execution)
+        runs.append(Path(part.out))
+        failed += rows.failed
+        ends.append(closing(runs[-1], rows))
+        text = resolve(get("reports", "suite").implementation)(runs, OURS)
+        write_text(out / "results.md", text)
+    data = {"out": out, "run": runs[0], "failed": sorted({*failed})}
+    return CommandResult("\n\n".join([f"{text}\n{out / 'results.md'}", *ends]), data, not failed)

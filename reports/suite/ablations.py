@@ -1,8 +1,8 @@
-"""Ablations: paired differences between variants of a method and the full method."""
+"""Paired differences between variants of a method and the method itself: ablations, tracking from images."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from ...bench.progress import counted
@@ -11,28 +11,50 @@ from ..statistics.comparisons import LEVEL, PairedComparison, compare, subjects_
 from ..table_report import table_of
 from ..tables import Table, TableCell, TableRow
 
-MEANING = f"Ablation minus method, mean over subjects and its {100 * (1 - LEVEL):g} % interval."
-TEST = f"exact sign-flip test over subjects, Holm over the ablations of a column, {LEVEL:.0%}"
-
 
 def ablation_table(runs: RunSet, method: str) -> Table:
-    """Differences of ablations from a method, with those columns of the comparison table that do not depend on the machine.
-
-    Speeds are left out: those of runs made one after another differ by up to a tenth without any difference of the method.
+    """Differences of ablations from a method, as `difference_table`.
 
     Parameters
     ----------
     runs : RunSet
         A run with only ``method`` itself and the conditions that are its ablations.
     """
-    ablations = [label for label, record in runs.records.items() if record.condition]
+    names = {label: record.condition for label, record in runs.records.items() if record.condition}
+    pairs = [(label, method) for label in names]
+    return difference_table(runs, pairs, names, "Ablations", "Ablation minus method", "ablations")
+
+
+def difference_table(
+    runs: RunSet,
+    pairs: Sequence[tuple[str, str]],
+    names: Mapping[str, str],
+    title: str,
+    meaning: str,
+    family: str,
+) -> Table:
+    """Paired differences, with those columns of the comparison table that do not depend on the machine.
+
+    Speeds are left out: those of runs made one after another differ by up to a tenth without any difference of the method.
+
+    Parameters
+    ----------
+    runs : RunSet
+        A run with the labels of ``pairs`` alone.
+    pairs : sequence of tuple of str
+        Labels whose difference is a row, first minus second.
+    names : mapping of str
+        Name of each row by the first label.
+    title, meaning, family : str
+        Heading of the rows; what is subtracted from what; what the tests of a column are corrected for.
+    """
     table = table_of(runs)
     bound = {spec.name for spec in runs.metrics if spec.machine_bound}
     kept = tuple(column for column in table.columns if column.metric not in bound)
     columns, tested = [], []
     for column in kept:
         found = compare(
-            *(runs.rows, [(label, method) for label in ablations]),
+            *(runs.rows, pairs),
             task=column.task,
             metric=column.metric,
             higher_is_better=column.higher_is_better,
@@ -42,19 +64,22 @@ def ablation_table(runs: RunSet, method: str) -> Table:
         tested += [each for each in found if each.p_holm is not None]
     versions = {row.method: row.version for row in table.rows}
     rows = tuple(
-        TableRow(runs.records[label].condition, versions[label], False, cells)
-        for label, cells in zip(ablations, zip(*columns), strict=True)
+        TableRow(names[label], versions[label], False, cells)
+        for (label, _), cells in zip(pairs, zip(*columns), strict=True)
     )
-    return replace(table, columns=kept, groups=(("Ablations", rows),), notes=(), marking=_marking(tested))
+    marking = _marking(tested, meaning, family)
+    return replace(table, columns=kept, groups=((title, rows),), notes=(), marking=marking)
 
 
-def _marking(tested: Sequence[PairedComparison]) -> str:
+def _marking(tested: Sequence[PairedComparison], meaning: str, family: str) -> str:
+    text = f"{meaning}, mean over subjects and its {100 * (1 - LEVEL):g} % interval."
+    test = f"exact sign-flip test over subjects, Holm over the {family} of a column, {LEVEL:.0%}"
     if any(each.testable for each in tested) or not tested:
-        return f"{MEANING} Bold: they differ ({TEST})."
+        return f"{text} Bold: they differ ({test})."
     first = tested[0]
     needed = subjects_needed(LEVEL, first.family)
     subjects = counted(first.subjects, "subject")
-    return f"{MEANING} With {subjects} no test can tell whether they differ (it takes {needed}; {TEST})."
+    return f"{text} With {subjects} no test can tell whether they differ (it takes {needed}; {test})."
 
 
 def _cell(found: PairedComparison, digits: int) -> TableCell:

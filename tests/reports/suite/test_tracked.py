@@ -1,0 +1,85 @@
+"""Tables of methods trained on tracking from images: beside the plain method, and not among ablations."""
+
+import re
+
+import pandas as pd
+import pytest
+
+from headbench.bench.engine.store import RunFolder
+from headbench.reports.runs import RunSet
+from headbench.reports.suite.suite import LARGE, suite_report
+from headbench.reports.suite.tracked import drop_table, tracked_table
+from headbench.reports.table_report import table_of
+
+PSNR = {
+    "mean-image": 20.0,
+    "ga": 30.0,
+    "ours": 31.0,
+    "ours+less": 30.5,
+    "ga+tracked": 29.0,
+    "ours+tracked": 30.75,
+}
+TRACKED = {"ga": "ga+tracked", "ours": "ours+tracked"}
+DROP = {"ga": 1.5, "ours": 1.0, "ga+tracked": 0.25, "ours+tracked": -0.5}
+
+
+@pytest.fixture
+def tracked_run(write_run):
+    """A run whose self-reenactment is worse than its novel views by `DROP`."""
+    folder = RunFolder(write_run("run", PSNR))
+    rows = pd.read_parquet(folder.rows)
+    for label, drop in DROP.items():
+        name, _, condition = label.partition("+")
+        own = (rows.method == name) & (rows.condition == condition)
+        rows.loc[own & (rows.task == "self_reenactment") & (rows.metric == "psnr"), "value"] -= drop
+    rows.to_parquet(folder.rows)
+    return folder.root
+
+
+def of_tracked(folder):
+    return RunSet.read([folder]).only([*TRACKED, *TRACKED.values()])
+
+
+def test_the_drop_is_novel_view_minus_self_reenactment(tracked_run):
+    table = drop_table(of_tracked(tracked_run))
+    assert {row.method: row.cells[-1].value for row in table.rows} == pytest.approx(DROP)
+    assert {row.method: float(row.cells[-1].text) for row in table.rows} == pytest.approx(DROP, abs=1e-4)
+    assert {row.method: row.cells[0].value for row in table.rows} == {name: PSNR[name] for name in DROP}
+
+
+def test_a_drop_is_missing_where_a_task_has_no_values(tracked_run):
+    folder = RunFolder(tracked_run)
+    rows = pd.read_parquet(folder.rows)
+    rows[rows.task != "self_reenactment"].to_parquet(folder.rows)
+    table = drop_table(of_tracked(tracked_run))
+    assert {row.method: row.cells[-1].value for row in table.rows} == dict.fromkeys(DROP)
+
+
+def test_rows_are_methods_and_cells_tracked_minus_plain(tracked_run):
+    runs = of_tracked(tracked_run)
+    table = tracked_table(runs, TRACKED)
+    plain = {row.method: row.cells for row in table_of(runs).rows}
+    assert [row.method for row in table.rows] == [*TRACKED]
+    for row in table.rows:
+        wanted = [b.value - a.value for a, b in zip(plain[row.method], plain[TRACKED[row.method]])]
+        kept = [i for i, column in enumerate(table_of(runs).columns) if column.metric != "fps"]
+        assert [cell.value for cell in row.cells] == pytest.approx([wanted[i] for i in kept])
+
+
+def test_tracking_from_images_is_no_ablation(tracked_run):
+    sections = re.split("^## ", suite_report([tracked_run], "ours"), flags=re.MULTILINE)[1:]
+    by_title = {section.partition("\n")[0]: section for section in sections}
+    assert [*by_title] == [
+        *("All frames", "Sequence EMO", "Tracked from images", "Ablations of ours", "Ablations of ours, EMO")
+    ]
+    assert {title for title, text in by_title.items() if "tracked" in text} == {"Tracked from images"}
+    assert {title for title, text in by_title.items() if "| less" in text} == {
+        *("Ablations of ours", "Ablations of ours, EMO")
+    }
+
+
+def test_a_second_run_has_its_own_heading(tracked_run, write_run):
+    large = write_run("run-large", {"ga": 30.0, "ours": 31.0})
+    first, second = suite_report([tracked_run, large], "ours").split(f"\n# {LARGE}\n")
+    assert first == suite_report([tracked_run], "ours")
+    assert second.strip() == suite_report([large], "ours").strip()
