@@ -85,7 +85,7 @@ class RenderedSubject:
         paint = paint_skin(person, self.anatomy, points, normals, cavity)
         ears = ear_share(self.anatomy, points, _region_share(self._fine, head, ("left_ear", "right_ear")))
         hair = make_hair(person, self.anatomy, points, normals, self._fine.faces, ears)
-        under = paint.albedo + hair.share[:, None] * (0.55 * person.hair - paint.albedo)
+        under = paint.albedo + hair.share[:, None] * (0.75 * person.hair - paint.albedo)
         self._folds = make_folds(person, self.anatomy, points, paint.lips, 1.0 - hair.share)
         self._skin_albedo, self._cap = under, hair.cap
         self._hair = hair.strands
