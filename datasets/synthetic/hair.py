@@ -428,6 +428,8 @@ def make_beard(
     lean /= np.linalg.norm(lean, axis=1, keepdims=True)
     length = person.beard * rng.uniform(0.6, 1.1, count) * (0.4 + 0.6 * share[root])
     length = s * np.where(above > 0.5, np.minimum(length, _MOUSTACHE), length)
+    ear = anatomy["left_ear"][2]
+    length *= 1.0 - 0.7 * smoothstep(start[:, 2], ear + 0.06 * s, ear + 0.03 * s)
     t = np.linspace(0.0, 1.0, 4)[None, :, None]
     out = (0.35 + 0.25 * rng.random((count, 1, 1))) * t * (1.0 - 0.45 * t)
     paths = start[:, None] + length[:, None, None] * (t * lean[:, None] + out * normal[:, None])
