@@ -65,12 +65,13 @@ def people() -> Image.Image:
     for seed in PEOPLE:
         row = []
         for index in range(10):
-            settings = SyntheticSettings(10, 1, 4, (110, 160), "procedural", seed, 0.0, 25)
+            settings = SyntheticSettings(10, 1, 4, (275, 401), "procedural", seed, 0.0, 9)
             plan = plan_subject(Path("unused"), index, geometry, settings)
             renderer = CaptureRenderer(plan)
             (skin,) = over_time([rest], 1.0, plan.person)
             renderer.set_pose(geometry.translation.pose(rest, plan.person.name, None), rest, skin)
-            row.append(renderer.render(FRONTAL, 1)[0])
+            image = Image.fromarray(renderer.render(FRONTAL, 1)[0])
+            row.append(np.asarray(image.resize((110, 160), Image.Resampling.LANCZOS)))
         rows.append(np.concatenate(row, axis=1))
     return Image.fromarray(np.concatenate(rows))
 
