@@ -113,7 +113,7 @@ def test_a_detector_finds_the_face(geometry):
             renderer.pose_at(*every[moment])
             picture, _ = renderer.render(FRONTAL, 1)
             boxes = detector.detect_multi_scale(
-                img=picture, scale_factor=1.05, step_ratio=1, min_size=(120, 120), max_size=(260, 260)
+                img=picture, scale_factor=1.08, step_ratio=1, min_size=(120, 120), max_size=(260, 260)
             )
             middles = [(box["c"] + box["width"] / 2, box["r"] + box["height"] / 2) for box in boxes]
             found.append(bool(middles) and all(abs(x - 137) < 40 and 110 < y < 270 for x, y in middles))
