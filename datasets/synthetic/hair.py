@@ -41,14 +41,15 @@ class Style:
 
 
 STYLES = {
-    "crop": Style(0.011, 0.0040, 3600, 0.0030, 0.0008, 0.05, 0.10, -0.30, 0.25, 0.0),
-    "short": Style(0.042, 0.0100, 1500, 0.0085, 0.0030, 0.30, 0.80, 0.55, 0.20, 0.028),
-    "bob": Style(0.105, 0.0120, 900, 0.0130, 0.0060, 0.85, 0.90, 0.70, 0.12, -0.020),
-    "swept": Style(0.068, 0.0100, 1300, 0.0100, 0.0035, 0.20, 0.15, 1.30, 0.16, 0.0),
-    "curly": Style(0.036, 0.0150, 2400, 0.0060, 0.0130, 0.10, 0.35, 0.40, 1.10, 0.015),
-    "long": Style(0.180, 0.0120, 900, 0.0140, 0.0060, 0.90, 0.80, 0.75, 0.14, 0.010),
+    "crop": Style(0.011, 0.0040, 5800, 0.0020, 0.0008, 0.05, 0.10, -0.30, 0.25, 0.0),
+    "short": Style(0.042, 0.0100, 2800, 0.0046, 0.0030, 0.30, 0.80, 0.55, 0.20, 0.028),
+    "bob": Style(0.105, 0.0120, 1600, 0.0070, 0.0060, 0.85, 0.90, 0.70, 0.12, -0.020),
+    "swept": Style(0.068, 0.0100, 2300, 0.0055, 0.0035, 0.20, 0.15, 1.30, 0.16, 0.0),
+    "curly": Style(0.036, 0.0150, 4000, 0.0038, 0.0130, 0.10, 0.35, 0.40, 1.10, 0.015),
+    "long": Style(0.180, 0.0120, 1600, 0.0075, 0.0060, 0.90, 0.80, 0.75, 0.14, 0.010),
 }
 
+_COLOURED = 0.3  # coverage from which on the skin has the colour of hair, and locks grow
 _TOO_SHORT_TO_HANG = 0.02  # metres; shorter hair cannot reach the face
 
 # Hairline: height above the brows (m) by azimuth from the front (degrees), for a head of average size.
@@ -58,7 +59,7 @@ _HEIGHT = np.array([0.060, 0.058, 0.050, 0.024, -0.008, -0.036, -0.026, -0.052, 
 
 @dataclass(frozen=True, eq=False)
 class Hair:
-    """``cap`` (N,) thickness over the fine skin points in metres, ``share`` (N,) coverage, and locks."""
+    """``cap`` (N,) thickness over the fine skin points in metres, ``share`` (N,) of hair in their colour, and locks."""
 
     cap: FloatArray
     share: FloatArray
@@ -73,7 +74,7 @@ def hair_share(person: Person, anatomy: Anatomy, points: FloatArray, ears: Float
     line = anatomy["glabella"][1] + s * np.interp(azimuth, _AZIMUTH, _HEIGHT)
     line = line + person.recession * s * smoothstep(azimuth, 1.15, 0.6)
     ragged = 0.0035 * s * fractal_noise(points, 0.012 * s, person.seed + 80, 3)
-    grown = smoothstep(points[:, 1] - line + ragged, -0.002 * s, 0.009 * s)
+    grown = smoothstep(points[:, 1] - line + ragged, -0.002 * s, 0.016 * s)
     return grown * (1.0 - ears) * (1.0 - _around_lobes(points, ears, s))
 
 
@@ -101,7 +102,8 @@ def make_hair(
     style, s = STYLES[person.style], anatomy.scale
     share = hair_share(person, anatomy, points, ears)
     uneven = 1.0 + 0.35 * fractal_noise(points, 0.03 * s, person.seed + 81, 2)
-    cap = style.cap * s * share * uneven
+    # The cap rises where its colour is hair already, so that no skin stands out from the head.
+    cap = style.cap * s * smoothstep(share, _COLOURED, 1.0) * uneven
     rng = np.random.default_rng(person.seed + 82)
     chosen = _sample(points, faces, share, style.locks, rng)
     weights = rng.dirichlet(np.ones(3), len(chosen))
@@ -111,19 +113,22 @@ def make_hair(
     # Hair close to the hairline is shorter on short heads; long hair keeps its length.
     edge = np.einsum("nk,nk->n", weights, share[faces[chosen]])
     lengths *= 0.45 + 0.55 * edge if style.length < 0.1 else 1.0
-    tree = cKDTree(surface)
+    tree = cKDTree(points)
     layer = rng.uniform(0.3, 1.0, len(roots))
 
     limit = _face_limit(anatomy)
+    # Locks of the temples have their roots in front of the limit.
+    temple = roots[:, 1] < anatomy["glabella"][1] + 0.05 * s
+    foremost = np.where(temple, roots[:, 2], -np.inf)
 
     def keep_out(place: FloatArray, along: float) -> FloatArray:
         _, nearest = tree.query(place, k=4)
         normal = normals[nearest].mean(axis=1)
-        height = np.einsum("ni,ni->n", place - surface[nearest].mean(axis=1), normal)
-        wanted = (0.0005 * s + style.rise * along) * layer
+        height = np.einsum("ni,ni->n", place - points[nearest].mean(axis=1), normal)
+        wanted = cap[nearest].mean(axis=1) + (0.0005 * s + style.rise * along) * layer
         place = place + np.maximum(wanted - height, 0.0)[:, None] * normal
         if style.length > _TOO_SHORT_TO_HANG:
-            place[:, 2] = np.minimum(place[:, 2], limit(place))
+            place[:, 2] = np.minimum(place[:, 2], np.maximum(limit(place), foremost))
         return place
 
     parting = style.parting * s
@@ -132,7 +137,7 @@ def make_hair(
     def field(place: FloatArray, along: float) -> FloatArray:
         _, nearest = tree.query(place)
         normal = normals[nearest]
-        side = np.tanh((place[:, 0] - parting) / (0.015 * s))
+        side = np.where(place[:, 0] < parting, -1.0, 1.0)
         top = smoothstep(normal[:, 1], 0.1, 0.8)
         front = smoothstep(place[:, 2], anatomy["vertex_top"][2] - 0.02 * s, anatomy["glabella"][2])
         wish = np.stack(
@@ -157,14 +162,14 @@ def make_hair(
     paths = grow(roots, lengths, field, keep_out, segments)
     _, nearest = tree.query(paths)
     facing = normals[nearest] + rng.normal(0.0, 0.10, (len(roots), 1, 3))
-    columns = 5
+    columns = 3
     tone = 0.55 * fractal_noise(roots, 0.02 * s, person.seed + 84, 2)[:, None] + 0.20 * rng.standard_normal(
         (len(roots), columns)
     )
     color = person.hair * np.exp(0.6 * tone)[:, :, None]
     width = style.width * s * rng.uniform(0.7, 1.3, len(roots))
-    locks = ribbons(paths, facing, width, color, tip_shade=1.3, tip_width=0.3, arch=0.16)
-    return Hair(cap, share, locks)
+    locks = ribbons(paths, facing, width, color, tip_shade=1.3, tip_width=0.2, root_width=0.3, arch=0.16)
+    return Hair(cap, smoothstep(share, 0.0, _COLOURED), locks)
 
 
 def _face_limit(anatomy: Anatomy) -> Callable[[FloatArray], FloatArray]:
@@ -193,10 +198,11 @@ def ear_share(anatomy: Anatomy, points: FloatArray, labelled: FloatArray) -> Flo
 def _sample(
     points: FloatArray, faces: IntArray, share: FloatArray, count: int, rng: np.random.Generator
 ) -> IntArray:
-    """Draw triangles by area times coverage."""
+    """Draw triangles by area where hair grows, most densely at its edge, which no locks from elsewhere cover."""
     corner = points[faces]
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-    chance = area * np.where(share[faces].mean(axis=1) > 0.15, 0.25 + 0.75 * share[faces].mean(axis=1), 0.0)
+    grown = share[faces].mean(axis=1)
+    chance = area * np.where(grown > _COLOURED, 3.0 - 2.0 * grown, 0.0)
     return rng.choice(len(faces), count, p=chance / chance.sum())
 
 
@@ -252,6 +258,7 @@ def ribbons(
     *,
     tip_shade: float = 1.0,
     tip_width: float = 0.25,
+    root_width: float = 1.0,
     arch: float = 0.0,
 ) -> Strands:
     """Tapered ribbons around paths (n, k, 3).
@@ -261,13 +268,13 @@ def ribbons(
     outward : FloatArray
         (n, k, 3) or (n, 1, 3) direction that a ribbon's flat side faces.
     width : FloatArray
-        (n,) metres, at the root.
+        (n,) metres, at the widest.
     color : FloatArray
         (n, c, 3) linear reflectance across each ribbon, c >= 2 columns.
     tip_shade : float
         Factor on the colour at the tip (above 1 for sun-bleached tips).
-    tip_width : float
-        Width at the tip relative to the width at the root.
+    tip_width, root_width : float
+        Width at the ends relative to the widest.
     arch : float
         Height of the middle above the edges, relative to the width.
     """
@@ -276,7 +283,7 @@ def ribbons(
     outward = np.broadcast_to(outward, paths.shape)
     across = np.cross(np.gradient(paths, axis=1), outward)
     across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
-    taper = np.interp(np.linspace(0.0, 1.0, points), [0.0, 0.6, 1.0], [1.0, 0.9, tip_width])
+    taper = np.interp(np.linspace(0.0, 1.0, points), [0.0, 0.2, 0.6, 1.0], [root_width, 1.0, 0.9, tip_width])
     wide = (width[:, None] * taper)[:, :, None, None]
     u = np.linspace(-1.0, 1.0, columns)[None, None, :, None]
     vertices = paths[:, :, None] + wide * (
@@ -421,6 +428,8 @@ def make_beard(
     lean /= np.linalg.norm(lean, axis=1, keepdims=True)
     length = person.beard * rng.uniform(0.6, 1.1, count) * (0.4 + 0.6 * share[root])
     length = s * np.where(above > 0.5, np.minimum(length, _MOUSTACHE), length)
+    ear = anatomy["left_ear"][2]
+    length *= 1.0 - 0.7 * smoothstep(start[:, 2], ear + 0.06 * s, ear + 0.03 * s)
     t = np.linspace(0.0, 1.0, 4)[None, :, None]
     out = (0.35 + 0.25 * rng.random((count, 1, 1))) * t * (1.0 - 0.45 * t)
     paths = start[:, None] + length[:, None, None] * (t * lean[:, None] + out * normal[:, None])

@@ -73,7 +73,7 @@ def _kept(seconds: float, constant: float) -> float:
 
 _AGED = np.array(
     [
-        {"forehead": 0.4, "glabella": 0.35, "crow": 0.3, "nasolabial": 0.9, "under": 0.4, "neck": 0.6}.get(
+        {"forehead": 0.4, "glabella": 0.35, "crow": 0.3, "nasolabial": 0.7, "under": 0.4, "neck": 0.6}.get(
             name.split("_")[0], 0.0
         )
         for name in FOLDS

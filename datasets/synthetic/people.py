@@ -15,8 +15,11 @@ _SHORT = 0.05  # metres; of longer hair the hairline does not recede
 _TRAITS, _BLOCK = 5, 10  # traits that every ten subjects are spread over evenly
 
 
-def _spread(seed: int, index: int) -> FloatArray:
-    """(5,) numbers in [0, 1): of every ten subjects of a seed, each has another tenth (a Latin hypercube)."""
+def spread(seed: int, index: int) -> FloatArray:
+    """(5,) numbers in [0, 1): of every ten subjects of a seed, each has another tenth of each (a Latin hypercube).
+
+    They are skin tone, age, hair style, beard and glasses.
+    """
     rng = np.random.default_rng([seed, 21, index // _BLOCK])
     tenths = np.stack([rng.permutation(_BLOCK) for _ in range(_TRAITS)], axis=1)
     return (tenths + rng.random((_BLOCK, _TRAITS)))[index % _BLOCK] / _BLOCK
@@ -25,7 +28,7 @@ def _spread(seed: int, index: int) -> FloatArray:
 def draw_person(name: str, index: int, seed: int, dynamics: float = 1.0) -> Person:
     """Draw subject number ``index`` of a capture made with ``seed``."""
     rng = np.random.default_rng([seed, index, 22])
-    tone, years, style, growth, eyewear = _spread(seed, index)
+    tone, years, style, growth, eyewear = spread(seed, index)
     age = AGES[0] + (AGES[1] - AGES[0]) * years
     place = tone * (len(SKIN) - 1)
     lower, upper = linear(SKIN[int(place)]), linear(SKIN[int(place) + 1])

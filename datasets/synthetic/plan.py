@@ -43,10 +43,11 @@ FIRST_SUBJECT = 900
 """First number of synthetic subjects; participants of NeRSemble have smaller ones."""
 
 _IDENTITY_SPREAD = 0.65  # standard deviations of the identity basis; 1 would draw rare faces too often
-_LOOK_BELOW = 0.004  # metres below the middle of the head
+_BUST = 0.213  # metres from the target down to the end of the bust, which lies below the image
+_LOOK_BELOW, _LOOK_ABOVE = 0.004, 0.012  # metres at most between the target and the middle of the head
 
 
-EDITION = 2
+EDITION = 3
 """Version of the content: captures of one version and the same settings have the same content."""
 
 
@@ -166,17 +167,17 @@ def plan_subject(out: Path, index: int, geometry: Geometry, settings: SyntheticS
 
 
 def _middle(anatomy: Anatomy, neutral: FloatArray, style: Style) -> FloatArray:
-    """Target of the cameras: the middle of the head with its hair, at rest, a little low so that the bust is
-    visible.
+    """Target of the cameras: near the middle of the head with its hair, at rest, so high that the bust's end is not visible.
 
-    Only parts above the chin are used: neck and shoulders need not be in the frame from every side.
+    Only parts above the chin make the middle: neck and shoulders need not be in the frame from every side.
     """
     skin = neutral[np.unique(anatomy.skin_faces)]
     above = skin[skin[:, 1] > anatomy["chin"][1]]
     low, high = above.min(axis=0), above.max(axis=0)
     low[2] -= (style.cap + style.rise) * anatomy.scale
     middle = 0.5 * (low + high)
-    return on_grid(middle - np.array([0.0, _LOOK_BELOW * anatomy.scale, 0.0]), LENGTH_BITS)
+    lift = np.clip(skin[:, 1].min() + _BUST - middle[1], -_LOOK_BELOW, _LOOK_ABOVE)
+    return on_grid(middle + np.array([0.0, lift, 0.0]), LENGTH_BITS)
 
 
 FRONTAL = "222200037"

@@ -39,7 +39,7 @@ def paint_skin(
     color = np.tile(person.skin, (len(points), 1))
     red = person.skin * np.array([1.02, 0.66, 0.62])
     color = _mix(color, red, 0.55 * _flush(anatomy, points))
-    color = _mix(color, person.skin * np.array([0.62, 0.52, 0.55]), 0.55 * _around_eyes(anatomy, points))
+    color = _mix(color, person.skin * np.array([0.62, 0.52, 0.55]), 0.4 * _around_eyes(anatomy, points))
     # Blotches, then pores: real skin is never even.
     color *= (1.0 + 0.10 * fractal_noise(points, 0.03 * s, seed, 3))[:, None]
     color[:, 1:] *= (1.0 - 0.06 * fractal_noise(points, 0.012 * s, seed + 7, 3))[:, None]
@@ -208,11 +208,14 @@ def _freckles(anatomy: Anatomy, points: FloatArray, seed: int) -> FloatArray:
 def stubble_share(anatomy: Anatomy, points: FloatArray, seed: int) -> FloatArray:
     """Weight of beard growth, grained as stubble."""
     s = anatomy.scale
-    mouth, chin = anatomy["mouth"], anatomy["chin"]
-    low = smoothstep(points[:, 1], mouth[1] + 0.018 * s, mouth[1] - 0.006 * s) * smoothstep(
-        points[:, 1], chin[1] - 0.03 * s, chin[1]
+    mouth, chin, ear = anatomy["mouth"], anatomy["chin"], anatomy["left_ear"]
+    # Its upper edge rises from the mouth's corners to the hair in front of the ears.
+    back = smoothstep(points[:, 2], ear[2] + 0.055 * s, ear[2] + 0.02 * s)
+    edge, base = mouth[1] + (ear[1] - mouth[1]) * back, chin[1] + 0.035 * s * back
+    low = smoothstep(points[:, 1], edge + 0.018 * s, edge - 0.006 * s) * smoothstep(
+        points[:, 1], base - 0.03 * s, base
     )
-    front = smoothstep(points[:, 2], anatomy["left_ear"][2] + 0.012 * s, anatomy["left_ear"][2] + 0.035 * s)
+    front = smoothstep(points[:, 2], ear[2] + 0.014 * s, ear[2] + 0.026 * s)
     cheeks = sum(blob(points, anatomy[f"{side}_cheek"], np.array([0.02, 0.026, 0.03]) * s) for side in SIDES)
     grain = 0.75 + 0.35 * value_noise(points / (0.0016 * s), seed + 60)
     return np.clip(low * front * (1.0 - 0.9 * np.minimum(cheeks, 1.0)) * grain, 0.0, 1.0)
@@ -229,7 +232,8 @@ def beard_share(person: Person, anatomy: Anatomy, points: FloatArray) -> FloatAr
     bare = np.zeros(len(points))
     distance = polygon_distance(points[near, :2], anatomy.lip_outline[:, :2])
     bare[near] = smoothstep(distance, 0.0022 * s, 0.0008 * s)
-    bare = np.maximum(bare, smoothstep(points[:, 2], mouth[2] - 0.062 * s, mouth[2] - 0.075 * s))
+    behind = smoothstep(points[:, 2], mouth[2] - 0.062 * s, mouth[2] - 0.075 * s)
+    bare = np.maximum(bare, behind * smoothstep(np.abs(points[:, 0]), 0.045 * s, 0.035 * s))
     return smoothstep(share, 0.22, 0.6) * (1.0 - bare)
 
 
@@ -376,7 +380,7 @@ class _Sketch:
             cut = np.abs(x) < wide * (1.0 - 0.10 * number)
             z = np.array([a["glabella"][2] - 0.35 * x[i] ** 2 / wide for i in range(41)])
             lines.append(np.stack([x, y, z], axis=1)[cut])
-        height, shade = self._lines(lines, 0.0010)
+        height, shade = self._lines(lines, 0.0009, bulge=0.2)
         x = self.points[:, 0]
         left = smoothstep(x, 0.006 * s, 0.026 * s)
         right = smoothstep(x, -0.006 * s, -0.026 * s)
@@ -406,7 +410,8 @@ class _Sketch:
                 [sign * reach * np.cos(angle), reach * np.sin(angle) + bend, -0.75 * reach], 1
             )
             lines.append(line)
-        return self._lines(lines, 0.0009, 0.0011)
+        height, shade = self._lines(lines, 0.0005, 0.0009, bulge=0.2)
+        return height, 0.45 * shade
 
     def _nasolabial(self, side: str, sign: float) -> tuple[FloatArray, FloatArray]:
         a, s = self.anatomy, self.s
@@ -424,7 +429,7 @@ class _Sketch:
         )
         height, shade = self._lines([line], 0.0020, 0.0021, bulge=0.5)
         cheek = blob(self.points, a[f"{side}_cheek"], 0.014 * s)
-        return height + 0.0012 * s * cheek, 0.7 * shade
+        return height + 0.0012 * s * cheek, 0.5 * shade
 
     def _bunny(self) -> tuple[FloatArray, FloatArray]:
         a, s = self.anatomy, self.s

@@ -24,7 +24,7 @@ from .plan import Geometry
 from .skin import gloss_at_rest, make_folds, paint_skin, sagging
 from .volume import smoothed
 
-_STRETCH_GLOSS = 3.0  # exponent of the stretch of area
+_STRETCH_GLOSS, _LEAST, _MOST = 3.0, 0.6, 1.25  # exponent of the stretch of area, and the range of the latter
 _WET = 1.2  # what wetness adds to the gloss of lips
 HEAD_JOINT, EYE_JOINTS = 1, (3, 4)
 _NECK_ROUNDS = 6  # of averaging over neighbours
@@ -85,7 +85,7 @@ class RenderedSubject:
         paint = paint_skin(person, self.anatomy, points, normals, cavity)
         ears = ear_share(self.anatomy, points, _region_share(self._fine, head, ("left_ear", "right_ear")))
         hair = make_hair(person, self.anatomy, points, normals, self._fine.faces, ears)
-        under = paint.albedo + hair.share[:, None] * (0.55 * person.hair - paint.albedo)
+        under = paint.albedo + hair.share[:, None] * (0.75 * person.hair - paint.albedo)
         self._folds = make_folds(person, self.anatomy, points, paint.lips, 1.0 - hair.share)
         self._skin_albedo, self._cap = under, hair.cap
         self._hair = hair.strands
@@ -192,7 +192,7 @@ class RenderedSubject:
     def _stretched_gloss(self, tracked: FloatArray, rest: FloatArray, wet: float) -> FloatArray:
         """Skin that is stretched loses its fine relief and shines more; so do wet lips."""
         area = _area_around(tracked, self._fine.coarse_faces)
-        stretch = self._fine.interpolate(np.clip(area / self._area, 0.6, 1.6))
+        stretch = self._fine.interpolate(np.clip(area / self._area, _LEAST, _MOST))
         return np.clip(rest * stretch**_STRETCH_GLOSS * (1.0 + _WET * wet * self._lips), 0.1, 4.0)
 
     def _rooted_vertices(

@@ -1,7 +1,7 @@
-"""``make pictures``: screenshots of the pages of a finished demo, and the README's picture.
+"""``make pictures``: screenshots of the pages of a finished demo, the README's picture, and thirty synthetic people.
 
 The report, the page of an avatar, a leaderboard and this site, at three widths in both schemes, as ``docs/pictures/*-after.webp``;
-the report as ``reports/gallery/report.jpg``. Needs Chromium.
+the report as ``reports/gallery/report.jpg``. These need Chromium. The people are ``docs/pictures/people.webp``.
 """
 
 from __future__ import annotations
@@ -12,14 +12,22 @@ import sys
 from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
+
+from headbench.datasets.synthetic.history import over_time
+from headbench.datasets.synthetic.performance import CONTROLS
+from headbench.datasets.synthetic.plan import FRONTAL, SyntheticSettings, load_geometry, plan_subject
+from headbench.datasets.synthetic.renderer import CaptureRenderer
 
 ROOT = Path(__file__).parents[2]
 SIZES = {1440: 1800, 1024: 1365, 390: 2000}
 """Height of a picture by width, pixels of the page."""
 STORED = 0.6
 """Scale of stored pictures, except those of phones."""
+PEOPLE = (91001, 91002, 91003)
+"""Seeds of the people, ten subjects and one row each."""
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
@@ -51,7 +59,25 @@ def picture(page: Page, path: Path) -> Image.Image:
     return Image.open(BytesIO(page.screenshot())).convert("RGB")
 
 
+def people() -> Image.Image:
+    """Thirty subjects at rest, from the front."""
+    geometry, rest, rows = load_geometry("procedural"), dict.fromkeys(CONTROLS, 0.0), []
+    for seed in PEOPLE:
+        row = []
+        for index in range(10):
+            settings = SyntheticSettings(10, 1, 4, (275, 401), "procedural", seed, 0.0, 9)
+            plan = plan_subject(Path("unused"), index, geometry, settings)
+            renderer = CaptureRenderer(plan)
+            (skin,) = over_time([rest], 1.0, plan.person)
+            renderer.set_pose(geometry.translation.pose(rest, plan.person.name, None), rest, skin)
+            image = Image.fromarray(renderer.render(FRONTAL, 1)[0])
+            row.append(np.asarray(image.resize((110, 160), Image.Resampling.LANCZOS)))
+        rows.append(np.concatenate(row, axis=1))
+    return Image.fromarray(np.concatenate(rows))
+
+
 def main(demo: Path) -> None:
+    people().save(ROOT / "docs" / "pictures" / "people.webp", quality=80)
     work = ROOT / "build" / "pictures"
     shutil.rmtree(work, ignore_errors=True)
     names = ("chromium", "chromium-browser", "google-chrome")

@@ -8,11 +8,12 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from headbench.datasets.head.geometry import vertex_normals
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.synthetic.anatomy import linear
 from headbench.datasets.synthetic.hair import STYLES
 from headbench.datasets.synthetic.history import coupled_strengths, over_time
-from headbench.datasets.synthetic.people import draw_person
+from headbench.datasets.synthetic.people import draw_person, spread
 from headbench.datasets.synthetic.plan import SyntheticSettings, plan_subject
 from headbench.datasets.synthetic.skin import FLUSHES, FOLDS
 from headbench.datasets.synthetic.subject import RenderedSubject
@@ -36,6 +37,20 @@ def test_ten_subjects_are_of_all_kinds(seed):
     )
 
 
+@pytest.mark.parametrize("first", [0, 10])
+def test_ages_and_skins_of_ten_fall_in_ten_tenths(first):
+    drawn = np.array([spread(3, index) for index in range(first, first + 10)])
+    people = [draw_person(str(index), index, 3) for index in range(first, first + 10)]
+    for trait in drawn.T:
+        assert sorted((10 * trait).astype(int)) == list(range(10))
+    tone, age = drawn.T[:2]
+    light = np.array([who.skin.mean() for who in people])
+    aged = np.array([who.sag for who in people])
+    # Neighbouring tones differ by less than what is random in a skin.
+    assert np.all(np.diff(light[np.argsort(tone)][::2]) < 0.0)
+    assert np.all(np.diff(aged[np.argsort(age)]) >= 0.0)
+
+
 @pytest.fixture(scope="module")
 def bearded(geometry):
     """A subject with everything that there is."""
@@ -47,6 +62,18 @@ def bearded(geometry):
 @pytest.fixture(scope="module")
 def subject(bearded):
     return RenderedSubject(bearded.person, bearded.geometry, bearded.shape)
+
+
+def test_no_skin_stands_out_and_locks_lie_over_the_cap(bearded):
+    who = replace(bearded.person, sag=0.0)
+    subject = RenderedSubject(who, bearded.geometry, bearded.shape)
+    assert subject._cap[subject.hair_share < 0.99].max() == 0.0
+    assert subject._cap.max() > 0.5 * STYLES[who.style].cap
+    normals = vertex_normals(subject._rest_points, subject._fine.faces)
+    surface = subject._rest_points + subject._cap[:, None] * normals
+    _, near = cKDTree(surface).query(subject._hair.vertices)
+    height = ((subject._hair.vertices - surface[near]) * normals[near]).sum(axis=1)
+    assert (height < -0.001).mean() < 0.02
 
 
 def folds(states):
@@ -123,7 +150,8 @@ def test_beard_and_glasses_lie_on_the_face_and_move_with_it(bearded, subject, re
     skin = calm["skin"].vertices
     assert cKDTree(skin).query(calm["beard"].vertices)[0].max() < 0.025
     assert 0.001 < cKDTree(skin).query(calm["glasses"].vertices)[0].max() < 0.04
-    mouth = subject.anatomy["mouth"]
+    mouth, ear = subject.anatomy["mouth"], subject.anatomy["left_ear"]
+    assert calm["beard"].vertices[:, 1].max() > ear[1] - 0.01
     middle = np.abs(calm["beard"].vertices - mouth)[:, :2] < np.array([0.012, 0.002])
     assert middle.all(axis=1).mean() < 0.002  # hardly any hair lies over the lips
     opened = {**rest, "jaw_open": 1.0}

@@ -4,11 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from scipy.ndimage import binary_dilation, binary_erosion
 from skimage.data import lbp_frontal_face_cascade_filename
 from skimage.draw import polygon2mask
 from skimage.feature import Cascade
 
+from headbench.datasets.head.model import HeadModel
 from headbench.datasets.synthetic.plan import FRONTAL, SyntheticSettings, plan_subject
 from headbench.datasets.synthetic.renderer import CaptureRenderer
 
@@ -93,25 +95,39 @@ def test_expression_is_seen_in_the_picture(renderer, plan):
     assert (np.abs(pictures[0] - pictures[1]).max(2) >= 6).sum() >= 10
 
 
+def _between_the_eyes(plan, sequence, timestep):
+    """(2,) pixels of the nose's bridge in the frontal picture."""
+    model = HeadModel(plan.geometry.head, dtype=torch.float64)
+    pose = model.pose_arguments([plan.poses[sequence][timestep]])
+    tracked = model(shape=torch.from_numpy(plan.shape), **pose).detach()
+    camera, bridge = plan.cameras[FRONTAL], tracked[0, plan.geometry.head.landmarks["nose_bridge"]].numpy()
+    pixel = camera.K @ (camera.world_to_camera[:3, :3] @ bridge + camera.world_to_camera[:3, 3])
+    return pixel[:2] / pixel[2]
+
+
 @pytest.mark.slow
 def test_a_detector_finds_the_face(geometry):
-    """scikit-image's LBP cascade, trained on photographs, finds the one face in most frames.
+    """The LBP cascade of scikit-image 0.26.0, trained on photographs, finds the one face in 97 % of frames.
 
-    The skin was not tuned on this seed. Of its first six moments' 60 frames two are missed: a beard, mouth open.
+    Four moments of each subject's natural performance, except those with the tongue out. Nothing was tuned on this seed.
     """
     detector = Cascade(lbp_frontal_face_cascade_filename())
     found = []
     for index in range(10):
-        settings = SyntheticSettings(10, 2, 8, (275, 401), "procedural", 4700, 0.0, 9)
+        settings = SyntheticSettings(10, 1, 60, (275, 401), "procedural", 4700, 0.0, 9, "natural")
         plan = plan_subject(Path("unused"), index, geometry, settings)
         renderer = CaptureRenderer(plan)
-        every = list(plan.moments())
-        for sequence, timestep in (every[moment] for moment in (0, 2, 6)):
-            renderer.pose_at(sequence, timestep)
+        tongue = {
+            name: [a["tongue_out"] for a in played.activations] for name, played in plan.performed.items()
+        }
+        every = [(name, timestep) for name, timestep in plan.moments() if tongue[name][timestep] < 0.1]
+        for moment in np.linspace(0, len(every) - 1, 4).astype(int):
+            renderer.pose_at(*every[moment])
             picture, _ = renderer.render(FRONTAL, 1)
             boxes = detector.detect_multi_scale(
                 img=picture, scale_factor=1.08, step_ratio=1, min_size=(120, 120), max_size=(260, 260)
             )
+            x, y = _between_the_eyes(plan, *every[moment])
             middles = [(box["c"] + box["width"] / 2, box["r"] + box["height"] / 2) for box in boxes]
-            found.append(bool(middles) and all(abs(x - 137) < 40 and 110 < y < 270 for x, y in middles))
-    assert np.mean(found) >= 0.95, found
+            found.append(bool(middles) and all(abs(a - x) < 40 and abs(b - y) < 60 for a, b in middles))
+    assert np.mean(found) >= 0.97, found
