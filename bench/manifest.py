@@ -51,13 +51,15 @@ class MethodRecord:
 
 @dataclass(frozen=True)
 class ClipRecord:
-    """What is known of a capture: its fingerprint, the steps that made it, frames of each split, frames left out."""
+    """What is known of a capture: its fingerprint, the steps that made it, frames of each split, frames left out, and the
+    cameras of the training split (none in old records)."""
 
     subject: str
     fingerprint: str
     steps: list[dict[str, Any]]
     splits: dict[str, int]
     excluded: dict[str, str]
+    training_cameras: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

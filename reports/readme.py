@@ -23,7 +23,7 @@ from ..bench.rows import ALL, Rows
 from .runs import RunSet
 from .statistics.comparisons import PairedComparison, compare
 from .suite.suite import suite_report
-from .table_report import table_of, table_text
+from .table_report import Columns, table_of, table_text
 from .writers import to_markdown
 
 GALLERY = "reports/gallery"
@@ -33,6 +33,8 @@ RESULTS = "results.md"
 PAGES = {"demo": "docs/explanation/results.md", "suite": "README.md"}
 """The page of each block, in the repository."""
 OURS = "ours"
+SHOWN = ("psnr", "lpips")
+"""Metrics of frames in the README, whose table would not fit a page with all; those of the suite's tables are in `RESULTS`."""
 
 
 def publish_demo(out: Path, root: Path) -> None:
@@ -122,20 +124,22 @@ def suite_block(folder: Path) -> str:
         f", not counting {minutes.count(None)} that were interrupted and continued" if None in minutes else ""
     )
     shown = runs.only([*runs.ranked, *runs.trivial])
+    columns = Columns((*SHOWN, "storage", "fps"))
     return (
-        f"{to_markdown(table_of(shown)).strip()}\n\n{conclusions(shown)}\n\n"
-        f"[Tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
+        f"{to_markdown(table_of(shown, columns=columns)).strip()}\n\n{conclusions(shown)}\n\n"
+        f"[SSIM, tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
         f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{interrupted}."
     )
 
 
 def conclusions(runs: RunSet) -> str:
     """What the rows allow to conclude about `OURS` and every other ranked method: a Markdown list, a line for each task."""
+    runs = runs.by_camera
     pairs = [(OURS, method) for method in runs.ranked if method != OURS]
     lines = []
     for task in runs.tasks:
         found: dict[tuple[str, str], list[str]] = {}
-        for spec in [spec for spec in runs.metrics if spec.name in ("psnr", "ssim", "lpips")]:
+        for spec in [spec for spec in runs.metrics if spec.name in SHOWN]:
             better = spec.higher_is_better
             for pair in compare(runs.rows, pairs, task=task, metric=spec.name, higher_is_better=better):
                 found.setdefault((pair.second, _conclusion(pair)), []).append(spec.label)

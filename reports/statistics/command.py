@@ -99,6 +99,7 @@ def compare_methods(
     from ..table_report import COMPARISON
     from .comparisons import compare
 
+    runs = runs.by_camera
     pairs = _pairs(runs, settings.against, settings.trivial)
     known = {spec.name: spec for spec in runs.metrics}
     for name in settings.metrics:
@@ -124,7 +125,7 @@ def compare_methods(
         text = _csv(every)
     else:
         text = "\n\n".join(_text(spec, c, note_of(times.get(spec.name, {}))) for spec, c in found)
-        text = f"{runs.part}\n\n{text}" if runs.part else text
+        text = "\n\n".join(filter(None, [runs.cameras, runs.part, text]))
     return CommandResult(text, {"level": settings.level, "comparisons": every})
 
 

@@ -25,6 +25,7 @@ def ablation_table(runs: RunSet, method: str) -> Table:
     runs : RunSet
         A run with only ``method`` itself and the conditions that are its ablations.
     """
+    runs = runs.by_camera
     ablations = [label for label, record in runs.records.items() if record.condition]
     table = table_of(runs)
     bound = {spec.name for spec in runs.metrics if spec.machine_bound}

@@ -19,10 +19,11 @@ def suite_report(run: Path, method: str) -> str:
     Under each table are the paired differences of every other method from ``method``, with intervals and tests. Those of the
     ablations are such differences, of whole frames and of the face, in all sequences and in each held-out one.
     """
-    whole = RunSet.read([run])
+    read = RunSet.read([run])
+    tested = sorted({frame[1] for frame in read.rows.frames("self_reenactment", FULL)})
+    whole = read.by_camera
     ablations = [label for label, record in whole.records.items() if record.condition]
     runs = whole.only([label for label in whole.records if label not in ablations])
-    tested = sorted({frame[1] for frame in runs.rows.frames("self_reenactment", FULL)})
     parts = {"All frames": FrameSelection()}
     parts |= {f"Region {region}": FrameSelection(region) for region in sorted(runs.rows.regions - {FULL})}
     parts |= {f"Sequence {name}": FrameSelection(sequences=(name,)) for name in tested}
