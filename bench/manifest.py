@@ -238,6 +238,9 @@ class Manifest:
             for name in ("needs", "code", "condition"):
                 if not method[name]:
                     del method[name]
+        for clip in record["clips"]:
+            if not clip["training_cameras"]:
+                del clip["training_cameras"]
         for metric in record["metrics"]:
             del metric["default"], metric["needs"], metric["suspect_above"]
         write_json(path, record)
