@@ -6,19 +6,26 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ...bench.progress import counted
+from ...bench.protocol import TASK_TITLES
 from ..runs import RunSet
 from ..statistics.comparisons import LEVEL, PairedComparison, compare, subjects_needed
 from ..table_report import table_of
 from ..tables import Table, TableCell, TableRow
 
 MEANING = f"Ablation minus method, mean over subjects and its {100 * (1 - LEVEL):g} % interval."
+CROSSED = (
+    "Ablation minus method in novel views, minus the same difference in self-reenactment: mean over subjects and its "
+    f"{100 * (1 - LEVEL):g} % interval. It is 0 where an ablation changes both tasks alike."
+)
+FIRST_TASK = "novel_view"
 TEST = f"exact sign-flip test over subjects, Holm over the ablations of a column, {LEVEL:.0%}"
 
 
-def ablation_table(runs: RunSet, method: str) -> Table:
+def ablation_table(runs: RunSet, method: str, *, crossed: bool = False) -> Table:
     """Differences of ablations from a method, with those columns of the comparison table that do not depend on the machine.
 
-    Speeds are left out: those of runs made one after another differ by up to a tenth without any difference of the method.
+    ``crossed``: differences in novel views minus those in self-reenactment instead, which show whether an ablation helps in one
+    task more than in the other. Speeds are left out: those of runs made one after another differ by up to a tenth without any difference of the method.
 
     Parameters
     ----------
@@ -30,11 +37,15 @@ def ablation_table(runs: RunSet, method: str) -> Table:
     table = table_of(runs)
     bound = {spec.name for spec in runs.metrics if spec.machine_bound}
     kept = tuple(column for column in table.columns if column.metric not in bound)
+    if crossed:
+        others = [column for column in kept if column.task not in ("", FIRST_TASK)]
+        kept = tuple(replace(c, title=f"{TASK_TITLES[FIRST_TASK]} minus {c.title.lower()}") for c in others)
     columns, tested = [], []
     for column in kept:
         found = compare(
             *(runs.rows, [(label, method) for label in ablations]),
-            task=column.task,
+            task=FIRST_TASK if crossed else column.task,
+            minus=column.task if crossed else "",
             metric=column.metric,
             higher_is_better=column.higher_is_better,
             level=LEVEL,
@@ -46,16 +57,22 @@ def ablation_table(runs: RunSet, method: str) -> Table:
         TableRow(runs.records[label].condition, versions[label], False, cells)
         for label, cells in zip(ablations, zip(*columns), strict=True)
     )
-    return replace(table, columns=kept, groups=(("Ablations", rows),), notes=(), marking=_marking(tested))
+    return replace(
+        table,
+        columns=kept,
+        groups=(("Ablations", rows),),
+        notes=(),
+        marking=_marking(tested, CROSSED if crossed else MEANING),
+    )
 
 
-def _marking(tested: Sequence[PairedComparison]) -> str:
+def _marking(tested: Sequence[PairedComparison], meaning: str) -> str:
     if any(each.testable for each in tested) or not tested:
-        return f"{MEANING} Bold: they differ ({TEST})."
+        return f"{meaning} Bold: not 0 ({TEST})."
     first = tested[0]
     needed = subjects_needed(LEVEL, first.family)
     subjects = counted(first.subjects, "subject")
-    return f"{MEANING} With {subjects} no test can tell whether they differ (it takes {needed}; {TEST})."
+    return f"{meaning} With {subjects} no test can tell whether they are 0 (it takes {needed}; {TEST})."
 
 
 def _cell(found: PairedComparison, digits: int) -> TableCell:
