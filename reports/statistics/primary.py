@@ -1,4 +1,4 @@
-"""Primary endpoints of the suite: the tests that were chosen in advance, corrected together. All others are exploratory."""
+"""Primary endpoints of the suite: a fixed list of tests, corrected together. All others are exploratory."""
 
 from __future__ import annotations
 
