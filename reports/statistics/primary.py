@@ -38,9 +38,7 @@ def primary_comparisons(runs: RunSet) -> list[PairedComparison]:
 def primary_section(runs: RunSet) -> str:
     """The primary endpoints as Markdown, and what the other tests of a page are."""
     found = primary_comparisons(runs)
-    exploratory = (
-        "All other tests on this page are exploratory: each is corrected within its own table alone."
-    )
+    exploratory = "All other tests on this page are exploratory: they are corrected over the comparisons of one metric and task alone."
     if not found:
         return f"## Primary endpoints\n\nNone: they compare `{PAIR[0]}` with `{PAIR[1]}`. {exploratory}"
     specs = {spec.name: spec for spec in runs.metrics}
