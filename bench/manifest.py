@@ -51,13 +51,15 @@ class MethodRecord:
 
 @dataclass(frozen=True)
 class ClipRecord:
-    """What is known of a capture: its fingerprint, the steps that made it, frames of each split, frames left out."""
+    """What is known of a capture: its fingerprint, the steps that made it, frames of each split, frames left out, and the
+    cameras of the training split (none in old records)."""
 
     subject: str
     fingerprint: str
     steps: list[dict[str, Any]]
     splits: dict[str, int]
     excluded: dict[str, str]
+    training_cameras: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -236,6 +238,9 @@ class Manifest:
             for name in ("needs", "code", "condition"):
                 if not method[name]:
                     del method[name]
+        for clip in record["clips"]:
+            if not clip["training_cameras"]:
+                del clip["training_cameras"]
         for metric in record["metrics"]:
             del metric["default"], metric["needs"], metric["suspect_above"]
         write_json(path, record)

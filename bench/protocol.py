@@ -17,9 +17,14 @@ from .io.files import digest
 
 Item = TypeVar("Item")
 
+SEEN_CAMERAS, UNSEEN_CAMERAS = "self_reenactment_seen", "self_reenactment_unseen"
+"""The frames of self-reenactment in tables and tests: at cameras of the training split, and at those held out of it."""
+
 TASK_TITLES: Mapping[str, str] = {
     "novel_view": "Novel view",
     "self_reenactment": "Self-reenactment",
+    SEEN_CAMERAS: "Self-reenactment at seen cameras",
+    UNSEEN_CAMERAS: "Self-reenactment at unseen cameras",
     "cross_reenactment": "Cross-reenactment",
     "extremes": "Extremes",
 }

@@ -313,6 +313,23 @@ class Rows:
         failed = (table["timestep"] < 0) & pd.MultiIndex.from_frame(table[["task", "metric"]]).isin(measured)
         return Rows(table[avatar | chosen | failed].assign(region=full))
 
+    def split_by_camera(
+        self, task: str, chosen: Collection[tuple[str, str]], inside: str, outside: str
+    ) -> Rows:
+        """The same rows, frames of ``task`` under two other tasks: ``inside`` for the ``chosen`` (subject, camera), else ``outside``.
+
+        Rows that stand for all frames of the task because a method failed are in both.
+        """
+        table = self._table
+        whole = (table["task"] == task) & (table["timestep"] < 0)
+        frames = (table["task"] == task) & ~whole
+        cameras = pd.MultiIndex.from_frame(table.loc[frames, ["subject", "camera"]])
+        names = table.loc[~whole, "task"].mask(frames[~whole], outside)
+        names[frames[frames].index[cameras.isin(list(chosen))]] = inside
+        parts = [table[~whole].assign(task=names.astype("str"))]
+        parts += [table[whole].assign(task=name) for name in (inside, outside)]
+        return Rows(pd.concat(parts, ignore_index=True))
+
     def updated(self, new: Rows) -> Rows:
         """These rows in their order, replaced by rows of ``new`` with the same method, seed, frame, region
         and metric.

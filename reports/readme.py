@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -24,8 +25,9 @@ from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from .runs import RunSet
 from .statistics.comparisons import PairedComparison, compare
+from .statistics.primary import primary_comparisons
 from .suite.suite import suite_report
-from .table_report import table_of, table_text
+from .table_report import Columns, table_of, table_text
 from .writers import to_markdown
 
 GALLERY = "reports/gallery"
@@ -35,6 +37,8 @@ RESULTS = "results.md"
 PAGES = {"demo": "docs/explanation/results.md", "suite": "README.md"}
 """The page of each block, in the repository."""
 OURS = "ours"
+SHOWN = ("psnr", "lpips")
+"""Metrics of frames in the README, whose table would not fit a page with all; those of the suite's tables are in `RESULTS`."""
 
 
 def publish_demo(out: Path, root: Path) -> None:
@@ -144,36 +148,63 @@ def suite_block(folder: Path) -> str:
         f", not counting {minutes.count(None)} that were interrupted and continued" if None in minutes else ""
     )
     shown = runs.only([*runs.ranked, *runs.trivial])
+    columns = Columns((*SHOWN, "storage", "fps"))
     return (
-        f"{to_markdown(table_of(shown)).strip()}\n\n{conclusions(shown)}\n\n"
-        f"[Tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
+        f"{to_markdown(table_of(shown, columns=columns)).strip()}\n\n{conclusions(shown)}\n\n"
+        f"[SSIM, tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
         f"The captures are those of `headbench run suite {options}`. "
         f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{interrupted}."
     )
 
 
 def conclusions(runs: RunSet) -> str:
-    """What the rows allow to conclude about `OURS` and every other ranked method: a Markdown list, a line for each task."""
-    pairs = [(OURS, method) for method in runs.ranked if method != OURS]
+    """What the rows allow to conclude about `OURS` and every other ranked method: Markdown lists, a line for each task.
+
+    The primary endpoints come first; the other methods are compared in an exploratory way.
+    """
+    runs = runs.by_camera
+    primary = primary_comparisons(runs)
+    known = {pair.second for pair in primary}
+    pairs = [(OURS, method) for method in runs.ranked if method not in (OURS, *known)]
+    specs = [spec for spec in runs.metrics if spec.name in SHOWN]
+    others = [
+        pair
+        for task, spec in product(runs.tasks if pairs else (), specs)
+        for pair in compare(
+            runs.rows, pairs, task=task, metric=spec.name, higher_is_better=spec.higher_is_better
+        )
+    ]
+    parts = [
+        (f"Primary endpoints, with Holm's correction over all {len(primary)}:", primary),
+        ("Exploratory, with Holm's correction for the pairs of each metric alone:", others),
+    ]
+    texts = [f"{title}\n\n{_conclusions(runs, found)}" for title, found in parts if found]
+    how = "Exact sign-flip tests over subjects, level 5%. They hold for these subjects and settings."
+    return "\n\n".join(["What may be concluded:", *texts, how])
+
+
+def _conclusions(runs: RunSet, pairs: Sequence[PairedComparison]) -> str:
+    """A line for each task, equal conclusions of several metrics together."""
+    specs = {spec.name: spec for spec in runs.metrics}
     lines = []
-    for task in runs.tasks:
+    for task in dict.fromkeys(pair.task for pair in pairs):
         found: dict[tuple[str, str], list[str]] = {}
-        for spec in [spec for spec in runs.metrics if spec.name in ("psnr", "ssim", "lpips")]:
-            better = spec.higher_is_better
-            for pair in compare(runs.rows, pairs, task=task, metric=spec.name, higher_is_better=better):
-                found.setdefault((pair.second, _conclusion(pair)), []).append(spec.label)
-        said = [f"{verdict} by {_listed(metrics)}" for (_, verdict), metrics in found.items()]
-        lines.append(f"- {TASK_TITLES.get(task, task)}: {'; '.join(said)}.")
-    how = "Exact sign-flip tests over subjects, corrected by Holm for the pairs of each metric, level 5%. They hold for these subjects and settings."
-    return "\n".join(["What may be concluded:", "", *lines, "", how])
+        for pair in pairs:
+            if pair.task == task:
+                said = (pair.second, _conclusion(pair, specs[pair.metric].unit))
+                found.setdefault(said, []).append(specs[pair.metric].label)
+        said_of = [f"{verdict} by {_listed(metrics)}" for (_, verdict), metrics in found.items()]
+        lines.append(f"- {TASK_TITLES.get(task, task)}: {'; '.join(said_of)}.")
+    return "\n".join(lines)
 
 
-def _conclusion(pair: PairedComparison) -> str:
+def _conclusion(pair: PairedComparison, unit: str) -> str:
+    within = f" (equivalent within {pair.margin:g} {unit})" if pair.equivalent else ""
     if pair.verdict.endswith(" is better"):
         first, second = f"`{pair.first}`", f"`{pair.second}`"
         better, worse = (first, second) if pair.verdict.startswith(f"{pair.first} ") else (second, first)
-        return f"{better} is better than {worse}"
-    return f"`{pair.first}` and `{pair.second}`: {pair.verdict}"
+        return f"{better} is better than {worse}{within}"
+    return f"`{pair.first}` and `{pair.second}`: {pair.verdict}{within}"
 
 
 def _listed(words: Sequence[str]) -> str:

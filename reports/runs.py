@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from ..bench.contracts import ByteArray, Clip, FrameKey
 from ..bench.engine.captures import open_run_clips
@@ -16,9 +16,10 @@ from ..bench.engine.scoring import FULL
 from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
 from ..bench.manifest import Manifest, MethodRecord
-from ..bench.protocol import missing_tasks
+from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, missing_tasks
 from ..bench.rows import ALL, Rows
 from ..bench.specs import MetricSpec
+from .cameras import EXPLAINED, SPLIT_TASK, unseen_cameras
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,8 @@ WHOLE = FrameSelection()
 class RunSet:
     """Runs on the same frames, in the order given. The methods in their ``rows`` are named by labels.
 
-    ``part`` describes the part of the frames in the rows, "" for all. ``records`` has the method's entry of
+    ``part`` describes the part of the frames in the rows, "" for all. ``cameras`` is a sentence on seen and unseen cameras,
+    "" before `by_camera`. ``records`` has the method's entry of
     the manifest by label; ``trivial`` has labels of trivial baselines. ``keys`` has the frames of each task
     in the protocol, including those without values. ``shown`` has, by label, the first run of the method and
     its name there, whose renders are shown.
@@ -177,6 +179,7 @@ class RunSet:
     keys: Mapping[str, frozenset[FrameKey]]
     shown: Mapping[str, tuple[RunData, str]]
     part: str = ""
+    cameras: str = ""
 
     @classmethod
     def read(cls, folders: Sequence[Path], part: FrameSelection = WHOLE) -> RunSet:
@@ -231,6 +234,26 @@ class RunSet:
         }
         return replace(self, rows=rows, tasks=tasks, metrics=metrics, keys=chosen, part=part.text)
 
+    @cached_property
+    def by_camera(self) -> Self:
+        """The same runs with self-reenactment at seen and at unseen cameras as two tasks; as one where runs do not tell them apart."""
+        if SPLIT_TASK not in self.tasks:
+            return self
+        keys = self.keys[SPLIT_TASK]
+        unseen, reason = unseen_cameras([run.manifest for run in self.runs], keys)
+        if not unseen:
+            return replace(self, cameras=reason)
+        inside = frozenset(key for key in keys if (key.subject, key.camera) in unseen)
+        parts = {SEEN_CAMERAS: keys - inside, UNSEEN_CAMERAS: inside}
+        place = self.tasks.index(SPLIT_TASK)
+        return replace(
+            self,
+            rows=self.rows.split_by_camera(SPLIT_TASK, unseen, UNSEEN_CAMERAS, SEEN_CAMERAS),
+            tasks=(*self.tasks[:place], *parts, *self.tasks[place + 1 :]),
+            keys={task: own for task, own in self.keys.items() if task != SPLIT_TASK} | parts,
+            cameras=EXPLAINED,
+        )
+
     def only(self, labels: Sequence[str]) -> RunSet:
         """The same runs with some of their methods."""
         records = {label: record for label, record in self.records.items() if label in labels}
@@ -255,8 +278,9 @@ class RunSet:
 
     @property
     def protocol_ids(self) -> dict[str, str]:
-        """Readable name of each task's protocol."""
-        return {task: protocol.id for run in self.runs for task, protocol in run.manifest.protocols.items()}
+        """Readable name of each task's protocol; the parts of a task have the protocol of the whole."""
+        ids = {task: protocol.id for run in self.runs for task, protocol in run.manifest.protocols.items()}
+        return ids | dict.fromkeys((SEEN_CAMERAS, UNSEEN_CAMERAS), ids.get(SPLIT_TASK, ""))
 
     @property
     def missing(self) -> tuple[str, ...]:

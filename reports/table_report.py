@@ -19,9 +19,11 @@ from ..bench.errors import InputError
 from ..bench.io.documents import read_json
 from ..bench.io.files import grouped_writes, write_text
 from ..bench.manifest import MethodRecord
+from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from ..bench.registry import unknown
 from ..bench.specs import MetricSpec
 from ..bench.streams import on_terminal
+from .cameras import SPLIT_TASK
 from .runs import WHOLE, FrameSelection, RunSet
 from .tables import AVATAR_TITLE, TITLES, RowGroup, Table, TableCell, TableRow, build_table
 from .writers import WRITERS, column_name, to_text
@@ -48,8 +50,9 @@ class ComparedRuns(RunSet):
         Values are means over frames, then sequences, subjects and seeds; not a number where one is missing.
         """
         metrics = [spec for spec in self.metrics if "comparison" in spec.tables]
+        runs = self.by_camera
         built = build_table(
-            self.rows, metrics, self.methods, self.tasks, trivial=self.trivial, protocol_ids=self.protocol_ids
+            runs.rows, metrics, self.methods, runs.tasks, trivial=self.trivial, protocol_ids=self.protocol_ids
         )
         columns = pd.MultiIndex.from_tuples(
             [(column.task or "avatar", column.metric) for column in built.columns], names=["task", "metric"]
@@ -90,6 +93,13 @@ class Columns:
         """The requested names among ``offered``, in the requested order."""
         names = tuple(offered)
         return tuple(dict.fromkeys(name for name in self.names if name in names)) or names
+
+    def by_camera(self, tasks: Collection[str]) -> Columns:
+        """The same for ``tasks`` among which self-reenactment is two; its name stands for both."""
+        if SPLIT_TASK not in self.names or SPLIT_TASK in tasks:
+            return self
+        parts = {SPLIT_TASK: tuple(task for task in (SEEN_CAMERAS, UNSEEN_CAMERAS) if task in tasks)}
+        return replace(self, names=tuple(n for name in self.names for n in parts.get(name) or (name,)))
 
     def check(self, metrics: Iterable[str], tasks: Iterable[str]) -> None:
         """Raise `InputError` for a name that is neither a metric nor a task of the layout, and for digits that are no numbers from 0 to 9."""
@@ -298,11 +308,13 @@ def table_of(
 ) -> Table:
     """Build a table of runs that were read; ``apart`` and ``claimed`` are those of `build_table`."""
     names = {label: label for label in runs.methods}
-    if layout in PAPER:
+    if layout in PAPER:  # whose tables have the mean over all cameras
         columns.check(PAPER[layout].digits, TASKS)
         metrics = PAPER[layout].metrics(runs, layout, columns)
         names = PAPER[layout].labels(runs, layout)
     else:
+        runs = runs.by_camera
+        columns = columns.by_camera(runs.tasks)
         known = {metric.name: metric for metric in runs.metrics if layout in metric.tables}
         columns.check(known, runs.tasks if any(metric.per_frame for metric in known.values()) else ())
         metrics = tuple(known[name] for name in columns.of(known))
@@ -324,6 +336,7 @@ def table_of(
         machine=runs.machine,
         part=runs.part if tasks else "",
         missing=runs.missing if tasks == runs.tasks else (),
+        cameras=runs.cameras if {SPLIT_TASK, SEEN_CAMERAS, UNSEEN_CAMERAS} & {*tasks} else "",
         keys=runs.keys,
         avatar_title=TITLES.get(layout, AVATAR_TITLE),
         name=layout,

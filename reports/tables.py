@@ -93,7 +93,8 @@ class Table:
     """A comparison, ready to be written in any format.
 
     ``marking`` says what the ranks mean, and by which test (``tested``: whether there is one), ``part`` which part of
-    the frames the values are of, "" for all, ``missing`` why a task has no columns, ``name`` the layout.
+    the frames the values are of, "" for all, ``missing`` why a task has no columns, ``name`` the layout, ``cameras`` what
+    seen and unseen cameras are, or why they are not shown apart.
     """
 
     columns: tuple[Column, ...]
@@ -108,6 +109,7 @@ class Table:
     missing: tuple[str, ...] = ()
     name: str = ""
     tested: bool = False
+    cameras: str = ""
 
     @property
     def titled(self) -> bool:
@@ -138,7 +140,7 @@ class Table:
             size = f"{counted(task.frames, 'frame')}, {counted(task.subjects, 'subject')}"
             name = f"{task.protocol_id} " if task.protocol_id else ""
             parts.append(f"{task.title}: {size}, protocol {name}({task.protocol_hash}).")
-        parts += [*self.missing, *([self.part] if self.part else [])]
+        parts += [*self.missing, *filter(None, [self.cameras, self.part])]
         if self.image_size:
             parts.append(f"Images of {self.image_size} pixels.")
         spread = f"mean of {self.seeds} seeds ± its standard deviation from seed to seed"
@@ -162,7 +164,7 @@ class Table:
         what = " and ".join(tasks) or " and ".join(dict.fromkeys(column.title for column in self.columns))
         size = f"images of {self.image_size.replace(' x ', '×')} pixels" if self.image_size else ""
         parts = [", ".join(filter(None, [what, same, size])) + "."]
-        parts += [self.part] if self.part else []
+        parts += [*filter(None, [self.cameras, self.part])]
         parts += [f"Mean ± standard deviation over {self.seeds} seeds."] if self.seeds > 1 else []
         ranks = {cell.rank for row in self.rows for cell in row.cells} - {None}
         if ranks:
@@ -219,6 +221,7 @@ def build_table(
     machine: str = "",
     part: str = "",
     missing: Sequence[str] = (),
+    cameras: str = "",
     keys: Mapping[str, Collection[FrameKey]] | None = None,
     avatar_title: str = AVATAR_TITLE,
     name: str = "",
@@ -245,8 +248,8 @@ def build_table(
         Frames of each task, if more are scored than have rows.
     protocol_ids : Mapping[str, str]
         Readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` (if
-        the rows do not record the machine that measured speed), ``part`` and the sentences of
-        ``missing``.
+        the rows do not record the machine that measured speed), ``part``, ``cameras`` and the
+        sentences of ``missing``.
     avatar_title : str
         Heading of the columns that belong to no task.
     name : str
@@ -324,6 +327,7 @@ def build_table(
         machine=measured_on(found.get("fps", {}), [*trivial, *unsupported], machine),
         part=part,
         missing=tuple(missing),
+        cameras=cameras,
         name=name,
         tested=any(best is not None and best.methods is not None for best in bests),
     )

@@ -226,6 +226,7 @@ CASES = {
         case("compare {demo} --metrics psnr", "ga +ours"),
         case("compare {demo} --metrics psnr --region face", "(?s)Region: face.*ga +ours"),
         case("compare {demo} --metrics psnr ssim --against ours --trivial --format csv", "ours"),
+        case("compare {demo} --metrics psnr --equivalence psnr=0.3", "equivalence within 0.3 dB not shown"),
         case("compare {demo} --baseline demo.json --update", "numbers written", "demo.json"),
         case("compare {demo} --baseline demo.json", "nothing got worse"),
         case(f"{GATE} --update", "numbers written", "baseline.json"),

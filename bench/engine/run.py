@@ -380,6 +380,7 @@ def describe(
                 steps=[asdict(step) for step in clip.steps],
                 splits={name: len(keys) for name, keys in clip.splits.items()},
                 excluded={str(key): reason for key, reason in sorted(clip.excluded.items())},
+                training_cameras=tuple(sorted({key.camera for key in clip.splits.get("train", ())})),
             )
             for clip in clips
         ),

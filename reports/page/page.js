@@ -439,7 +439,7 @@ $("curve").addEventListener("pointerdown", e => { $("curve").setPointerCapture(e
 $("curve").addEventListener("pointermove", e => { if ($("curve").hasPointerCapture(e.pointerId)) scrubAt(e); });
 
 // Quality against cost. Each label takes the first of four places that nothing else covers.
-let costTask = data.plots.length ? data.plots[0].task : 0;
+let costTask = data.plots.length ? data.plots[0].task : "";
 function plots() {
   const kept = data.plots.filter(plot => plot.task === costTask);
   $("plots").replaceChildren(...kept.map(() => make("div")));
@@ -670,7 +670,7 @@ if (frames.length) {
 } else for (const id of ["pictures", "worst-frames"]) $(id).hidden = true;
 const plotted = unique(data.plots.map(plot => plot.task));
 if (plotted.length) {
-  if (plotted.length > 1) choice($("cost-of"), "cost-of", plotted.map(n => [String(n), data.tasks[n]]), String(costTask), value => { costTask = +value; plots(); });
+  if (plotted.length > 1) choice($("cost-of"), "cost-of", plotted.map(task => [task, task]), costTask, value => { costTask = value; plots(); });
   plots();
 } else $("cost").hidden = true;
 if (!data.training.length) $("training").hidden = true;

@@ -348,6 +348,7 @@ def _parts(runs: RunSet) -> list[TitledTable]:
 def _plots(runs: RunSet, metrics: Sequence[MetricSpec]) -> list[dict[str, Any]]:
     """Quality by the first metric against size and frame time, with the front; empty without points."""
     plots = []
+    runs = runs.by_camera
     for task in runs.tasks if metrics else ():
         for cost, words in (("megabytes", "Size (MB)"), ("milliseconds", "Frame time (ms)")):
             points = []
@@ -361,7 +362,7 @@ def _plots(runs: RunSet, metrics: Sequence[MetricSpec]) -> list[dict[str, Any]]:
             sign = 1 if metrics[0].higher_is_better else -1
             plots.append(
                 {
-                    "task": runs.tasks.index(task),
+                    "task": TASK_TITLES.get(task, task),
                     "title": f"{TASK_TITLES.get(task, task)}: {metrics[0].label} against {words.split(' (')[0].lower()}",
                     "x": words,
                     "y": f"{metrics[0].label} ({metrics[0].unit})" if metrics[0].unit else metrics[0].label,

@@ -11,9 +11,10 @@ import numpy as np
 from markupsafe import Markup
 
 from ...bench.progress import counted
-from ...bench.protocol import TASK_TITLES
+from ...bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
 from ...bench.specs import MetricSpec
 from ..aggregate import summarise
+from ..cameras import SPLIT_TASK
 from ..conditions import conditions
 from ..pareto.points import SIZE, SPEED
 from ..runs import RunSet
@@ -93,8 +94,9 @@ def verdict(
     values : Values
         Of `frame_values`, for spans of frames where nothing can be tested.
     """
+    whole, runs = runs, runs.by_camera
     ranked = [row.method for row in table.rows if not row.trivial]
-    found = Conclusions(title_of(runs), facts=_facts(runs))
+    found = Conclusions(title_of(runs), facts=_facts(whole))
     spans = []
     for task in runs.tasks if metrics else ():
         scores = _scores(runs, ranked, metrics[0], task)
@@ -215,8 +217,9 @@ def _span(
     """The lead of the best method over the next one in single frames."""
     sign = 1 if spec.higher_is_better else -1
     leads = []
+    whole = SPLIT_TASK if task in (SEEN_CAMERAS, UNSEEN_CAMERAS) else task
     for key in runs.keys[task]:
-        frame = ShownFrame(task, key)
+        frame = ShownFrame(whole, key)
         pair = [values.get((spec.name, name, frame)) for name in (leader, second)]
         if pair[0] is not None and pair[1] is not None:
             leads.append(sign * (pair[0] - pair[1]))

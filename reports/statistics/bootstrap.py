@@ -93,30 +93,49 @@ def _by_seed(rows: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
+def differences(subjects: Sequence[SubjectPairs], less: Sequence[SubjectPairs] = ()) -> FloatArray:
+    """(n,) differences of subjects; with ``less``, pairs of another task, minus the difference of the same subject in it.
+
+    Raises `InputError` unless both have the same subjects.
+    """
+    values = np.array([subject.difference for subject in subjects])
+    if not less:
+        return values
+    names, others = ([subject.subject for subject in each] for each in (subjects, less))
+    if names != others:
+        raise InputError("rows", "subjects", f"the same in both tasks: {', '.join(names)}", ", ".join(others))
+    return values - np.array([subject.difference for subject in less])
+
+
 REPLICATES = 4_000
 LEAST_SUBJECTS = 3
 """Two subjects have one degree of freedom, which is too few for an interval."""
 
 
 def interval(
-    subjects: Sequence[SubjectPairs], level: float = 0.05, replicates: int = REPLICATES, seed: int = 0
+    subjects: Sequence[SubjectPairs],
+    level: float = 0.05,
+    replicates: int = REPLICATES,
+    seed: int = 0,
+    less: Sequence[SubjectPairs] = (),
 ) -> tuple[float, float] | None:
     """Confidence interval of the mean difference over the population of subjects, in the metric's unit.
 
-    ``level`` is one minus the confidence; ``seed`` that of the draws. None with fewer than `LEAST_SUBJECTS` subjects,
+    ``level`` is one minus the confidence; ``seed`` that of the draws; ``less`` that of `differences`. None with fewer than `LEAST_SUBJECTS` subjects,
     or where so few have no bounded interval (values without variation within subjects, three subjects).
     """
     count = len(subjects)
     if count < LEAST_SUBJECTS:
         return None
-    observed = np.array([subject.difference for subject in subjects])
+    observed = differences(subjects, less)
     mean, error = observed.mean(), _standard_error(observed)
     if error == 0:
         return float(mean), float(mean)
     generator = np.random.default_rng(seed)
     # Any two entries of a subject's pool are independent draws within it, so a replicate that has the subject twice
     # takes two entries.
-    pools = np.stack([_means_within(subject, replicates, generator) for subject in subjects])
+    both = zip(subjects, less, strict=True) if less else ((subject,) for subject in subjects)
+    pools = np.stack([_means_within(tasks, replicates, generator) for tasks in both])
     drawn = generator.integers(count, size=(replicates, count))
     means = pools[drawn, generator.integers(replicates, size=drawn.shape)]
     shifts, errors = means.mean(axis=1) - mean, _standard_error(means)
@@ -153,14 +172,28 @@ def _standard_error(values: FloatArray) -> FloatArray:
     return values.std(axis=-1, ddof=1) / math.sqrt(values.shape[-1])
 
 
-def _means_within(subject: SubjectPairs, replicates: int, generator: np.random.Generator) -> FloatArray:
-    """(replicates,) differences of one subject, its seeds, sequences and blocks of timesteps drawn anew."""
-    length = block_length(subject.sequences)
+def _means_within(
+    tasks: Sequence[SubjectPairs], replicates: int, generator: np.random.Generator
+) -> FloatArray:
+    """(replicates,) differences of one subject in a task, minus those in a second one; both are of the same trainings.
+
+    Seeds, sequences and blocks of timesteps are drawn anew.
+    """
     # Shares of as many seeds, drawn with replacement.
-    first, second = (
+    shares = [
         generator.multinomial(seeds, np.full(seeds, 1 / seeds), size=replicates) / seeds
-        for seeds in map(len, subject.means())
-    )
+        for seeds in map(len, tasks[0].means())
+    ]
+    means, *less = (_task_draws(task, shares, replicates, generator) for task in tasks)
+    return means - less[0] if less else means
+
+
+def _task_draws(
+    subject: SubjectPairs, shares: Sequence[FloatArray], replicates: int, generator: np.random.Generator
+) -> FloatArray:
+    """(replicates,) differences of one subject for (replicates, S1) and (replicates, S2) ``shares`` of the seeds."""
+    first, second = shares
+    length = block_length(subject.sequences)
     chosen = generator.integers(len(subject.sequences), size=(replicates, len(subject.sequences)))
     totals = np.zeros(replicates)
     for index, sequence in enumerate(subject.sequences):

@@ -13,7 +13,7 @@ from ...bench.benchmarks import Row, findings
 from ...bench.contracts import FloatArray, Progress
 from ...bench.specs import CommandResult
 from .bootstrap import SequencePairs, SubjectPairs, interval
-from .comparisons import LEVEL, best_set, least_p, sign_flip_p
+from .comparisons import LEVEL, best_set, equivalence_p, least_p, sign_flip_p
 
 
 @dataclass(frozen=True)
@@ -102,15 +102,32 @@ def stress(quick: bool, progress: Progress) -> CommandResult:
     for advantage in (0.0, 0.25, 0.5):
         left_out, kept = best_set_errors(5, 9, trials, advantage)
         sets.append({"best by dB": advantage, "left out %": 100 * left_out, "others marked %": 100 * kept})
+    alike: list[Row] = [
+        {"true difference, dB": mean, "called equivalent %": 100 * equivalence_share(9, trials, mean)}
+        for mean in (0.0, MARGIN / 2, MARGIN)
+    ]
     error = standard_error(trials)
     faults = [f"{row['simulated']}: not as promised" for row in cases if row["verdict"] == BROKEN]
     limit = 100 * (LEVEL + 2 * error)
     faults += [f"best by {row['best by dB']:g} dB: left out" for row in sets if row["left out %"] > limit]
+    if alike[-1]["called equivalent %"] > limit:
+        faults.append("difference of the margin: called equivalent")
     note = (
         f"{trials} trials each; nominal {LEVEL:.0%} tests, {1 - LEVEL:.0%} intervals; standard error {error:.1%}. The best "
-        "are of 5\nmethods, 9 subjects (standard deviation 0.25 dB)."
+        "are of 5\nmethods, 9 subjects (standard deviation 0.25 dB); equivalence is tested "
+        f"within {MARGIN:g} dB, with as many subjects of the same deviation."
     )
-    return findings({"Tests and intervals": cases, "Sets of the best": sets}, note, faults)
+    tables = {"Tests and intervals": cases, "Sets of the best": sets, "Equivalence": alike}
+    return findings(tables, note, faults)
+
+
+MARGIN = 0.3
+
+
+def equivalence_share(subjects: int, trials: int, mean: float, seed: int = 0) -> float:
+    """How often `equivalence_p` finds differences of standard deviation 0.25 to be within `MARGIN`, in [0, 1]."""
+    values = mean + 0.25 * np.random.default_rng(seed).standard_normal((trials, subjects))
+    return float(np.mean([equivalence_p(each, MARGIN) <= LEVEL for each in values]))
 
 
 BROKEN = "not as promised"

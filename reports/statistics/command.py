@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import chain, combinations
@@ -51,13 +52,18 @@ class CompareSettings(BaselineOptions):
     level: float = 0.05
     """Level of the tests; intervals have a confidence of one minus it."""
 
+    equivalence: tuple[str, ...] = ()
+    """Test whether methods are equivalent, too: METRIC=MARGIN in the metric's unit, such as `psnr=0.3`, for each metric to test."""
+
     format: Literal["text", "csv"] = "text"
     """How to print; --json gives everything, each subject's difference included."""
 
     dependent = (
         *DEPENDENT,
         DependentOptions(
-            ("against", "metrics", "trivial", "region", "sequences", "level", "format"), "baseline", False
+            ("against", "metrics", "trivial", "region", "sequences", "level", "equivalence", "format"),
+            "baseline",
+            False,
         ),
     )
 
@@ -68,11 +74,28 @@ class CompareSettings(BaselineOptions):
             raise ValueError(f"runs: one folder with --baseline, found {len(self.runs)}")
         if not 0 < self.level < 1:
             raise ValueError(f"level is {self.level}; a number between 0 and 1")
+        self.margins()
+
+    def margins(self) -> dict[str, float]:
+        """Margins of equivalence by metric. Raises `ValueError` for words that are not METRIC=MARGIN with a positive margin."""
+        found = {}
+        for word in self.equivalence:
+            metric, _, number = word.partition("=")
+            try:
+                found[metric] = float(number)
+            except ValueError:
+                found[metric] = math.nan
+            if not (metric and math.isfinite(found[metric]) and found[metric] > 0):
+                raise ValueError(
+                    f"equivalence is {word}; METRIC=MARGIN with a positive number, such as psnr=0.3"
+                )
+        return found
 
 
 FIELDS = (
     *("task", "metric", "first", "second", "difference", "low", "high", "effect", "p", "p_holm"),
     *("family", "subjects", "wins", "seeds_first", "seeds_second", "verdict", "reason", "note"),
+    *("margin", "p_equivalence", "p_equivalence_holm", "equivalent"),
 )
 
 
@@ -99,6 +122,7 @@ def compare_methods(
     from ..table_report import COMPARISON
     from .comparisons import compare
 
+    runs = runs.by_camera
     pairs = _pairs(runs, settings.against, settings.trivial)
     known = {spec.name: spec for spec in runs.metrics}
     for name in settings.metrics:
@@ -106,13 +130,24 @@ def compare_methods(
             raise InputError("command line", "--metrics", f"metrics of the runs: {', '.join(known)}", name)
     asked = settings.metrics or [name for name, spec in known.items() if COMPARISON in spec.tables]
     metrics = [spec for name, spec in known.items() if name in asked]
+    margins = settings.margins()
+    for name in margins:
+        if name not in asked:
+            raise InputError("command line", "--equivalence", f"compared metrics: {', '.join(asked)}", name)
     columns = [(task, spec) for task in runs.tasks for spec in metrics if spec.per_frame]
     columns += [("", spec) for spec in metrics if not spec.per_frame]
     found: list[tuple[MetricSpec, list[PairedComparison]]] = []
     for index, (task, spec) in enumerate(columns):
-        better = spec.higher_is_better
-        what = {"task": task, "metric": spec.name}
-        found.append((spec, compare(runs.rows, pairs, **what, higher_is_better=better, level=settings.level)))
+        compared = compare(
+            runs.rows,
+            pairs,
+            task=task,
+            metric=spec.name,
+            higher_is_better=spec.higher_is_better,
+            level=settings.level,
+            margin=margins.get(spec.name),
+        )
+        found.append((spec, compared))
         progress(index + 1, len(columns), spec.label)
     times = conditions(runs.rows, metrics, list(dict.fromkeys(chain(*pairs))))
     every = []
@@ -124,7 +159,7 @@ def compare_methods(
         text = _csv(every)
     else:
         text = "\n\n".join(_text(spec, c, note_of(times.get(spec.name, {}))) for spec, c in found)
-        text = f"{runs.part}\n\n{text}" if runs.part else text
+        text = "\n\n".join(filter(None, [runs.cameras, runs.part, text]))
     return CommandResult(text, {"level": settings.level, "comparisons": every})
 
 
@@ -150,7 +185,21 @@ def _plain(comparison: PairedComparison) -> dict[str, Any]:
         "subjects": comparison.subjects,
         "wins": comparison.wins,
         "verdict": comparison.verdict,
+        "equivalent": comparison.equivalent,
     }
+
+
+def equivalence_text(comparison: PairedComparison, unit: str) -> str:
+    """Outcome of the test of equivalence in words; "" without one."""
+    if comparison.margin is None or comparison.p_equivalence_holm is None:
+        return ""
+    within = f"{comparison.margin:g} {unit}".rstrip()
+    p = f"(Holm {comparison.p_equivalence_holm:.4f})"
+    return (
+        f"equivalent within {within} {p}"
+        if comparison.equivalent
+        else f"equivalence within {within} not shown {p}"
+    )
 
 
 def _csv(comparisons: Sequence[dict[str, Any]]) -> str:
@@ -187,7 +236,8 @@ def _text(spec: MetricSpec, comparisons: Sequence[PairedComparison], note: str) 
         digits = spec.digits + 1
         bounds = "-" if c.low is None or c.high is None else f"{c.low:+.{digits}f} {c.high:+.{digits}f}"
         numbers = [f"{c.difference:+.{digits}f}", bounds, f"{c.p:.4f}", f"{c.p_holm:.4f}"]
-        lines.append([c.first, c.second, *numbers, f"{c.wins} of {c.subjects}", c.verdict])
+        verdict = "; ".join(filter(None, [c.verdict, equivalence_text(c, spec.unit)]))
+        lines.append([c.first, c.second, *numbers, f"{c.wins} of {c.subjects}", verdict])
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     body = [
         "  ".join(t.ljust(w) if i in (0, 1, 7) else t.rjust(w) for i, (t, w) in enumerate(zip(line, widths)))

@@ -8,7 +8,8 @@ R. A. Fisher, The Design of Experiments (1935), section 21.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -18,7 +19,7 @@ from ...bench.contracts import FloatArray
 from ...bench.progress import counted
 from ...bench.rows import Rows
 from ..aggregate import summarise, whole_images
-from .bootstrap import interval, pair
+from .bootstrap import differences, interval, pair
 
 EXACT_UP_TO = 20
 """Subjects up to which every assignment is tried."""
@@ -27,27 +28,45 @@ DRAWS = 99_999
 CHUNK = 4_096
 
 
-def sign_flip_p(differences: Sequence[float] | FloatArray) -> float:
-    """Two-sided p-value of the mean of (n,) differences, one per subject; 1 if n is 0."""
+def sign_flip_p(differences: Sequence[float] | FloatArray, *, greater: bool = False) -> float:
+    """P-value of the mean of (n,) differences, one per subject; 1 if n is 0.
+
+    Two-sided, or for the alternative that the mean is ``greater`` than zero.
+    """
     values = np.asarray(differences, dtype=np.float64)
     if not np.isfinite(values).all():
         raise ValueError("differences must be finite")
     if not values.size:
         return 1.0
     # Sums of the same terms in another order differ by rounding; they count as equal.
-    threshold = abs(values.sum()) - 1e-9 * np.abs(values).sum()
+    observed = values.sum() if greater else abs(values.sum())
+    threshold = observed - 1e-9 * np.abs(values).sum()
     if values.size <= EXACT_UP_TO:
-        # The first sign is fixed: flipping all signs does not change the absolute sum.
-        sums = values[:1]
+        sums = np.zeros(1)
         for value in values[1:]:
             sums = np.concatenate([sums + value, sums - value])
-        return float(np.mean(np.abs(sums) >= threshold))
+        # Two-sided, the first sign is fixed: flipping all signs does not change the absolute sum.
+        sums = np.concatenate([sums + values[0], sums - values[0]]) if greater else np.abs(sums + values[0])
+        return float(np.mean(sums >= threshold))
     generator = np.random.default_rng(0)
     extreme = 0
     for start in range(0, DRAWS, CHUNK):
         signs = generator.integers(0, 2, size=(min(CHUNK, DRAWS - start), values.size)) * 2 - 1
-        extreme += int(np.sum(np.abs(signs @ values) >= threshold))
+        sums = signs @ values
+        extreme += int(np.sum((sums if greater else np.abs(sums)) >= threshold))
     return (1 + extreme) / (1 + DRAWS)
+
+
+def equivalence_p(differences: Sequence[float] | FloatArray, margin: float) -> float:
+    """P-value of two one-sided sign-flip tests against means of -``margin`` and below, and of ``margin`` and above.
+
+    The larger of the two p-values (D. Schuirmann, Journal of Pharmacokinetics and Biopharmaceutics 15, 1987). It is small only
+    where the mean of (n,) differences lies within the margin; at least 2^-n.
+    """
+    if not (math.isfinite(margin) and margin > 0):
+        raise ValueError(f"margin is {margin}; a positive number")
+    values = np.asarray(differences, dtype=np.float64)
+    return max(sign_flip_p(margin + values, greater=True), sign_flip_p(margin - values, greater=True))
 
 
 def least_p(subjects: int) -> float:
@@ -79,7 +98,8 @@ LEVEL = 0.05
 class PairedComparison:
     """First method minus second on one metric of one task; the subject is the unit.
 
-    ``difference`` is None where a method lacks values (``reason``); the interval (``low``, ``high``) over the population
+    Where ``minus`` names another task, the difference in that task is subtracted: an interaction of methods and tasks, 0 where
+    the methods differ by the same in both. ``difference`` is None where a method lacks values (``reason``); the interval (``low``, ``high``) over the population
     of subjects where they are too few.
     """
 
@@ -101,6 +121,15 @@ class PairedComparison:
     p_holm: float | None = None  # corrected for the family
     family: int = 0  # comparisons of this metric
     reason: str = ""
+    minus: str = ""
+    margin: float | None = None  # of the test of equivalence, in the metric's unit; None without this test
+    p_equivalence: float | None = None  # of `equivalence_p` alone
+    p_equivalence_holm: float | None = None  # corrected for the family
+
+    @property
+    def equivalent(self) -> bool | None:
+        """Whether the difference is shown to lie within the margin; None without a test of equivalence."""
+        return None if self.p_equivalence_holm is None else self.p_equivalence_holm <= self.level
 
     @property
     def subjects(self) -> int:
@@ -128,6 +157,8 @@ class PairedComparison:
             return f"not testable with {counted(self.subjects, 'subject')} (it takes {needed})"
         if self.p_holm > self.level:
             return "cannot be told apart"
+        if self.minus:
+            return "the differences differ"
         return f"{self.first if (self.difference > 0) == self.higher_is_better else self.second} is better"
 
 
@@ -139,24 +170,34 @@ def compare(
     metric: str,
     higher_is_better: bool,
     level: float = LEVEL,
+    minus: str = "",
+    margin: float | None = None,
 ) -> list[PairedComparison]:
     """Compare pairs of methods on one metric of one task ("" for a metric of the avatar as a whole), on whole images.
 
     The pairs are one family: their p-values are corrected together, by Holm. A method that lacks a value of any
-    frame has no comparison, but a reason; it does not count in the family. ``rows`` are
+    frame has no comparison, but a reason; it does not count in the family. ``minus`` is a second task whose differences are
+    subtracted, subject by subject; with a ``margin``, in the metric's unit, equivalence is tested too. ``rows`` are
     checked by `Rows.check`. Raises `InputError` if both methods are complete, but on different frames.
     """
     comparisons = []
-    summaries = {name: summarise(rows, name, metric, task) for name in dict.fromkeys(chain(*pairs))}
+    tasks = [task, *([minus] if minus else [])]
+    summaries = {
+        name: [summarise(rows, name, metric, each) for each in tasks] for name in dict.fromkeys(chain(*pairs))
+    }
     for names in pairs:
-        comparison = PairedComparison(task, metric, higher_is_better, *names, level)
-        absent = [f"{name}: {summaries[name].reason}" for name in names if summaries[name].value is None]
+        comparison = PairedComparison(
+            task, metric, higher_is_better, *names, level, minus=minus, margin=margin
+        )
+        absent = [
+            f"{name}: {each.reason}" for name in names for each in summaries[name] if each.value is None
+        ]
         if absent:
-            comparisons.append(replace(comparison, reason=" ".join(absent)))
+            comparisons.append(replace(comparison, reason=" ".join(dict.fromkeys(absent))))
             continue
-        subjects = pair(*(whole_images(rows, name, metric, task) for name in names))
-        values = np.array([subject.difference for subject in subjects])
-        low, high = interval(subjects, level) or (None, None)
+        subjects, *less = (pair(*(whole_images(rows, n, metric, each) for n in names)) for each in tasks)
+        values = differences(subjects, *less)
+        low, high = interval(subjects, level, less=less[0] if less else ()) or (None, None)
         deviation = float(values.std(ddof=1)) if len(values) > 1 else 0.0
         comparisons.append(
             replace(
@@ -168,11 +209,27 @@ def compare(
                 high=high,
                 effect=float(values.mean()) / deviation if deviation > 0 else None,
                 p=sign_flip_p(values),
+                p_equivalence=None if margin is None else equivalence_p(values, margin),
             )
         )
-    tested = [c.p for c in comparisons if c.p is not None]
-    adjusted = iter(holm(tested))
-    return [c if c.p is None else replace(c, p_holm=next(adjusted), family=len(tested)) for c in comparisons]
+    return as_one_family(comparisons)
+
+
+def as_one_family(comparisons: Iterable[PairedComparison]) -> list[PairedComparison]:
+    """Correct p-values together, by Holm: those of differences as one family, those of equivalence as another."""
+    given = list(comparisons)
+    tested = [c.p for c in given if c.p is not None]
+    differing = iter(holm(tested))
+    alike = iter(holm([c.p_equivalence for c in given if c.p_equivalence is not None]))
+    return [
+        replace(
+            c,
+            p_holm=None if c.p is None else next(differing),
+            p_equivalence_holm=None if c.p_equivalence is None else next(alike),
+            family=0 if c.p is None else len(tested),
+        )
+        for c in given
+    ]
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from ...bench.progress import counted
+from ...bench.protocol import TASK_TITLES
 from ..runs import RunSet
 from ..statistics.comparisons import LEVEL, PairedComparison, compare, subjects_needed
 from ..table_report import table_of
 from ..tables import Table, TableCell, TableRow
 
 
-def ablation_table(runs: RunSet, method: str) -> Table:
+CROSSED = (
+    "Ablation minus method in novel views, minus the same difference in self-reenactment: mean over subjects and its "
+    f"{100 * (1 - LEVEL):g} % interval. It is 0 where an ablation changes both tasks alike."
+)
+FIRST_TASK = "novel_view"
+
+
+def ablation_table(runs: RunSet, method: str, *, crossed: bool = False) -> Table:
     """Differences of ablations from a method, as `difference_table`.
 
     Parameters
@@ -22,7 +30,13 @@ def ablation_table(runs: RunSet, method: str) -> Table:
     """
     names = {label: record.condition for label, record in runs.records.items() if record.condition}
     pairs = [(label, method) for label in names]
-    return difference_table(runs, pairs, names, "Ablations", "Ablation minus method", "ablations")
+    meaning = CROSSED if crossed else meaning_of("Ablation minus method")
+    return difference_table(runs, pairs, names, "Ablations", meaning, "ablations", crossed=crossed)
+
+
+def meaning_of(subtracted: str) -> str:
+    """Sentence about the cells of a table of differences."""
+    return f"{subtracted}, mean over subjects and its {100 * (1 - LEVEL):g} % interval."
 
 
 def difference_table(
@@ -32,10 +46,13 @@ def difference_table(
     title: str,
     meaning: str,
     family: str,
+    *,
+    crossed: bool = False,
 ) -> Table:
     """Paired differences, with those columns of the comparison table that do not depend on the machine.
 
-    Speeds are left out: those of runs made one after another differ by up to a tenth without any difference of the method.
+    ``crossed``: differences in novel views minus those in self-reenactment instead, which show whether a change helps in one
+    task more than in the other. Speeds are left out: those of runs made one after another differ by up to a tenth without any difference of the method.
 
     Parameters
     ----------
@@ -46,16 +63,21 @@ def difference_table(
     names : mapping of str
         Name of each row by the first label.
     title, meaning, family : str
-        Heading of the rows; what is subtracted from what; what the tests of a column are corrected for.
+        Heading of the rows; sentence about the cells; what the tests of a column are corrected for.
     """
+    runs = runs.by_camera
     table = table_of(runs)
     bound = {spec.name for spec in runs.metrics if spec.machine_bound}
     kept = tuple(column for column in table.columns if column.metric not in bound)
+    if crossed:
+        others = [column for column in kept if column.task not in ("", FIRST_TASK)]
+        kept = tuple(replace(c, title=f"{TASK_TITLES[FIRST_TASK]} minus {c.title.lower()}") for c in others)
     columns, tested = [], []
     for column in kept:
         found = compare(
             *(runs.rows, pairs),
-            task=column.task,
+            task=FIRST_TASK if crossed else column.task,
+            minus=column.task if crossed else "",
             metric=column.metric,
             higher_is_better=column.higher_is_better,
             level=LEVEL,
@@ -72,14 +94,13 @@ def difference_table(
 
 
 def _marking(tested: Sequence[PairedComparison], meaning: str, family: str) -> str:
-    text = f"{meaning}, mean over subjects and its {100 * (1 - LEVEL):g} % interval."
     test = f"exact sign-flip test over subjects, Holm over the {family} of a column, {LEVEL:.0%}"
     if any(each.testable for each in tested) or not tested:
-        return f"{text} Bold: they differ ({test})."
+        return f"{meaning} Bold: not 0 ({test})."
     first = tested[0]
     needed = subjects_needed(LEVEL, first.family)
     subjects = counted(first.subjects, "subject")
-    return f"{text} With {subjects} no test can tell whether they differ (it takes {needed}; {test})."
+    return f"{meaning} With {subjects} no test can tell whether they are 0 (it takes {needed}; {test})."
 
 
 def _cell(found: PairedComparison, digits: int) -> TableCell:

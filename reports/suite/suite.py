@@ -10,6 +10,7 @@ from ...bench.engine.scoring import FULL
 from ...bench.experiments.suite_settings import TRACKED
 from ..runs import FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
+from ..statistics.primary import primary_section
 from ..table_report import table_of
 from ..writers import to_markdown
 from .ablations import ablation_table
@@ -18,14 +19,14 @@ from .tracked import DROP, drop_table, tracked_table
 LARGE = "Images of twice the size"
 MEANING = (
     f"Under the condition `{TRACKED}`, methods are trained and driven with tracking that was estimated from the images, otherwise "
-    f"with the capture's own. {DROP}: novel view minus self-reenactment."
+    f"with the capture's own. {DROP} to a task: novel views minus that task."
 )
 
 
 def suite_report(runs: Sequence[Path], method: str) -> str:
     """Tables of a suite as Markdown: whole frames, each region, each held-out sequence, tracking from images, ablations.
 
-    Under each table are the paired differences of every other method from ``method``, with intervals and tests. Those of the
+    The primary endpoints are first; everything else is labelled as exploratory. Under each table are the paired differences of every other method from ``method``, with intervals and tests. Those of the
     ablations and of tracking from images are such differences, of whole frames and of the face, the former also in each
     held-out sequence.
 
@@ -40,14 +41,16 @@ def suite_report(runs: Sequence[Path], method: str) -> str:
     return f"\n# {LARGE}\n\n".join(parts)
 
 
-def _tables(whole: RunSet, method: str) -> str:
+def _tables(read: RunSet, method: str) -> str:
+    whole = read.by_camera
     changed = [label for label, record in whole.records.items() if record.condition]
     runs = whole.only([label for label in whole.records if label not in changed])
-    tested = sorted({frame[1] for frame in runs.rows.frames("self_reenactment", FULL)})
+    tested = sorted({frame[1] for frame in read.rows.frames("self_reenactment", FULL)})
     parts = {"All frames": FrameSelection()}
     parts |= {f"Region {region}": FrameSelection(region) for region in sorted(runs.rows.regions - {FULL})}
     parts |= {f"Sequence {name}": FrameSelection(sequences=(name,)) for name in tested}
-    sections = [_section(title, runs.of(part), method) for title, part in parts.items()]
+    sections = [primary_section(runs)]
+    sections += [_section(title, runs.of(part), method) for title, part in parts.items()]
     regions = (FULL, *({"face"} & runs.rows.regions))
     tracked = {whole.records[label].name: label for label in changed if _is_tracked(whole, label)}
     if tracked:
@@ -55,7 +58,7 @@ def _tables(whole: RunSet, method: str) -> str:
         for region in regions:
             of_region = runs.of(FrameSelection(region))
             tables = (drop_table(of_region), tracked_table(of_region, tracked))
-            texts = [f"## {_title('Tracked from images', region)}", MEANING, *map(to_markdown, tables)]
+            texts = [f"## {_title('Tracked from images', region)} (exploratory)", MEANING, *map(to_markdown, tables)]
             sections.append("\n\n".join(map(str.strip, texts)))
     ablations = [label for label in changed if not _is_tracked(whole, label)]
     if ablations:
@@ -63,7 +66,10 @@ def _tables(whole: RunSet, method: str) -> str:
         for region, chosen in product(regions, ((), *((name,) for name in tested))):
             table = ablation_table(runs.of(FrameSelection(region, chosen)), method)
             title = _title(f"Ablations of {method}", region, *chosen)
-            sections.append(f"## {title}\n\n{to_markdown(table).strip()}")
+            sections.append(f"## {title} (exploratory)\n\n{to_markdown(table).strip()}")
+        table = ablation_table(runs, method, crossed=True)
+        title = f"Ablations of {method}, novel views minus self-reenactment (exploratory)"
+        sections.append(f"## {title}\n\n{to_markdown(table).strip()}")
     return "\n\n".join(sections) + "\n"
 
 
@@ -77,7 +83,7 @@ def _title(text: str, region: str, *chosen: str) -> str:
 
 def _section(title: str, runs: RunSet, method: str) -> str:
     """A table and, where the method is among several, their differences from it."""
-    text = f"## {title}\n\n{to_markdown(table_of(runs)).strip()}"
+    text = f"## {title} (exploratory)\n\n{to_markdown(table_of(runs)).strip()}"
     if method not in runs.ranked or len(runs.ranked) < 2:
         return text
     folders = tuple(str(run.folder.root) for run in runs.runs)

@@ -8,32 +8,41 @@ from dataclasses import replace
 from ..runs import RunSet
 from ..table_report import Columns, table_of
 from ..tables import Column, Table, TableCell, TableRow
-from .ablations import difference_table
+from .ablations import difference_table, meaning_of
 
-NOVEL, SELF, METRIC = "novel_view", "self_reenactment", "psnr"
+NOVEL, METRIC = "novel_view", "psnr"
 DROP = "Drop"
 
 
 def drop_table(runs: RunSet) -> Table:
-    """PSNR of both tasks, and a last column with their difference, novel view minus self-reenactment."""
+    """PSNR of all tasks, and a last column for each other task: that of novel views minus that of the task."""
     table = table_of(runs, columns=Columns((METRIC,)))
-    places = {column.task: index for index, column in enumerate(table.columns)}
-    shown = table.columns[places[NOVEL]]
-    column = Column("", DROP, METRIC, shown.label, shown.unit, shown.digits, higher_is_better=False)
+    (first,) = (place for place, column in enumerate(table.columns) if column.task == NOVEL)
+    others = [place for place in range(len(table.columns)) if place != first]
 
-    def with_drop(row: TableRow) -> TableRow:
-        first, second = (row.cells[places[task]].value for task in (NOVEL, SELF))
-        cell = TableCell("missing", None, "–")
-        if first is not None and second is not None:
-            cell = TableCell("ok", first - second, f"{first - second:.{column.digits}f}")
-        return replace(row, cells=(*row.cells, cell))
+    def drop(place: int) -> Column:
+        shown = table.columns[place]
+        title = f"{DROP} to {shown.title.lower()}"
+        return Column("", title, METRIC, shown.label, shown.unit, shown.digits, higher_is_better=False)
 
-    return replace(table.mapped(with_drop), columns=(*table.columns, column))
+    def with_drops(row: TableRow) -> TableRow:
+        return replace(row, cells=(*row.cells, *(_difference(row, first, place, table) for place in others)))
+
+    columns = (*table.columns, *map(drop, others))
+    return replace(table.mapped(with_drops), columns=columns)
+
+
+def _difference(row: TableRow, first: int, second: int, table: Table) -> TableCell:
+    values = [row.cells[place].value for place in (first, second)]
+    if None in values:
+        return TableCell("missing", None, "–")
+    difference = values[0] - values[1]
+    return TableCell("ok", difference, f"{difference:.{table.columns[second].digits}f}")
 
 
 def tracked_table(runs: RunSet, tracked: Mapping[str, str]) -> Table:
     """Differences that tracking from images makes, a row for each method: ``tracked`` has its label by the label of the method."""
     pairs = [(changed, method) for method, changed in tracked.items()]
     names = {changed: method for method, changed in tracked.items()}
-    meaning = "Trained on tracking from images minus on the capture's tracking"
+    meaning = meaning_of("Trained on tracking from images minus on the capture's tracking")
     return difference_table(runs, pairs, names, "Tracked from images", meaning, "methods")

@@ -1,13 +1,15 @@
 import json
+from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
+from headbench.bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from headbench.bench.rows import Rows
 from headbench.reports.runs import RunSet
-from headbench.reports.table_report import published_rows, table_of, table_text
+from headbench.reports.table_report import Columns, published_rows, table_of, table_text
 
 from .latex import check_latex, compile_latex
 from .made_rows import TASKS
@@ -51,6 +53,26 @@ def test_paper_3_compares_insta_and_ours(write_run):
     assert "not comparable" in table.caption
     plain = table_of(RunSet.read([folder]), "paper-3")
     assert [row.cells for row in plain.rows] == [row.cells[::2] for row in table.rows]
+
+
+GALLERY = Path(__file__).parents[2] / "reports" / "gallery"
+
+
+@pytest.mark.parametrize("layout", ["paper-1", "comparison"])
+def test_tables_of_papers_alone_have_the_mean_over_cameras(layout):
+    rows = pd.read_parquet(GALLERY / "rows.parquet")
+    rows = rows[(rows.method == "ga") & (rows.metric == "psnr") & (rows.region == "full")]
+    held_out = rows[rows.task == "novel_view"].camera.iloc[0]
+    own = rows[rows.task == "self_reenactment"]
+    where = own.camera.where(own.camera == held_out, "seen").map(
+        {"seen": SEEN_CAMERAS, held_out: UNSEEN_CAMERAS}
+    )
+    groups = where.mask(where.notna(), "self_reenactment") if layout == "paper-1" else where
+    expected = own.groupby([groups, "sequence"]).value.mean().groupby(level=0).mean().to_dict()
+    table = table_of(RunSet.read([GALLERY]), layout, columns=Columns(("psnr", "self_reenactment")))
+    (row,) = [row for row in table.rows if row.method in ("ga", "GaussianAvatars")]
+    found = {column.task: cell.value for column, cell in zip(table.columns, row.cells, strict=True)}
+    assert found == pytest.approx(expected)
 
 
 def test_paper_4_puts_settings_of_ours_from_runs_side_by_side(write_run):

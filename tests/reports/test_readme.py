@@ -47,7 +47,22 @@ def test_conclusions_name_the_better_method(difference, p, said):
         p_holm=p,
         family=1,
     )
-    assert readme._conclusion(pair) == said
+    assert readme._conclusion(pair, "dB") == said
+
+
+def test_a_conclusion_states_equivalence():
+    pair = PairedComparison(
+        *("novel_view", "psnr", True, "ours", "ga"),
+        differences=tuple((f"s{n}", 0.1) for n in range(10)),
+        difference=0.1,
+        p_holm=0.2,
+        family=1,
+        margin=0.3,
+        p_equivalence_holm=0.01,
+    )
+    assert readme._conclusion(pair, "dB") == (
+        "`ours` and `ga`: cannot be told apart (equivalent within 0.3 dB)"
+    )
 
 
 def test_too_few_subjects_allow_no_conclusion(write_run):

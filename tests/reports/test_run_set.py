@@ -1,6 +1,7 @@
 import pytest
 
 from headbench.bench.errors import InputError
+from headbench.bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from headbench.bench.rows import ALL
 from headbench.reports.runs import FrameSelection, RunSet
 from headbench.reports.table_report import table_of, table_text
@@ -90,9 +91,8 @@ def test_sequences_leave_tasks_without_them_out(faces):
     assert not free & {frame[1] for frame in runs.rows.frames("novel_view", "full")}
     part = RunSet.read([faces], FrameSelection(sequences=tuple(free)))
     assert part.tasks == ("self_reenactment",)
-    assert cell(table_of(part), "self_reenactment", "error") == cell(
-        table_of(runs), "self_reenactment", "error"
-    )
+    for task in (SEEN_CAMERAS, UNSEEN_CAMERAS):
+        assert cell(table_of(part), task, "error") == cell(table_of(runs), task, "error")
     assert f"Sequences: {', '.join(free)}." in table_text([faces], sequences=tuple(free))
 
 
@@ -141,9 +141,72 @@ def test_a_failed_subject_leaves_no_mean_of_the_others(half_failed, part):
     table = table_of(RunSet.read([half_failed], part))
     assert {cell.status for row in table.rows for cell in row.cells} == {"failed"}
     assert all(task.subjects == 2 for task in table.tasks)
-    assert [task.task for task in table.tasks] == (
-        ["self_reenactment"] if part.sequences else ["novel_view", "self_reenactment"]
+    views = [] if part.sequences else ["novel_view"]
+    assert [task.task for task in table.tasks] == [*views, SEEN_CAMERAS, UNSEEN_CAMERAS]
+
+
+def self_reenactment(run):
+    """Value of each task of self-reenactment in the comparison, with the table."""
+    table = table_of(RunSet.read([run]))
+    return {task.task: cell(table, task.task, "error") for task in table.tasks[1:]}, table
+
+
+def test_seen_and_unseen_cameras_are_two_tasks(make_run):
+    run = make_run("a")
+    rows = RunSet.read([run]).rows.select(
+        method="toy", metric="error", task="self_reenactment", region="full", seeds=ALL
     )
+    by_camera = rows.groupby("camera")["value"].mean()  # the toy trains on camera a of each subject
+    found, table = self_reenactment(run)
+    assert found == pytest.approx({SEEN_CAMERAS: by_camera["a"], UNSEEN_CAMERAS: by_camera["b"]})
+    assert by_camera["a"] != by_camera["b"]
+    assert [task.frames for task in table.tasks[1:]] == [2, 2]
+    assert {task.protocol_hash for task in table.tasks[1:]} == {*rows["protocol"]}
+    for caption in (table.caption, table.short_caption):
+        assert "unseen cameras are held out" in caption
+
+
+def forget_cameras(manifest):
+    for clip in manifest["clips"]:
+        del clip["training_cameras"]
+
+
+def test_old_records_name_unseen_cameras_by_novel_views(make_run, change_manifest):
+    run = make_run("a")
+    expected, _ = self_reenactment(run)
+    change_manifest(run, forget_cameras)
+    found, _ = self_reenactment(run)
+    assert found == expected
+
+
+def train_on_both(manifest):
+    for clip in manifest["clips"]:
+        clip["training_cameras"] = ["a", "b"]
+
+
+def score_some_views(manifest):
+    forget_cameras(manifest)
+    for clip in manifest["clips"]:
+        clip["splits"]["novel_view"] += 1
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [(train_on_both, "trained on all of its cameras"), (score_some_views, "do not record which cameras")],
+)
+def test_one_column_states_why(make_run, change_manifest, change, why):
+    run = make_run("a")
+    expected = self_reenactment(run)[0]
+    change_manifest(run, change)
+    found, table = self_reenactment(run)
+    assert found == pytest.approx({"self_reenactment": sum(expected.values()) / 2})
+    assert why in table.caption
+
+
+def test_runs_that_disagree_on_cameras_share_one_column(make_run, change_manifest):
+    runs = [make_run("a"), make_run("b", seeds=(1,))]
+    change_manifest(runs[1], train_on_both)
+    assert "differ in which cameras" in table_of(RunSet.read(runs)).caption
 
 
 def test_methods_under_a_condition_are_listed_apart(write_run):

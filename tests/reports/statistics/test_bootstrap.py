@@ -138,3 +138,33 @@ def test_blocks_are_at_most_a_third_and_at_least_one_timestep():
     (subject,) = Population(1, timesteps=30, correlation=0.99).draw(np.random.default_rng(0))
     assert block_length(subject.sequences) == 10
     assert block_length(subjects_of([1.0])[0].sequences) == 1
+
+
+def test_the_difference_of_two_tasks_has_students_interval():
+    first, second = np.random.default_rng(1).normal(3, 2, (2, 60))
+    found = interval(subjects_of(first), replicates=20_000, less=subjects_of(second))
+    expected = stats.t.interval(0.95, 59, (first - second).mean(), stats.sem(first - second))
+    assert found == pytest.approx(expected, abs=0.08)
+
+
+def test_seeds_that_move_both_tasks_alike_widen_nothing():
+    generator = np.random.default_rng(0)
+    one = np.ones(1)
+    tasks = ([], [])
+    for subject in range(12):
+        seeds = generator.normal(0, 10, 3)
+        for index, task in enumerate(tasks):
+            own = generator.normal(index, 0.1)
+            pairs = SequencePairs((seeds + own)[:, None], 0 * one[None], one)
+            task.append(SubjectPairs(str(subject), (pairs,)))
+    low, high = interval(tasks[0], less=tasks[1])
+    assert low < -1 < high
+    assert high - low < 0.5
+    alone = interval(tasks[0])
+    assert alone[1] - alone[0] > 5
+
+
+def test_tasks_of_other_subjects_are_refused():
+    subjects = subjects_of([1.0, 2.0, 3.0])
+    with pytest.raises(InputError, match="the same in both tasks: 0, 1, 2"):
+        interval(subjects, less=subjects[:2])

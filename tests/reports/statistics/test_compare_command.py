@@ -150,3 +150,31 @@ def test_a_failed_method_has_a_reason(make_run, capsys):
 def test_one_method_alone_has_nothing_to_be_compared_with(make_run, capsys):
     assert cli.main(["compare", str(make_run("a"))]) == 2
     assert "two methods" in capsys.readouterr().err
+
+
+def test_equivalence_is_tested_where_a_margin_is_given(folder):
+    # Differences of 2 to 3.2 levels in seven subjects: all within 4, no more than half of them within 2.5.
+    wide, narrow = (
+        compare_runs(CompareSettings((str(folder),), equivalence=(f"error={margin}",)))
+        for margin in ("4", "2.5")
+    )
+    novel, reenacted, size = wide.text.split("\n\n")
+    for text in (novel, reenacted):
+        assert "good is better; equivalent within 4 levels (Holm 0.0078)" in text
+    assert "equivalen" not in size
+    assert narrow.text.count("good is better; equivalence within 2.5 levels not shown") == 2
+    text = compare_runs(CompareSettings((str(folder),), equivalence=("error=4",), format="csv")).text
+    first, *_, last = csv.DictReader(io.StringIO(text))
+    assert (first["margin"], first["equivalent"], last["equivalent"]) == ("4.0", "True", "")
+
+
+@pytest.mark.parametrize("word", ["0.3", "error=", "error=0", "error=-1", "error=nan", "=0.3"])
+def test_a_margin_is_a_metric_and_a_positive_number(word):
+    with pytest.raises(ValueError, match="METRIC=MARGIN"):
+        CompareSettings(("run",), equivalence=(word,))
+
+
+def test_margins_of_other_metrics_are_refused(folder):
+    settings = CompareSettings((str(folder),), metrics=("size",), equivalence=("error=4",))
+    with pytest.raises(InputError, match="--equivalence: expected compared metrics: size, found error"):
+        compare_runs(settings)

@@ -9,7 +9,14 @@ from scipy import stats
 
 from headbench.bench.rows import Rows
 from headbench.reports.statistics import comparisons
-from headbench.reports.statistics.comparisons import best_set, holm, least_p, sign_flip_p, subjects_needed
+from headbench.reports.statistics.comparisons import (
+    best_set,
+    equivalence_p,
+    holm,
+    least_p,
+    sign_flip_p,
+    subjects_needed,
+)
 
 from ..made_rows import avatar_row, row
 
@@ -17,8 +24,8 @@ LEVELS = {"low": 20.0, "middle": 20.5, "high": 25.0}
 PAIRS = [("high", "low"), ("high", "middle"), ("low", "middle")]
 
 
-def compare(rows, pairs, task="novel_view", metric="psnr", *, higher_is_better=True):
-    what = {"task": task, "metric": metric, "higher_is_better": higher_is_better}
+def compare(rows, pairs, task="novel_view", metric="psnr", *, higher_is_better=True, **options):
+    what = {"task": task, "metric": metric, "higher_is_better": higher_is_better, **options}
     return comparisons.compare(Rows(rows), pairs, **what)
 
 
@@ -98,8 +105,8 @@ def test_values_of_the_avatar_are_compared_too():
     assert found.seeds == (2, 2)
 
 
-def permutation_p(values):
-    options = {"permutation_type": "samples", "n_resamples": np.inf, "vectorized": True}
+def permutation_p(values, **options):
+    options |= {"permutation_type": "samples", "n_resamples": np.inf, "vectorized": True}
     return stats.permutation_test((values,), np.mean, **options).pvalue
 
 
@@ -207,3 +214,110 @@ def test_rejects_what_the_sequential_procedure_rejects(values, level):
 def test_an_example_by_hand():
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([]) == []
+
+
+@given(differences)
+def test_one_sided_equals_the_enumeration_too(values):
+    signs = itertools.product((1, -1), repeat=len(values))
+    sums = [sum(s * v for s, v in zip(each, values)) for each in signs]
+    expected = np.mean([total >= sum(values) for total in sums])
+    assert sign_flip_p(values, greater=True) == pytest.approx(expected)
+
+
+def test_one_sided_assignments_are_drawn_alike(monkeypatch):
+    values = np.random.default_rng(0).normal(0.4, 1, 12)
+    exact = permutation_p(values, alternative="greater")
+    assert sign_flip_p(values, greater=True) == pytest.approx(exact)
+    monkeypatch.setattr(comparisons, "EXACT_UP_TO", 5)
+    assert sign_flip_p(values, greater=True) == pytest.approx(exact, abs=0.005)
+
+
+@pytest.mark.parametrize("mean", [-0.5, 0.0, 0.25])
+def test_equivalence_is_two_one_sided_tests(mean):
+    values = np.random.default_rng(1).normal(mean, 0.2, 9)
+    below = permutation_p(values + 0.3, alternative="greater")
+    above = permutation_p(values - 0.3, alternative="less")
+    assert equivalence_p(values, 0.3) == pytest.approx(max(below, above))
+    assert equivalence_p(-values, 0.3) == pytest.approx(equivalence_p(values, 0.3))
+
+
+def test_equivalence_of_ten_alike_has_the_least_p():
+    assert equivalence_p(np.zeros(10), 0.3) == 2**-10
+    assert equivalence_p([], 0.3) == 1
+
+
+@pytest.mark.parametrize("margin", [0.0, -0.3, np.inf, np.nan])
+def test_a_margin_that_is_none_is_refused(margin):
+    with pytest.raises(ValueError, match="margin"):
+        equivalence_p([0.1], margin)
+
+
+@pytest.mark.parametrize("draw", ["normal", "laplace", "uniform"])
+def test_at_the_margin_equivalence_keeps_its_level(draw):
+    # Symmetric about the margin: the one-sided test is exact, at most 5 % are called equivalent.
+    draws = {"normal": {"scale": 0.2}, "laplace": {"scale": 0.2}, "uniform": {"low": -0.4, "high": 0.4}}
+    values = 0.3 + getattr(np.random.default_rng(0), draw)(size=(2_000, 8), **draws[draw])
+    share = np.mean([equivalence_p(each, 0.3) <= 0.05 for each in values])
+    assert share == pytest.approx(0.05, abs=3 * np.sqrt(0.05 * 0.95 / 2_000) + 2**-8)
+
+
+def test_equivalence_has_the_power_of_its_t_tests():
+    def by_t(values):
+        sides = [stats.ttest_1samp(values, s * 0.3, alternative=a) for s, a in ((-1, "greater"), (1, "less"))]
+        return max(side.pvalue for side in sides)
+
+    values = np.random.default_rng(2).normal(0, 0.25, (500, 10))
+    found = np.mean([equivalence_p(each, 0.3) <= 0.05 for each in values])
+    expected = np.mean([by_t(each) <= 0.05 for each in values])
+    assert expected > 0.8
+    assert found == pytest.approx(expected, abs=0.05)
+
+
+def test_equivalence_is_corrected_over_the_pairs():
+    rows = rows_of(9, {"a": 20.0, "b": 20.02, "c": 25.0})
+    pairs = [("a", "b"), ("a", "c"), ("b", "c")]
+    found = compare(rows, pairs, margin=0.3)
+    assert [c.p_equivalence for c in found] == [2**-9, 1, 1]
+    assert [c.p_equivalence_holm for c in found] == [3 * 2**-9, 1, 1]
+    assert [c.equivalent for c in found] == [True, False, False]
+    assert [c.p_holm for c in found] == [c.p_holm for c in compare(rows, pairs)]
+    assert {c.equivalent for c in compare(rows, pairs)} == {None}
+
+
+def two_tasks(subjects=8, gain=1.0, tasks=("novel_view", "self_reenactment")):
+    """Method a ahead of b by 1 in the first task and by ``1 + gain`` in the other, each give or take 0.1."""
+    generator = np.random.default_rng(5)
+    return pd.DataFrame(
+        row(m, "psnr", level * (1 + gain * i) + generator.normal(0, 0.1), f"s{s}", timestep=t, task=task)
+        for m, level in (("a", 1.0), ("b", 0.0))
+        for i, task in enumerate(tasks)
+        for s in range(subjects)
+        for t in range(4)
+    )
+
+
+def test_an_interaction_is_a_difference_of_differences():
+    rows = two_tasks()
+    (found,) = compare(rows, [("a", "b")], minus="self_reenactment")
+    means = rows.groupby(["method", "task", "subject"])["value"].mean().unstack("subject")
+    by_task = means.loc["a"] - means.loc["b"]
+    expected = by_task.loc["novel_view"] - by_task.loc["self_reenactment"]
+    assert dict(found.differences) == pytest.approx(expected.to_dict())
+    assert found.p == pytest.approx(permutation_p(expected.to_numpy()))
+    assert found.low < expected.mean() < found.high
+    assert found.high - found.low < 0.4
+    assert found.verdict == "the differences differ"
+
+
+def test_equal_differences_are_no_interaction():
+    (found,) = compare(two_tasks(gain=0.0), [("a", "b")], minus="self_reenactment")
+    assert found.low < 0 < found.high
+    assert found.verdict == "cannot be told apart"
+
+
+def test_an_interaction_takes_both_tasks():
+    rows = two_tasks()
+    alone = rows[rows["task"] == "novel_view"]
+    (found,) = compare(alone, [("a", "b")], minus="self_reenactment")
+    assert found.verdict == "no comparison"
+    assert "Not measured" in found.reason

@@ -3,6 +3,7 @@
 import pytest
 
 from headbench.bench.condition import PLAIN, Condition
+from headbench.bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from headbench.reports.runs import RunSet
 from headbench.reports.statistics.comparisons import PairedComparison
 from headbench.reports.suite.ablations import _cell, ablation_table
@@ -24,6 +25,21 @@ def test_rows_are_ablations_and_cells_their_differences(make_run):
     assert [cell.value for cell in row.cells] == pytest.approx(wanted)
     assert any(wanted)
     assert [float(cell.text.split()[0]) for cell in row.cells] == pytest.approx(wanted, abs=1e-3)
+
+
+def test_crossed_cells_are_differences_between_the_tasks(make_run):
+    conditions = (PLAIN, Condition("less", ("toy",), {"level": 0.5}))
+    runs = RunSet.read([make_run("run", settings={"toy": {"level": 0.25}}, conditions=conditions)])
+    plain, crossed = (ablation_table(runs, "toy", crossed=each) for each in (False, True))
+    (cells,), (found,) = ([row.cells for row in table.rows] for table in (plain, crossed))
+    by_task = {c.task: cell.value for c, cell in zip(plain.columns, cells) if c.task}
+    views = by_task.pop("novel_view")
+    assert [column.task for column in crossed.columns] == [SEEN_CAMERAS, UNSEEN_CAMERAS]
+    expected = [views - value for value in by_task.values()]
+    assert [cell.value for cell in found] == pytest.approx(expected, abs=1e-9)
+    assert any(abs(value) > 0 for value in expected)
+    assert crossed.columns[0].title == "Novel view minus self-reenactment at seen cameras"
+    assert "the same difference in self-reenactment" in crossed.caption
 
 
 def test_speeds_of_different_runs_are_not_compared(write_run):

@@ -1,0 +1,63 @@
+"""Primary endpoints of the suite: a fixed list of tests, corrected together. All others are exploratory."""
+
+from __future__ import annotations
+
+from itertools import product
+
+from ...bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
+from ..runs import RunSet
+from .command import equivalence_text
+from .comparisons import LEVEL, PairedComparison, as_one_family, compare
+
+PAIR = ("ours", "ga")
+PRIMARY = tuple(product(("novel_view", SEEN_CAMERAS, UNSEEN_CAMERAS), ("psnr", "lpips")))
+"""Task and metric of each endpoint; `docs/explanation/statistics.md` has the same list."""
+MARGINS = {"psnr": 0.3}
+"""Differences within which the methods count as equivalent, in the metric's unit."""
+
+
+def primary_comparisons(runs: RunSet) -> list[PairedComparison]:
+    """The primary endpoints of whole frames, Holm over all; empty where the runs lack one of `PAIR` or the metrics."""
+    runs = runs.by_camera
+    specs = {spec.name: spec for spec in runs.metrics}
+    if not {*PAIR} <= {*runs.methods} or not {metric for _, metric in PRIMARY} <= {*specs}:
+        return []
+    found = [
+        compare(
+            *(runs.rows, [PAIR]),
+            task=task,
+            metric=metric,
+            higher_is_better=specs[metric].higher_is_better,
+            margin=MARGINS.get(metric),
+        )
+        for task, metric in PRIMARY
+    ]
+    return as_one_family(each for (each,) in found)
+
+
+def primary_section(runs: RunSet) -> str:
+    """The primary endpoints as Markdown, and what the other tests of a page are."""
+    found = primary_comparisons(runs)
+    exploratory = "All other tests on this page are exploratory: they are corrected over the comparisons of one metric and task alone."
+    if not found:
+        return f"## Primary endpoints\n\nNone: they compare `{PAIR[0]}` with `{PAIR[1]}`. {exploratory}"
+    specs = {spec.name: spec for spec in runs.metrics}
+    confidence = f"{100 * (1 - LEVEL):g} % interval"
+    lines = [["endpoint", f"{PAIR[0]} - {PAIR[1]}", confidence, "p", "Holm", "", "equivalence"], ["---"] * 7]
+    for c in found:
+        spec = specs[c.metric]
+        unit = f" ({spec.unit})" if spec.unit else ""
+        head = f"{TASK_TITLES.get(c.task, c.task)}, {spec.label}{unit}"
+        if c.difference is None or c.p is None or c.p_holm is None:
+            lines.append([head, "-", "", "", "", f"{c.verdict}: {c.reason}", ""])
+            continue
+        digits = spec.digits + 1
+        bounds = "-" if c.low is None or c.high is None else f"{c.low:+.{digits}f}, {c.high:+.{digits}f}"
+        numbers = [f"{c.difference:+.{digits}f}", bounds, f"{c.p:.4f}", f"{c.p_holm:.4f}"]
+        lines.append([head, *numbers, c.verdict, equivalence_text(c, spec.unit)])
+    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    how = (
+        f"Exact sign-flip tests over subjects, Holm over all {len(found)} endpoints; equivalence by two one-sided sign-flip tests, "
+        f"Holm over these; level {LEVEL:.0%}. {exploratory}"
+    )
+    return f"## Primary endpoints\n\n{table}\n\n{how}"
