@@ -316,7 +316,7 @@ class Rows:
     def split_by_camera(
         self, task: str, chosen: Collection[tuple[str, str]], inside: str, outside: str
     ) -> Rows:
-        """The same rows, frames of ``task`` under two other tasks: ``inside`` for the ``chosen`` (subject, camera), else ``outside``.
+        """The same rows, frames of ``task`` as two tasks: ``inside`` for the ``chosen`` (subject, camera), else ``outside``.
 
         Rows that stand for all frames of the task because a method failed are in both.
         """

@@ -20,7 +20,7 @@ EXPLAINED = (
 def unseen_cameras(
     manifests: Sequence[Manifest], keys: Collection[FrameKey]
 ) -> tuple[frozenset[tuple[str, str]], str]:
-    """The (subject, camera) among frames of self-reenactment without training frames; none and a reason where they cannot be shown apart.
+    """The (subject, camera) without training frames among those of self-reenactment; none and a reason where unknown.
 
     The reason is one sentence, for captions.
     """

@@ -236,7 +236,7 @@ class RunSet:
 
     @cached_property
     def by_camera(self) -> Self:
-        """The same runs with self-reenactment at seen and at unseen cameras as two tasks; as one where runs do not tell them apart."""
+        """The same runs with self-reenactment at seen and at unseen cameras as two tasks, or as one where unknown."""
         if SPLIT_TASK not in self.tasks:
             return self
         keys = self.keys[SPLIT_TASK]

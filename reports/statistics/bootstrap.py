@@ -121,7 +121,8 @@ def interval(
 ) -> tuple[float, float] | None:
     """Confidence interval of the mean difference over the population of subjects, in the metric's unit.
 
-    ``level`` is one minus the confidence; ``seed`` that of the draws; ``less`` that of `differences`. None with fewer than `LEAST_SUBJECTS` subjects,
+    ``level`` is one minus the confidence; ``seed`` that of the draws; ``less`` that of `differences`. None with fewer
+    than `LEAST_SUBJECTS` subjects,
     or where so few have no bounded interval (values without variation within subjects, three subjects).
     """
     count = len(subjects)

@@ -99,7 +99,8 @@ class PairedComparison:
     """First method minus second on one metric of one task; the subject is the unit.
 
     Where ``minus`` names another task, the difference in that task is subtracted: an interaction of methods and tasks, 0 where
-    the methods differ by the same in both. ``difference`` is None where a method lacks values (``reason``); the interval (``low``, ``high``) over the population
+    the methods differ by the same in both. ``difference`` is None where a method lacks values
+    (``reason``); the interval (``low``, ``high``) over the population
     of subjects where they are too few.
     """
 

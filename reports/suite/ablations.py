@@ -52,7 +52,8 @@ def difference_table(
     """Paired differences, with those columns of the comparison table that do not depend on the machine.
 
     ``crossed``: differences in novel views minus those in self-reenactment instead, which show whether a change helps in one
-    task more than in the other. Speeds are left out: those of runs made one after another differ by up to a tenth without any difference of the method.
+    task more than in the other. Speeds are left out: those of runs made one after another differ by up
+    to a tenth without any difference of the method.
 
     Parameters
     ----------

@@ -26,9 +26,9 @@ MEANING = (
 def suite_report(runs: Sequence[Path], method: str) -> str:
     """Tables of a suite as Markdown: whole frames, each region, each held-out sequence, tracking from images, ablations.
 
-    The primary endpoints are first; everything else is labelled as exploratory. Under each table are the paired differences of every other method from ``method``, with intervals and tests. Those of the
-    ablations and of tracking from images are such differences, of whole frames and of the face, the former also in each
-    held-out sequence.
+    The primary endpoints are first; everything else is labelled as exploratory. Under each table are the paired differences of
+    every other method from ``method``, with intervals and tests. Those of the ablations and of tracking from images are such
+    differences, of whole frames and of the face, the former also in each held-out sequence.
 
     Parameters
     ----------
