@@ -9,6 +9,7 @@
 
 #include "bench/native/module.h"
 #include "bench/native/parallel.h"
+#include "bench/native/workspace.h"
 #include "tree.h"
 
 namespace nb = nanobind;
@@ -149,15 +150,15 @@ class World {
     for (std::size_t i = 0; i < extents.size(); ++i)
       for (std::int64_t strip = extents[i].top / strip_rows; strip * strip_rows < extents[i].bottom; ++strip)
         seen[strip].push_back(static_cast<std::int32_t>(i));
-    std::vector<Sample> samples(band * columns);
-    Floats narrow(rows * width * 4);
+    const Buffer<Sample> samples(band * columns);
+    const Buffer<float> narrow(rows * width * 4);
     const Scene scene = current();
     for (std::int64_t begin = 0; begin < rows; begin += band) {
       const std::int64_t taken = std::min(band, rows - begin);
       parallel_for(taken, strip_rows, threads, [&](std::int64_t first, std::int64_t last) {
         const std::int64_t count_rows = last - first;
-        Floats memory(kStripFloats * count_rows * stride_of(columns));
-        std::vector<std::int32_t> met(count_rows * stride_of(columns));
+        const Buffer<float> memory(kStripFloats * count_rows * stride_of(columns));
+        const Buffer<std::int32_t> met(count_rows * stride_of(columns));
         const std::vector<std::int32_t>& triangles = seen[(begin + first) / strip_rows];
         Sample* row = samples.data() + first * columns;
         kernels_.see(scene, lens,
@@ -173,13 +174,13 @@ class World {
       });
       gather(threads);
       parallel_for(taken, 1, threads, [&](std::int64_t row, std::int64_t) {
-        Floats wide(columns * 4);
+        const Buffer<float> wide(columns * 4);
         kernels_.shade(scene, samples.data() + row * columns, columns, wide.data());
         float* out = narrow.data() + (begin + row) * width * 4;
         for (std::int64_t x = 0; x < width; ++x) {
           float sums[4] = {};
           for (std::int64_t tap = 0; tap < count; ++tap)
-            for (int c = 0; c < 4; ++c) sums[c] += taps.data()[tap] * wide[4 * (x * grid + tap) + c];
+            for (int c = 0; c < 4; ++c) sums[c] += taps.data()[tap] * wide.data()[4 * (x * grid + tap) + c];
           std::copy_n(sums, 4, out + 4 * x);
         }
       });
