@@ -114,6 +114,9 @@ def test_a_few_simulations_keep_the_level_of_the_test():
     few = calibration.calibrate(Population(5, sequences=1, timesteps=10), 3)
     assert few["test rejects %"] is None
     assert calibration.best_set_errors(3, 5, 3) == (0, 1)
+    at_margin, far_within = (calibration.equivalence_share(9, 80, mean) for mean in (calibration.MARGIN, 0.0))
+    assert at_margin <= 0.12
+    assert far_within > 0.7
 
 
 @pytest.mark.slow
