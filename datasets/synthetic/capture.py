@@ -162,7 +162,9 @@ def synthesize(
     )
     if edition != EDITION:
         remedy = "Use the version of headbench that made it, or name the folder of the capture."
-        raise InputError("synthetic capture", "edition", f"{EDITION}, which this version makes", str(edition), remedy)
+        raise InputError(
+            "synthetic capture", "edition", f"{EDITION}, which this version makes", str(edition), remedy
+        )
     _check(settings)
     KERNEL.load()
     geometry = load_geometry(head)

@@ -12,7 +12,6 @@ from ..statistics.comparisons import LEVEL, PairedComparison, compare, subjects_
 from ..table_report import table_of
 from ..tables import Table, TableCell, TableRow
 
-
 CROSSED = (
     "Ablation minus method in novel views, minus the same difference in self-reenactment: mean over subjects and its "
     f"{100 * (1 - LEVEL):g} % interval. It is 0 where an ablation changes both tasks alike."

@@ -58,7 +58,11 @@ def _tables(read: RunSet, method: str) -> str:
         for region in regions:
             of_region = runs.of(FrameSelection(region))
             tables = (drop_table(of_region), tracked_table(of_region, tracked))
-            texts = [f"## {_title('Tracked from images', region)} (exploratory)", MEANING, *map(to_markdown, tables)]
+            texts = [
+                f"## {_title('Tracked from images', region)} (exploratory)",
+                MEANING,
+                *map(to_markdown, tables),
+            ]
             sections.append("\n\n".join(map(str.strip, texts)))
     ablations = [label for label in changed if not _is_tracked(whole, label)]
     if ablations:

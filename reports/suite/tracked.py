@@ -33,10 +33,10 @@ def drop_table(runs: RunSet) -> Table:
 
 
 def _difference(row: TableRow, first: int, second: int, table: Table) -> TableCell:
-    values = [row.cells[place].value for place in (first, second)]
-    if None in values:
+    novel, other = row.cells[first].value, row.cells[second].value
+    if novel is None or other is None:
         return TableCell("missing", None, "–")
-    difference = values[0] - values[1]
+    difference = novel - other
     return TableCell("ok", difference, f"{difference:.{table.columns[second].digits}f}")
 
 

@@ -14,7 +14,14 @@ from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.datasets.synthetic.plan import EDITION, FRONTAL
 
-SMALL = {"cameras": 2, "timesteps": 8, "size": (32, 46), "samples_per_pixel": 9, "workers": 1, "performance": "full"}
+SMALL = {
+    "cameras": 2,
+    "timesteps": 8,
+    "size": (32, 46),
+    "samples_per_pixel": 9,
+    "workers": 1,
+    "performance": "full",
+}
 
 
 @pytest.fixture(scope="module")

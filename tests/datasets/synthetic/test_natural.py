@@ -127,6 +127,7 @@ def test_the_tongue_is_labelled_in_free_alone(timesteps):
     assert sum(counts.values()) == timesteps
     assert set(counts) == set(NAMES)
     excluded = {
-        n: perform(n, c, 5, kind="natural", every=frames_kept(timesteps, counts)).excluded for n, c in counts.items()
+        n: perform(n, c, 5, kind="natural", every=frames_kept(timesteps, counts)).excluded
+        for n, c in counts.items()
     }
     assert {name for name, frames in excluded.items() if frames} <= {"FREE-2-recombined"}
