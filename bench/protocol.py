@@ -11,6 +11,8 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any, Literal, TypeVar
 
+import numpy as np
+
 from .contracts import Clip, FrameKey, TaskName
 from .errors import InputError
 from .io.files import digest
@@ -201,3 +203,10 @@ def evenly(frames: Sequence[Item], count: int | None) -> list[Item]:
     if count < 1:
         raise InputError("protocol", "max_frames", "at least 1", str(count))
     return [frames[(2 * i + 1) * len(frames) // (2 * count)] for i in range(count)]
+
+
+def evenly_with_ends(items: Sequence[Item], most: int) -> list[Item]:
+    """Evenly spread items, up to a maximum number, including the first and the last if there are two or more."""
+    return [
+        items[place] for place in np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)
+    ]

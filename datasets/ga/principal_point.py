@@ -18,6 +18,7 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray
 from ...bench.errors import InputError
+from ...bench.protocol import evenly_with_ends
 from ..head.subject import PosedSubject
 from ..images import read_image, read_mask
 from .cameras import CaptureCameras
@@ -114,8 +115,7 @@ def _pick_views(
     """Up to `FRAMES` frames, spread over timesteps and cameras (by a stride coprime to most rig sizes)."""
     cameras = rig.resolve("top")
     ordered = sorted(entries, key=lambda e: (e.timestep, e.camera_index))
-    picks = np.linspace(0, len(ordered) - 1, min(FRAMES, len(ordered))).round().astype(int)
-    chosen = [ordered[i] for i in np.unique(picks)]
+    chosen = evenly_with_ends(ordered, FRAMES)
     subject = PosedSubject(tracking.head, tracking.shape, tracking.static_offset)
     return [
         OutlineView(mesh, cameras[entry.camera_id], partial(_foreground, entry, background))

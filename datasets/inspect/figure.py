@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, IntArray, Progress, no_progress
+from ...bench.protocol import evenly_with_ends
 from ..clip import CaptureClip
 from ..figures import HELD_OUT, MUTED, TRAIN, bands, hexadecimal, new_figure, pixels, shortened, show
 from ..head.geometry import rigid_alignment
@@ -229,8 +230,7 @@ def pick_cameras(clip: CaptureClip, count: int) -> list[str]:
     held_out = _held_out(clip)
     first = [name for name in clip.cameras if name in held_out][:1]
     others = [name for name in clip.cameras if name not in first]
-    picks = np.unique(np.linspace(0, len(others) - 1, max(0, min(count - len(first), len(others)))).round())
-    return (first + [others[int(i)] for i in picks])[:count]
+    return (first + evenly_with_ends(others, max(0, count - len(first))))[:count]
 
 
 def pick_timesteps(clip: CaptureClip, space: ExpressionSpace, count: int) -> list[tuple[int, str]]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from ...bench.contracts import Camera, FloatArray, Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.protocol import evenly_with_ends
 from ..ga.layout import CyConvention
 from ..ga.transforms import FrameEntry
 from ..head.geometry import vertex_normals
@@ -218,7 +219,7 @@ def _pick_timesteps(
     chosen = []
     for part in np.array_split(sorted(around), max(1, min(count, len(around)))):
         if len(part):
-            few = part[np.unique(np.linspace(0, len(part) - 1, _CANDIDATES).round().astype(int))].tolist()
+            few = evenly_with_ends(part.tolist(), _CANDIDATES)
             chosen.append(max(few, key=lambda t: _speed(subject, parameters, around[t])))
     return {timestep: around[timestep] for timestep in chosen}
 

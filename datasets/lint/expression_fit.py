@@ -18,6 +18,7 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray
 from ...bench.errors import InputError
+from ...bench.protocol import evenly_with_ends
 from ..ga.layout import CyConvention
 from ..ga.transforms import FrameEntry
 from ..head.geometry import vertex_normals
@@ -91,11 +92,10 @@ def weigh_expression(
     if not usable:
         return None
     usable.sort(key=lambda entry: entry.timestep)
-    picks = np.unique(np.linspace(0, len(usable) - 1, FRAMES).round().astype(int))
     members = _members(subject)
     moving: list[_Picked] = []
     resting: list[_Picked] = []
-    for entry in (usable[i] for i in picks):
+    for entry in evenly_with_ends(usable, FRAMES):
         pose = parameters[entry.timestep].pose
         if pose is None:
             continue

@@ -31,12 +31,13 @@ from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers
 from ...bench.io.documents import checked, read_json, read_text
 from ...bench.io.files import reading, with_slashes
 from ...bench.io.images import probe_image
+from ...bench.protocol import evenly_with_ends
 from ..ga.layout import ALL_FRAMES_FILE, SPLIT_FILES
 from ..ga.transforms import check_lenses, read_rigid
 from ..head.arrays import HeadArrays
 from ..head.loaders import EYELIDS_REMEDY
 from ..head.model import HeadModel
-from .mesh_fit import MeshFit, check_distance, read_vertices, spread
+from .mesh_fit import MeshFit, check_distance, read_vertices
 from .track import Track, VideoFrame, coefficients, frame_number, ordered
 
 log = logging.getLogger(__name__)
@@ -210,8 +211,7 @@ class _Meshes:
             model = HeadModel(head, dtype=torch.float64)
             self._neutral = model.canonical(torch.from_numpy(shape))[0].numpy()
         self._expressions = np.asarray(head.expression_basis, np.float64)
-        few = spread(CHECKED_MESHES, len(sources))
-        self._compared = {sources[i].number for i in few}
+        self._compared = {source.number for source in evenly_with_ends(sources, CHECKED_MESHES)}
         self._farthest, self._fitted, self._read = 0.0, 0, 0
         self._missed = self._closed = 0.0
         self.files: set[Path] = set()

@@ -7,7 +7,6 @@ parameters to about 1e-6. The residual shows whether the head model is the one o
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +17,7 @@ from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers
 from ...bench.io.files import read_bytes, reading
+from ...bench.protocol import evenly_with_ends
 from ..head.arrays import JOINT_NAMES, HeadArrays
 from ..head.model import HeadModel
 
@@ -88,7 +88,7 @@ class MeshFit:
         weights = np.asarray(head.skinning_weights, np.float64)[:, _TURNING]
         parts = [*weights.T, *np.abs(self._lids).max(axis=1).T]
         strong = [np.flatnonzero(part > 0.1 * part.max(initial=0)) for part in parts]
-        picked = [rows[np.asarray(spread(_ROWS, len(rows)), np.int64)] for rows in strong]
+        picked = [rows[evenly_with_ends(range(len(rows)), _ROWS)] for rows in strong]
         self._rows: IntArray = np.unique(np.concatenate(picked))
 
     def fit_identity(self, mesh: FloatArray) -> Identity:
@@ -179,8 +179,3 @@ def check_distance(file: Path, distance: float, version: str) -> None:
             "(generic_model.pkl), whose coefficients are not those of FLAME 2023."
         )
         raise InputError(file, "v", expected, f"{1e3 * distance:.3g} mm", remedy)
-
-
-def spread(count: int, of: int) -> Sequence[int]:
-    """``count`` indices spread evenly over ``of``."""
-    return sorted({round(i * (of - 1) / max(count - 1, 1)) for i in range(min(count, of))})

@@ -26,6 +26,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from sklearn.cluster import AgglomerativeClustering, KMeans, SpectralClustering
 
 from ...bench.contracts import Clip, FloatArray, HeadAsset, IntArray, Progress, no_progress
+from ...bench.protocol import evenly_with_ends
 from ..head.arrays import region
 from ..head.subject import PosedSubject, pose_in_head_frame
 
@@ -359,9 +360,7 @@ def classes_of(embedding: FloatArray, classes: int) -> IntArray:
     that differ from seed to seed, and mostly fit worse. Beyond `START_LIMIT` items the hierarchy is that of
     items spread evenly over the order given.
     """
-    start = np.unique(
-        np.linspace(0, len(embedding) - 1, min(START_LIMIT, len(embedding))).round().astype(int)
-    )
+    start = evenly_with_ends(range(len(embedding)), START_LIMIT)
     sample = embedding[start]
     groups = AgglomerativeClustering(classes).fit_predict(sample)
     centres = np.array([sample[groups == group].mean(axis=0) for group in range(classes)])

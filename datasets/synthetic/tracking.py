@@ -21,6 +21,7 @@ import torch
 from scipy.optimize import nnls
 
 from ...bench.contracts import FloatArray, HeadPose
+from ...bench.protocol import evenly_with_ends
 from ..head.arrays import HeadArrays, region
 from ..head.model import HeadModel
 from ..rounding import COEFFICIENT_BITS, on_grid, share_left
@@ -222,7 +223,7 @@ class _Displacement:
         lids = skin[closing[skin] > LID_SHARE * closing[skin].max()]
         lips = np.asarray(region(head, "lips"))
         self.parts = {"face": np.setdiff1d(skin, np.union1d(lips, lids)), "lips": lips, "lids": lids}
-        self._rows = np.unique(np.linspace(0, len(poses) - 1, min(_MOMENTS, len(poses))).round().astype(int))
+        self._rows = evenly_with_ends(range(len(poses)), _MOMENTS)
         self._poses = [poses[row] for row in self._rows]
         self._exact = self._vertices(self._poses)
 

@@ -11,6 +11,7 @@ import numpy as np
 from ...bench.contracts import ByteArray, Progress, no_progress
 from ...bench.io.files import write_json
 from ...bench.progress import counted
+from ...bench.protocol import evenly_with_ends
 from ...bench.specs import CommandResult
 from .settings import TrackSettings
 
@@ -70,9 +71,9 @@ def draw_overlay(tracked: Tracked, cameras: Sequence[str]) -> ByteArray:
 
     clip = tracked.clip
     keys = {(key.timestep, key.camera): key for key in clip.files}
-    timesteps = _spread([residual.timestep for residual in tracked.report.residuals], ROWS)
+    timesteps = evenly_with_ends([residual.timestep for residual in tracked.report.residuals], ROWS)
     subject, rows = PosedSubject.of(clip), []
-    shown = _spread(cameras, COLUMNS)
+    shown = evenly_with_ends(cameras, COLUMNS)
     height, width = clip.image(keys[timesteps[0], shown[0]]).shape[:2]
     for timestep, mesh in subject.each(clip, timesteps):
         row = []
@@ -84,11 +85,6 @@ def draw_overlay(tracked: Tracked, cameras: Sequence[str]) -> ByteArray:
             row += [image, draw_mesh(mesh, clip.head.faces, camera, background=image, opacity=0.6)]
         rows.append(np.concatenate(row, axis=1))
     return np.concatenate(rows)
-
-
-def _spread(values: Sequence[Any], count: int) -> list[Any]:
-    places = np.linspace(0, len(values) - 1, min(count, len(values))).round().astype(int)
-    return [values[place] for place in places]
 
 
 def _text(tracked: Tracked) -> list[str]:

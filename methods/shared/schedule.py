@@ -8,21 +8,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 import torch
 
 from ...bench.contracts import IntArray
 from .config import DensifiedTraining
-
-Item = TypeVar("Item")
-
-
-def evenly(items: Sequence[Item], most: int) -> list[Item]:
-    """Evenly spread items, up to a maximum number, including the first and the last if there are two or more."""
-    rows = np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int))
-    return [items[row] for row in rows]
 
 
 @dataclass(frozen=True)

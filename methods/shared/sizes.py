@@ -17,10 +17,10 @@ import numpy as np
 from ...bench.contracts import Avatar, Budget, Clip, FrameKey, Progress
 from ...bench.io.files import digest
 from ...bench.io.images import quantise
+from ...bench.protocol import evenly_with_ends
 from .config import Capacity
 from .loop import Fit
 from .losses import picture_ssim, psnr, squared_error
-from .schedule import evenly
 
 log = logging.getLogger(__name__)
 Config = TypeVar("Config")
@@ -107,7 +107,7 @@ def choose_sizes(
     if not clip.held_out or not clip.splits["train"]:
         log.warning("only one timestep of training, so none can be held out; the configured sizes are used")
         return config, ()
-    frames = evenly(clip.held_out, FRAMES)
+    frames = evenly_with_ends(clip.held_out, FRAMES)
     budget = Budget(
         _trial_iterations(fit.budget.iterations, capacity.share),
         None if fit.budget.seconds is None else fit.budget.seconds * capacity.share,

@@ -15,6 +15,7 @@ from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, Frame, Frame
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.images import read_pixels
+from ...bench.protocol import evenly_with_ends
 from ...datasets.images import write_image
 from ..shared.avatar_files import TRACKED, write_arrays, write_record
 from ..shared.loop import Fit, TrainingSummary
@@ -226,10 +227,7 @@ class NearestCamera(TrainedMethod[NearestCameraConfig, NearestCameraAvatar]):
     def _timesteps(self, clip: Clip) -> list[int]:
         timesteps = sorted({key.timestep for key in clip.splits["train"]})
         most = self.config.max_timesteps
-        if most is None or most >= len(timesteps):
-            return timesteps
-        chosen = np.linspace(0, len(timesteps) - 1, max(most, 1)).round().astype(int)
-        return [timesteps[number] for number in chosen]
+        return timesteps if most is None else evenly_with_ends(timesteps, max(most, 1))
 
 
 def driving_signal(pose: HeadPose) -> FloatArray:

@@ -7,6 +7,7 @@ from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
 from headbench.bench.io.files import digest
 from headbench.bench.protocol import (
+    evenly_with_ends,
     make_protocol,
     make_protocol_without_truth,
     make_protocols,
@@ -97,3 +98,11 @@ def test_clips_on_different_backgrounds_are_not_one_comparison(toy, clip, tmp_pa
 @pytest.mark.parametrize(("count", "timesteps"), [(1, [1]), (2, [0, 2]), (3, [0, 1, 2]), (9, [0, 1, 2])])
 def test_a_limit_takes_frames_evenly(clip, count, timesteps):
     assert [key.timestep for key in make_protocol("novel_view", [clip], count).keys] == timesteps
+
+
+@pytest.mark.parametrize(
+    ("count", "most", "chosen"),
+    [(0, 3, []), (1, 3, [0]), (5, 1, [0]), (5, 2, [0, 4]), (5, 3, [0, 2, 4]), (5, 9, [0, 1, 2, 3, 4])],
+)
+def test_evenly_spread_items_include_both_ends(count, most, chosen):
+    assert evenly_with_ends(range(count), most) == chosen

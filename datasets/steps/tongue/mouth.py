@@ -27,6 +27,7 @@ from ....bench.contracts import (
 )
 from ....bench.errors import InputError
 from ....bench.machine import processor_count
+from ....bench.protocol import evenly_with_ends
 from ...head.arrays import JOINT_NAMES, region
 from ...head.geometry import vertex_normals
 from ...head.subject import PosedSubject
@@ -219,7 +220,7 @@ def facing_cameras(clip: Clip, atlas: MouthAtlas, count: int) -> list[str]:
     Raises `InputError` if it faces none within 55 degrees.
     """
     timesteps = list(frames_by_timestep(clip))
-    spread = [timesteps[i] for i in np.unique(np.linspace(0, len(timesteps) - 1, 15).round().astype(int))]
+    spread = evenly_with_ends(timesteps, 15)
     cosines: dict[str, list[float]] = {camera: [] for camera in clip.cameras}
     for _, vertices in posed_meshes(clip, spread):
         centre = atlas.points(vertices).mean(axis=0)

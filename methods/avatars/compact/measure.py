@@ -14,12 +14,12 @@ from ....bench.contracts import ByteArray, Clip, HeadAsset, Progress, no_progres
 from ....bench.engine.stored import avatar_digest, open_avatar, write_avatar_record
 from ....bench.errors import InputError
 from ....bench.io.images import quantise
+from ....bench.protocol import evenly_with_ends
 from ....bench.specs import CommandResult
 from ...ours.avatar import OursAvatar
 from ...ours.storage import StoredField
 from ...shared.avatar_files import read_shared_head, save_shared_head
 from ...shared.losses import picture_ssim, psnr, squared_error
-from ...shared.schedule import evenly
 from ...shared.subject_mesh import SubjectMesh
 from .container import Content, write_content
 from .file import COMPACT_FILE, decode, encode, exact_sizes, part_sizes
@@ -177,7 +177,7 @@ class Comparison:
     def __init__(self, clip: Clip, exact: OursAvatar, frames: int, scale: int = 1):
         self._clip, self._scale = clip, scale
         keys = [*clip.splits["novel_view"], *clip.splits["self_reenactment"]]
-        self.keys = evenly(keys, frames)
+        self.keys = evenly_with_ends(keys, frames)
         self._truth = [clip.image(key) for key in self.keys] if scale == 1 else None
         self._exact = self._pictures(exact)
         self.exact = self._quality(self._exact)

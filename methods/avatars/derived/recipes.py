@@ -13,9 +13,9 @@ from torch import Tensor
 
 from ....bench.contracts import Camera, Clip, HeadPose, SplatAvatar
 from ....bench.io.files import write_bytes
+from ....bench.protocol import evenly_with_ends
 from ...ours.field import PLANES
 from ...shared.rendering import USUAL, Cutoffs
-from ...shared.schedule import evenly
 from ...shared.tensor_files import read_safetensors
 from ..views import contribution
 
@@ -109,7 +109,7 @@ VIEWS = 64
 
 def training_views(clip: Clip, count: int = VIEWS) -> list[tuple[Camera, HeadPose]]:
     """At most ``count`` training frames, evenly spread over their sorted keys."""
-    keys = evenly(sorted(clip.splits["train"]), count)
+    keys = evenly_with_ends(sorted(clip.splits["train"]), count)
     return [(clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys]
 
 

@@ -20,6 +20,7 @@ from ....bench.io.files import check_writable, write_text
 from ....bench.io.images import encode_image, quantise
 from ....bench.io.provenance import RENDER, note, source_type, tool
 from ....bench.io.style import policy_hash, stylesheet
+from ....bench.protocol import evenly_with_ends
 from ....bench.specs import CommandResult, ResolutionRule
 from ...shared.avatar_files import read_shared_head
 from ...shared.rendering import view_of
@@ -204,7 +205,7 @@ def _camera(view: Mapping[str, Any], azimuth: float, elevation: float) -> Camera
 
 def _spread(count: int) -> list[int]:
     """At most `MOST_MOMENTS` numbers below ``count``, evenly spread."""
-    return sorted({round(number) for number in np.linspace(0, count - 1, min(count, MOST_MOMENTS))})
+    return evenly_with_ends(range(count), MOST_MOMENTS)
 
 
 def draw(moved: Moved, camera: Camera) -> FloatArray:
