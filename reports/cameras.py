@@ -12,9 +12,7 @@ from ..bench.contracts import FrameKey
 from ..bench.manifest import ClipRecord, Manifest
 
 SPLIT_TASK = "self_reenactment"
-EXPLAINED = (
-    "Seen cameras have training frames of other timesteps; unseen cameras are held out of all training."
-)
+EXPLAINED = "Seen cameras have training frames in the capture, of other timesteps; unseen cameras have none."
 
 
 def unseen_cameras(

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import cv2
 
@@ -126,10 +127,14 @@ def suite_results(folder: Path) -> str:
     return suite_report(_suite_runs(folder), OURS)
 
 
+def _made(manifest: Manifest) -> dict[str, Any]:
+    """What the settings of the captures of a run were, for all subjects alike."""
+    return dict(manifest.clips[0].steps[0]["parameters"]["synthetic"])
+
+
 def suite_options(manifest: Manifest) -> tuple[str, ...]:
     """Options of ``headbench run suite`` that make the captures of a stored run, as it records them."""
-    made = manifest.clips[0].steps[0]["parameters"]["synthetic"]  # of all subjects alike
-    given = {"tracker": "per-frame", **made}
+    given = {"tracker": "per-frame", **_made(manifest)}
     given["size"] = "x".join(map(str, given["size"]))
     names = ("performance", "tracker", "tracking_error", "cameras", "timesteps", "size", "subjects")
     options = [(f"--{name.replace('_', '-')}", str(given[name])) for name in names]
@@ -141,7 +146,8 @@ def suite_options(manifest: Manifest) -> tuple[str, ...]:
 def suite_block(folder: Path) -> str:
     """Return the block for the stored results of the suite: Markdown."""
     runs = RunSet.read([folder / RUN])
-    options = " ".join(suite_options(RunFolder(folder / RUN).read_manifest()))
+    manifest = RunFolder(folder / RUN).read_manifest()
+    options, edition = " ".join(suite_options(manifest)), _made(manifest).get("edition", 1)
     minutes = [value for _, value in _minutes(folder / RUN)]
     hours = sum(value for value in minutes if value is not None) / 60
     interrupted = (
@@ -152,7 +158,7 @@ def suite_block(folder: Path) -> str:
     return (
         f"{to_markdown(table_of(shown, columns=columns)).strip()}\n\n{conclusions(shown)}\n\n"
         f"[SSIM, tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
-        f"The captures are those of `headbench run suite {options}`. "
+        f"The captures are of edition {edition} and have the options `headbench run suite {options}`. "
         f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{interrupted}."
     )
 
@@ -164,8 +170,9 @@ def conclusions(runs: RunSet) -> str:
     """
     runs = runs.by_camera
     primary = primary_comparisons(runs)
-    known = {pair.second for pair in primary}
-    pairs = [(OURS, method) for method in runs.ranked if method not in (OURS, *known)]
+    tested = [pair for pair in primary if pair.p is not None]
+    known = {(pair.second, pair.task, pair.metric) for pair in tested}
+    pairs = [(OURS, method) for method in runs.ranked if method != OURS]
     specs = [spec for spec in runs.metrics if spec.name in SHOWN]
     others = [
         pair
@@ -173,9 +180,10 @@ def conclusions(runs: RunSet) -> str:
         for pair in compare(
             runs.rows, pairs, task=task, metric=spec.name, higher_is_better=spec.higher_is_better
         )
+        if (pair.second, task, spec.name) not in known
     ]
     parts = [
-        (f"Primary endpoints, with Holm's correction over all {len(primary)}:", primary),
+        (f"Primary endpoints, with Holm's correction over all {len(tested)}:", tested),
         ("Exploratory, with Holm's correction for the pairs of each metric alone:", others),
     ]
     texts = [f"{title}\n\n{_conclusions(runs, found)}" for title, found in parts if found]
@@ -199,7 +207,8 @@ def _conclusions(runs: RunSet, pairs: Sequence[PairedComparison]) -> str:
 
 
 def _conclusion(pair: PairedComparison, unit: str) -> str:
-    within = f" (equivalent within {pair.margin:g} {unit})" if pair.equivalent else ""
+    shown = "equivalent" if pair.equivalent else "equivalence not shown"
+    within = "" if pair.margin is None else f" ({shown} within {f'{pair.margin:g} {unit}'.rstrip()})"
     if pair.verdict.endswith(" is better"):
         first, second = f"`{pair.first}`", f"`{pair.second}`"
         better, worse = (first, second) if pair.verdict.startswith(f"{pair.first} ") else (second, first)

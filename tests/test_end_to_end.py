@@ -174,7 +174,7 @@ def cell(method):
 
 OTHERS = "synth --out others --subjects 2 --cameras 2 --timesteps 4 --size 24x32"
 PLAIN = "run --data {capture} --out plain --methods mean-image,nearest-camera --preset smoke --set metrics=psnr,ssim,fps --set frames_per_task=3"
-SUITE = "run suite --out suite --methods mean-image --preset smoke --subjects 1 --cameras 2 --timesteps 60 --size 32x32"
+SUITE = "run suite --out suite --methods mean-image --preset smoke --subjects 1 --cameras 2 --timesteps 60 --size 16x16 --large 1"
 GATE = "compare plain --baseline baseline.json"
 RECORD = "export nersemble {capture} --out recording"
 PREPARE = "prepare nersemble --root recording/recording --tracking recording/tracking --head recording/head_model.npz"

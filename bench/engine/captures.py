@@ -149,7 +149,7 @@ def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dic
     arguments = {name: default for name, default in defaults.items() if name not in given}
     return arguments | build_arguments(
         make,
-        {key: value for key, value in recorded.items() if key != "style"},
+        {"edition": 1, **{key: value for key, value in recorded.items() if key != "style"}},
         where,
         harness=given,
     )

@@ -77,7 +77,7 @@ class SuiteSettings(ExecutionOptions):
 
     large: int = 0
     """Number of subjects, from the first, that are also rendered at twice the size, with a run and tables of their own, without
-    conditions. Each takes about 4 processor hours to render, four times as long as at the usual size."""
+    conditions. Each takes about half a processor hour to render, twice as long as at the usual size."""
 
     cameras: int = 16
     """Views of each, the held-out one included."""

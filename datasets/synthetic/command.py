@@ -47,7 +47,7 @@ class SynthSettings(ExecutionOptions):
     """`natural` has the speeds, blinks, gaze and correlations of tracked recordings, at every n-th frame of a video; from 59
     timesteps it plays every sequence and holds out speech and three parts of FREE, each scored as a sequence: seen, recombined
     and beyond the range of training. `full` and `parts` are the smooth performances of earlier editions, without and with these
-    parts. Of them `expressions` has no jaw and tongue motion, and `still` moves only head, neck and eyes."""
+    parts. `expressions` is `full` without motion of jaw and tongue, and `still` moves only head, neck and eyes."""
     dynamics: float = 1.0
     """Scale of wrinkles and blush, 0 to 3."""
     tracking_error: float = 0.0

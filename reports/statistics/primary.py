@@ -38,7 +38,10 @@ def primary_comparisons(runs: RunSet) -> list[PairedComparison]:
 def primary_section(runs: RunSet) -> str:
     """The primary endpoints as Markdown, and what the other tests of a page are."""
     found = primary_comparisons(runs)
-    exploratory = "All other tests on this page are exploratory: they are corrected over the comparisons of one metric and task alone."
+    exploratory = (
+        "All other tests on this page are exploratory: they are corrected over the comparisons of one metric and task alone, "
+        "those of the endpoints among them."
+    )
     if not found:
         return f"## Primary endpoints\n\nNone: they compare `{PAIR[0]}` with `{PAIR[1]}`. {exploratory}"
     specs = {spec.name: spec for spec in runs.metrics}
@@ -57,7 +60,8 @@ def primary_section(runs: RunSet) -> str:
         lines.append([head, *numbers, c.verdict, equivalence_text(c, spec.unit)])
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     how = (
-        f"Exact sign-flip tests over subjects, Holm over all {len(found)} endpoints; equivalence by two one-sided sign-flip tests, "
-        f"Holm over these; level {LEVEL:.0%}. {exploratory}"
+        f"Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in found)} endpoints that can be tested; "
+        "equivalence by two one-sided sign-flip tests, which assume that subjects differ symmetrically about the mean, Holm over "
+        f"these; level {LEVEL:.0%}. {exploratory}"
     )
     return f"## Primary endpoints\n\n{table}\n\n{how}"

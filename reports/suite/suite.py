@@ -37,11 +37,11 @@ def suite_report(runs: Sequence[Path], method: str) -> str:
     method : str
         Label of the method that others are compared with.
     """
-    parts = [_tables(RunSet.read([folder]), method) for folder in runs]
+    parts = [_tables(RunSet.read([folder]), method, primary=folder == runs[0]) for folder in runs]
     return f"\n# {LARGE}\n\n".join(parts)
 
 
-def _tables(read: RunSet, method: str) -> str:
+def _tables(read: RunSet, method: str, *, primary: bool) -> str:
     whole = read.by_camera
     changed = [label for label, record in whole.records.items() if record.condition]
     runs = whole.only([label for label in whole.records if label not in changed])
@@ -49,7 +49,7 @@ def _tables(read: RunSet, method: str) -> str:
     parts = {"All frames": FrameSelection()}
     parts |= {f"Region {region}": FrameSelection(region) for region in sorted(runs.rows.regions - {FULL})}
     parts |= {f"Sequence {name}": FrameSelection(sequences=(name,)) for name in tested}
-    sections = [primary_section(runs)]
+    sections = [primary_section(runs)] if primary else []
     sections += [_section(title, runs.of(part), method) for title, part in parts.items()]
     regions = (FULL, *({"face"} & runs.rows.regions))
     tracked = {whole.records[label].name: label for label in changed if _is_tracked(whole, label)}

@@ -222,6 +222,7 @@ def _make_capture(settings: ParitySettings, out: Path, progress: Progress) -> No
             cameras=settings.cameras,
             timesteps=settings.timesteps,
             size=size,
+            performance="full",  # that of the published figures of parity
             progress=progress,
         )
 
