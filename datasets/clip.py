@@ -90,6 +90,11 @@ class CaptureClip:
     read_background: FloatArray | None = None
     source: Clip | None = None
 
+    @cached_property
+    def frame_at(self) -> Mapping[tuple[int, str], FrameKey]:
+        """The frame of each timestep and camera, excluded ones among them."""
+        return {(key.timestep, key.camera): key for key in self.files}
+
     def __repr__(self) -> str:
         cameras, frames = len(self.cameras), {name: len(keys) for name, keys in self.splits.items()}
         return f"{type(self).__name__}({self.subject!r}, cameras: {cameras}, frames: {frames})"

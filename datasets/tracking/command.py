@@ -70,16 +70,15 @@ def draw_overlay(tracked: Tracked, cameras: Sequence[str]) -> ByteArray:
     from ..mesh_pictures import draw_mesh
 
     clip = tracked.clip
-    keys = {(key.timestep, key.camera): key for key in clip.files}
     timesteps = evenly_with_ends([residual.timestep for residual in tracked.report.residuals], ROWS)
     subject, rows = PosedSubject.of(clip), []
     shown = evenly_with_ends(cameras, COLUMNS)
-    height, width = clip.image(keys[timesteps[0], shown[0]]).shape[:2]
+    height, width = clip.image(clip.frame_at[timesteps[0], shown[0]]).shape[:2]
     for timestep, mesh in subject.each(clip, timesteps):
         row = []
         for name in shown:
             camera = clip.cameras[name].resized(width, height)
-            image = clip.image(keys[timestep, name])
+            image = clip.image(clip.frame_at[timestep, name])
             if image.shape[:2] != (height, width):
                 continue
             row += [image, draw_mesh(mesh, clip.head.faces, camera, background=image, opacity=0.6)]

@@ -213,7 +213,6 @@ class NetworkLandmarks:
         self, network: LandmarkNetwork, embedding: Embedding, clip: CaptureClip, cameras: Sequence[str]
     ):
         self._network, self._embedding, self._clip, self._cameras = network, embedding, clip, [*cameras]
-        self._keys = {(key.timestep, key.camera): key for key in clip.files}
         self._views = Views([clip.cameras[name] for name in cameras])
         self._rest, self._normals = _rest(clip.head, embedding)
 
@@ -223,7 +222,7 @@ class NetworkLandmarks:
         for column, name in enumerate(self._cameras):
             near = None
             for row, timestep in enumerate(timesteps):
-                image = self._clip.image(self._keys[timestep, name])
+                image = self._clip.image(self._clip.frame_at[timestep, name])
                 trials: list[FloatArray | None] = [None] if near is None else [near, None]
                 for tried in trials:
                     near = self._network.find(image, tried)

@@ -106,11 +106,10 @@ def track(
     """
     where = f"clip of {clip.subject}"
     check_cameras(clip, cameras)
-    keys = {(key.timestep, key.camera): key for key in clip.files}
-    timesteps = sorted({timestep for timestep, _ in keys})
+    timesteps = sorted({timestep for timestep, _ in clip.frame_at})
     if not timesteps:
         raise InputError(where, "timesteps", "at least one frame", "none")
-    missing = [(t, name) for t in timesteps for name in cameras if (t, name) not in keys]
+    missing = [(t, name) for t in timesteps for name in cameras if (t, name) not in clip.frame_at]
     if missing:
         found = f"none at timestep {missing[0][0]} of camera {missing[0][1]}"
         raise InputError(where, "frames", "an image of every camera at every timestep", found)
@@ -129,7 +128,9 @@ def track(
             raise InputError(where, "landmarks", "a face in some image", "none")
         begin = time.perf_counter()
         fitter = Fitter(clip.head, views, landmarks)
-        stack = FrameStack([clip.image(keys[timestep, name]) for timestep in part for name in cameras])
+        stack = FrameStack(
+            [clip.image(clip.frame_at[timestep, name]) for timestep in part for name in cameras]
+        )
         keep = shape is not None
         state = fitter.fit_landmarks(fitter.start(shape), keep_shape=keep)
 
