@@ -132,22 +132,24 @@ def _made(manifest: Manifest) -> dict[str, Any]:
     return dict(manifest.clips[0].steps[0]["parameters"]["synthetic"])
 
 
-def suite_options(manifest: Manifest) -> tuple[str, ...]:
-    """Options of ``headbench run suite`` that make the captures of a stored run, as it records them."""
+def suite_options(folder: Path) -> tuple[str, ...]:
+    """Options of ``headbench run suite`` that make the captures of stored runs, as these record them."""
+    manifest, *large = (RunFolder(run).read_manifest() for run in _suite_runs(folder))
     given = {"tracker": "per-frame", **_made(manifest)}
     given["size"] = "x".join(map(str, given["size"]))
     names = ("performance", "tracker", "tracking_error", "cameras", "timesteps", "size", "subjects")
     options = [(f"--{name.replace('_', '-')}", str(given[name])) for name in names]
     tracked = [each for each in manifest.methods if each.condition == TRACKED]
     named = [each.name for each in tracked] or [NONE]
+    options.append(("--large", str(sum(len(each.clips) for each in large))))
     return tuple(word for option in options for word in option) + ("--tracked", *named)
 
 
 def suite_block(folder: Path) -> str:
     """Return the block for the stored results of the suite: Markdown."""
     runs = RunSet.read([folder / RUN])
-    manifest = RunFolder(folder / RUN).read_manifest()
-    options, edition = " ".join(suite_options(manifest)), _made(manifest).get("edition", 1)
+    options = " ".join(suite_options(folder))
+    edition = _made(RunFolder(folder / RUN).read_manifest()).get("edition", 1)
     minutes = [value for _, value in _minutes(folder / RUN)]
     hours = sum(value for value in minutes if value is not None) / 60
     interrupted = (

@@ -69,7 +69,7 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
         large = replace(
             config, data=str(out / "capture-large"), out=str(out / LARGE_RUN), conditions=(PLAIN,)
         )
-        parts.append((large, settings.large, (2 * width, 2 * height)))
+        parts.append((large, min(settings.large, settings.subjects), (2 * width, 2 * height)))
     runs: list[Path] = []
     failed: list[str] = []
     ends = []
