@@ -18,6 +18,7 @@ from headbench.bench.audit.settings import VerifySettings
 from headbench.bench.audit.verify import verify_run
 from headbench.bench.errors import ExitCode
 from headbench.bench.protocol import Protocol
+from headbench.datasets.synthetic.plan import EDITION
 from headbench.reports.leaderboard import submissions
 from headbench.reports.leaderboard.page import build
 from headbench.reports.leaderboard.settings import LeaderboardSettings
@@ -147,6 +148,7 @@ def synthetic(**changes):
         "timesteps": 6,
         "subjects": 1,
         "seed": 5,
+        "edition": EDITION,
         **changes,
     }
     settings = {name: value for name, value in made.items() if value is not None}
@@ -384,6 +386,7 @@ def test_equal_renders_of_two_bundles_are_pointed_out(verdicts):
         ({"seed": -1}, "--seed: expected a whole number from 0"),
         ({"samples_per_pixel": 10**9}, "--samples: expected"),
         ({"head": "procedural/../../x"}, "--head"),
+        ({"edition": None}, f"edition: expected {EDITION}, .* found 1"),
     ],
 )
 def test_a_capture_is_made_again_within_limits(honest, tmp_path, changes, expected):
