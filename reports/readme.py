@@ -25,6 +25,7 @@ from ..bench.manifest import Manifest
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from .runs import RunSet
+from .statistics.command import equivalence_text
 from .statistics.comparisons import PairedComparison, compare
 from .statistics.primary import primary_comparisons
 from .suite.suite import suite_report
@@ -149,7 +150,7 @@ def suite_block(folder: Path) -> str:
     """Return the block for the stored results of the suite: Markdown."""
     runs = RunSet.read([folder / RUN])
     options = " ".join(suite_options(folder))
-    edition = _made(RunFolder(folder / RUN).read_manifest()).get("edition", 1)
+    edition = _made(runs.runs[0].manifest).get("edition", 1)
     minutes = [value for _, value in _minutes(folder / RUN)]
     hours = sum(value for value in minutes if value is not None) / 60
     interrupted = (
@@ -209,8 +210,8 @@ def _conclusions(runs: RunSet, pairs: Sequence[PairedComparison]) -> str:
 
 
 def _conclusion(pair: PairedComparison, unit: str) -> str:
-    shown = "equivalent" if pair.equivalent else "equivalence not shown"
-    within = "" if pair.margin is None else f" ({shown} within {f'{pair.margin:g} {unit}'.rstrip()})"
+    tested = equivalence_text(pair, unit, p=False)
+    within = f" ({tested})" if tested else ""
     if pair.verdict.endswith(" is better"):
         first, second = f"`{pair.first}`", f"`{pair.second}`"
         better, worse = (first, second) if pair.verdict.startswith(f"{pair.first} ") else (second, first)

@@ -91,6 +91,7 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
         runs.append(Path(part.out))
         failed += rows.failed
         ends.append(closing(runs[-1], rows))
+        # After each run: the tables of the first, which took hours, do not wait for the second.
         text = resolve(get("reports", "suite").implementation)(runs, OURS)
         write_text(out / "results.md", text)
     data = {"out": out, "run": runs[0], "failed": sorted({*failed})}

@@ -76,7 +76,7 @@ class SuiteSettings(ExecutionOptions):
     methods, 8 for five methods, 9 for ten ablations."""
 
     large: int = 2
-    """At most so many subjects, from the first, are also rendered at twice the size, with a run and tables of their own, without
+    """At most this many subjects, from the first, are also rendered at twice the size, with a run and tables of their own, without
     conditions. Each takes about half a processor hour to render, twice as long as at the usual size."""
 
     cameras: int = 16

@@ -189,17 +189,15 @@ def _plain(comparison: PairedComparison) -> dict[str, Any]:
     }
 
 
-def equivalence_text(comparison: PairedComparison, unit: str) -> str:
-    """Outcome of the test of equivalence in words; "" without one."""
+def equivalence_text(comparison: PairedComparison, unit: str, *, p: bool = True) -> str:
+    """Outcome of the test of equivalence in words, with its p-value; "" without one."""
     if comparison.margin is None or comparison.p_equivalence_holm is None:
         return ""
     within = f"{comparison.margin:g} {unit}".rstrip()
-    p = f"(Holm {comparison.p_equivalence_holm:.4f})"
-    return (
-        f"equivalent within {within} {p}"
-        if comparison.equivalent
-        else f"equivalence within {within} not shown {p}"
+    text = (
+        f"equivalent within {within}" if comparison.equivalent else f"equivalence within {within} not shown"
     )
+    return f"{text} (Holm {comparison.p_equivalence_holm:.4f})" if p else text
 
 
 def _csv(comparisons: Sequence[dict[str, Any]]) -> str:

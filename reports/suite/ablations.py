@@ -12,10 +12,6 @@ from ..statistics.comparisons import LEVEL, PairedComparison, compare, subjects_
 from ..table_report import table_of
 from ..tables import Table, TableCell, TableRow
 
-CROSSED = (
-    "Ablation minus method in novel views, minus the same difference in self-reenactment: mean over subjects and its "
-    f"{100 * (1 - LEVEL):g} % interval. It is 0 where an ablation changes both tasks alike."
-)
 FIRST_TASK = "novel_view"
 
 
@@ -29,7 +25,10 @@ def ablation_table(runs: RunSet, method: str, *, crossed: bool = False) -> Table
     """
     names = {label: record.condition for label, record in runs.records.items() if record.condition}
     pairs = [(label, method) for label in names]
-    meaning = CROSSED if crossed else meaning_of("Ablation minus method")
+    meaning = meaning_of("Ablation minus method")
+    if crossed:
+        both = "Ablation minus method in novel views, minus the same difference in self-reenactment"
+        meaning = f"{meaning_of(both)} It is 0 where an ablation changes both tasks alike."
     return difference_table(runs, pairs, names, "Ablations", meaning, "ablations", crossed=crossed)
 
 
