@@ -132,6 +132,8 @@ class MethodSpec:
     variants : str
         "package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]`` for
         ``headbench run sweep``: variants of a trained avatar that need no training; "" for none.
+    ablations : Mapping[str, Mapping[str, Any]]
+        Settings by name that leave out or change one part of the method, for ``headbench run suite --ablations``.
     devices : tuple[str, ...]
         Supported kinds of devices, such as "cpu"; empty means any. A run on another device is
         refused.
@@ -161,6 +163,7 @@ class MethodSpec:
     default: bool = False
     demo: bool = False
     variants: str = ""
+    ablations: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     renders: str = ""
     devices: tuple[str, ...] = ()
     needs: str = ""

@@ -81,7 +81,8 @@ class Lines:
         "paper" takes jaw bases from training poses, seeded with the identity. "official" draws them
         from held-out poses as the authors' program does: a leak, for comparison with it only.
     bounds : Literal['head', 'face']
-        Box in which splats have dynamic opacity: the "head" (whole mesh) or the "face" region.
+        Box in which splats have dynamic opacity: the "face" region, as in the paper's supplement, or the
+        "head" (whole mesh), as in the authors' program.
     start : int
         Iteration (published scale) at which lines and penalty start.
     lr, network_lr : float
@@ -95,7 +96,7 @@ class Lines:
     expressions: int = 80
     jaw_bases: int = 16
     jaw_bases_variant: Literal["paper", "official"] = "paper"
-    bounds: Literal["head", "face"] = "head"
+    bounds: Literal["head", "face"] = "face"
     start: int = 60_000
     lr: float = 2e-3
     network_lr: float = 1e-4

@@ -28,7 +28,7 @@ from .appearance import OursAppearance, outer_layers_start
 from .avatar import OursAvatar
 from .capacity import CapacityPlan, plan_capacity
 from .config import OursConfig
-from .spec import OURS as SPEC
+from .spec import OURS, OURS_PLUS
 from .storage import FIELD_FILE, write_field
 
 log = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 class Ours(TrainedMethod[OursConfig, OursAvatar]):
     """The method: see the module."""
 
-    name, version = SPEC.name, SPEC.version
+    name, version = OURS.name, OURS.version
     config_class, avatar_class = OursConfig, OursAvatar
     _plan: CapacityPlan | None = None
 
@@ -101,6 +101,12 @@ class Ours(TrainedMethod[OursConfig, OursAvatar]):
         clusters = cluster_expressions(clip, count, seed=seed, variant=variant)
         timesteps = np.array([key.timestep for key in keys])
         return Weighted(balanced_weights(timesteps, clusters.by_timestep), seed)
+
+
+class OursPlus(Ours):
+    """The method with the additions of `spec.ADDITIONS`, which its presets have."""
+
+    name, version = OURS_PLUS.name, OURS_PLUS.version
 
 
 def _mesh(clip: Clip, device: str) -> SubjectMesh:

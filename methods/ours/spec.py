@@ -1,40 +1,66 @@
-"""Spec of "ours". Light: the implementation is not imported."""
+"""Specs of "ours" and "ours-plus". Light: the implementation is not imported."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from ...bench.specs import MethodSpec
 from ..shared.config import splat_presets
 
 SHORT: dict[str, Any] = {
-    "planes": {
-        "lr": 8e-3,
-        "network_lr": 1.5e-3,
-        "residual_lr": 1e-2,
-        "direction_smoothing": 0.3,
-        "move_splats": False,
-    },
-    "lines": {"lr": 2e-2, "network_lr": 1e-3, "bounds": "face"},
-    "penalty": {"weight": 1e-3, "softness": 0.1},
-    "capacity": {"mode": "auto"},
+    "planes": {"lr": 8e-3, "network_lr": 1.5e-3},
+    "lines": {"lr": 2e-2, "network_lr": 1e-3},
     "sh_dc_lr": 0.02,
     "sh_rest_lr": 1e-3,
-    "storage": "compact",
 }
-"""Settings of runs much shorter than published (docs/explanation/methods/ours.md, "Presets")."""
+"""Learning rates of runs much shorter than published (docs/explanation/methods/ours.md, "Presets")."""
+
+ADDITIONS: Mapping[str, Mapping[str, Any]] = {
+    "weak-penalty": {"penalty": {"weight": 1e-3, "softness": 0.1}},
+    "own-colors": {"planes": {"residual_lr": 1e-2}},
+    "smooth-directions": {"planes": {"direction_smoothing": 0.3}},
+    "fixed-positions": {"planes": {"move_splats": False}},
+    "planned-sizes": {"capacity": {"mode": "auto"}},
+}
+"""What "ours-plus" adds to the published method, by name."""
+
+ABLATIONS: Mapping[str, Mapping[str, Any]] = {
+    "no-lines": {"lines": {"enabled": False}},
+    "lines-move-splats": {"lines": {"dynamic": ["position", "rotation", "scale"]}},
+    "no-penalty": {"penalty": {"weight": 0.0}},
+    "no-balanced-sampling": {"sampling": {"balanced": False}},
+    "harmonics": {"color": "sh"},
+    "official": {"lines": {"bounds": "head"}},
+    **ADDITIONS,
+}
+"""The first two are the paper's Table 4; "official" is the choice of the authors' program, lines in the whole head."""
+
+
+def _with_additions(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of "ours" and, in each group, those of all additions."""
+    result = dict(settings)
+    for groups in ADDITIONS.values():
+        for group, values in groups.items():
+            result[group] = {**result.get(group, {}), **values}
+    return result
+
+
+PAPER: dict[str, Any] = {"planes": {"bounds_variant": "paper"}}
 
 OURS = MethodSpec(
     name="ours",
     default=True,
     demo=True,
-    version="3",
+    version="4",
     summary="Mesh-bound splats with tri-plane colour and expression-driven opacity along feature lines.",
     implementation="headbench.methods.ours.method:Ours",
     config="headbench.methods.ours.config:OursConfig",
     needs="headbench.methods.shared.needs:splats",
     variants="headbench.methods.avatars.derived.ours_variants:variants",
-    presets=splat_presets(SHORT, {"planes": {"bounds_variant": "paper"}}),
+    ablations=ABLATIONS,
+    presets=splat_presets(SHORT, PAPER),
     source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
     "CVPR 2025, arXiv 2504.14967",
     bibtex=r"""@inproceedings{wang2025compact,
@@ -44,4 +70,16 @@ OURS = MethodSpec(
   year      = {2025},
   eprint    = {2504.14967},
 }""",
+)
+
+OURS_PLUS = replace(
+    OURS,
+    name="ours-plus",
+    default=False,
+    demo=False,
+    ablations={},
+    summary="The method ours with headbench's additions: weak penalty, colours of splats, smoothed directions, planned sizes.",
+    implementation="headbench.methods.ours.method:OursPlus",
+    presets=splat_presets(_with_additions(SHORT), _with_additions(PAPER)),
+    source=f"Additions by headbench to {OURS.source}",
 )

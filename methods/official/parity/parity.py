@@ -158,8 +158,8 @@ def as_theirs(native: str, iterations: int, samples: int) -> dict[str, Any]:
     """Settings that make a native run of any length equivalent to the run of the authors' program.
 
     ``samples`` is the initial number of splats of gbs. The authors' program raises the harmonics' degree every 1,000
-    iterations regardless of the length, removes large splats from the first regular reset of opacities, and here uses
-    all images equally often.
+    iterations regardless of the length, removes large splats from the first regular reset of opacities, has lines in
+    the whole head (those of ours), and here uses all images equally often.
     """
     if native == "gbs":
         errors = {"correctives_variant": "official", "lower_teeth_variant": "official"}
@@ -171,7 +171,7 @@ def as_theirs(native: str, iterations: int, samples: int) -> dict[str, Any]:
     settings: dict[str, Any] = {"splats": {"prune_extent_from": moment}}
     if native == "ga":
         return {**settings, "min_sh_every": 1_000}
-    return {**settings, "sampling": {"balanced": False}}
+    return {**settings, "sampling": {"balanced": False}, "lines": {"bounds": "head"}}
 
 
 def differences_of(rows: Rows, native: str, official: str, orders: Sequence[int]) -> list[Difference]:

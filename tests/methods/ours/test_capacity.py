@@ -25,7 +25,7 @@ from .toy import changed
 SMALL = OursConfig(
     splats=SplatTraining(max_splats=2000, min_densify_every=40, min_settle=20),
     hidden=16,
-    lines=Lines(resolution=8, channels=4),
+    lines=Lines(resolution=8, channels=4, bounds="head"),
     penalty=Penalty(face_mm=0.1, other_mm=0.2),
     capacity=PlannedCapacity(mode="auto"),
 )
