@@ -66,6 +66,9 @@ class Condition:
         Changes of the method's settings, laid over those of the run.
     budget : str
         Part of the method's budget, above 0 and at most 1, such as "1/4".
+    as_tracked : bool
+        The method gets the head model, neck, static offset and cameras of the capture, without the conversion to a head model and to
+        one video that it usually has (`MethodSpec.conversion`).
     clip : Named
         Change of the clip that the method is trained on; the frames that are scored stay those of the run.
     derive : Named
@@ -78,6 +81,7 @@ class Condition:
     methods: tuple[str, ...] = ()
     settings: dict[str, Any] = field(default_factory=dict)
     budget: str = "1"
+    as_tracked: bool = False
     clip: Named = field(default_factory=Named)
     derive: Named = field(default_factory=Named)
     drive: Named = field(default_factory=Named)

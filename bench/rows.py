@@ -228,6 +228,11 @@ class Rows:
         """Subjects of the rows."""
         return set(self._table["subject"].unique())
 
+    def subjects_of(self, methods: Collection[str]) -> dict[str, frozenset[str]]:
+        """Subjects that each method has rows of."""
+        pairs = self._table[["method", "subject"]].drop_duplicates()
+        return {name: frozenset(map(str, pairs.loc[pairs["method"] == name, "subject"])) for name in methods}
+
     def seeds(self, method: str | All) -> set[int]:
         """Seeds of a method."""
         known = self._seeds
@@ -264,6 +269,12 @@ class Rows:
     def renamed(self, labels: Mapping[str, str]) -> Rows:
         """The same rows, every method under another name."""
         return Rows(self._table.assign(method=[labels[str(name)] for name in self._table["method"]]))
+
+    def of_protocols(self, hashes: Mapping[str, str]) -> Rows:
+        """The same rows with other protocols, by their hashes; those that are not named keep theirs."""
+        return Rows(
+            self._table.assign(protocol=[hashes.get(str(h), str(h)) for h in self._table["protocol"]])
+        )
 
     def labelled(self) -> Rows:
         """The same rows with `label_of` of method and condition as the method: each label is an entry of a table."""
@@ -366,6 +377,10 @@ class Rows:
     def of_methods(self, names: Collection[str]) -> Rows:
         """The rows of some methods."""
         return Rows(self._table[self._table["method"].isin(list(names))])
+
+    def of_subjects(self, names: Collection[str]) -> Rows:
+        """The rows of some subjects."""
+        return Rows(self._table[self._table["subject"].isin(list(names))])
 
     def of_metrics(self, names: Sequence[str]) -> Rows:
         """The rows of some metrics, in the order of ``names``."""

@@ -112,6 +112,9 @@ class MethodSpec:
     monocular : bool
         Whether the method needs the views as one video, one frame per timestep, with the rigid head
         motion in the cameras.
+    conversion : Literal['required', 'published']
+        Why the method has ``head_models`` and ``monocular``: it works with nothing else, or they follow the publication
+        alone and `Condition.as_tracked` may leave the conversion out.
     resolution : ResolutionRule
         The image size that the method works at.
     preset_resolutions : Mapping[str, ResolutionRule]
@@ -155,6 +158,7 @@ class MethodSpec:
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     head_models: tuple[str, ...] = ()
     monocular: bool = False
+    conversion: Literal["required", "published"] = "required"
     native: bool = True
     version: str = "1"
     source: str = ""

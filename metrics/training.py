@@ -32,6 +32,26 @@ TRAINING_MEMORY = replace(
     summary="Largest resident memory of the training process.",
 )
 
+TRAINING_PROCESSOR = replace(
+    TRAINING_TIME,
+    name="training_processor",
+    label="Training, all threads",
+    unit="s",
+    digits=0,
+    implementation="headbench.metrics.training:training_processor",
+    summary="Processor time of the training, all threads together.",
+)
+TRAINING_ITERATIONS = replace(
+    TRAINING_TIME,
+    name="training_iterations",
+    label="Iterations",
+    unit="",
+    digits=0,
+    machine_bound=False,
+    implementation="headbench.metrics.training:training_iterations",
+    summary="Iterations of the training.",
+)
+
 
 def training_time(record: Mapping[str, Any]) -> Measurement:
     """Minutes of wall clock from the start of the fit to its end.
@@ -48,6 +68,28 @@ def training_time(record: Mapping[str, Any]) -> Measurement:
     load = record.get("load", {})
     known = {name: float(load[name]) for name in ("threads", "cores", "other_cores") if name in load}
     return Measurement(seconds / 60, {"seconds": seconds, **known})
+
+
+def training_processor(record: Mapping[str, Any]) -> Measurement:
+    """Seconds of processor time from the start of the fit to its end, all threads and finished child processes together.
+
+    Raises `UnavailableError` if the training was interrupted, as `training_time` does.
+    """
+    details = training_time(record).details
+    return Measurement(
+        _number(record, "processor_seconds"), {k: v for k, v in details.items() if k != "seconds"}
+    )
+
+
+def training_iterations(record: Mapping[str, Any]) -> Measurement:
+    """Iterations that the training was given.
+
+    Raises `UnavailableError` for a budget in seconds alone.
+    """
+    budget = record.get("method", {}).get("budget", {})
+    if budget.get("iterations") is None:
+        raise UnavailableError("The budget was in seconds.", "Name iterations for their number.")
+    return Measurement(float(budget["iterations"]), {})
 
 
 def training_memory(record: Mapping[str, Any]) -> Measurement:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from ..bench.audit.bundle import without_paths
 from ..bench.engine.scoring import FULL
 from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
-from ..bench.experiments.suite_settings import LARGE_RUN, NONE, RUN, TRACKED
+from ..bench.experiments.suite_settings import EQUAL, NONE, TRACKED
 from ..bench.io.files import write_bytes, write_text
 from ..bench.io.images import encode_image, read_png
 from ..bench.manifest import Manifest
@@ -28,7 +28,7 @@ from .runs import RunSet
 from .statistics.command import equivalence_text
 from .statistics.comparisons import PairedComparison, compare
 from .statistics.primary import primary_comparisons
-from .suite.suite import suite_report
+from .suite.suite import suite_report, suite_runs
 from .table_report import Columns, table_of, table_text
 from .writers import to_markdown
 
@@ -56,8 +56,8 @@ def publish_demo(out: Path, root: Path) -> None:
 def publish_suite(out: Path, root: Path) -> None:
     """Copy manifest and rows of a suite's run to the repository ``root``, and write its tables and block."""
     target = root / SUITE
-    for run in _suite_runs(out):
-        _copy(RunFolder(run), RunFolder(target / run.name))
+    for run in chain(*suite_runs(out)):
+        _copy(RunFolder(run), RunFolder(target / run.relative_to(out)))
     write_text(target / RESULTS, suite_results(target))
     _write(root / PAGES["suite"], "suite", suite_block(target))
 
@@ -117,15 +117,9 @@ def _minutes(run_folder: Path) -> list[tuple[str, float | None]]:
     ]
 
 
-def _suite_runs(folder: Path) -> list[Path]:
-    """Runs of a suite; images of twice the size are optional."""
-    large = folder / LARGE_RUN
-    return [folder / RUN, *([large] if large.exists() else [])]
-
-
 def suite_results(folder: Path) -> str:
-    """All tables of the stored run of the suite."""
-    return suite_report(_suite_runs(folder), OURS)
+    """All tables of the stored runs of the suite."""
+    return suite_report(folder, OURS)
 
 
 def _made(manifest: Manifest) -> dict[str, Any]:
@@ -135,28 +129,33 @@ def _made(manifest: Manifest) -> dict[str, Any]:
 
 def suite_options(folder: Path) -> tuple[str, ...]:
     """Options of ``headbench run suite`` that make the captures of stored runs, as these record them."""
-    manifest, *large = (RunFolder(run).read_manifest() for run in _suite_runs(folder))
-    given = {"tracker": "per-frame", **_made(manifest)}
+    runs, *large = ([RunFolder(run).read_manifest() for run in part] for part in suite_runs(folder))
+    given = {"tracker": "per-frame", **_made(runs[0])}
     given["size"] = "x".join(map(str, given["size"]))
     names = ("performance", "tracker", "tracking_error", "cameras", "timesteps", "size", "subjects")
     options = [(f"--{name.replace('_', '-')}", str(given[name])) for name in names]
-    tracked = [each for each in manifest.methods if each.condition == TRACKED]
-    named = [each.name for each in tracked] or [NONE]
-    options.append(("--large", str(sum(len(each.clips) for each in large))))
-    return tuple(word for option in options for word in option) + ("--tracked", *named)
+    options.append(("--large", str(sum(len(each.clips) for part in large for each in part))))
+    words = [word for option in options for word in option]
+    for option, condition in (("--tracked", TRACKED), ("--equal-iterations", EQUAL)):
+        named = dict.fromkeys(
+            each.name for run in runs for each in run.methods if each.condition == condition
+        )
+        words += [option, *(named or [NONE])]
+    return tuple(words)
 
 
 def suite_block(folder: Path) -> str:
     """Return the block for the stored results of the suite: Markdown."""
-    runs = RunSet.read([folder / RUN])
+    folders = suite_runs(folder)[0]
+    runs = RunSet.read(folders)
     options = " ".join(suite_options(folder))
     edition = _made(runs.runs[0].manifest).get("edition", 1)
-    minutes = [value for _, value in _minutes(folder / RUN)]
+    minutes = [value for each in folders for _, value in _minutes(each)]
     hours = sum(value for value in minutes if value is not None) / 60
     interrupted = (
         f", not counting {minutes.count(None)} that were interrupted and continued" if None in minutes else ""
     )
-    shown = runs.only([*runs.ranked, *runs.trivial])
+    shown = runs.only([*runs.ranked, *runs.trivial]).shared
     columns = Columns((*SHOWN, "storage", "fps"))
     return (
         f"{to_markdown(table_of(shown, columns=columns)).strip()}\n\n{conclusions(shown)}\n\n"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from itertools import product
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Self
@@ -16,7 +17,7 @@ from ..bench.engine.scoring import FULL
 from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
 from ..bench.manifest import Manifest, MethodRecord
-from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, missing_tasks
+from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, joined_protocol, missing_tasks
 from ..bench.rows import ALL, Rows
 from ..bench.specs import MetricSpec
 from .cameras import EXPLAINED, SPLIT_TASK, unseen_cameras
@@ -185,7 +186,8 @@ class RunSet:
     def read(cls, folders: Sequence[Path], part: FrameSelection = WHOLE) -> RunSet:
         """Read runs, or a part of their frames.
 
-        Seeds of the same method with the same settings are merged. A method with other
+        Runs of other subjects are joined: their protocols may differ in clips alone. Seeds and subjects of the same method
+        with the same settings are merged. A method with other
         settings is a separate one, named after the settings that differ ("ours (dynamic=opacity)"), or after
         the folders if that is too long.
 
@@ -198,8 +200,7 @@ class RunSet:
         if not folders:
             raise InputError("runs", "", "at least one folder", "none")
         runs = tuple(RunData.read(folder) for folder in folders)
-        _check_protocols(runs)
-        return cls.of_runs(runs, _labels(runs)).of(part)
+        return cls.of_runs(_with_one_protocol(runs), _labels(runs)).of(part)
 
     @classmethod
     def of_runs(cls, runs: tuple[RunData, ...], labels: Sequence[Mapping[str, str]]) -> RunSet:
@@ -253,6 +254,22 @@ class RunSet:
             keys={task: own for task, own in self.keys.items() if task != SPLIT_TASK} | parts,
             cameras=EXPLAINED,
         )
+
+    @property
+    def shared(self) -> Self:
+        """The same runs with those subjects alone that every label has rows of."""
+        cells = self.rows.subjects_of(self.methods)
+        kept = frozenset.intersection(*cells.values()) if cells else frozenset()
+        if all(found == kept for found in cells.values()):
+            return self
+        keys = {task: frozenset(k for k in own if k.subject in kept) for task, own in self.keys.items()}
+        return replace(self, rows=self.rows.of_subjects(kept), keys=keys)
+
+    @property
+    def without_conditions(self) -> Self:
+        """The same runs, whose methods under conditions are ranked as methods of their own."""
+        records = {label: replace(record, condition="") for label, record in self.records.items()}
+        return replace(self, records=records)
 
     def only(self, labels: Sequence[str]) -> RunSet:
         """The same runs with some of their methods."""
@@ -309,11 +326,25 @@ def _of_part(rows: Rows, part: FrameSelection, file: Path) -> Rows:
     return rows.of_part(part.region, part.sequences, FULL)
 
 
-def _check_protocols(runs: Sequence[RunData]) -> None:
-    first: dict[str, RunData] = {}
-    for run in runs:
-        for task in run.tasks:
-            check_same_protocol(first.setdefault(task, run), run, task)
+def _with_one_protocol(runs: tuple[RunData, ...]) -> tuple[RunData, ...]:
+    """The runs, whose rows have the protocol of all subjects together; see `joined_protocol`."""
+    whole: dict[str, str] = {}
+    for task in dict.fromkeys(task for run in runs for task in run.tasks):
+        own = [run for run in runs if task in run.tasks]
+        if len({run.manifest.protocols[task].hash for run in own}) == 1:
+            continue
+        for index, run in enumerate(own):
+            for earlier in own[:index]:
+                if {*_subjects(run, task)} & {*_subjects(earlier, task)}:
+                    check_same_protocol(earlier, run, task)
+        protocols = [run.manifest.protocols[task].protocol(run.folder.manifest) for run in own]
+        joined = joined_protocol(protocols).hash
+        whole |= {protocol.hash: joined for protocol in protocols}
+    return tuple(replace(run, rows=run.rows.of_protocols(whole)) for run in runs) if whole else runs
+
+
+def _subjects(run: RunData, task: str) -> list[str]:
+    return [subject for subject, _ in run.manifest.protocols[task].clips]
 
 
 def check_same_protocol(first: RunData, run: RunData, task: str) -> None:
@@ -338,11 +369,11 @@ def _metrics(runs: Sequence[RunData]) -> tuple[MetricSpec, ...]:
 
 @dataclass
 class _Training:
-    """A method with its settings, the runs that it is in, by index, and their seeds."""
+    """A method with its settings, the runs that it is in, by index, and its subjects and seeds there."""
 
     record: MethodRecord
     runs: list[int]
-    seeds: set[int]
+    cells: set[tuple[str, int]]
 
 
 def _labels(runs: Sequence[RunData]) -> list[dict[str, str]]:
@@ -350,14 +381,14 @@ def _labels(runs: Sequence[RunData]) -> list[dict[str, str]]:
     trainings: dict[str, list[_Training]] = {}
     for index, run in enumerate(runs):
         for record in run.manifest.methods:
-            seeds = run.rows.seeds(record.label)
+            cells = {*product(sorted(run.rows.subjects), run.rows.seeds(record.label))}
             known = trainings.setdefault(record.label, [])
-            same = next((t for t in known if t.record == record and not t.seeds & seeds), None)
+            same = next((t for t in known if t.record == record and not t.cells & cells), None)
             if same is None:
-                known.append(_Training(record, [index], seeds))
+                known.append(_Training(record, [index], cells))
             else:
                 same.runs.append(index)
-                same.seeds |= seeds
+                same.cells |= cells
     labels: list[dict[str, str]] = [{} for _ in runs]
     for name, known in trainings.items():
         folders = [runs[training.runs[0]].folder.root for training in known]

@@ -308,7 +308,7 @@ def captured_again(manifest: Manifest, out: Path, limit: int, progress: Progress
         captures[digest(arguments)] = f"capture of {clip.subject}", arguments
     total = 0
     for where, arguments in captures.values():
-        factors = (*arguments["size"], *(arguments[name] for name in ("cameras", "timesteps", "subjects")))
+        factors = (*arguments["size"], *(arguments[name] for name in ("cameras", "timesteps")))
         total += math.prod(factors)
         if total > limit or min(factors) < 1:
             expected = f"at most {limit} pixels in all for a bundle of this size"

@@ -133,13 +133,13 @@ def capture_configuration(
 
 
 def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dict[str, Any]:
-    """Settings that reproduce a subject's synthetic capture, all of them, from the steps recorded in its clip.
+    """Settings that reproduce the synthetic capture of one subject, all of them, from the steps recorded in its clip.
 
     Raises `InputError` for a capture that is not synthetic, not of the procedural head, or made by settings that are not
     known here.
     """
     make = resolve(get("datasets", "synthetic").implementation)
-    where, given = f"capture of {subject}", ("out", "pictures", "execution", "workers", "progress")
+    where, given = f"capture of {subject}", ("out", "pictures", "only", "execution", "workers", "progress")
     parameters = steps[0].get("parameters") if steps else None
     recorded = parameters.get("synthetic") if isinstance(parameters, Mapping) else None
     if not isinstance(recorded, Mapping) or not str(recorded.get("head")).startswith("procedural"):
@@ -147,12 +147,13 @@ def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dic
         raise InputError("--data", where, expected, "none", "Name the folder of the capture with --data.")
     defaults = {name: each.default for name, each in inspect.signature(make).parameters.items()}
     arguments = {name: default for name, default in defaults.items() if name not in given}
-    return arguments | build_arguments(
+    found = build_arguments(
         make,
         {"edition": 1, **{key: value for key, value in recorded.items() if key != "style"}},
         where,
         harness=given,
     )
+    return {**arguments, **found, "only": subject}
 
 
 def relative_paths(config: RunConfig) -> dict[str, str]:

@@ -280,6 +280,8 @@ def resolve_cells(config: RunConfig) -> list[tuple[ResolvedMethod, Condition]]:
                 settings = merge(config.settings.get(spec.name, {}), condition.settings)
                 changed = resolve_method(spec, config.preset, settings)
                 changed = replace(changed, spec=replace(changed.spec, name=method.spec.name))
+            if condition.as_tracked:
+                changed = replace(changed, spec=_unconverted(changed.spec, condition.name))
             if condition.part != 1 and changed.budget == Budget():
                 if condition.methods:
                     where = f"conditions, budget of {condition.name}"
@@ -293,6 +295,14 @@ def resolve_cells(config: RunConfig) -> list[tuple[ResolvedMethod, Condition]]:
             labels.add(label)
             cells.append((replace(changed, budget=condition.part_of(changed.budget)), condition))
     return cells
+
+
+def _unconverted(spec: MethodSpec, condition: str) -> MethodSpec:
+    """A method that takes the capture's own head model and views. Raises `InputError` for one that works only with a conversion."""
+    if spec.conversion == "required" and (spec.head_models or spec.monocular):
+        expected = f"methods that work without the conversion of captures, for condition {condition}"
+        raise InputError("settings", "conditions, methods", expected, spec.name)
+    return replace(spec, head_models=(), monocular=False)
 
 
 KINDS = ("clip", "derive", "drive")

@@ -1,21 +1,22 @@
-"""Settings of the suite, and its ablations."""
+"""The suite: its conditions, and a run for each subject."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from ..comparison import closing
 from ..condition import PLAIN, Condition, Named
 from ..contracts import Progress, no_progress
-from ..engine.config import RunConfig, parse_size, resolve_cells, resolve_metrics
+from ..engine.config import RunConfig, parse_size, resolve_cells, resolve_methods, resolve_metrics
 from ..engine.run import check_settings, run
 from ..errors import InputError
 from ..executors.settings import check_executor
 from ..io.files import write_text
 from ..registry import discover, get, resolve
-from ..specs import CommandResult
-from .suite_settings import ABLATIONS, LARGE_RUN, RUN, SEED, TRACKED, SuiteSettings
+from ..specs import CommandResult, MethodSpec
+from .suite_settings import ALL, AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, NONE, RUN, SEED, TRACKED, SuiteSettings
 
 OURS = "ours"
 REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
@@ -25,8 +26,8 @@ REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
 def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandResult:
     """Run the benchmark suite: ten synthetic subjects, all methods, tables by region and part.
 
-    Ablations and tracking from images are conditions of the same run. Images of twice the size have captures and a run of their
-    own, since a mean over subjects has one size. Writes ``results.md`` into ``out``.
+    Every subject has a run of its own, with conditions; subjects are worked on one after another, and the tables of ``results.md``
+    are written after each. Images of twice the size have captures and runs of their own, since a mean over subjects has one size.
 
     Raises
     ------
@@ -37,62 +38,90 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
     methods = settings.methods or tuple(
         name for name, plugin in discover("methods").items() if plugin.spec and plugin.spec.demo
     )
-    if settings.ablations and OURS not in methods:
-        expected = f"{OURS} among them, which --ablations are compared with"
-        raise InputError("command line", "--methods", expected, ", ".join(methods))
-    ablations = [Condition(name, (OURS,), dict(ABLATIONS[name])) for name in settings.chosen]
-    tracked = settings.tracked_of(methods)
-    # A condition without methods would be one of all methods.
-    conditions = [Condition(TRACKED, tracked, clip=Named(TRACKED))] if tracked else []
-    config = RunConfig(
+    plain = RunConfig(
         data=str(out / "capture"),
         out=str(out / RUN),
         methods=methods,
         preset=settings.preset,
         seeds=settings.seeds,
         regions=REGIONS,
-        conditions=(PLAIN, *conditions, *ablations),
         isolation=settings.isolation,
     )
+    config = replace(plain, conditions=(PLAIN, *_conditions(settings, plain)))
     cells = resolve_cells(config)
     resolve_metrics(config)
     check_executor(execution, config.device)
     check_settings(cell for cell in cells if not cell[0].is_isolated(config.isolation))
-    plain = next((m.record() for m, c in cells if m.spec.name == OURS and c == PLAIN), None)
-    for method, condition in cells:
-        if condition.settings and method.record() == plain:
-            expected = f"ablations that change {OURS} of preset {settings.preset}"
-            raise InputError("command line", "--ablations", expected, condition.name)
     width, height = parse_size(settings.size)
-    parts = [(config, settings.subjects, (width, height))]
-    if settings.large:
-        large = replace(
-            config, data=str(out / "capture-large"), out=str(out / LARGE_RUN), conditions=(PLAIN,)
-        )
-        parts.append((large, min(settings.large, settings.subjects), (2 * width, 2 * height)))
-    runs: list[Path] = []
+    large = replace(plain, data=str(out / "capture-large"), out=str(out / LARGE_RUN), conditions=(PLAIN,))
     failed: list[str] = []
-    ends = []
-    for part, subjects, size in parts:
-        resolve(get("datasets", "synthetic").implementation)(
-            part.data,
-            subjects=subjects,
-            cameras=settings.cameras,
-            timesteps=settings.timesteps,
-            size=size,
-            seed=SEED,
-            performance=settings.performance,
-            tracking_error=settings.tracking_error,
-            tracker=settings.tracker,
-            execution=execution,
-            progress=progress,
-        )
-        rows = run(part, execution)
-        runs.append(Path(part.out))
-        failed += rows.failed
-        ends.append(closing(runs[-1], rows))
-        # After each run: the tables of the first, which took hours, do not wait for the second.
-        text = resolve(get("reports", "suite").implementation)(runs, OURS)
-        write_text(out / "results.md", text)
-    data = {"out": out, "run": runs[0], "failed": sorted({*failed})}
+    ends: list[str] = []
+    runs: list[Path] = []
+    for place in range(settings.first - 1, settings.subjects):
+        parts = [(config, (width, height))]
+        if place < settings.large:
+            parts.append((large, (2 * width, 2 * height)))
+        for part, size in parts:
+            (capture,) = resolve(get("datasets", "synthetic").implementation)(
+                part.data,
+                subjects=settings.subjects,
+                only=place,
+                cameras=settings.cameras,
+                timesteps=settings.timesteps,
+                size=size,
+                seed=SEED,
+                performance=settings.performance,
+                tracking_error=settings.tracking_error,
+                tracker=settings.tracker,
+                execution=execution,
+                progress=progress,
+            )
+            own = replace(part, data=str(capture), out=str(Path(part.out) / f"{place + 1:02d}"))
+            rows = run(own, execution)
+            runs.append(Path(own.out))
+            failed += rows.failed
+            ends.append(closing(runs[-1], rows))
+            text = resolve(get("reports", "suite").implementation)(out, OURS)
+            write_text(out / "results.md", text)
+    data = {"out": out, "runs": runs, "failed": sorted({*failed})}
     return CommandResult("\n\n".join([f"{text}\n{out / 'results.md'}", *ends]), data, not failed)
+
+
+def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:
+    """All but the plain comparison. A condition without methods would be one of all methods, so such ones are left out."""
+    resolved = resolve_methods(config)
+    specs = {method.spec.name: method.spec for method in resolved}
+    tracked = settings.tracked_of(tuple(specs))
+    own = tuple(name for name, spec in specs.items() if spec.conversion == "published")
+    found = [Condition(AS_TRACKED, own, as_tracked=True), Condition(TRACKED, tracked, clip=Named(TRACKED))]
+    found += [
+        Condition(LEVEL.format(level), tracked, clip=Named("tracking-error", {"level": level}))
+        for level in settings.levels
+    ]
+    iterations = {
+        method.spec.name: method.budget.iterations for method in resolved if not method.spec.trivial
+    }
+    if (count := iterations.get(OURS)) is not None:
+        others = tuple(name for name, own in iterations.items() if own not in (None, count))
+        asked = settings.equal_iterations or others
+        names = tuple(name for name in asked if name != NONE)
+        found.append(Condition(EQUAL, names, {"budget": {"iterations": count}}))
+    return [condition for condition in found if condition.methods] + _ablations(settings.ablations, specs)
+
+
+def _ablations(asked: Sequence[str], specs: dict[str, MethodSpec]) -> list[Condition]:
+    """The requested ablations in the order of the method's spec. Raises `InputError` for unknown ones, and without the method."""
+    if not asked:
+        return []
+    if OURS not in specs:
+        expected = f"{OURS} among them, which --ablations are compared with"
+        raise InputError("command line", "--methods", expected, ", ".join(specs))
+    known = specs[OURS].ablations
+    unknown = [name for name in asked if name not in (*known, ALL)]
+    if unknown:
+        raise InputError("command line", "--ablations", f"{', '.join(known)} or {ALL}", unknown[0])
+    return [
+        Condition(name, (OURS,), dict(changed))
+        for name, changed in known.items()
+        if name in asked or ALL in asked
+    ]

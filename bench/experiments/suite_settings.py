@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from ..engine.config import Isolation, parse_size
 from ..errors import InputError
@@ -14,39 +13,25 @@ from ..listing import presets_of_methods
 SEED = 26_000
 """Of the suite's captures. Settings of methods are chosen on captures of seeds below 10,000 (`docs/explanation/statistics.md`)."""
 
-ABLATIONS: Mapping[str, Mapping[str, Any]] = {
-    "no-lines": {"lines": {"enabled": False}},
-    "lines-move-splats": {"lines": {"dynamic": ["position", "rotation", "scale"]}},
-    "no-penalty": {"penalty": {"weight": 0.0}},
-    "no-balanced-sampling": {"sampling": {"balanced": False}},
-    "harmonics": {"color": "sh"},
-    "official": {"lines": {"bounds": "head"}},
-    "weak-penalty": {"penalty": {"weight": 1e-3, "softness": 0.1}},
-    "own-colors": {"planes": {"residual_lr": 1e-2}},
-    "smooth-directions": {"planes": {"direction_smoothing": 0.3}},
-    "fixed-positions": {"planes": {"move_splats": False}},
-    "planned-sizes": {"capacity": {"mode": "auto"}},
-}
-"""Settings of the method "ours" by name of the ablation. The first two are the paper's Table 4; "official" is the choice of the
-authors' program, lines in the whole head; the last five are the additions of "ours-plus", one by one."""
-
 ALL, NONE = "all", "none"
 
-TRACKED = "tracked"
-"""Condition of methods that are trained on tracking estimated from the images."""
-TRACKED_METHODS = ("ga", "gbs", "ours")
-"""Methods that have this condition where none are named."""
+TRACKED, LEVEL, AS_TRACKED, EQUAL = "tracked", "tracking-{:g}", "as-tracked", "equal-iterations"
+"""Names of conditions: tracking estimated from the images; simulated tracking errors of a level; the capture's own tracking for a
+method that otherwise gets it converted; as many iterations as "ours" has."""
+TRACKED_METHODS = ("ga", "gbs", "ours", "ours-plus")
+"""Methods that have the first two conditions where none are named."""
 
 RUN, LARGE_RUN = "run", "run-large"
-"""Folders of a suite's runs; the second has images of twice the size."""
+"""Folders of a suite's runs, each with a folder for each subject; those of the second have images of twice the size."""
 
 
 @dataclass(frozen=True)
 class SuiteSettings(ExecutionOptions):
     """The whole benchmark: makes the suite's synthetic subjects, trains and measures methods on all, writes result tables.
 
-    Subjects differ in shape, skin, hair and performance; their tracking has errors, and their held-out sequence parts: seen,
-    recombined and beyond training, and speech. Started again after a kill it continues. Takes hours.
+    Subjects differ in shape, skin, hair and performance. Each is captured, trained and measured in a run of its own, so that finished
+    subjects can be kept apart from a machine. Every method has the same processor time with the preset `fast`. Started again after
+    a kill it continues. Takes hours.
     """
 
     out: str
@@ -62,19 +47,31 @@ class SuiteSettings(ExecutionOptions):
     """Seeds of the training."""
 
     ablations: tuple[str, ...] = ()
-    """Train ours with these parts left out or changed, too, each as a condition of the run; or "all"."""
+    """Train ours with these parts left out or changed, too, each as a condition of the run (`headbench list methods --json` has their
+    settings); or "all"."""
 
     tracked: tuple[str, ...] = ()
     """Methods trained a second time, on tracking estimated from the images as by `headbench track`, as condition `tracked` of
-    the run; or "none". Default: those of ga, gbs and ours that run. Tracking takes about 1 second a timestep, once a
+    the run; or "none". Default: those of ga, gbs, ours and ours-plus that run. Tracking takes about 1 second a timestep, once a
     subject; each method one more training."""
+
+    levels: tuple[float, ...] = ()
+    """Train the methods of --tracked once more for each of these levels of simulated tracking errors (see `headbench synth`), as
+    conditions such as `tracking-3`."""
+
+    equal_iterations: tuple[str, ...] = ()
+    """Methods trained a second time, with as many iterations as ours, as condition `equal-iterations`; or "none". Default: all that have
+    other numbers of iterations."""
 
     subjects: int = 10
     """Number of the suite's subjects, from the first. Significant differences require 6 subjects for two
     methods, 8 for five methods, 9 for ten ablations."""
 
+    first: int = 1
+    """Begin with this subject, counted from 1. Earlier ones may have been measured on another machine."""
+
     large: int = 2
-    """At most this many subjects, from the first, are also rendered at twice the size, with a run and tables of their own, without
+    """At most this many subjects, from the first, are also rendered at twice the size, with runs and tables of their own, without
     conditions. Each takes about half a processor hour to render, twice as long as at the usual size."""
 
     cameras: int = 16
@@ -89,7 +86,7 @@ class SuiteSettings(ExecutionOptions):
     performance: Literal["parts", "natural"] = "natural"
     """As for `headbench synth`; with `natural` each subject has another choreography."""
 
-    tracking_error: float = 1.0
+    tracking_error: float = 0.0
     """As for `headbench synth`."""
 
     tracker: Literal["per-frame", "video"] = "video"
@@ -101,25 +98,27 @@ class SuiteSettings(ExecutionOptions):
     def __post_init__(self) -> None:
         """Refuse invalid sizes and names."""
         parse_size(self.size)
-        unknown = [name for name in self.ablations if name not in (*ABLATIONS, ALL)]
-        if unknown:
-            raise InputError("command line", "--ablations", f"{', '.join(ABLATIONS)} or {ALL}", unknown[0])
-        if NONE in self.tracked and len(self.tracked) > 1:
+        for option in ("tracked", "equal_iterations"):
+            names = getattr(self, option)
+            if NONE in names and len(names) > 1:
+                where = f"--{option.replace('_', '-')}"
+                raise InputError("command line", where, f"names of methods, or {NONE}", " ".join(names))
+        for name, least in (("large", 0), ("first", 1)):
+            if getattr(self, name) < least:
+                raise InputError("command line", f"--{name}", f"at least {least}", str(getattr(self, name)))
+        if self.first > self.subjects:
             raise InputError(
-                "command line", "--tracked", f"names of methods, or {NONE}", " ".join(self.tracked)
+                "command line", "--first", f"at most --subjects, {self.subjects}", str(self.first)
             )
-        if self.large < 0:
-            raise InputError("command line", "--large", "at least 0", str(self.large))
+        if any(not 0 < level <= 4 for level in self.levels):
+            raise InputError(
+                "command line", "--levels", "above 0 and at most 4", " ".join(map(str, self.levels))
+            )
 
     @staticmethod
     def notes() -> str:
         """Description of the presets in the help."""
         return presets_of_methods()
-
-    @property
-    def chosen(self) -> tuple[str, ...]:
-        """Names of the requested ablations, in the order of `ABLATIONS`."""
-        return tuple(name for name in ABLATIONS if name in self.ablations or ALL in self.ablations)
 
     def tracked_of(self, methods: tuple[str, ...]) -> tuple[str, ...]:
         """Names of the methods that have the condition `TRACKED`, among those that run."""

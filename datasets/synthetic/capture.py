@@ -43,6 +43,7 @@ from .plan import (
     SyntheticSettings,
     load_geometry,
     plan_subject,
+    subject_name,
 )
 from .renderer import CaptureRenderer
 from .tracking import TRACKERS, Tracker
@@ -82,6 +83,7 @@ def synthesize(
     correctives: float = 0.0,
     edition: int = EDITION,
     pictures: str | Path | None = None,
+    only: int | str | None = None,
     workers: int | None = None,
     execution: Execution | None = None,
     progress: Progress = no_progress,
@@ -123,6 +125,8 @@ def synthesize(
     pictures : str | Path | None
         Folder of an earlier capture that differs only in its tracking. Its pictures are linked, or
         copied if links are not supported, instead of rendered.
+    only : int | str | None
+        The one subject to make in this call, by place from 0 or by name; others of the capture may follow. None makes all.
     workers : int | None
         Number of rendering processes; by default one per core, or one for little work.
     execution : Execution | None
@@ -173,10 +177,13 @@ def synthesize(
     if pictures is not None:
         _check_pictures(Path(pictures), wanted)
     _claim(out, wanted)
-    plans = [plan_subject(out, index, geometry, settings) for index in range(subjects)]
+    chosen = [place for place in range(subjects) if only in (None, place, subject_name(place))]
+    if not chosen:
+        raise InputError("synthetic capture", "only", f"one of its {subjects} subjects", repr(only)[:40])
+    plans = [plan_subject(out, index, geometry, settings) for index in chosen]
     if pictures is not None:
         _take_over(Path(pictures), out, plans)
-    total = subjects * timesteps * cameras
+    total = len(plans) * timesteps * cameras
     done = 0
     progress(done, total, "planned")
     if execution is not None and execution.executor != "inline":

@@ -47,6 +47,11 @@ _BUST = 0.213  # metres from the target down to the end of the bust, which lies 
 _LOOK_BELOW, _LOOK_ABOVE = 0.004, 0.012  # metres at most between the target and the middle of the head
 
 
+def subject_name(place: int) -> str:
+    """Name of the subject at a place of a capture, from 0."""
+    return f"{FIRST_SUBJECT + place}"
+
+
 EDITION = 3
 """Version of the content: captures of one version and the same settings have the same content."""
 
@@ -111,7 +116,7 @@ class SubjectPlan:
 
 def plan_subject(out: Path, index: int, geometry: Geometry, settings: SyntheticSettings) -> SubjectPlan:
     """Plan subject number ``index``: nothing is rendered or written."""
-    name = f"{FIRST_SUBJECT + index}"
+    name = subject_name(index)
     who = draw_person(name, index, settings.seed, settings.dynamics)
     rng = np.random.default_rng([settings.seed, index, 3])
     head = geometry.head

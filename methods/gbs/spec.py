@@ -53,6 +53,7 @@ GBS = MethodSpec(
     presets=PRESETS,
     head_models=("flame2020", "procedural2020", "ict-facekit"),
     monocular=True,
+    conversion="published",
     source="3D Gaussian Blendshapes for Head Avatar Animation, SIGGRAPH 2024, arXiv 2404.19398",
     bibtex=r"""@inproceedings{ma2024blendshapes,
   title     = {{3D} {Gaussian} Blendshapes for Head Avatar Animation},

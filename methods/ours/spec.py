@@ -76,7 +76,6 @@ OURS_PLUS = replace(
     OURS,
     name="ours-plus",
     default=False,
-    demo=False,
     ablations={},
     summary="The method ours with headbench's additions: weak penalty, colours of splats, smoothed directions, planned sizes.",
     implementation="headbench.methods.ours.method:OursPlus",

@@ -2,29 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
 
 from ...bench.engine.scoring import FULL
-from ...bench.experiments.suite_settings import TRACKED
+from ...bench.engine.store import RunFolder
+from ...bench.experiments.suite_settings import AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, RUN, TRACKED
 from ..runs import FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
 from ..statistics.primary import primary_section
-from ..table_report import table_of
+from ..table_report import Columns, table_of
 from ..writers import to_markdown
 from .ablations import ablation_table
-from .tracked import DROP, drop_table, tracked_table
+from .tracked import DROP_MEANING, condition_table, drop_table
 
 LARGE = "Images of twice the size"
-MEANING = (
-    f"Under the condition `{TRACKED}`, methods are trained and driven with tracking that was estimated from the images, otherwise "
-    f"with the capture's own. {DROP} to a task: novel views minus that task."
-)
+LEVEL_START = LEVEL.partition("{")[0]
+MEANINGS = {
+    TRACKED: "trained and driven with tracking that was estimated from the images, otherwise with the capture's own",
+    AS_TRACKED: "given the capture's own head model, neck, static offset and views, otherwise those of its publication: another head "
+    "model, the neck's rotation merged into the head's, no static offset, one video",
+}
+COST = ("training_processor", "training_iterations", "training_time", "storage")
 
 
-def suite_report(runs: Sequence[Path], method: str) -> str:
-    """Tables of a suite as Markdown: whole frames, each region, each held-out sequence, tracking from images, ablations.
+def suite_runs(folder: Path) -> list[list[Path]]:
+    """Folders of a suite's finished runs, one for each subject: those of the usual size, then those of twice the size, if any.
+
+    A suite of earlier versions has one run for all subjects.
+    """
+    parts = []
+    for base in (folder / RUN, folder / LARGE_RUN):
+        places = [base, *sorted(base.iterdir())] if base.is_dir() else []
+        parts.append([place for place in places if RunFolder(place).rows.is_file()])
+    return [part for part in parts if part]
+
+
+def suite_report(folder: Path, method: str) -> str:
+    """Tables of a suite as Markdown: whole frames, each region, each held-out sequence, conditions, ablations.
 
     The primary endpoints are first; everything else is labelled as exploratory. Under each table are the paired differences of
     every other method from ``method``, with intervals and tests. Those of the ablations and of tracking from images are such
@@ -32,41 +48,55 @@ def suite_report(runs: Sequence[Path], method: str) -> str:
 
     Parameters
     ----------
-    runs : sequence of Path
-        Folders of the run of a suite and, if there is one, of that with images of twice the size.
+    folder : Path
+        Folder of the suite.
     method : str
         Label of the method that others are compared with.
     """
-    parts = [_tables(RunSet.read([folder]), method, primary=folder == runs[0]) for folder in runs]
+    parts = [
+        _tables(RunSet.read(runs), method, primary=index == 0)
+        for index, runs in enumerate(suite_runs(folder))
+    ]
     return f"\n# {LARGE}\n\n".join(parts)
 
 
 def _tables(read: RunSet, method: str, *, primary: bool) -> str:
     whole = read.by_camera
-    changed = [label for label, record in whole.records.items() if record.condition]
-    runs = whole.only([label for label in whole.records if label not in changed])
+    by_condition: dict[str, dict[str, str]] = {}
+    for label, record in whole.records.items():
+        by_condition.setdefault(record.condition, {})[record.name] = label
+    plain = by_condition[""]
+    unconverted = by_condition.get(AS_TRACKED, {})
+    runs = whole.only([*plain.values(), *unconverted.values()]).shared
     tested = sorted({frame[1] for frame in read.rows.frames("self_reenactment", FULL)})
     parts = {"All frames": FrameSelection()}
     parts |= {f"Region {region}": FrameSelection(region) for region in sorted(runs.rows.regions - {FULL})}
     parts |= {f"Sequence {name}": FrameSelection(sequences=(name,)) for name in tested}
     sections = [primary_section(runs)] if primary else []
     sections += [_section(title, runs.of(part), method) for title, part in parts.items()]
+    if equal := by_condition.get(EQUAL, {}):
+        labels = [equal.get(name, label) for name, label in plain.items() if label not in whole.trivial]
+        sections.append(_section("Equal iterations", whole.only(labels).shared.without_conditions, method))
+    if any(spec.name in COST for spec in runs.metrics):
+        columns = Columns(tuple(spec.name for spec in runs.metrics if spec.name in COST))
+        cost = to_markdown(table_of(runs, "cost", columns=columns)).strip()
+        sections.append(f"## Cost (exploratory)\n\n{cost}")
     regions = (FULL, *({"face"} & runs.rows.regions))
-    tracked = {whole.records[label].name: label for label in changed if _is_tracked(whole, label)}
-    if tracked:
-        runs = whole.only([*tracked, *tracked.values()])
+    tracking = [c for c in by_condition if c == TRACKED or c.startswith(LEVEL_START)]
+    for condition in (*tracking, *({AS_TRACKED} & {*by_condition})):
+        changed = {name: label for name, label in by_condition[condition].items() if name in plain}
+        own = whole.only([*changed, *changed.values()]).shared
         for region in regions:
-            of_region = runs.of(FrameSelection(region))
-            tables = (drop_table(of_region), tracked_table(of_region, tracked))
-            texts = [
-                f"## {_title('Tracked from images', region)} (exploratory)",
-                MEANING,
-                *map(to_markdown, tables),
-            ]
-            sections.append("\n\n".join(map(str.strip, texts)))
-    ablations = [label for label in changed if not _is_tracked(whole, label)]
+            sections.append(_condition_section(own.of(FrameSelection(region)), condition, changed, region))
+    ablations = [
+        label
+        for condition, labels in by_condition.items()
+        if condition not in ("", EQUAL, AS_TRACKED, *tracking)
+        for name, label in labels.items()
+        if name == method
+    ]
     if ablations:
-        runs = whole.only([method, *ablations])
+        runs = whole.only([method, *ablations]).shared
         for region, chosen in product(regions, ((), *((name,) for name in tested))):
             table = ablation_table(runs.of(FrameSelection(region, chosen)), method)
             title = _title(f"Ablations of {method}", region, *chosen)
@@ -77,8 +107,20 @@ def _tables(read: RunSet, method: str, *, primary: bool) -> str:
     return "\n\n".join(sections) + "\n"
 
 
-def _is_tracked(runs: RunSet, label: str) -> bool:
-    return runs.records[label].condition == TRACKED
+def _condition_section(runs: RunSet, condition: str, changed: Mapping[str, str], region: str) -> str:
+    """Values with and without a condition, the drop from novel views to other tasks, and paired differences."""
+    level = condition.removeprefix(LEVEL_START)
+    titles = {TRACKED: "Tracked from images", AS_TRACKED: "Capture not converted"}
+    title = titles.get(condition, f"Tracking errors of level {level}")
+    simulated = f"trained and driven with simulated tracking errors of level {level}"
+    meaning = f"Under the condition `{condition}`, methods are {MEANINGS.get(condition, simulated)}."
+    tables = (drop_table(runs), condition_table(runs, changed, title))
+    texts = [
+        f"## {_title(title, region)} (exploratory)",
+        f"{meaning} {DROP_MEANING}",
+        *map(to_markdown, tables),
+    ]
+    return "\n\n".join(map(str.strip, texts))
 
 
 def _title(text: str, region: str, *chosen: str) -> str:

@@ -1,4 +1,4 @@
-"""Tables of methods that were trained on the capture's tracking and on tracking estimated from its images."""
+"""Tables of methods under a condition of tracking: beside the plain methods, and as differences from them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from .ablations import difference_table, meaning_of
 
 NOVEL, METRIC = "novel_view", "psnr"
 DROP = "Drop"
+DROP_MEANING = f"{DROP} to a task: novel views minus that task."
 
 
 def drop_table(runs: RunSet) -> Table:
@@ -40,9 +41,18 @@ def _difference(row: TableRow, first: int, second: int, table: Table) -> TableCe
     return TableCell("ok", difference, f"{difference:.{table.columns[second].digits}f}")
 
 
-def tracked_table(runs: RunSet, tracked: Mapping[str, str]) -> Table:
-    """Differences that tracking from images makes, a row for each method: ``tracked`` has its label by the label of the method."""
-    pairs = [(changed, method) for method, changed in tracked.items()]
-    names = {changed: method for method, changed in tracked.items()}
-    meaning = meaning_of("Trained on tracking from images minus on the capture's tracking")
-    return difference_table(runs, pairs, names, "Tracked from images", meaning, "methods")
+def condition_table(runs: RunSet, changed: Mapping[str, str], title: str) -> Table:
+    """Differences that a condition makes, a row for each method.
+
+    Parameters
+    ----------
+    changed : mapping of str
+        Label of the method under the condition by its plain label.
+    title : str
+        Heading of the rows.
+    """
+    pairs = [(label, method) for method, label in changed.items()]
+    names = {label: method for method, label in changed.items()}
+    return difference_table(
+        runs, pairs, names, title, meaning_of("With the condition minus without"), "methods"
+    )

@@ -1,13 +1,15 @@
 import pytest
 
 from headbench.bench.errors import UnavailableError
-from headbench.metrics.training import training_memory, training_time
+from headbench.metrics.training import training_iterations, training_memory, training_processor, training_time
 
 RECORD = {
     "seconds": 150.0,
     "interruptions": 0,
     "peak_memory_bytes": 1_500_000_000,
     "memory_before_bytes": 400_000_000,
+    "processor_seconds": 280.5,
+    "method": {"budget": {"iterations": 4000, "seconds": None}},
 }
 
 
@@ -18,14 +20,22 @@ def test_time_in_minutes_and_memory_in_si_gigabytes():
     assert measured.details == {"bytes": 1.5e9, "before_bytes": 4e8}
 
 
+def test_processor_time_and_iterations_are_those_of_the_record():
+    assert training_processor(RECORD).value == 280.5
+    assert training_iterations(RECORD).value == 4000
+    with pytest.raises(UnavailableError, match="in seconds"):
+        training_iterations({"method": {"budget": {"iterations": None, "seconds": 60.0}}})
+
+
 def test_an_interrupted_training_has_no_time_but_a_memory():
     interrupted = {**RECORD, "interruptions": 2}
-    with pytest.raises(UnavailableError, match="interrupted 2 times"):
-        training_time(interrupted)
+    for metric in (training_time, training_processor):
+        with pytest.raises(UnavailableError, match="interrupted 2 times"):
+            metric(interrupted)
     assert training_memory(interrupted).value == 1.5
 
 
-@pytest.mark.parametrize("metric", [training_time, training_memory])
+@pytest.mark.parametrize("metric", [training_time, training_memory, training_processor])
 def test_a_record_that_does_not_tell_is_said(metric):
     with pytest.raises(UnavailableError, match="has no"):
         metric({})

@@ -114,11 +114,14 @@ def toy_run(make_run):
 def make_run(toy, tmp_path):
     """Run a toy comparison over two subjects into a folder of that name; changes are settings of the run."""
 
-    def make(name, methods=("toy_plugin:METHOD",), **changes):
+    def make(name, methods=("toy_plugin:METHOD",), subjects=("subject1", "subject2"), **changes):
         settings = {"metrics": ("toy_plugin:ERROR", "toy_plugin:FILES"), "reader": "toy_plugin:READER"}
-        subjects = ("subject1", "subject2")
         return run_on(
-            tmp_path / "data", tmp_path / name, *methods, subjects=subjects, **settings | changes
+            tmp_path / "data" / "-".join(subjects),
+            tmp_path / name,
+            *methods,
+            subjects=subjects,
+            **settings | changes,
         ).root
 
     return make

@@ -5,6 +5,7 @@ from headbench.bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from headbench.bench.rows import ALL
 from headbench.reports.runs import FrameSelection, RunSet
 from headbench.reports.table_report import table_of, table_text
+from headbench.reports.writers import to_markdown
 
 
 def test_other_seeds_of_the_same_settings_join(make_run):
@@ -217,3 +218,25 @@ def test_methods_under_a_condition_are_listed_apart(write_run):
     assert [*groups.values()] == [["ga"], ["ga+few", "mean-image+few"], ["mean-image"]]
     curve = RunSet.read([write_run("curve", {"ga+few": 31.0, "ga+more": 32.0})])
     assert curve.ranked == ("ga+few", "ga+more")
+
+
+def test_runs_of_other_subjects_are_read_as_one_run(make_run):
+    both = make_run("both")
+    apart = [make_run(name, subjects=(name,)) for name in ("subject1", "subject2")]
+    one, joined = RunSet.read([both]), RunSet.read(apart)
+    assert {task: joined.rows.protocols(task) for task in joined.tasks} == {
+        task: one.rows.protocols(task) for task in one.tasks
+    }
+    assert joined.keys == one.keys
+    assert joined.methods == one.methods
+    assert to_markdown(table_of(joined)) == to_markdown(table_of(one))
+    with pytest.raises(InputError, match="Score the same frames"):
+        RunSet.read([both, apart[0]])
+
+
+def test_the_shared_subjects_are_those_of_every_method(make_run):
+    both = ("toy_plugin:MIRROR", "toy_plugin:METHOD")
+    runs = RunSet.read([make_run("a", both, ("subject1",)), make_run("b", subjects=("subject2",))])
+    assert runs.shared.rows.subjects == {"subject1"}
+    assert {key.subject for keys in runs.shared.keys.values() for key in keys} == {"subject1"}
+    assert runs.only(["toy"]).shared.rows.subjects == {"subject1", "subject2"}

@@ -1,6 +1,7 @@
 """The suite on two small subjects: its tables, and what is refused before any work."""
 
 import re
+from functools import reduce
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,15 +9,18 @@ import numpy as np
 import pytest
 
 from headbench.bench import cli
-from headbench.bench.engine.config import resolve_method
+from headbench.bench.configuration import merge
+from headbench.bench.engine.config import resolve_cells, resolve_method
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.experiments import suite as module
-from headbench.bench.experiments.suite_settings import ABLATIONS, SEED, SuiteSettings
+from headbench.bench.experiments.suite_settings import SEED, SuiteSettings
 from headbench.bench.registry import get
 from headbench.datasets.synthetic.panels import default_samples
 from headbench.datasets.synthetic.performance import EXPRESSION_CONTROLS
 from headbench.datasets.synthetic.plan import RESIDUALS, SyntheticSettings, load_geometry, plan_subject
+from headbench.methods.ours.spec import ADDITIONS, OURS, OURS_PLUS
 from headbench.reports.readme import SUITE, suite_options
+from headbench.reports.suite.suite import suite_runs
 
 SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16x16")
 
@@ -24,12 +28,13 @@ SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16
 @pytest.mark.slow
 def test_the_suite_makes_subjects_and_tables_by_region_and_part(tmp_path, capsys):
     words = ["run", "suite", "--out", str(tmp_path / "s"), "--methods", "mean-image", "ga", "ours"]
-    words += ["--tracked", "ga", "--large", "1"]
+    words += ["--tracked", "ga", "--large", "1", "--equal-iterations", "none"]
     assert cli.main([*words, "--preset", "smoke", *SMALL]) == 0
     text = (tmp_path / "s" / "results.md").read_text()
     usual, large = (re.findall("^## (.*)", part, re.MULTILINE) for part in text.split("\n# "))
     parts = [f"Sequence FREE-{part}" for part in ("1-seen", "2-recombined", "3-beyond", "4-speech")]
     tables = ["All frames", *(f"Region {name}" for name in sorted(module.REGIONS)), *parts]
+    tables.append("Cost")
     assert large == [f"{title} (exploratory)" for title in tables]
     tracked = [f"Tracked from images{region} (exploratory)" for region in ("", ", face")]
     assert usual == ["Primary endpoints", *large, *tracked]
@@ -44,15 +49,18 @@ def test_the_suite_makes_subjects_and_tables_by_region_and_part(tmp_path, capsys
 
 @pytest.fixture
 def asked(monkeypatch, tmp_path):
-    """What a suite with some options makes: (arguments of the capture, configuration of the run) of each part."""
+    """What a suite with some options makes: (arguments of the capture, configuration of the run) of each run, in order."""
 
     def plan(*options):
         captures, runs = [], []
+
+        def capture(out, **given):
+            captures.append(given | {"out": out})
+            return [Path(out) / "one"]
+
         found = {
-            get("datasets", "synthetic").implementation: lambda out, **given: captures.append(
-                given | {"out": out}
-            ),
-            get("reports", "suite").implementation: lambda runs, method: "tables",
+            get("datasets", "synthetic").implementation: capture,
+            get("reports", "suite").implementation: lambda folder, method: "tables",
         }
         monkeypatch.setattr(module, "resolve", found.__getitem__)
         monkeypatch.setattr(
@@ -67,8 +75,9 @@ def asked(monkeypatch, tmp_path):
 
 def test_the_stored_suite_can_be_made_again_by_its_options(asked):
     folder = Path(__file__).parents[3] / SUITE
-    stored = RunFolder(folder / "run").read_manifest()
-    ((capture, config),) = asked(*suite_options(folder))
+    (first, *_), *_ = suite_runs(folder)
+    stored = RunFolder(first).read_manifest()
+    (capture, config), *_ = asked(*suite_options(folder))
     names = ("subjects", "cameras", "timesteps", "size", "seed", "performance", "tracking_error", "tracker")
     samples = default_samples(*capture["size"])
     planned = SyntheticSettings(
@@ -81,38 +90,53 @@ def test_the_stored_suite_can_be_made_again_by_its_options(asked):
     usual = {"dynamics": 1.0, "tracker": "per-frame", **dict.fromkeys(RESIDUALS, 0.0)}
     recorded = usual | dict(stored.clips[0].steps[0]["parameters"]["synthetic"])
     del recorded["style"]
-    assert recorded.pop("edition") < planned.pop("edition")
+    assert recorded.pop("edition") <= planned.pop("edition")
     assert recorded == planned | {"size": list(planned["size"])}
     assert not any(condition.clip for condition in config.conditions)
 
 
+ONE = ("--subjects", "1", "--large", "0")
+
+
 @pytest.mark.parametrize(
-    ("options", "tracked"),
+    ("options", "conditions"),
     [
-        (["--methods", "mean-image", "ga", "insta"], ("ga",)),
-        (["--methods", "ours", "ga", "gbs"], ("ga", "gbs", "ours")),
-        (["--methods", "ga", "insta", "--tracked", "insta"], ("insta",)),
-        (["--methods", "ga", "ours", "--tracked", "none"], None),
-        (["--methods", "insta"], None),
+        (["--methods", "mean-image", "ga", "insta"], {"tracked": ("ga",)}),
+        (["--methods", "ours", "gbs"], {"as-tracked": ("gbs",), "tracked": ("gbs", "ours")}),
+        (["--methods", "ga", "insta", "--tracked", "insta"], {"tracked": ("insta",)}),
+        (
+            ["--methods", "ga", "ours-plus", "--levels", "3"],
+            {"tracked": ("ga", "ours-plus"), "tracking-3": ("ga", "ours-plus")},
+        ),
+        (["--methods", "ga", "--tracked", "none", "--levels", "3"], {}),
+        (["--methods", "insta"], {}),
     ],
 )
-def test_tracking_from_images_is_a_condition_of_methods(asked, options, tracked):
-    ((_, config),) = asked(*options, "--large", "0")
-    found = {condition.clip.name: condition.methods for condition in config.conditions}
-    assert found == {"": ()} | ({} if tracked is None else {"tracked": tracked})
+def test_conditions_of_tracking_have_methods(asked, options, conditions):
+    ((_, config),) = asked(*options, *ONE, "--equal-iterations", "none")
+    assert {each.name: each.methods for each in config.conditions} == {"": (), **conditions}
 
 
-def test_large_images_are_a_run_of_the_first_subjects(asked):
-    options = ("--methods", "ours", "ga", "--ablations", "no-lines")
-    (usual, run), (large, own) = asked(*options, "--size", "40x58", "--subjects", "3", "--large", "2")
-    changed = {"out": own.data, "subjects": 2, "size": (80, 116)}
-    assert large == usual | changed
-    assert (usual["out"], usual["subjects"], usual["size"]) == (run.data, 3, (40, 58))
-    assert len({usual["out"], large["out"], run.out, own.out}) == 4
-    assert asked("--methods", "ours", "--subjects", "1")[1][0]["subjects"] == 1
-    assert own.methods == run.methods
-    assert [condition.name for condition in run.conditions] == ["", "tracked", "no-lines"]
-    assert [condition.name for condition in own.conditions] == [""]
+def test_equal_iterations_are_those_of_ours(asked):
+    given = ("--methods", "mean-image", "ours", "insta", "--preset", "smoke", "--tracked", "none")
+    ((_, config),) = asked(*given, *ONE)
+    cells = {(m.spec.name, c.name): m.budget.iterations for m, c in resolve_cells(config)}
+    assert cells["insta", "equal-iterations"] == cells["ours", ""] != cells["insta", ""]
+    assert {name for name, condition in cells if condition} == {"insta"}
+
+
+def test_every_subject_has_a_run_and_the_first_also_large_images(asked):
+    options = ("--methods", "ours", "ga", "--ablations", "no-lines", "--equal-iterations", "none")
+    found = asked(*options, "--size", "40x58", "--subjects", "3", "--large", "1")
+    assert [capture["only"] for capture, _ in found] == [0, 0, 1, 2]
+    assert [capture["size"] for capture, _ in found] == [(40, 58), (80, 116), (40, 58), (40, 58)]
+    assert {capture["subjects"] for capture, _ in found} == {3}
+    assert [Path(run.out).relative_to(Path(found[0][1].out).parents[1]).as_posix() for _, run in found] == [
+        *("run/01", "run-large/01", "run/02", "run/03")
+    ]
+    names = [[condition.name for condition in run.conditions] for _, run in found]
+    assert names == [["", "tracked", "no-lines"], [""], *[["", "tracked", "no-lines"]] * 2]
+    assert asked(*options, "--subjects", "3", "--first", "3", "--large", "0")[0][0]["only"] == 2
 
 
 @pytest.mark.parametrize(("performance", "alike"), [("natural", False), ("parts", True)])
@@ -139,11 +163,17 @@ def test_subjects_of_natural_captures_have_own_choreographies(tmp_path, performa
             assert alike or abs(correlation) < 0.5, name
 
 
-@pytest.mark.parametrize("name", ABLATIONS)
+@pytest.mark.parametrize("name", OURS.ablations)
 def test_every_ablation_is_a_setting_of_ours_that_changes_it(name):
-    plain = resolve_method(get("methods", "ours"), "fast", {})
-    changed = resolve_method(get("methods", "ours"), "fast", ABLATIONS[name])
-    assert changed.record() != plain.record()
+    for preset in OURS.presets:
+        plain, changed = (resolve_method(OURS, preset, values) for values in ({}, OURS.ablations[name]))
+        assert changed.config != plain.config
+
+
+def test_the_additions_together_are_ours_plus():
+    settings = reduce(merge, ADDITIONS.values(), {})
+    for preset in OURS.presets:
+        assert resolve_method(OURS, preset, settings).config == resolve_method(OURS_PLUS, preset, {}).config
 
 
 @pytest.mark.parametrize(
@@ -155,13 +185,17 @@ def test_every_ablation_is_a_setting_of_ours_that_changes_it(name):
         (["--ablations", "all", "--methods", "ga"], "ours among them"),
         (["--ablations", "no-head"], "no-lines, lines-move-splats"),
         (
-            ["--ablations", "no-lines", "fixed-sizes", "--preset", "paper"],
-            "ablations that change ours of preset paper",
+            ["--ablations", "no-lines", "fixed-sizes"],
+            "fixed-sizes",
         ),
         (["--methods", "ours", "ga-official"], "checkout"),
         (["--tracked", "ours", "--methods", "ga"], "methods of tracked"),
         (["--tracked", "ga", "none"], "names of methods, or none"),
         (["--large", "-1"], "at least 0"),
+        (["--first", "0"], "at least 1"),
+        (["--subjects", "2", "--first", "3"], "at most --subjects, 2"),
+        (["--levels", "5"], "above 0 and at most 4"),
+        (["--equal-iterations", "ours", "none"], "names of methods, or none"),
         (["--performance", "still"], "natural"),
         (["--tracker", "none"], "per-frame"),
         (["--executor", "processes", "--workers", "0"], "at least 1"),

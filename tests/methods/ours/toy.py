@@ -17,7 +17,9 @@ from headbench.methods.shared.subject_mesh import SubjectMesh
 from ..recorded import recorded
 
 SMALL = OursConfig(
-    hidden=8, planes=Planes(resolution=8, channels=(4, 2, 2)), lines=Lines(resolution=6, channels=3, bounds="head")
+    hidden=8,
+    planes=Planes(resolution=8, channels=(4, 2, 2)),
+    lines=Lines(resolution=6, channels=3, bounds="head"),
 )
 
 

@@ -8,7 +8,7 @@ import pytest
 from headbench.bench.engine.store import RunFolder
 from headbench.reports.runs import RunSet
 from headbench.reports.suite.suite import LARGE, suite_report
-from headbench.reports.suite.tracked import drop_table, tracked_table
+from headbench.reports.suite.tracked import condition_table, drop_table
 from headbench.reports.table_report import table_of
 
 PSNR = {
@@ -25,8 +25,8 @@ DROP = {"ga": 1.5, "ours": 1.0, "ga+tracked": 0.25, "ours+tracked": -0.5}
 
 @pytest.fixture
 def tracked_run(write_run):
-    """A run whose self-reenactment is worse than its novel views by `DROP`."""
-    folder = RunFolder(write_run("run", PSNR))
+    """A suite's run whose self-reenactment is worse than its novel views by `DROP`."""
+    folder = RunFolder(write_run("suite/run", PSNR))
     rows = pd.read_parquet(folder.rows)
     for label, drop in DROP.items():
         name, _, condition = label.partition("+")
@@ -57,7 +57,7 @@ def test_a_drop_is_missing_where_a_task_has_no_values(tracked_run):
 
 def test_rows_are_methods_and_cells_tracked_minus_plain(tracked_run):
     runs = of_tracked(tracked_run)
-    table = tracked_table(runs, TRACKED)
+    table = condition_table(runs, TRACKED, "Tracked from images")
     plain = {row.method: row.cells for row in table_of(runs).rows}
     assert [row.method for row in table.rows] == [*TRACKED]
     for row in table.rows:
@@ -67,21 +67,26 @@ def test_rows_are_methods_and_cells_tracked_minus_plain(tracked_run):
 
 
 def test_tracking_from_images_is_no_ablation(tracked_run):
-    sections = re.split("^## ", suite_report([tracked_run], "ours"), flags=re.MULTILINE)[1:]
+    sections = re.split("^## ", suite_report(tracked_run.parent, "ours"), flags=re.MULTILINE)[1:]
     by_title = {section.partition("\n")[0]: section for section in sections}
     ablations = ["", ", EMO", ", novel views minus self-reenactment"]
     ablations = [f"Ablations of ours{what} (exploratory)" for what in ablations]
     tracked = "Tracked from images (exploratory)"
-    plain = ["Primary endpoints", "All frames (exploratory)", "Sequence EMO (exploratory)"]
+    plain = [
+        "Primary endpoints",
+        *(f"{name} (exploratory)" for name in ("All frames", "Sequence EMO", "Cost")),
+    ]
     assert [*by_title] == [*plain, tracked, *ablations]
     assert {title for title, text in by_title.items() if "tracked" in text} == {tracked}
     assert {title for title, text in by_title.items() if "| less" in text} == {*ablations}
 
 
 def test_a_second_run_has_its_own_heading(tracked_run, write_run):
-    large = write_run("run-large", {"ga": 30.0, "ours": 31.0})
-    first, second = suite_report([tracked_run, large], "ours").split(f"\n# {LARGE}\n")
-    assert first == suite_report([tracked_run], "ours")
-    primary, own = suite_report([large], "ours").split("\n\n## All frames")
+    alone = suite_report(tracked_run.parent, "ours")
+    write_run("suite/run-large/01", {"ga": 30.0, "ours": 31.0})
+    first, second = suite_report(tracked_run.parent, "ours").split(f"\n# {LARGE}\n")
+    assert first == alone
+    write_run("other/run/01", {"ga": 30.0, "ours": 31.0})
+    primary, own = suite_report(tracked_run.parents[1] / "other", "ours").split("\n\n## All frames")
     assert primary.startswith("## Primary endpoints")
     assert second.strip() == f"## All frames{own}".strip()
