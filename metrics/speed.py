@@ -13,6 +13,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import count, islice, repeat
 from typing import Any, Protocol
@@ -89,8 +90,24 @@ THROUGHPUT = replace(
     tables=("speed",),
 )
 
+FPS_ONE_THREAD = replace(
+    FPS,
+    name="fps_one_thread",
+    label="1 thread",
+    detail="one_thread_fps",
+    summary="The same on one thread.",
+    tables=("speed",),
+)
+FPS_WITHOUT_HEAD = replace(
+    FPS_ONE_THREAD,
+    name="fps_without_head",
+    label="1 thread, without head model",
+    detail="without_head_fps",
+    summary="The same on one thread, from the posed mesh: without the stage from driving signal to mesh and features.",
+)
+
 WHITE = (1.0, 1.0, 1.0)
-READ_BACK = "read_back"
+HEAD_STAGE, READ_BACK = "drive", "read_back"
 NUDGE = 1e-5  # added to every expression coefficient per lap of the workload: too little to see, a new signal
 
 Clock = Callable[[], float]
@@ -152,6 +169,8 @@ class SpeedProtocol:
     stages_s: float = 3.0
     static: int = 40
     static_s: float = 2.0
+    one_thread: int = 300
+    one_thread_s: float = 5.0
 
 
 def fps(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurement:
@@ -160,7 +179,8 @@ def fps(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurem
     The mean of per-frame rates would flatter a jittery method. Details, all of wall clock unless said: ``frames``,
     ``mean_ms``, ``p5_ms``, ``p50_ms``, ``p95_ms``, ``p99_ms``, ``iqr_ms``, ``max_ms`` and ``processor_ms`` (mean time
     of all threads) of the latency; ``throughput_fps``; ``<stage>_ms``, the median of each stage where the avatar reports
-    stages; ``static_ms``, the median where neither camera nor pose changes; ``warm_up_frames``; ``stationary`` (1 or
+    stages; ``one_thread_fps``, the rate of ``p50_ms`` where torch and the kernels have one thread, and ``without_head_fps``, that
+    rate without the first stage, "drive", where the avatar reports stages; ``static_ms``, the median where neither camera nor pose changes; ``warm_up_frames``; ``stationary`` (1 or
     0); ``load``, the mean number of busy processes of the last minute. A run adds threads and the cores that others kept busy.
     Numbers of different machines do not compare.
 
@@ -203,6 +223,14 @@ def measure_speed(
     if drawing is avatar:
         medians = stage_times(drawing, stream, plan.stages, plan.stages_s, clock)
         details |= {f"{stage}_ms": value for stage, value in medians.items()}
+    with one_thread():
+        waited = latencies(drawing, stream, plan.one_thread, plan.one_thread_s, clock)
+        alone = float(np.median(waited))
+        details["one_thread_fps"] = 1000 / alone
+        if drawing is avatar:
+            medians = stage_times(drawing, stream, plan.stages, plan.stages_s, clock)
+            whole = sum(medians.values())
+            details["without_head_fps"] = 1000 / (alone * (1 - medians.get(HEAD_STAGE, 0.0) / whole))
     static = latencies(drawing, repeat(next(stream)), plan.static, plan.static_s, clock)
     details |= {
         "static_ms": float(np.median(static)),
@@ -310,6 +338,21 @@ def stage_times(
         drawing.read_back(drawing.draw(*frame, WHITE, end_stage))
         end_stage(READ_BACK)
     return {stage: float(np.median(values)) for stage, values in times.items()}
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch on one thread, and with it the kernels, which have as many as torch."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        yield
+        return
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def synchroniser() -> Callable[[], None]:

@@ -24,7 +24,11 @@ MEANINGS = {
     AS_TRACKED: "given the capture's own head model, neck, static offset and views, otherwise those of its publication: another head "
     "model, the neck's rotation merged into the head's, no static offset, one video",
 }
-COST = ("training_processor", "training_iterations", "training_time", "storage")
+AVATAR_TABLES = {
+    "cost": ("training_processor", "training_iterations", "training_time", "storage"),
+    "speed": ("fps", "fps_one_thread", "fps_without_head", "processor_time"),
+}
+"""Metrics of the tables without frames, by layout."""
 
 
 def suite_runs(folder: Path) -> list[list[Path]]:
@@ -77,10 +81,10 @@ def _tables(read: RunSet, method: str, *, primary: bool) -> str:
     if equal := by_condition.get(EQUAL, {}):
         labels = [equal.get(name, label) for name, label in plain.items() if label not in whole.trivial]
         sections.append(_section("Equal iterations", whole.only(labels).shared.without_conditions, method))
-    if any(spec.name in COST for spec in runs.metrics):
-        columns = Columns(tuple(spec.name for spec in runs.metrics if spec.name in COST))
-        cost = to_markdown(table_of(runs, "cost", columns=columns)).strip()
-        sections.append(f"## Cost (exploratory)\n\n{cost}")
+    for layout, names in AVATAR_TABLES.items():
+        if own := tuple(spec.name for spec in runs.metrics if spec.name in names and layout in spec.tables):
+            text = to_markdown(table_of(runs, layout, columns=Columns(own))).strip()
+            sections.append(f"## {layout.capitalize()} (exploratory)\n\n{text}")
     regions = (FULL, *({"face"} & runs.rows.regions))
     tracking = [c for c in by_condition if c == TRACKED or c.startswith(LEVEL_START)]
     for condition in (*tracking, *({AS_TRACKED} & {*by_condition})):

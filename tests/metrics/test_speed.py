@@ -1,7 +1,9 @@
 """The measurement of speed against renderers of a given duration, on a clock of their own."""
 
+import sys
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -79,8 +81,8 @@ def test_latencies_are_those_of_known_durations():
 
 
 def test_speed_is_that_of_the_mean_time_not_the_mean_of_rates():
-    quick = SpeedProtocol(warm_up=2, warm_up_limit=2, latency=4, throughput=1, stages=1, static=2)
-    durations = [0.005, 0.005, 0.002, 0.002, 0.002, 0.020, 0.1, 0.001, 0.003]
+    quick = SpeedProtocol(warm_up=2, warm_up_limit=2, latency=4, throughput=1, stages=1, one_thread=1, static=2)
+    durations = [0.005, 0.005, 0.002, 0.002, 0.002, 0.020, 0.1, 0.05, 0.001, 0.003]
     renderer = Renderer(durations)
     measured = measure_speed(renderer, WORKLOAD, quick, renderer.clock)
     assert measured.value == pytest.approx(4 / 0.026)  # not 387
@@ -89,17 +91,19 @@ def test_speed_is_that_of_the_mean_time_not_the_mean_of_rates():
     assert [details[f"p{p}_ms"] for p in (5, 50, 95, 99)] == pytest.approx(list(expected))
     assert (details["frames"], details["max_ms"]) == (4, pytest.approx(20))
     assert details["throughput_fps"] == pytest.approx(10)
+    assert details["one_thread_fps"] == pytest.approx(20)
+    assert "without_head_fps" not in details
     assert details["static_ms"] == pytest.approx(2)  # of 1 and 3
     assert "raster_ms" not in details
     assert (details["warm_up_frames"], details["stationary"]) == (2, 0)
 
 
 def test_only_static_frames_repeat_a_pose():
-    quick = SpeedProtocol(warm_up=4, warm_up_limit=4, latency=8, throughput=3, static=5)
+    quick = SpeedProtocol(warm_up=4, warm_up_limit=4, latency=8, throughput=3, one_thread=2, static=5)
     renderer = Renderer(constant(0.001))
     measure_speed(renderer, WORKLOAD, quick, renderer.clock)
     moving, static = renderer.seen[:-5], renderer.seen[-5:]
-    assert len(moving) == 4 + 8 + 3
+    assert len(moving) == 4 + 8 + 3 + 2
     assert [camera for camera, _ in moving] == [WORKLOAD[i % 3][0] for i in range(len(moving))]
     signals = {pose.expression.tobytes() for _, pose in moving}
     assert len(signals) == len(moving)
@@ -134,9 +138,9 @@ def test_warm_up_ends_when_times_are_stationary(durations, frames, steady):
 
 def test_a_slow_renderer_stops_at_the_limits():
     renderer = Renderer([1.0] * 100)
-    plan = SpeedProtocol(warm_up_s=1.5, latency_s=2.5, throughput_s=3.5, static_s=0.5)
+    plan = SpeedProtocol(warm_up_s=1.5, latency_s=2.5, throughput_s=3.5, one_thread_s=1.5, static_s=0.5)
     measured = measure_speed(renderer, WORKLOAD, plan, renderer.clock)
-    assert len(renderer.seen) == 2 + 3 + 4 + 1
+    assert len(renderer.seen) == 2 + 3 + 4 + 2 + 1
     assert (measured.details["warm_up_frames"], measured.details["frames"]) == (2, 3)
     assert measured.value == pytest.approx(1)
 
@@ -149,6 +153,31 @@ def test_stages_are_told_apart_and_reading_back_is_the_last():
     measured = measure_speed(renderer, WORKLOAD, clock=renderer.clock)
     assert measured.details["p50_ms"] == pytest.approx(15)
     assert measured.details["deform_ms"] == pytest.approx(2)
+
+
+def test_one_thread_has_rates_with_and_without_the_head_model(monkeypatch):
+    threads = {"now": 4, "seen": []}
+    torch = SimpleNamespace(
+        get_num_threads=lambda: threads["now"],
+        set_num_threads=lambda count: threads.update(now=count),
+        cuda=SimpleNamespace(is_available=lambda: False),
+    )
+    monkeypatch.setitem(sys.modules, "torch", torch)
+
+    class Parallel(Staged):
+        """Each stage takes its time divided by the threads."""
+
+        def draw(self, camera, pose, background, done):
+            self.costs = {name: cost / threads["now"] for name, cost in Staged().costs.items()}
+            return super().draw(camera, pose, background, done)
+
+    staged = Parallel()
+    found = measure_speed(staged, WORKLOAD, SpeedProtocol(warm_up_limit=3), staged.clock)
+    assert threads["now"] == 4
+    assert found.details["one_thread_fps"] == pytest.approx(1 / 0.015)
+    assert found.value == pytest.approx(1 / (0.007 / 4 + 0.008))
+    # Of 15 ms, of which 8 are for reading back, the first stage has 1.
+    assert found.details["without_head_fps"] == pytest.approx(1 / 0.014)
 
 
 def test_throughput_does_not_wait_for_each_frame():
@@ -188,7 +217,7 @@ def test_the_metric_times_the_avatar_by_the_wall_clock():
     avatar = Avatar()
     measured = fps(avatar, WORKLOAD)
     plan = SpeedProtocol()
-    loops = plan.latency + plan.throughput + plan.static
+    loops = plan.latency + plan.throughput + plan.one_thread + plan.static
     assert avatar.calls == measured.details["warm_up_frames"] + loops
     assert measured.value == pytest.approx(1000 / measured.details["mean_ms"])
     assert all(np.isfinite(value) for value in measured.details.values())

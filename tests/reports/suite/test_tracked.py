@@ -74,7 +74,7 @@ def test_tracking_from_images_is_no_ablation(tracked_run):
     tracked = "Tracked from images (exploratory)"
     plain = [
         "Primary endpoints",
-        *(f"{name} (exploratory)" for name in ("All frames", "Sequence EMO", "Cost")),
+        *(f"{name} (exploratory)" for name in ("All frames", "Sequence EMO", "Cost", "Speed")),
     ]
     assert [*by_title] == [*plain, tracked, *ablations]
     assert {title for title, text in by_title.items() if "tracked" in text} == {tracked}
