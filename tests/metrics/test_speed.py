@@ -81,7 +81,9 @@ def test_latencies_are_those_of_known_durations():
 
 
 def test_speed_is_that_of_the_mean_time_not_the_mean_of_rates():
-    quick = SpeedProtocol(warm_up=2, warm_up_limit=2, latency=4, throughput=1, stages=1, one_thread=1, static=2)
+    quick = SpeedProtocol(
+        warm_up=2, warm_up_limit=2, latency=4, throughput=1, stages=1, one_thread=1, static=2
+    )
     durations = [0.005, 0.005, 0.002, 0.002, 0.002, 0.020, 0.1, 0.05, 0.001, 0.003]
     renderer = Renderer(durations)
     measured = measure_speed(renderer, WORKLOAD, quick, renderer.clock)

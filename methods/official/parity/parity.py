@@ -67,21 +67,36 @@ class Difference:
 
     Attributes
     ----------
-    orders : tuple[int, ...]
-        Orders for which both methods have complete results.
+    pairs : tuple[tuple[str, int], ...]
+        Subjects and orders for which both methods have complete results.
     native, official : tuple[float, ...]
-        Mean over frames, then sequences, then subjects, for each order.
+        Mean over frames, then sequences, for each pair.
     half_width : float | None
-        Half width of its 95 % interval (Student's t over orders); None with a single order.
+        Half width of its 95 % interval (Student's t over pairs); None with a single pair.
     """
 
     task: str
     metric: str
-    orders: tuple[int, ...]
+    pairs: tuple[tuple[str, int], ...]
     native: tuple[float, ...]
     official: tuple[float, ...]
     difference: float
     half_width: float | None
+
+    def equivalence_p(self, margin: float) -> float | None:
+        """P-value of two one-sided t-tests over pairs against differences of the margin and beyond; None with a single pair.
+
+        D. Schuirmann, Journal of Pharmacokinetics and Biopharmaceutics 15, 1987. It is at most 5 % where the 90 % interval lies within
+        the margin. Orders on one capture are treated as independent of each other.
+        """
+        apart = [b - a for a, b in zip(self.native, self.official, strict=True)]
+        if len(apart) < 2:
+            return None
+        error = stdev(apart) / math.sqrt(len(apart))
+        distance = margin - abs(self.difference)
+        if error == 0.0:
+            return 0.0 if distance > 0 else 1.0
+        return float(student_t.sf(distance / error, len(apart) - 1))
 
 
 def compare(settings: ParitySettings, progress: Progress = no_progress) -> CommandResult:
@@ -110,7 +125,12 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
         "official": official,
         "iterations": settings.iterations,
         "settings": {name: config.settings[name] for name in config.methods},
-        "differences": [asdict(each) for each in differences],
+        "differences": [
+            {**asdict(each), "equivalence_p": each.equivalence_p(settings.tolerance)}
+            if each.metric == "psnr"
+            else asdict(each)
+            for each in differences
+        ],
         "avatars": cells,
         "causes": causes,
         "run": "run",
@@ -175,30 +195,31 @@ def as_theirs(native: str, iterations: int, samples: int) -> dict[str, Any]:
 
 
 def differences_of(rows: Rows, native: str, official: str, orders: Sequence[int]) -> list[Difference]:
-    """Differences by task and metric, over the orders for which both have values."""
+    """Differences by task and metric, over the subjects and orders for which both have values."""
     found = []
     for task in TASKS:
         for metric in METRICS:
             of_native, of_official = (_means(rows, name, task, metric) for name in (native, official))
-            both = [order for order in orders if order in of_native and order in of_official]
+            both = sorted(pair for pair in of_native.keys() & of_official.keys() if pair[1] in orders)
             if not both:
                 continue
-            apart = [of_official[order] - of_native[order] for order in both]
-            values = [tuple(of[order] for order in both) for of in (of_native, of_official)]
+            apart = [of_official[pair] - of_native[pair] for pair in both]
+            values = [tuple(of[pair] for pair in both) for of in (of_native, of_official)]
             found.append(
                 Difference(task, metric, tuple(both), values[0], values[1], fmean(apart), _half_width(apart))
             )
     return found
 
 
-def _means(rows: Rows, method: str, task: str, metric: str) -> dict[int, float]:
-    """Mean over frames, then sequences, then subjects, by order."""
+def _means(rows: Rows, method: str, task: str, metric: str) -> dict[tuple[str, int], float]:
+    """Mean over frames, then sequences, by subject and order."""
     table = rows.select(method=method, metric=metric, task=task, region=FULL, seeds=rows.seeds(method))
-    whole = table.groupby("seed")["status"].agg(lambda status: set(status) == {"ok"})
-    table = table[table["seed"].map(whole).astype(bool)]
-    means = table.groupby(["seed", "subject", "sequence"])["value"].mean()
-    by_order = means.groupby(["seed", "subject"]).mean().groupby("seed").mean()
-    return dict(zip(map(int, by_order.index), map(float, by_order), strict=True))
+    by = ["subject", "seed"]
+    whole = table.groupby(by)["status"].transform(lambda status: set(status) == {"ok"})
+    means = table[whole.astype(bool)].groupby([*by, "sequence"])["value"].mean().groupby(by).mean()
+    return {
+        (str(pair[0]), int(pair[1])): float(value) for pair, value in zip(means.index, means, strict=True)
+    }
 
 
 def _half_width(values: Sequence[float]) -> float | None:
@@ -219,6 +240,7 @@ def _make_capture(settings: ParitySettings, out: Path, progress: Progress) -> No
     with locked(_capture(out), beside=True):
         synthesize(
             _capture(out),
+            subjects=settings.subjects,
             cameras=settings.cameras,
             timesteps=settings.timesteps,
             size=size,
@@ -265,21 +287,43 @@ def _text(
         f"{'# ' if markdown else ''}{native} and {official}, {settings.iterations:,} iterations each",
         "",
         (
-            "Equal settings and the same image in each iteration; both methods are trained once for each order of the images. Means over "
-            "frames, then sequences, then subjects; the difference is official minus native, with its 95 % interval over orders."
+            "Equal settings and the same image in each iteration; both methods are trained once for each subject and order of the images. "
+            "Means over frames, then sequences; the difference is official minus native, with its 95 % interval over subjects and orders."
         ),
         "",
         _table(differences, native, official, markdown=markdown),
+        *_equivalence(differences, settings.tolerance),
     ]
     splats = [
         f"{name}: " + ", ".join(str(cell["splats"] or "?") for cell in cells[name])
         for name in (native, official)
     ]
-    lines += ["", "Splats by order: " + "; ".join(splats) + ".", "", "Known causes of differences:", ""]
+    lines += [
+        "",
+        "Splats by subject and order: " + "; ".join(splats) + ".",
+        "",
+        "Known causes of differences:",
+        "",
+    ]
     lines += [f"- {cause}" for cause in causes]
     if rows.failed:
         lines += ["", f"Failed: {', '.join(rows.failed)}; see run/tables/comparison.md for the reasons."]
     return "\n".join(lines) + "\n"
+
+
+def _equivalence(differences: Sequence[Difference], margin: float) -> list[str]:
+    """A line for each task: whether its PSNR is equivalent."""
+    lines = []
+    for each in differences:
+        p = each.equivalence_p(margin) if each.metric == "psnr" else None
+        if p is not None:
+            verdict = "equivalent" if p <= 1 - CONFIDENCE else "equivalence not shown"
+            task = each.task.replace("_", " ")
+            lines += [
+                "",
+                f"PSNR of {task}: {verdict} within {margin:g} dB (two one-sided t-tests, p = {p:.4f}).",
+            ]
+    return lines
 
 
 def _table(differences: Sequence[Difference], native: str, official: str, *, markdown: bool) -> str:
@@ -289,17 +333,18 @@ def _table(differences: Sequence[Difference], native: str, official: str, *, mar
     for each in differences:
         digits = 2 if each.metric == "psnr" else 4
         width = "" if each.half_width is None else f" ± {each.half_width:.{digits}f}"
-        mean = ("all", fmean(each.native), fmean(each.official), each.difference, width)
-        of_orders = zip(each.orders, each.native, each.official, strict=True)
-        every = [*((order, a, b, b - a, "") for order, a, b in of_orders), mean]
-        for order, a, b, difference, interval in every:
-            where = {"task": each.task.replace("_", " "), "metric": titles[each.metric], "order": str(order)}
+        mean = (("all", "all"), fmean(each.native), fmean(each.official), each.difference, width)
+        of_pairs = zip(each.pairs, each.native, each.official, strict=True)
+        every = [*((pair, a, b, b - a, "") for pair, a, b in of_pairs), mean]
+        for (subject, order), a, b, difference, interval in every:
+            where = {"task": each.task.replace("_", " "), "metric": titles[each.metric]}
+            where |= {"subject": str(subject), "order": str(order)}
             values = {native: f"{a:.{digits}f}", official: f"{b:.{digits}f}"}
             shown = f"{difference:+.{digits}f}{interval}"
             shown = f"**{shown}**" if markdown and order == "all" else shown
             rows.append({**where, **values, "difference": shown})
     if not markdown:
         return aligned(rows)
-    names = ["task", "metric", "order", native, official, "difference"]
-    lines = [names, [":---"] * 2 + ["---:"] * 4, *([*row.values()] for row in rows)]
+    names = ["task", "metric", "subject", "order", native, official, "difference"]
+    lines = [names, [":---"] * 2 + ["---:"] * 5, *([*row.values()] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

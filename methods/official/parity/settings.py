@@ -31,7 +31,8 @@ class ParitySettings(ExecutionOptions):
     """Folder to write."""
 
     data: str | None = None
-    """Capture to train on. Default: a synthetic one is made in OUT/capture, of SIZE with --cameras and --timesteps."""
+    """Capture to train on, of one subject or several. Default: a synthetic one is made in OUT/capture, of --subjects heads, SIZE, with
+    --cameras and --timesteps."""
 
     head: str | None = None
     """Head model for captures that bring none: FLAME pickle or npz."""
@@ -39,8 +40,8 @@ class ParitySettings(ExecutionOptions):
     iterations: int = 1_000
     """Length of each training."""
 
-    orders: int = 3
-    """Number of orders of the images, each with one training of either method. A single order gives no interval."""
+    orders: int = 5
+    """Number of orders of the images, each with one training of either method. A single order on one capture gives no interval."""
 
     device: Literal["cuda", "cpu-shim"] = "cuda"
     """Device of the authors' code: CUDA, or headbench's CPU renderer instead of its rasteriser
@@ -56,10 +57,13 @@ class ParitySettings(ExecutionOptions):
     """Held-out frames scored for each task, evenly spread; default: all."""
 
     tolerance: float = 0.3
-    """Mean difference of PSNR, in decibels, up to which the two count as equal."""
+    """Difference of PSNR, in decibels, within which the two count as equivalent; also the limit of the mean difference."""
 
     samples: int = 5_000
     """Initial number of splats on the head, for gbs; published: 50,000, whose differences for each expression take gigabytes."""
+
+    subjects: int = 2
+    """Heads of the synthetic capture; both methods are trained on each with every order."""
 
     size: str = "96x136"
     """Width x height of the synthetic capture's images in pixels."""
@@ -71,12 +75,18 @@ class ParitySettings(ExecutionOptions):
     """Timesteps of the synthetic capture."""
 
     dependent = (
-        DependentOptions(("size", "cameras", "timesteps"), "data", False),
+        DependentOptions(("subjects", "size", "cameras", "timesteps"), "data", False),
         DependentOptions(("samples",), "method", ("gbs",)),
     )
 
     def __post_init__(self) -> None:
         """Raise ValueError for invalid settings."""
         parse_size(self.size)
-        if self.iterations < 1 or self.orders < 1 or self.samples < 10 or not self.tolerance > 0:
-            raise ValueError("iterations and orders must be at least 1, samples 10, the tolerance above 0")
+        if (
+            min(self.iterations, self.orders, self.subjects) < 1
+            or self.samples < 10
+            or not self.tolerance > 0
+        ):
+            raise ValueError(
+                "iterations, orders and subjects must be at least 1, samples 10, the tolerance above 0"
+            )

@@ -4,8 +4,10 @@ import json
 import math
 import re
 import sys
+from dataclasses import replace
 
 import pytest
+from scipy import stats
 
 from headbench.bench import cli
 from headbench.bench.configuration import build
@@ -50,7 +52,7 @@ def test_both_are_trained_and_their_difference_tabled(folder, capsys, monkeypatc
     assert parity(*words) == 0
     text = (folder / "out" / "parity.md").read_text()
     assert capsys.readouterr().out.strip() == text.strip()
-    assert re.search(r"\| novel view \| PSNR \| all \| .*\*\*[+-][\d.]+\*\*", text)
+    assert re.search(r"\| novel view \| PSNR \| all \| all \| .*\*\*[+-][\d.]+\*\*", text)
     assert OFFICIAL in text
     assert "not the original" in text
     found = read_json(folder / "out" / "parity.json")
@@ -117,7 +119,7 @@ def test_settings_do_what_the_program_is_told(tmp_path):
     assert (native.samples, native.teeth_samples, native.min_sh_every) == (300, 30, 1_000)
 
 
-def test_differences_are_paired_by_order():
+def test_differences_are_paired_by_subject_and_order():
     values = {"ga": (20.0, 22.0, 24.0), "official": (21.0, 22.0, 26.0)}
     rows = [
         Row(name, "1", order, "novel_view", "s", sequence, 0, "c", "full", "psnr", value + shift, "hash")
@@ -130,11 +132,18 @@ def test_differences_are_paired_by_order():
     assert found.difference == pytest.approx(1.0)
     # Student's t with two degrees of freedom, 97.5 %: 4.3027; the differences 1, 0, 2 have a deviation of 1.
     assert found.half_width == pytest.approx(4.302653 / math.sqrt(3), rel=1e-6)
+    expected = stats.ttest_1samp([1, 0, 2], 1.5, alternative="less").pvalue
+    assert found.equivalence_p(1.5) == pytest.approx(expected)
+    assert found.equivalence_p(0.5) > 0.5
     (single,) = differences_of(Rows.of(rows), "ga", "official", [0])
-    assert single.half_width is None
+    assert single.half_width is single.equivalence_p(9.0) is None
     kept = [row for row in rows if (row.method, row.seed) != ("official", 0)]
     (found,) = differences_of(Rows.of(kept), "ga", "official", range(3))
-    assert (found.orders, found.native) == ((1, 2), pytest.approx(values["ga"][1:]))
+    assert (found.pairs, found.native) == ((("s", 1), ("s", 2)), pytest.approx(values["ga"][1:]))
+    both = [*rows, *(replace(row, subject="t", value=row.value + 10) for row in rows)]
+    (found,) = differences_of(Rows.of(both), "ga", "official", range(3))
+    assert found.pairs == tuple((subject, order) for subject in "st" for order in range(3))
+    assert found.difference == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("settings", [{"device": "cpu-shim"}, {"order": "native"}])
@@ -145,7 +154,7 @@ def test_code_that_the_shim_does_not_know_is_refused(settings, official_clip):
 
 
 def test_settings_without_meaning_are_refused():
-    for wrong in ({"orders": 0}, {"tolerance": 0.0}):
+    for wrong in ({"orders": 0}, {"subjects": 0}, {"tolerance": 0.0}):
         with pytest.raises(ValueError, match="at least 1"):
             ParitySettings("ga", checkout="x", out="y", **wrong)
     with pytest.raises(InputError, match="WIDTHxHEIGHT"):
