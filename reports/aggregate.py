@@ -53,18 +53,18 @@ def summarise(rows: Rows, method: str, metric: str, task: str) -> Aggregate:
         what = "frames" if task else "avatars"
         reason = f"{gap} of {expected} {what} have no value: run the comparison to its end."
         return Aggregate("missing", None, reason)
-    by_seed = [fmean(means.values()) for means in _subject_means(mine).values()]
+    by_seed = [fmean(means.values()) for means in means_by_seed(mine).values()]
     return Aggregate("ok", fmean(by_seed), spread=stdev(by_seed) if len(by_seed) > 1 else None)
 
 
 def subject_means(rows: pd.DataFrame) -> dict[str, float]:
     """Mean of each subject: over frames of a sequence, then over sequences, then over seeds."""
-    by_seed = _subject_means(rows).values()
+    by_seed = means_by_seed(rows).values()
     subjects = sorted({subject for means in by_seed for subject in means})
     return {each: fmean(means[each] for means in by_seed if each in means) for each in subjects}
 
 
-def _subject_means(rows: pd.DataFrame) -> dict[int, dict[str, float]]:
+def means_by_seed(rows: pd.DataFrame) -> dict[int, dict[str, float]]:
     """Means over the frames of a sequence, then over sequences, by seed and subject, both sorted.
 
     Not by pandas, whose grouping of a few hundred rows takes twenty times as long.

@@ -18,7 +18,7 @@ from ..bench.audit.bundle import without_paths
 from ..bench.engine.scoring import FULL
 from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
-from ..bench.experiments.suite_settings import EQUAL, NONE, TRACKED
+from ..bench.experiments.suite_settings import EQUAL, LARGE_RUN, NONE, RUN, SEEDS_RUN, TRACKED
 from ..bench.io.files import write_bytes, write_text
 from ..bench.io.images import encode_image, read_png
 from ..bench.manifest import Manifest
@@ -56,7 +56,7 @@ def publish_demo(out: Path, root: Path) -> None:
 def publish_suite(out: Path, root: Path) -> None:
     """Copy manifest and rows of a suite's run to the repository ``root``, and write its tables and block."""
     target = root / SUITE
-    for run in chain(*suite_runs(out)):
+    for run in chain.from_iterable(suite_runs(out, base) for base in (RUN, SEEDS_RUN, LARGE_RUN)):
         _copy(RunFolder(run), RunFolder(target / run.relative_to(out)))
     write_text(target / RESULTS, suite_results(target))
     _write(root / PAGES["suite"], "suite", suite_block(target))
@@ -129,12 +129,14 @@ def _made(manifest: Manifest) -> dict[str, Any]:
 
 def suite_options(folder: Path) -> tuple[str, ...]:
     """Options of ``headbench run suite`` that make the captures of stored runs, as these record them."""
-    runs, *large = ([RunFolder(run).read_manifest() for run in part] for part in suite_runs(folder))
+    runs, large = (
+        [RunFolder(run).read_manifest() for run in suite_runs(folder, base)] for base in (RUN, LARGE_RUN)
+    )
     given = {"tracker": "per-frame", **_made(runs[0])}
     given["size"] = "x".join(map(str, given["size"]))
     names = ("performance", "tracker", "tracking_error", "cameras", "timesteps", "size", "subjects")
     options = [(f"--{name.replace('_', '-')}", str(given[name])) for name in names]
-    options.append(("--large", str(sum(len(each.clips) for part in large for each in part))))
+    options.append(("--large", str(sum(len(each.clips) for each in large))))
     words = [word for option in options for word in option]
     for option, condition in (("--tracked", TRACKED), ("--equal-iterations", EQUAL)):
         named = dict.fromkeys(
@@ -146,10 +148,10 @@ def suite_options(folder: Path) -> tuple[str, ...]:
 
 def suite_block(folder: Path) -> str:
     """Return the block for the stored results of the suite: Markdown."""
-    folders = suite_runs(folder)[0]
+    folders = suite_runs(folder)
     runs = RunSet.read(folders)
     options = " ".join(suite_options(folder))
-    edition = _made(runs.runs[0].manifest).get("edition", 1)
+    made = _made(runs.runs[0].manifest)
     minutes = [value for each in folders for _, value in _minutes(each)]
     hours = sum(value for value in minutes if value is not None) / 60
     interrupted = (
@@ -160,7 +162,7 @@ def suite_block(folder: Path) -> str:
     return (
         f"{to_markdown(table_of(shown, columns=columns)).strip()}\n\n{conclusions(shown)}\n\n"
         f"[SSIM, tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
-        f"The captures are of edition {edition} and have the options `headbench run suite {options}`. "
+        f"The captures are of edition {made.get('edition', 1)}, made with seed {made['seed']}, and have the options `headbench run suite {options}`. "
         f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{interrupted}."
     )
 

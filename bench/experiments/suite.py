@@ -16,7 +16,19 @@ from ..executors.settings import check_executor
 from ..io.files import write_text
 from ..registry import discover, get, resolve
 from ..specs import CommandResult, MethodSpec
-from .suite_settings import ALL, AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, NONE, RUN, SEED, TRACKED, SuiteSettings
+from .suite_settings import (
+    ALL,
+    AS_TRACKED,
+    EQUAL,
+    LARGE_RUN,
+    LEVEL,
+    NONE,
+    RUN,
+    SEED,
+    SEEDS_RUN,
+    TRACKED,
+    SuiteSettings,
+)
 
 OURS = "ours"
 REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
@@ -54,11 +66,15 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
     check_settings(cell for cell in cells if not cell[0].is_isolated(config.isolation))
     width, height = parse_size(settings.size)
     large = replace(plain, data=str(out / "capture-large"), out=str(out / LARGE_RUN), conditions=(PLAIN,))
+    seeds = tuple(max(settings.seeds) + further for further in (1, 2))
+    more_seeds = replace(plain, out=str(out / SEEDS_RUN), seeds=seeds, conditions=(PLAIN,))
     failed: list[str] = []
     ends: list[str] = []
     runs: list[Path] = []
     for place in range(settings.first - 1, settings.subjects):
         parts = [(config, (width, height))]
+        if place < settings.repeated:
+            parts.append((more_seeds, (width, height)))
         if place < settings.large:
             parts.append((large, (2 * width, 2 * height)))
         for part, size in parts:

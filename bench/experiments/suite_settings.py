@@ -21,8 +21,9 @@ method that otherwise gets it converted; as many iterations as "ours" has."""
 TRACKED_METHODS = ("ga", "gbs", "ours", "ours-plus")
 """Methods that have the first two conditions where none are named."""
 
-RUN, LARGE_RUN = "run", "run-large"
-"""Folders of a suite's runs, each with a folder for each subject; those of the second have images of twice the size."""
+RUN, LARGE_RUN, SEEDS_RUN = "run", "run-large", "run-seeds"
+"""Folders of a suite's runs, each with a folder for each subject; those of the second have images of twice the size, those of the
+third other training seeds."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,10 @@ class SuiteSettings(ExecutionOptions):
     """At most this many subjects, from the first, are also rendered at twice the size, with runs and tables of their own, without
     conditions. Each takes about half a processor hour to render, twice as long as at the usual size."""
 
+    repeated: int = 0
+    """At most this many subjects, from the first, are also trained with two further seeds, without conditions, in runs of their own;
+    `results.md` then has the variance between and within subjects."""
+
     cameras: int = 16
     """Views of each, the held-out one included."""
 
@@ -103,7 +108,7 @@ class SuiteSettings(ExecutionOptions):
             if NONE in names and len(names) > 1:
                 where = f"--{option.replace('_', '-')}"
                 raise InputError("command line", where, f"names of methods, or {NONE}", " ".join(names))
-        for name, least in (("large", 0), ("first", 1)):
+        for name, least in (("large", 0), ("repeated", 0), ("first", 1)):
             if getattr(self, name) < least:
                 raise InputError("command line", f"--{name}", f"at least {least}", str(getattr(self, name)))
         if self.first > self.subjects:

@@ -8,14 +8,16 @@ from pathlib import Path
 
 from ...bench.engine.scoring import FULL
 from ...bench.engine.store import RunFolder
-from ...bench.experiments.suite_settings import AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, RUN, TRACKED
+from ...bench.experiments.suite_settings import AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, RUN, SEEDS_RUN, TRACKED
+from ...bench.rows import ALL
 from ..runs import FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
-from ..statistics.primary import primary_section
+from ..statistics.primary import PAIR, primary_section
 from ..table_report import Columns, table_of
 from ..writers import to_markdown
 from .ablations import ablation_table
 from .tracked import DROP_MEANING, condition_table, drop_table
+from .variance import variance_section
 
 LARGE = "Images of twice the size"
 LEVEL_START = LEVEL.partition("{")[0]
@@ -31,23 +33,21 @@ AVATAR_TABLES = {
 """Metrics of the tables without frames, by layout."""
 
 
-def suite_runs(folder: Path) -> list[list[Path]]:
-    """Folders of a suite's finished runs, one for each subject: those of the usual size, then those of twice the size, if any.
+def suite_runs(folder: Path, base: str = RUN) -> list[Path]:
+    """Folders of a suite's finished runs of one kind, one for each subject.
 
     A suite of earlier versions has one run for all subjects.
     """
-    parts = []
-    for base in (folder / RUN, folder / LARGE_RUN):
-        places = [base, *sorted(base.iterdir())] if base.is_dir() else []
-        parts.append([place for place in places if RunFolder(place).rows.is_file()])
-    return [part for part in parts if part]
+    place = folder / base
+    places = [place, *sorted(place.iterdir())] if place.is_dir() else []
+    return [each for each in places if RunFolder(each).rows.is_file()]
 
 
 def suite_report(folder: Path, method: str) -> str:
-    """Tables of a suite as Markdown: whole frames, each region, each held-out sequence, conditions, ablations.
+    """Tables of a suite as Markdown: whole frames, each region, each held-out sequence, conditions, ablations, variance.
 
     The primary endpoints are first; everything else is labelled as exploratory. Under each table are the paired differences of
-    every other method from ``method``, with intervals and tests. Those of the ablations and of tracking from images are such
+    every other method from ``method``, with intervals and tests. Those of the ablations and of conditions are such
     differences, of whole frames and of the face, the former also in each held-out sequence.
 
     Parameters
@@ -57,11 +57,15 @@ def suite_report(folder: Path, method: str) -> str:
     method : str
         Label of the method that others are compared with.
     """
-    parts = [
-        _tables(RunSet.read(runs), method, primary=index == 0)
-        for index, runs in enumerate(suite_runs(folder))
-    ]
-    return f"\n# {LARGE}\n\n".join(parts)
+    runs, large, seeds = (suite_runs(folder, base) for base in (RUN, LARGE_RUN, SEEDS_RUN))
+    text = _tables(RunSet.read(runs), method, primary=True)
+    if seeds:
+        names = [run.name for run in seeds]
+        both = RunSet.read([*(run for run in runs if run.name in names), *seeds])
+        text += f"\n{variance_section(both.only([*both.ranked]), PAIR)}\n"
+    if large:
+        text += f"\n# {LARGE}\n\n{_tables(RunSet.read(large), method, primary=False)}"
+    return text
 
 
 def _tables(read: RunSet, method: str, *, primary: bool) -> str:
@@ -76,14 +80,16 @@ def _tables(read: RunSet, method: str, *, primary: bool) -> str:
     parts = {"All frames": FrameSelection()}
     parts |= {f"Region {region}": FrameSelection(region) for region in sorted(runs.rows.regions - {FULL})}
     parts |= {f"Sequence {name}": FrameSelection(sequences=(name,)) for name in tested}
-    sections = [primary_section(runs)] if primary else []
+    sections = [primary_section(runs), _machines(read)] if primary else []
     sections += [_section(title, runs.of(part), method) for title, part in parts.items()]
     if equal := by_condition.get(EQUAL, {}):
-        labels = [equal.get(name, label) for name, label in plain.items() if label not in whole.trivial]
+        budgets = {name: whole.records[label].budget.get("iterations") for name, label in plain.items()}
+        same = {name: plain[name] for name, budget in budgets.items() if budget == budgets[method]}
+        labels = [label for label in ({**same, **equal}).values() if label not in whole.trivial]
         sections.append(_section("Equal iterations", whole.only(labels).shared.without_conditions, method))
     for layout, names in AVATAR_TABLES.items():
-        if own := tuple(spec.name for spec in runs.metrics if spec.name in names and layout in spec.tables):
-            text = to_markdown(table_of(runs, layout, columns=Columns(own))).strip()
+        if shown := tuple(spec.name for spec in runs.metrics if spec.name in names and layout in spec.tables):
+            text = to_markdown(table_of(runs, layout, columns=Columns(shown))).strip()
             sections.append(f"## {layout.capitalize()} (exploratory)\n\n{text}")
     regions = (FULL, *({"face"} & runs.rows.regions))
     tracking = [c for c in by_condition if c == TRACKED or c.startswith(LEVEL_START)]
@@ -109,6 +115,18 @@ def _tables(read: RunSet, method: str, *, primary: bool) -> str:
         title = f"Ablations of {method}, novel views minus self-reenactment (exploratory)"
         sections.append(f"## {title}\n\n{to_markdown(table).strip()}")
     return "\n\n".join(sections) + "\n"
+
+
+def _machines(runs: RunSet) -> str:
+    """Which processors trained which subjects: paired differences are within a subject, and so within one of them."""
+    trained = runs.rows.select(
+        method=ALL, condition=ALL, metric="training_time", task="", region=FULL, seeds=ALL
+    )
+    known: dict[str, dict[str, None]] = {}
+    for subject, machine in zip(trained["subject"], trained["machine"]):
+        known.setdefault(str(machine) or "unknown processors", {})[str(subject)] = None
+    listed = [f"{machine}: subjects {', '.join(subjects)}" for machine, subjects in known.items()]
+    return f"Trained on: {'; '.join(listed) or 'unknown processors'}."
 
 
 def _condition_section(runs: RunSet, condition: str, changed: Mapping[str, str], region: str) -> str:
