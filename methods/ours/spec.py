@@ -20,7 +20,6 @@ SHORT: dict[str, Any] = {
     "capacity": {"mode": "auto"},
     "sh_dc_lr": 0.02,
     "sh_rest_lr": 1e-3,
-    "storage": "compact",
 }
 """Settings of runs much shorter than published (docs/explanation/methods/ours.md, "Presets")."""
 
