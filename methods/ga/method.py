@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip, FloatArray, HeadPose
+from ..avatars.compact.bound import read_bound
+from ..avatars.compact.file import COMPACT_FILE
 from ..ops.harmonics import (
     coefficient_count,
     harmonic_colors,
@@ -124,8 +126,8 @@ class GAAppearance:
 class GAAvatar(StoredSplatAvatar):
     """A trained GaussianAvatars head.
 
-    Files: ``point_cloud.ply`` in GaussianAvatars' layout and ``subject.npz`` count as storage. The folder also has the
-    shared head model and the refined tracking of the training timesteps, which is part of the driving signal.
+    Files: ``point_cloud.ply`` in GaussianAvatars' layout and ``subject.npz``, or the coded file in place of both, count as
+    storage. The folder also has the shared head model and the refined tracking of the training timesteps, which is part of the driving signal.
 
     Attributes
     ----------
@@ -157,13 +159,17 @@ class GAAvatar(StoredSplatAvatar):
     @classmethod
     def read(cls, folder: Path, device: str) -> GAAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        head = read_shared_head(folder)
-        subject = read_subject(folder / SUBJECT_FILE, head)
+        head, coded = read_shared_head(folder), folder / COMPACT_FILE
+        if coded.exists():
+            stored = [coded]
+            subject, splats, binding = read_bound(coded, head, device)
+        else:
+            stored = [folder / PLY_FILE, folder / SUBJECT_FILE]
+            subject = read_subject(folder / SUBJECT_FILE, head)
+            splats, binding = read_ga_splats(folder / PLY_FILE, len(head.faces), device)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
-        splats, binding = read_ga_splats(folder / PLY_FILE, len(mesh.faces), device)
         driving = folder / DRIVING_FILE
         refined = RefinedTracking.read(driving) if driving.exists() else None
-        stored = [folder / PLY_FILE, folder / SUBJECT_FILE]
         return cls(stored, mesh, subject, splats, binding, refined, device)
 
     def harmonics(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:

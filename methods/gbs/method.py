@@ -15,10 +15,11 @@ from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.schedule import ShuffledEpochs
 from ..shared.sizes import Size, halves
-from .avatar import AVATAR_FILE, GBSAvatar, write_avatar
+from .avatar import GBSAvatar
 from .config import GBSConfig
 from .points import SurfacePoints, padded_offset, with_mouth
 from .spec import GBS as SPEC
+from .storage import AVATAR_FILE, write_avatar
 from .training import GBSTraining
 
 

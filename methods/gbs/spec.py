@@ -49,6 +49,7 @@ GBS = MethodSpec(
     summary="GaussianBlendshapes: splats of a neutral head plus linear differences for each expression, skinned.",
     implementation="headbench.methods.gbs.method:GBS",
     config="headbench.methods.gbs.config:GBSConfig",
+    variants="headbench.methods.avatars.derived.coded:gbs_variants",
     needs="headbench.methods.shared.needs:splats",
     presets=PRESETS,
     head_models=("flame2020", "procedural2020", "ict-facekit"),

@@ -14,13 +14,16 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ...bench.configuration import build
-from ...bench.contracts import Camera, Frame, HeadPose, no_stage
+from ...bench.contracts import Camera, Frame, HeadAsset, HeadPose, no_stage
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.documents import parse_json
 from ...bench.io.files import write_bytes
 from ...bench.native.dispatch import to_device
-from ..shared.avatar_files import SUBJECT_FILE, RefinedTracking, read_shared_head, read_subject
+from ..avatars.compact.container import read_content
+from ..avatars.compact.file import COMPACT_FILE
+from ..avatars.compact.networks import as_tensors, read_networks
+from ..shared.avatar_files import SUBJECT_FILE, RefinedTracking, Subject, read_shared_head, read_subject
 from ..shared.rendering import Drawn, LastPose, PosedSplats, posed_splats, read_back
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from ..shared.threads import torch_on_one_thread
@@ -35,7 +38,7 @@ DRIVING_FILE = "driving.npz"
 class GHAAvatar:
     """A trained head of Gaussians.
 
-    Files: ``avatar.safetensors`` and ``subject.npz`` count as storage. The folder also has the shared head model and
+    Files: ``avatar.safetensors`` and ``subject.npz``, or the coded file in place of both, count as storage. The folder also has the shared head model and
     the corrected head poses of the training timesteps, which are part of the driving signal.
 
     Parameters
@@ -46,13 +49,15 @@ class GHAAvatar:
 
     def __init__(
         self,
-        folder: Path,
+        files: Sequence[Path],
+        subject: Subject,
         driver: Driver,
         head: GaussianHead,
         tensors: Mapping[str, Tensor],
         corrected: RefinedTracking | None,
     ):
-        self._folder, self._driver, self._head = folder, driver, head
+        self._files, self._driver, self._head = files, driver, head
+        self.subject = subject
         self._tensors, self._corrected = tensors, corrected
         self._last = LastPose(self._computed)
         self._ground = tensors["background"].cpu().numpy()
@@ -62,9 +67,14 @@ class GHAAvatar:
     @classmethod
     def read(cls, folder: Path, device: str) -> GHAAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        shared = read_shared_head(folder)
-        subject = read_subject(folder / SUBJECT_FILE, shared)
-        head, tensors = read_avatar(folder / AVATAR_FILE, code_size(shared), device)
+        shared, coded = read_shared_head(folder), folder / COMPACT_FILE
+        if coded.exists():
+            files = [coded]
+            subject, head, tensors = read_coded(coded, shared, device)
+        else:
+            files = [folder / AVATAR_FILE, folder / SUBJECT_FILE]
+            subject = read_subject(folder / SUBJECT_FILE, shared)
+            head, tensors = read_avatar(files[0], code_size(shared), device)
         driver = Driver(
             *(shared, subject.shape, subject.static_offset),
             origin=tensors["origin"].cpu().numpy(),
@@ -75,7 +85,7 @@ class GHAAvatar:
         )
         driving = folder / DRIVING_FILE
         corrected = RefinedTracking.read(driving) if driving.exists() else None
-        return cls(folder, driver, head, tensors, corrected)
+        return cls(files, subject, driver, head, tensors, corrected)
 
     @torch.no_grad()
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
@@ -109,7 +119,7 @@ class GHAAvatar:
 
     def files(self) -> Sequence[Path]:
         """The tensors and the subject."""
-        return [self._folder / AVATAR_FILE, self._folder / SUBJECT_FILE]
+        return self._files
 
     def _posed(self, pose: HeadPose) -> FeatureSplats:
         return self._last(pose if self._corrected is None else self._corrected(pose), no_stage)
@@ -175,19 +185,38 @@ def read_avatar(path: Path, expression_size: int, device: str) -> tuple[Gaussian
     """
     tensors, metadata = read_safetensors(path)
     head = GaussianHead.of(_settings(path, metadata.get(CONFIG, "")), expression_size)
-    columns = sum(POINTS.values()) + head.config.features
+    return head, _checked(path, tensors, head, expression_size, device)
+
+
+def read_coded(path: Path, shared: HeadAsset, device: str) -> tuple[Subject, GaussianHead, dict[str, Tensor]]:
+    """The same, with the subject, of a coded file (`compact.networks`)."""
+    content, size = read_content(path), code_size(shared)
+    head = GaussianHead.of(_settings(path, content.text.get(CONFIG, "")), size)
+    subject, arrays = read_networks(path, shared, _shapes(head, size), TABLE, content)
+    return subject, head, _checked(path, as_tensors(arrays, "cpu"), head, size, device)
+
+
+TABLE = "table"
+"""Name of the table of the points with their features."""
+OF_CODE = ("expression_scale", "code_low", "code_high")
+
+
+def _shapes(head: GaussianHead, expression_size: int) -> dict[str, tuple[int | None, ...]]:
+    """Shapes of the stored tensors; None for any size."""
     shapes: dict[str, tuple[int | None, ...]] = {
         **head.shapes(),
         "landmarks": (None, 3),
-        "table": (None, columns),
+        TABLE: (None, sum(POINTS.values()) + head.config.features),
     }
-    of_code = ("expression_scale", "code_low", "code_high")
-    shapes |= {
-        "origin": (3,),
-        "center": (3,),
-        "background": (3,),
-        **dict.fromkeys(of_code, (expression_size,)),
-    }
+    shapes |= dict.fromkeys(("origin", "center", "background"), (3,))
+    return shapes | dict.fromkeys(OF_CODE, (expression_size,))
+
+
+def _checked(
+    path: Path, tensors: dict[str, Tensor], head: GaussianHead, expression_size: int, device: str
+) -> dict[str, Tensor]:
+    """The stored tensors as the avatar uses them. Raises `InputError` for the first that does not fit."""
+    shapes = _shapes(head, expression_size)
     members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in shapes.items()}
     # Without bounds of the code, these are float32's largest numbers.
     members |= dict.fromkeys(("code_low", "code_high"), Member("f", (expression_size,), dtype="f4"))
@@ -195,11 +224,11 @@ def read_avatar(path: Path, expression_size: int, device: str) -> tuple[Gaussian
     if not len(tensors["landmarks"]) or not (tensors["expression_scale"] > 0).all():
         raise InputError(path, "landmarks, expression_scale", "at least one; above 0", "none, or not above 0")
     tensors = {name: tensors[name].to(device) for name in shapes}
-    table = tensors.pop("table").split([*POINTS.values(), head.config.features], dim=1)
+    table = tensors.pop(TABLE).split([*POINTS.values(), head.config.features], dim=1)
     for name, column in zip((*POINTS, "features"), table):
         tensors[name] = (column[:, 0] if name == "opacities" else column).contiguous()
     check_sizes(path, tensors["log_scales"])
-    return head, tensors
+    return tensors
 
 
 def _settings(path: Path, text: str) -> GHAConfig:

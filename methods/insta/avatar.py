@@ -12,11 +12,14 @@ import torch
 from torch import Tensor
 
 from ...bench.configuration import build
-from ...bench.contracts import Camera, Frame, HeadPose
+from ...bench.contracts import Camera, Frame, HeadAsset, HeadPose
 from ...bench.errors import HeadbenchError, InputError
 from ...bench.io.arrays import Member, read_arrays
-from ...bench.io.documents import read_json
+from ...bench.io.documents import parse_json, read_json
 from ...bench.native.dispatch import fits
+from ..avatars.compact.container import Arrays, Content, read_content
+from ..avatars.compact.file import COMPACT_FILE, decode_subject
+from ..avatars.compact.networks import as_tensors, read_networks
 from ..shared.avatar_files import SUBJECT_FILE, read_shared_head, read_subject, write_arrays
 from ..shared.subject_mesh import SubjectMesh, pose_key
 from ..shared.threads import threads
@@ -46,7 +49,7 @@ class InstaAvatar:
 
     def __init__(
         self,
-        folder: Path,
+        files: Sequence[Path],
         mesh: SubjectMesh,
         config: InstaConfig,
         field: RadianceField,
@@ -55,7 +58,7 @@ class InstaAvatar:
         surface: PosedSurface,
         mouth: torch.Tensor,
     ):
-        self.space, self._folder, self._mesh, self._surface = space, folder, mesh, surface.surface
+        self.space, self._files, self._mesh, self._surface = space, files, mesh, surface.surface
         round_samples = min(config.round_samples, ROUND_SAMPLES)
         marching = Marching(config.step, round_samples, config.stop_transmittance)
         self._inference = Inference(field, parameters, space, mouth, marching)
@@ -64,18 +67,28 @@ class InstaAvatar:
     @classmethod
     def read(cls, folder: Path, device: str) -> InstaAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        head = read_shared_head(folder)
-        subject = read_subject(folder / SUBJECT_FILE, head)
-        config = read_settings(folder / SETTINGS_FILE)
+        head, coded = read_shared_head(folder), folder / COMPACT_FILE
+        content = read_content(coded) if coded.exists() else None
+        if content is not None:
+            files = [coded]
+            subject = decode_subject(Arrays(coded, content), head)
+            config = _settings(parse_json(content.text.get(SETTINGS, ""), coded, SETTINGS), coded)
+        else:
+            files = [folder / name for name in (FIELD_FILE, SETTINGS_FILE, SUBJECT_FILE)]
+            subject = read_subject(folder / SUBJECT_FILE, head)
+            config = read_settings(folder / SETTINGS_FILE)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, "cpu")
         surface = canonical_surface(head, mesh, config)
         occupancy = Occupancy(surface, config)
         architecture = Architecture.of(config, mesh.model.expression_size)
         size = tuple(int(side) for side in occupancy.size)
-        parameters, cells = read_field(folder / FIELD_FILE, architecture, size, device)
+        if content is not None:
+            parameters, cells = _read_coded(coded, head, content, architecture, size, device)
+        else:
+            parameters, cells = read_field(folder / FIELD_FILE, architecture, size, device)
         field = RadianceField(architecture, occupancy.box(device), Prior.of(config))
         space = occupied_space(occupancy, cells)
-        return cls(folder, mesh, config, field, parameters, space, surface.rest, mouth_triangles(head))
+        return cls(files, mesh, config, field, parameters, space, surface.rest, mouth_triangles(head))
 
     @torch.no_grad()
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
@@ -100,8 +113,8 @@ class InstaAvatar:
         return Frame(rgb.clip(0, 1), alpha.clip(0, 1))
 
     def files(self) -> Sequence[Path]:
-        """Field, settings and subject."""
-        return [self._folder / name for name in (FIELD_FILE, SETTINGS_FILE, SUBJECT_FILE)]
+        """Field, settings and subject, or the coded file."""
+        return self._files
 
     def _posed(self, pose: HeadPose) -> PosedSurface:
         """The surface of a pose; the last one is cached, since several cameras often render one pose."""
@@ -115,12 +128,20 @@ class InstaAvatar:
 FIELD_FILE = "field.npz"
 SETTINGS_FILE = "field.json"
 OCCUPIED = "occupied"
+SETTINGS = "settings"
+"""Key of the settings in the coded file."""
+TABLE = "table"
+"""Name of the features of the hash grid."""
 
 
 def read_settings(path: Path) -> InstaConfig:
     """Read settings from JSON. Raises `InputError` for settings that are unknown or out of range."""
+    return _settings(read_json(path), path)
+
+
+def _settings(values: Mapping[str, Any], path: Path) -> InstaConfig:
     try:
-        config: InstaConfig = build(InstaConfig, read_json(path), str(path))
+        config: InstaConfig = build(InstaConfig, values, str(path))
     except InputError:
         raise
     except (HeadbenchError, TypeError, ValueError) as error:
@@ -148,6 +169,24 @@ def read_field(
     arrays = read_arrays(path, {**members, OCCUPIED: Member("u", (-(-cells // 8),), dtype="u1")})
     parameters = {name: torch.from_numpy(arrays[name].astype(np.float32)).to(device) for name in shapes}
     return parameters, np.flatnonzero(np.unpackbits(arrays[OCCUPIED], count=cells))
+
+
+def _read_coded(
+    path: Path,
+    head: HeadAsset,
+    content: Content,
+    architecture: Architecture,
+    size: tuple[int, ...],
+    device: str,
+) -> tuple[dict[str, Tensor], np.ndarray]:
+    """The same of the content of a coded file (`compact.networks`)."""
+    cells = math.prod(size)
+    shapes: dict[str, tuple[int | None, ...]] = {**architecture.shapes(), OCCUPIED: (-(-cells // 8),)}
+    _, arrays = read_networks(path, head, shapes, content=content)
+    bits = arrays.pop(OCCUPIED)
+    if bits.dtype != np.uint8:
+        raise InputError(path, OCCUPIED, "uint8", str(bits.dtype))
+    return as_tensors(arrays, device), np.flatnonzero(np.unpackbits(bits, count=cells))
 
 
 class RayColors(NamedTuple):

@@ -37,7 +37,7 @@ class OursAvatar(StoredSplatAvatar):
     """A trained head: splats without colour, planes, lines and two small networks.
 
     Values that depend only on the canonical position (plane features, positions on the lines) are computed once when
-    the avatar is loaded. A folder has the exact file, the compact one or both; the compact one is read by default.
+    the avatar is loaded. A folder has the files of a training, or the coded file in place of them.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class OursAvatar(StoredSplatAvatar):
 
     @classmethod
     def read(cls, folder: Path, device: str, *, exact: bool = False) -> OursAvatar:
-        """Read an avatar from its folder; ``exact`` reads the exact file even if there is a compact one.
+        """Read an avatar from its folder; ``exact`` reads the files of a training even if there is a coded one.
 
         Raises `InputError` for damaged or foreign files.
         """

@@ -226,9 +226,6 @@ class OursConfig:
         ``sh_degree`` in canonical directions instead (an ablation).
     sh_degree, sh_every, min_sh_every, sh_dc_lr, sh_rest_lr : int, int, int, float, float
         As for `GAConfig`.
-    storage : Literal['exact', 'compact']
-        "exact" keeps the avatar as float32; "compact" also writes a quantised file (`compact.file`),
-        which is then loaded, rendered, measured and counted.
     """
 
     splats: SplatTraining = field(default_factory=SplatTraining)
@@ -246,7 +243,6 @@ class OursConfig:
     min_sh_every: int = 100
     sh_dc_lr: float = 0.0025
     sh_rest_lr: float = 0.000125
-    storage: Literal["exact", "compact"] = "exact"
 
     def __post_init__(self) -> None:
         if self.hidden < 1:

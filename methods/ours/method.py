@@ -15,9 +15,6 @@ from ...bench.contracts import Clip
 from ...datasets.head.arrays import faces_in_region
 from ...datasets.steps.clusters import cluster_expressions
 from ...datasets.steps.jaw_bases import leaks
-from ..avatars.compact.file import COMPACT_FILE, write_compact
-from ..avatars.compact.precision import Precision
-from ..avatars.compact.simplify import simplify, training_poses
 from ..shared.avatar_files import SUBJECT_FILE, Subject, finish_fit, save_shared_head, write_subject
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
@@ -78,10 +75,6 @@ class Ours(TrainedMethod[OursConfig, OursAvatar]):
         subject = Subject.of(clip)
         write_subject(out / SUBJECT_FILE, subject)
         save_shared_head(out, clip.head)
-        if config.storage == "compact":
-            exact, precision = OursAvatar.read(out, device, exact=True), Precision()
-            field = simplify(exact, training_poses(clip), precision)
-            write_compact(out / COMPACT_FILE, field, subject, clip.head, precision)
         finish_fit(
             fit,
             outcome,

@@ -63,7 +63,6 @@ SETTINGS = {
         "planes": {"resolution": 8},
         "lines": {"resolution": 4, "channels": 2},
         "hidden": 8,
-        "storage": "exact",
     },
 }
 """Two iterations of the smallest form of each method."""

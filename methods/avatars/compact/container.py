@@ -1,10 +1,12 @@
-"""The file of a compact avatar: packed arrays by name in one safetensors file, with their shapes beside them.
+"""The file of a coded avatar: packed arrays by name in one safetensors file, with their shapes beside them.
 
 Layout
 ------
-* Each tensor is a one-dimensional uint8 stream of `packing.pack`.
-* The metadata has one key, ``compact``: JSON with ``version`` (1), ``text`` (strings by name), ``steps`` (numbers by
-  name) and ``arrays``: for each tensor ``[dtype, shape]``.
+* The metadata has one key, ``compact``: JSON with ``version`` (2), ``text`` (strings by name), ``steps`` (numbers by
+  name), ``arrays``: for each array ``[dtype, shape]``, and ``tables``: lists of names of arrays of whole numbers that are
+  coded together.
+* Each tensor is a one-dimensional uint8 stream: of `entropy.encode` for a table, under the name of its first array, and of
+  `pack` for every other array. Files of version 1, which have no tables, are read, too.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from __future__ import annotations
 import json
 import lzma
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,40 +22,85 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import save
 
-from ....bench.contracts import FloatArray
+from ....bench.contracts import FloatArray, IntArray
 from ....bench.errors import InputError
 from ....bench.io.arrays import Member
 from ....bench.io.documents import parse_json
 from ....bench.io.files import write_bytes
 from ...shared.tensor_files import check_tensors, read_safetensors
+from . import entropy
 
-KEY, VERSION = "compact", 1
-MAX_ARRAYS = 64
-MOST, MOST_PER_BYTE = 2**22, 16
-"""Maximum number of array elements in a file: 4 million plus 16 per packed byte. Avatars have one or two per byte; the
-coder packs zeros ten thousand times smaller."""
+KEY, VERSION = "compact", 2
+MAX_ARRAYS = 256
+MAX_ROWS = 4096
+"""Maximum number of rows of a table."""
+FEW_COLUMNS = 512
+"""Arrays whose last axis is shorter are one row of a table."""
+MOST, MOST_PER_BYTE = 2**22, 64
+"""Maximum number of array elements in a file: 4 million plus 64 per packed byte. Avatars have one to ten per byte; the
+coders pack zeros ten thousand times smaller."""
 
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """Content of such a file: arrays of the types of `packing.DTYPES`, texts and steps by name."""
+    """Content of such a file: arrays of the types of `DTYPES`, texts and steps by name.
+
+    Arrays of whole numbers are coded in their order; each can be conditioned on those before it with as many columns.
+    """
 
     arrays: Mapping[str, np.ndarray]
     text: Mapping[str, str] = field(default_factory=dict)
     steps: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Packed:
+    """Streams of the arrays of a file by name, names of the arrays in each table, and bytes by array."""
+
+    streams: Mapping[str, bytes]
+    tables: Sequence[Sequence[str]]
+    sizes: Mapping[str, int]
+
+
+def packed(arrays: Mapping[str, np.ndarray]) -> Packed:
+    """Code arrays: tables of whole numbers where that is shorter, else each array by itself."""
+    streams: dict[str, bytes] = {}
+    tables: list[list[str]] = []
+    sizes: dict[str, int] = {}
+    alone = {name: pack(values) for name, values in arrays.items()}
+    by_columns: dict[int, list[str]] = {}
+    for name, values in arrays.items():
+        rows, columns = _table_shape(values.shape)
+        if values.dtype.kind == "u" and rows <= MAX_ROWS and rows * columns:
+            by_columns.setdefault(columns, []).append(name)
+    for names in by_columns.values():
+        table = [row for name in names for row in arrays[name].reshape(_table_shape(arrays[name].shape))]
+        stream, bits = entropy.encode(table) if len(table) <= MAX_ROWS else (b"", np.zeros(0))
+        if stream and len(stream) < sum(len(alone[name]) for name in names):
+            streams[names[0]] = stream
+            tables.append(names)
+            ends = np.cumsum([_table_shape(arrays[name].shape)[0] for name in names])
+            parts = [float(part.sum()) / 8 for part in np.split(bits, ends[:-1])]
+            sizes |= {name: math.ceil(part) for name, part in zip(names, parts)}
+    together = {name for names in tables for name in names}
+    streams |= {name: stream for name, stream in alone.items() if name not in together}
+    sizes |= {name: len(stream) for name, stream in alone.items() if name not in together}
+    return Packed(streams, tables, sizes)
+
+
 def packed_sizes(arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
     """Bytes that each array takes in a file."""
-    return {name: len(pack(values)) for name, values in arrays.items()}
+    return dict(packed(arrays).sizes)
 
 
 def write_content(path: Path, content: Content) -> None:
     """Write a file whole or not at all; equal content gives equal bytes."""
-    packed = {name: np.frombuffer(pack(values), np.uint8) for name, values in content.arrays.items()}
+    coded_arrays = packed(content.arrays)
+    streams = {name: np.frombuffer(stream, np.uint8) for name, stream in coded_arrays.streams.items()}
     arrays = {name: [values.dtype.str[1:], list(values.shape)] for name, values in content.arrays.items()}
     layout = {"version": VERSION, "text": dict(content.text), "steps": dict(content.steps), "arrays": arrays}
-    write_bytes(path, save(packed, {KEY: json.dumps(layout, separators=(",", ":"))}))
+    layout["tables"] = coded_arrays.tables
+    write_bytes(path, save(streams, {KEY: json.dumps(layout, separators=(",", ":"))}))
 
 
 def read_content(path: Path) -> Content:
@@ -63,36 +110,73 @@ def read_content(path: Path) -> Content:
     """
     tensors, metadata = read_safetensors(path)
     layout = _layout(path, metadata, sum(value.nbytes for value in tensors.values()))
-    if set(tensors) != set(layout["arrays"]):
-        found = ", ".join(sorted(set(tensors).symmetric_difference(layout["arrays"])))
+    tables = {names[0]: names for names in layout["tables"]}
+    together = {name for names in layout["tables"] for name in names[1:]}
+    if set(tensors) != set(layout["arrays"]) - together:
+        found = ", ".join(sorted(set(tensors).symmetric_difference(set(layout["arrays"]) - together)))
         raise InputError(path, KEY, "the file's tensors and no others", f"a difference in {found}")
     check_tensors(path, tensors, dict.fromkeys(tensors, Member("u", (None,), dtype="u1")))
-    arrays = {}
+    arrays: dict[str, np.ndarray] = {}
     for name, stream in sorted(tensors.items()):
-        dtype, shape = layout["arrays"][name]
+        expected = {each: layout["arrays"][each] for each in tables.get(name, [name])}
         try:
-            arrays[name] = unpack(stream.numpy().tobytes(), dtype, tuple(shape))
+            if name in tables:
+                arrays |= _unpack_table(stream.numpy().tobytes(), expected)
+            else:
+                dtype, shape = expected[name]
+                arrays[name] = unpack(stream.numpy().tobytes(), dtype, tuple(shape))
         except ValueError as error:
+            dtype, shape = expected[name]
             raise InputError(path, name, f"{dtype} of shape {tuple(shape)}", str(error)) from error
-    return Content(arrays, layout["text"], layout["steps"])
+    return Content({name: arrays[name] for name in layout["arrays"]}, layout["text"], layout["steps"])
 
 
-def _layout(path: Path, metadata: Mapping[str, str], packed: int) -> dict[str, Any]:
+def _table_shape(shape: Sequence[int]) -> tuple[int, int]:
+    """Rows and columns of an array in a table."""
+    size = math.prod(shape)
+    few = not shape or shape[-1] < FEW_COLUMNS
+    return (1, size) if few else (size // shape[-1], shape[-1])
+
+
+def _unpack_table(stream: bytes, expected: Mapping[str, tuple[str, list[int]]]) -> dict[str, np.ndarray]:
+    """The arrays of a table with their types and shapes. Raises ValueError for a damaged stream."""
+    shapes = {name: _table_shape(shape) for name, (_, shape) in expected.items()}
+    rows, columns = sum(rows for rows, _ in shapes.values()), {columns for _, columns in shapes.values()}
+    if len(columns) != 1 or rows > MAX_ROWS or any(dtype[0] != "u" for dtype, _ in expected.values()):
+        raise ValueError("a table of arrays that do not belong together")
+    found = iter(entropy.decode(stream, rows, columns.pop()))
+    arrays = {}
+    for name, (dtype, shape) in expected.items():
+        values = np.stack([next(found) for _ in range(shapes[name][0])])
+        if int(values.max(initial=0)) > np.iinfo(DTYPES[dtype]).max:
+            raise ValueError(f"numbers larger than {dtype} holds")
+        arrays[name] = values.astype(DTYPES[dtype]).reshape(shape)
+    return arrays
+
+
+def _layout(path: Path, metadata: Mapping[str, str], size: int) -> dict[str, Any]:
     """The checked JSON metadata of a file with this number of packed bytes."""
     layout = parse_json(metadata.get(KEY, "{}"), path, KEY)
-    if layout.get("version") != VERSION:
-        raise InputError(path, KEY, f"the layout of a compact avatar, version {VERSION}", "none or another")
+    if layout.get("version") not in (1, VERSION):
+        raise InputError(
+            path, KEY, f"the layout of a compact avatar, version 1 or {VERSION}", "none or another"
+        )
     arrays, text, steps = (layout.get(name) for name in ("arrays", "text", "steps"))
     if not isinstance(arrays, dict) or len(arrays) > MAX_ARRAYS or not all(map(_is_entry, arrays.values())):
         expected = f"up to {MAX_ARRAYS} times [type, shape], types among {', '.join(DTYPES)}"
         raise InputError(path, f"{KEY}, arrays", expected, repr(arrays)[:200])
-    numbers, limit = sum(math.prod(shape) for _, shape in arrays.values()), MOST + MOST_PER_BYTE * packed
+    numbers, limit = sum(math.prod(shape) for _, shape in arrays.values()), MOST + MOST_PER_BYTE * size
     if numbers > limit:
-        raise InputError(path, f"{KEY}, arrays", f"at most {limit} numbers in {packed} bytes", f"{numbers}")
+        raise InputError(path, f"{KEY}, arrays", f"at most {limit} numbers in {size} bytes", f"{numbers}")
     if not isinstance(text, dict) or not all(isinstance(value, str) for value in text.values()):
         raise InputError(path, f"{KEY}, text", "strings by name", repr(text)[:200])
     if not isinstance(steps, dict) or not all(map(_is_step, steps.values())):
         raise InputError(path, f"{KEY}, steps", "numbers from 0 to 1 by name", repr(steps)[:200])
+    tables = layout.setdefault("tables", [])
+    listed = isinstance(tables, list) and all(isinstance(names, list) and names for names in tables)
+    names = [name for names in tables for name in names] if listed else [None]
+    if not all(isinstance(name, str) and name in arrays for name in names) or len(set(names)) != len(names):
+        raise InputError(path, f"{KEY}, tables", "lists of names of arrays, each once", repr(tables)[:200])
     return layout
 
 
@@ -161,6 +245,11 @@ class Arrays:
         self.path, self.steps, self.text = path, content.steps, content.text
         self._left: dict[str, np.ndarray] = dict(content.arrays)
 
+    @property
+    def names(self) -> list[str]:
+        """Names of the arrays that were not taken."""
+        return list(self._left)
+
     def __contains__(self, name: str) -> bool:
         return name in self._left
 
@@ -201,6 +290,10 @@ class Arrays:
             return self.floats(name, *shape)
         return dequantise(self.integers(name, *shape), step)
 
+    def drop(self, name: str) -> None:
+        """Leave an array out, if it is there."""
+        self._left.pop(name, None)
+
     def rest(self) -> Mapping[str, FloatArray]:
         """Remaining arrays; they must be float32 throughout and are stored as they are."""
         return {name: self.floats(name, *values.shape) for name, values in list(self._left.items())}
@@ -212,7 +305,12 @@ def quantise(values: FloatArray, step: FloatArray | float) -> np.ndarray:
     Returns the smallest of uint8, uint16, uint32 that holds them all; beyond 31 bits values are clamped.
     """
     whole = np.rint(np.asarray(values, np.float64) / step).clip(-(2**30), 2**30 - 1).astype(np.int64)
-    return narrow(np.where(whole < 0, -2 * whole - 1, 2 * whole))
+    return narrow(fold(whole))
+
+
+def fold(whole: IntArray) -> IntArray:
+    """Whole numbers with folded signs: 0, -1, 1, -2, ... become 0, 1, 2, 3, ..."""
+    return np.where(whole < 0, -2 * whole - 1, 2 * whole)
 
 
 def dequantise(folded: np.ndarray, step: FloatArray | float) -> FloatArray:

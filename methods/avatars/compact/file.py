@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ....bench.contracts import HeadAsset
+from ....bench.contracts import FloatArray, HeadAsset
 from ....bench.errors import InputError
 from ...ours.field import PLANES, CanonicalFrames
 from ...ours.storage import PER_SPLAT, RESIDUAL, SPLAT_WIDTHS, StoredField, checked_field
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import SubjectMesh
-from .container import Arrays, Content, coded, packed_sizes, read_content, write_content
+from .container import Arrays, Content, coded, packed_sizes, read_content
 from .encoding import (
     HARMONICS,
     MATRICES,
@@ -33,20 +33,33 @@ PARTS: Mapping[str, tuple[str, ...]] = {
     "rotations": ("rotations",),
     "opacities": ("logits",),
     "triangles": ("triangles",),
-    "harmonics": HARMONICS,
+    "classes": ("classes",),
+    "harmonics": (*HARMONICS, "colours"),
     "colors": (RESIDUAL,),
     "planes": PLANES,
     "lines": ("lines",),
-    "networks": (*MATRICES, "line_gain", "line_bias"),
+    "differences": ("difference", "moved_by"),
+    "tables": ("features", "grid/"),
+    "networks": (*MATRICES, "line_gain", "line_bias", "matrix/"),
     "subject": ("shape", "static_offset"),
 }
 """Parts of an avatar by the prefixes of their array names; all other arrays are "other"."""
 
 
-def encode(field: StoredField, subject: Subject, head: HeadAsset, precision: Precision) -> Content:
-    """Content of the compact file of an avatar whose splats are sorted by triangle (`simplify`)."""
+def encode(
+    field: StoredField,
+    subject: Subject,
+    head: HeadAsset,
+    precision: Precision,
+    weights: FloatArray | None = None,
+) -> Content:
+    """Content of the coded file of an avatar whose splats are sorted by triangle (`simplify`).
+
+    ``weights`` is the (N,) `importance` of the splats; None: all are equally visible.
+    """
+    precision = precision.scaled
     tensors = {name: value.cpu() for name, value in field.tensors.items()}
-    splats, steps = encode_splats(tensors, precision, "rotation" in field.dynamic)
+    splats, steps = encode_splats(tensors, precision, "rotation" in field.dynamic, weights)
     person = encode_subject(subject, precision)
     steps |= person.steps
     text = {**person.text, "dynamic": ",".join(field.dynamic)}
@@ -57,7 +70,8 @@ def encode(field: StoredField, subject: Subject, head: HeadAsset, precision: Pre
     mesh = SubjectMesh(head, stored.shape, stored.static_offset, "cpu")
     frames = CanonicalFrames.of(mesh.frames(mesh.canonical))
     positions = frames.positions(table[:, -1].to(torch.int64), table[:, : SPLAT_WIDTHS["means"]])
-    shared = encode_field(tensors, positions, precision)
+    shared = encode_field(tensors, positions, precision, weights)
+    steps |= {"planes": precision.planes, "lines": precision.lines}
     coded_names = {*PER_SPLAT, *PLANES, "lines", *MATRICES}
     other = {name: value.numpy() for name, value in tensors.items() if name not in coded_names}
     return Content({**splats, **shared, **person.arrays, **other}, text, steps)
@@ -75,13 +89,6 @@ def decode(path: Path, content: Content, head: HeadAsset, device: str) -> tuple[
     return subject, field._replace(tensors={name: value.to(device) for name, value in tensors.items()})
 
 
-def write_compact(
-    path: Path, field: StoredField, subject: Subject, head: HeadAsset, precision: Precision
-) -> None:
-    """Write a compact file whole or not at all."""
-    write_content(path, encode(field, subject, head, precision))
-
-
 def read_compact(path: Path, head: HeadAsset, device: str) -> tuple[Subject, StoredField]:
     """Read what `write_compact` wrote. Raises `InputError` for anything else, before it takes more memory."""
     return decode(path, read_content(path), head, device)
@@ -90,15 +97,6 @@ def read_compact(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Sto
 def part_sizes(content: Content) -> dict[str, int]:
     """Packed bytes by part, without the header of a few kB."""
     return _by_part(packed_sizes(content.arrays))
-
-
-def exact_sizes(field: StoredField, subject: Subject) -> dict[str, int]:
-    """Bytes by part of the exact files, without their headers."""
-    sizes = {name: value.nbytes for name, value in field.tensors.items() if name != "splats"}
-    widths = {"opacities": "logits", "means": "positions", "quats": "rotations", "binding": "triangles"}
-    count = len(field.tensors["splats"])
-    sizes |= {widths.get(name, name): 4 * width * count for name, width in SPLAT_WIDTHS.items()}
-    return _by_part({**sizes, "shape": subject.shape.nbytes, "static_offset": subject.static_offset.nbytes})
 
 
 def _by_part(sizes: Mapping[str, int]) -> dict[str, int]:

@@ -1,102 +1,113 @@
-"""Store an avatar compactly, and measure the loss of quality by part."""
+"""Store an avatar through the codec, and measure the loss of quality by part."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ....bench.contracts import ByteArray, Clip, HeadAsset, Progress, no_progress
-from ....bench.engine.stored import avatar_digest, open_avatar, write_avatar_record
+from ....bench.contracts import Avatar, ByteArray, Clip, HeadAsset, Progress, SplatAvatar, no_progress
+from ....bench.engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
+from ....bench.engine.stored import StoredAvatar, avatar_digest, open_avatar, write_avatar_record
 from ....bench.errors import InputError
 from ....bench.io.images import quantise
 from ....bench.protocol import evenly_with_ends
 from ....bench.specs import CommandResult
-from ...ours.avatar import OursAvatar
-from ...ours.storage import StoredField
-from ...shared.avatar_files import read_shared_head, save_shared_head
+from ...shared.avatar_files import read_shared_head
 from ...shared.losses import picture_ssim, psnr, squared_error
-from ...shared.subject_mesh import SubjectMesh
-from .container import Content, write_content
-from .file import COMPACT_FILE, decode, encode, exact_sizes, part_sizes
+from ..export import neutral_pose
+from .codecs import DRIVING_FILE, ENCODERS, write_coded
+from .file import COMPACT_FILE, part_sizes
 from .precision import EXACT, Precision
 from .settings import CompactSettings
-from .simplify import simplify, training_poses
 
 SIMPLIFIED, WHOLE = "left out", "all"
 
 
 def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) -> CommandResult:
-    """Store an avatar of the method "ours", and measure its size and quality; see the settings.
+    """Store an avatar of a native method through the codec, and measure its size and quality; see the settings.
 
-    Raises `InputError` for a folder without the exact file of an avatar of method "ours", and for the capture of
-    another subject.
+    Raises `InputError` for a folder without the files of a training, and for the capture of another subject.
     """
     stored, out = open_avatar(Path(settings.avatar)), Path(settings.out)
     folder = stored.folder
-    if not isinstance(stored.load(), OursAvatar):
+    exact = stored.load()
+    if type(exact) not in ENCODERS or any(path.name == COMPACT_FILE for path in exact.files()):
         found = f"an avatar of {stored.record['method']}"
-        raise InputError(folder, "", "the exact file of an avatar of method ours", found)
-    exact = OursAvatar.read(folder, "cpu", exact=True)
+        raise InputError(folder, "", "the files of a trained avatar of a native method", found)
     head = read_shared_head(folder)
-    clip = None
-    if settings.compare is not None:
-        clip = settings.open(settings.compare, progress)
-        if clip.subject != exact.subject.name:
-            raise InputError(settings.compare, "subject", repr(exact.subject.name), repr(clip.subject))
-    field = simplify(exact, [] if clip is None else training_poses(clip), settings.precision)
-    content = encode(field, exact.subject, head, settings.precision)
-    write_content(out / COMPACT_FILE, content)
-    save_shared_head(out, head)
-    shown = exact.subject.name, exact.subject.shape, head.version
-    source = {"of": avatar_digest(folder), "precision": asdict(settings.precision)}
-    write_avatar_record(out, stored.method, *shown, "compact", source)
+    with TemporaryDirectory() as scratch:
+        form = None
+        if settings.compare is not None:
+            clip = settings.open(settings.compare, progress)
+            if clip.subject != stored.record["subject"]:
+                raise InputError(
+                    settings.compare, "subject", repr(stored.record["subject"]), repr(clip.subject)
+                )
+            needs = MethodNeeds.of(stored.method.spec)
+            step = plan(clip, needs, stored.heads)
+            kept = Path(scratch) / "adapted"
+            form = AdaptedClip(clip) if step is None else apply(step, needs, kept, f"adapting {clip.subject}")
+            comparison = Comparison(clip, form, exact, settings.frames, settings.scale)
+        own = None if form is None else form.clip
+        content = write_coded(exact, head, out, settings.precision, own, folder / DRIVING_FILE)
+        record = stored.record
+        source = {"of": avatar_digest(folder), "precision": asdict(settings.precision)}
+        shown = record["subject"], record["shape"], record["head_model"]
+        write_avatar_record(out, stored.method, *shown, "compact", source)
+        whole = {
+            "exact_bytes": sum(path.stat().st_size for path in exact.files()),
+            "compact_bytes": (out / COMPACT_FILE).stat().st_size,
+        }
+        parts = part_sizes(content)
+        data: dict[str, Any] = {"file": out / COMPACT_FILE, "precision": settings.precision}
+        if isinstance(exact, SplatAvatar):
+            data["splats"] = _splats(exact, head)
+            data["splats_kept"] = _splats(_read(stored, out), head)
+        data |= {"whole": whole, "parts": {part: {"compact_bytes": size} for part, size in parts.items()}}
+        if own is not None:
+            precision = settings.precision.scaled
 
-    parts = {
-        part: {"exact_bytes": size, "compact_bytes": part_sizes(content).get(part, 0)}
-        for part, size in exact_sizes(exact.field, exact.subject).items()
-    }
-    whole = {
-        "exact_bytes": sum(path.stat().st_size for path in exact.files()),
-        "compact_bytes": (out / COMPACT_FILE).stat().st_size,
-    }
-    data: dict[str, Any] = {
-        "file": out / COMPACT_FILE,
-        "precision": settings.precision,
-        "splats": len(exact.field.tensors["splats"]),
-        "splats_kept": len(field.tensors["splats"]),
-        "whole": whole,
-        "parts": parts,
-    }
-    if clip is not None:
-        comparison = Comparison(clip, exact, settings.frames, settings.scale)
-        costs = _costs(field, exact, head, settings.precision, comparison, progress)
-        data |= {"frames": len(comparison.keys), "exact": _plain(comparison.exact), "quality": costs}
+            def read_as(variant: Precision) -> Avatar:
+                """The avatar read back from a file of these steps."""
+                write_coded(exact, head, Path(scratch) / "coded", variant, own, folder / DRIVING_FILE)
+                return _read(stored, Path(scratch) / "coded")
+
+            names = [part for part in precision.parts if part in parts]
+            costs = _costs(names, precision, read_as, comparison, progress)
+            data |= {"frames": len(comparison.keys), "exact": _plain(comparison.exact), "quality": costs}
     return CommandResult(_text(data), data)
 
 
+def _read(stored: StoredAvatar, folder: Path) -> Avatar:
+    avatar: Avatar = stored.method.create().load(folder, device="cpu")
+    return avatar
+
+
+def _splats(avatar: Avatar, head: HeadAsset) -> int:
+    assert isinstance(avatar, SplatAvatar)
+    return len(avatar.splats(neutral_pose(head)).means)
+
+
 def _costs(
-    field: StoredField,
-    exact: OursAvatar,
-    head: HeadAsset,
+    names: Sequence[str],
     precision: Precision,
+    read_as: Callable[[Precision], Avatar],
     comparison: Comparison,
     progress: Progress,
 ) -> dict[str, dict[str, float | None]]:
     """Quality with each part rounded alone, with all parts rounded, and with invisible splats removed only."""
-    variants = {
-        part.name: replace(EXACT, **{part.name: getattr(precision, part.name)}) for part in fields(precision)
-    }
-    variants = {name: variants[name] for name in exact_sizes(field, exact.subject) if name in variants}
+    variants = {name: replace(EXACT, **{name: getattr(precision, name)}) for name in names}
     variants |= {SIMPLIFIED: EXACT, WHOLE: precision}
     result = {}
     for done, (name, variant) in enumerate(variants.items()):
         progress(done, len(variants), name)
-        result[name] = _plain(comparison(avatar_of(encode(field, exact.subject, head, variant), head)))
+        result[name] = _plain(comparison(read_as(variant)))
     return result
 
 
@@ -107,20 +118,23 @@ def _plain(quality: Quality) -> dict[str, float | None]:
 
 def _text(data: Mapping[str, Any]) -> str:
     qualities, exact = data.get("quality", {}), data.get("exact")
-    head = f"{'part':<12}{'exact':>12}{'compact':>12}"
+    head = f"{'part':<12}{'exact':>12}{'coded':>12}"
     if exact:
         head += f"{'dB to truth':>14}{'SSIM to truth':>15}{'dB to exact':>13}"
     rows = [head]
     for part, sizes in data["parts"].items():
         rows.append(_row(part, sizes, qualities.get(part), exact))
     if exact:
-        rows.append(_row(SIMPLIFIED, None, qualities[SIMPLIFIED], exact))
+        rows.append(_row(SIMPLIFIED, {}, qualities[SIMPLIFIED], exact))
     rows.append(_row(WHOLE, data["whole"], qualities.get(WHOLE), exact))
-    kept, count, whole = data["splats_kept"], data["splats"], data["whole"]
-    rows.append(
-        f"{data['file']}: {whole['compact_bytes'] / 1e6:.3f} MB, 1/{whole['exact_bytes'] / whole['compact_bytes']:.1f} "
-        f"of the exact files; {kept} of {count} splats, {whole['compact_bytes'] / max(kept, 1):.1f} bytes for each"
-    )
+    whole = data["whole"]
+    ratio = whole["exact_bytes"] / whole["compact_bytes"]
+    line = f"{data['file']}: {whole['compact_bytes'] / 1e6:.3f} MB, 1/{ratio:.1f} of the exact files"
+    if "splats" in data:
+        count = data["splats"]
+        each = whole["compact_bytes"] / max(count, 1)
+        line += f"; {data['splats_kept']} of {count} splats kept, {each:.1f} bytes for each trained one"
+    rows.append(line)
     if exact:
         rows.append(
             f"Quality on {data['frames']} held-out frames, each part rounded alone. Left out: what no training pose "
@@ -135,12 +149,13 @@ def _text(data: Mapping[str, Any]) -> str:
 
 def _row(
     part: str,
-    sizes: Mapping[str, int] | None,
+    sizes: Mapping[str, int],
     quality: Mapping[str, float | None] | None,
     exact: Mapping[str, float | None] | None,
 ) -> str:
     row = f"{part:<12}"
-    row += f"{'':>24}" if sizes is None else f"{sizes['exact_bytes']:>12,}{sizes['compact_bytes']:>12,}"
+    for name in ("exact_bytes", "compact_bytes"):
+        row += f"{sizes[name]:>12,}" if name in sizes else f"{'':>12}"
     if quality is None or exact is None:
         return row.rstrip()
     against = [f"{'':>14}", f"{'':>15}"]
@@ -168,31 +183,36 @@ class Comparison:
 
     Parameters
     ----------
+    form : AdaptedClip
+        The clip adapted to the method, whose poses animate the avatar.
     frames : int
         Number of frames, spread evenly over both held-out splits.
     scale : int
         Enlargement of the renders; above 1 there is no ground truth.
     """
 
-    def __init__(self, clip: Clip, exact: OursAvatar, frames: int, scale: int = 1):
-        self._clip, self._scale = clip, scale
+    def __init__(self, clip: Clip, form: AdaptedClip, exact: Avatar, frames: int, scale: int = 1):
+        self._clip, self._form, self._scale = clip, form, scale
         keys = [*clip.splits["novel_view"], *clip.splits["self_reenactment"]]
         self.keys = evenly_with_ends(keys, frames)
         self._truth = [clip.image(key) for key in self.keys] if scale == 1 else None
         self._exact = self._pictures(exact)
         self.exact = self._quality(self._exact)
 
-    def __call__(self, avatar: OursAvatar) -> Quality:
+    def __call__(self, avatar: Avatar) -> Quality:
         """Quality of another avatar on the same frames."""
         return self._quality(self._pictures(avatar))
 
-    def _pictures(self, avatar: OursAvatar) -> list[ByteArray]:
-        clip, scale, pictures = self._clip, self._scale, []
+    def _pictures(self, avatar: Avatar) -> list[ByteArray]:
+        clip, scale, pictures = self._form.clip, self._scale, []
         background = tuple(float(channel) for channel in clip.background)
         for key in self.keys:
-            camera = clip.cameras[key.camera]
-            camera = camera.resized(scale * camera.width, scale * camera.height)
-            pictures.append(quantise(avatar.render(camera, clip.poses[key.timestep], background).rgb))
+            seen = self._form.key(key)
+            camera = clip.cameras[seen.camera]
+            if scale > 1:
+                camera = camera.resized(scale * camera.width, scale * camera.height)
+            rgb = avatar.render(camera, clip.poses[seen.timestep], background).rgb
+            pictures.append(quantise(self._form.restore(key, rgb) if scale == 1 else rgb))
         return pictures
 
     def _quality(self, pictures: Sequence[ByteArray]) -> Quality:
@@ -203,10 +223,3 @@ class Comparison:
         decibels = [psnr(squared_error(*pair)) for pair in pairs]
         similarity = [picture_ssim(*pair) for pair in pairs]
         return Quality(float(np.mean(decibels)), float(np.mean(similarity)), against_exact)
-
-
-def avatar_of(content: Content, head: HeadAsset) -> OursAvatar:
-    """The avatar decoded from the content of a compact file."""
-    subject, field = decode(Path(COMPACT_FILE), content, head, "cpu")
-    mesh = SubjectMesh(head, subject.shape, subject.static_offset, "cpu")
-    return OursAvatar([], mesh, subject, field, "cpu")

@@ -7,51 +7,71 @@ from dataclasses import dataclass, fields
 
 @dataclass(frozen=True)
 class Precision:
-    """Quantisation steps of the parts of a compact avatar; smaller is finer, and 0 keeps a part as float32.
+    """Quantisation steps of the parts of a coded avatar; smaller is finer, and 0 keeps a part as float32.
 
-    Each step is in a unit in which equal errors are equally visible, so that one number serves a whole part. The range
-    of values needs no fixed number of bits because values are entropy-coded. The defaults cost less than 0.1 dB
-    together (``headbench export compact --compare`` measures each).
+    Each step is in a unit in which equal errors are equally visible, so that one number serves a whole part. With a capture,
+    steps are those of a splat of average visibility in the training views, and others have steps in inverse proportion to
+    their visibility (`transform.visibility_classes`). The range of values needs no fixed number of bits because values are
+    entropy-coded. ``headbench export compact --compare`` measures what each costs.
     """
 
-    positions: float = 0.08
+    step: float = 1.0
+    """Factor of all steps: a coarser or finer codec with the same balance."""
+
+    positions: float = 0.1
     """Step of local positions, in the splat's own size (geometric mean of its three standard deviations)."""
 
     scales: float = 0.06
     """Step of log-scales: 0.06 is an error of at most 3 %."""
 
-    rotations: float = 0.02
-    """Step of the three smaller components of unit quaternions: 0.02 is an error of about 1 degree."""
+    rotations: float = 0.03
+    """Step of the three smaller components of unit quaternions: 0.03 is an error of about 1 degree."""
 
-    opacities: float = 0.1
-    """Step of opacity logits: an opacity is off by 0.0125 at most."""
+    opacities: float = 0.15
+    """Step of opacity logits: an opacity is off by 0.019 at most."""
 
-    harmonics: float = 0.02
-    """Step of spherical-harmonics coefficients, if colours are stored as such: 0.0056 of colour in degree 0."""
+    harmonics: float = 0.008
+    """Step of colours by spherical harmonics, in colour: root mean square over directions, see `colour_metric`."""
 
-    colors: float = 0.02
+    colors: float = 0.008
     """Step of the separate colours of splats, added to those of the planes."""
 
-    planes: float = 0.005
-    """Step of the colour contribution of one plane channel, in [0, 1], as weighted by the colour network."""
+    planes: float = 0.02
+    """Step of the colour contribution of the channels of a plane, in [0, 1], as weighted by the colour network."""
 
-    lines: float = 0.001
-    """Step of the offset (logits) by one channel of one line at coefficient 1, as weighted by the offset network.
-    Small, since the errors of thousands of channels add up: at 0.003 a trained avatar lost 0.13 dB, at 0.001
-    nothing, for 16 kB more."""
+    lines: float = 0.008
+    """Step of the offset (logits) by the channels of one line at coefficient 1, as weighted by the offset network.
+    Small, since the errors of thousands of channels add up."""
 
-    networks: float = 0.01
+    networks: float = 0.015
     """Step of network weights, relative to the largest weight of the same row: 1/127 would be 8 bits."""
 
-    subject: float = 2e-6
+    tables: float = 0.2
+    """Step of trained features (of a hash grid, or of splats that a network shades), in their standard deviation."""
+
+    subject: float = 1e-5
     """Step of the subject's static offset, metres."""
 
     def __post_init__(self) -> None:
-        for part in fields(self):
-            step = getattr(self, part.name)
+        for part in self.parts:
+            step = getattr(self, part)
             if not 0 <= step < 1:
-                raise ValueError(f"{part.name} must be at least 0 and below 1, found {step}")
+                raise ValueError(f"{part} must be at least 0 and below 1, found {step}")
+        if not 0 < self.step <= MAX_STEP:
+            raise ValueError(f"step must be above 0 and at most {MAX_STEP:g}, found {self.step}")
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts."""
+        return tuple(part.name for part in fields(self) if part.name != "step")
+
+    @property
+    def scaled(self) -> Precision:
+        """The same steps with the factor 1."""
+        steps = {part: min(self.step * getattr(self, part), LARGEST_STEP) for part in self.parts}
+        return Precision(**steps)
 
 
-EXACT = Precision(**{part.name: 0.0 for part in fields(Precision)})
+MAX_STEP, LARGEST_STEP = 64.0, 0.999
+EXACT = Precision(**dict.fromkeys(Precision().parts, 0.0))
 """Nothing is rounded."""

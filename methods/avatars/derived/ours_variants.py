@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import torch
@@ -15,18 +15,19 @@ from ...ours.avatar import OursAvatar
 from ...ours.storage import FIELD_FILE, PER_SPLAT, StoredField, checked_field, read_field, save_field
 from ...shared.avatar_files import SUBJECT_FILE, read_shared_head, save_shared_head, write_subject
 from ...shared.subject_mesh import SubjectMesh
-from ..compact.file import COMPACT_FILE, read_compact, write_compact
+from ..compact.codecs import encode_avatar
+from ..compact.container import write_content
+from ..compact.file import COMPACT_FILE, read_compact
 from ..compact.precision import Precision
-from ..compact.simplify import simplify
+from ..views import training_views
 from .recipes import (
     OURS,
     Recipe,
     coarser_lines,
     coarser_planes,
     contributions,
-    most_contributing,
+    kept_rows,
     read_reduced,
-    training_views,
     write_reduced,
 )
 
@@ -39,12 +40,11 @@ def variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
     """The variants of `recipes.OURS` that change this avatar."""
     whole = OursAvatar.read(folder, device, exact=(folder / FIELD_FILE).exists())
     head = read_shared_head(folder)
-    weights = contributions(whole, training_views(clip))
+    weights = cache(lambda: contributions(whole, training_views(clip)))
     for recipe in OURS:
         if _idle(recipe, whole.field):
             continue
-        rows = most_contributing(weights, recipe.splats).to(device)
-        yield Variant(recipe.name, recipe.summary, partial(_make, whole, head, rows, recipe, device))
+        yield Variant(recipe.name, recipe.summary, partial(_make, whole, head, clip, weights, recipe, device))
 
 
 def _idle(recipe: Recipe, field: StoredField) -> bool:
@@ -60,9 +60,16 @@ def _resampled(tensors: dict[str, Tensor], recipe: Recipe) -> dict[str, Tensor]:
 
 
 def _make(
-    whole: OursAvatar, head: HeadAsset, rows: Tensor, recipe: Recipe, device: str, out: Path
+    whole: OursAvatar,
+    head: HeadAsset,
+    clip: Clip,
+    weights: Callable[[], Tensor],
+    recipe: Recipe,
+    device: str,
+    out: Path,
 ) -> OursAvatar:
     """Write an avatar reduced by a recipe; return the avatar that is read back."""
+    rows = kept_rows(weights, recipe.splats, len(whole.field.tensors["splats"])).to(device)
     tensors = dict(whole.field.tensors)
     for name in PER_SPLAT:
         if name in tensors:
@@ -71,11 +78,10 @@ def _make(
     field = StoredField(tensors, whole.field.dynamic)
     save_shared_head(out, head)
     subject = whole.subject
-    if recipe.storage == "compact":
-        path, precision = out / COMPACT_FILE, Precision()
-        # Sorts the splats by triangle and removes lines that would be rounded to zero.
-        field = simplify(OursAvatar([], whole.mesh, subject, field, device), [], precision)
-        write_compact(path, field, subject, head, precision)
+    if recipe.storage == "coded":
+        path = out / COMPACT_FILE
+        reduced = OursAvatar([], whole.mesh, subject, field, device)
+        write_content(path, encode_avatar(reduced, head, Precision(step=recipe.step), clip))
         subject, field = read_compact(path, head, device)
         stored = [path]
     else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,20 +11,20 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from ....bench.contracts import Camera, Clip, HeadPose, SplatAvatar
+from ....bench.contracts import Camera, HeadPose, SplatAvatar
 from ....bench.io.files import write_bytes
-from ....bench.protocol import evenly_with_ends
 from ...ours.field import PLANES
 from ...shared.rendering import USUAL, Cutoffs
 from ...shared.tensor_files import read_safetensors
 from ..views import contribution
+from .coded import STEPS, coded_name
 
-Storage = Literal["exact", "half", "8bit", "compact"]
+Storage = Literal["exact", "half", "8bit", "coded"]
 STORAGE_SUMMARIES: dict[Storage, str] = {
     "exact": "",
     "half": "16-bit floats",
     "8bit": "8 bits between each column's extremes",
-    "compact": "quantised by visible effect, entropy-coded",
+    "coded": "quantised by visible effect, entropy-coded",
 }
 # Both avatars of a capture at 144x208 (20,000 splats, 2,000 iterations) lost 0.3 and 0.8 dB, and twice their LPIPS, by
 # the earlier ones, for no measurable processor time; hence no other variant has them.
@@ -44,6 +44,8 @@ class Recipe:
         Samples along a side of a plane, along a line.
     cutoffs : Cutoffs
         Thresholds of the renderer.
+    step : float
+        Factor of all quantisation steps of a coded avatar.
     """
 
     splats: float = 1.0
@@ -52,6 +54,7 @@ class Recipe:
     lines: int | None = None
     storage: Storage = "exact"
     cutoffs: Cutoffs = USUAL
+    step: float = 1.0
 
     @property
     def name(self) -> str:
@@ -61,7 +64,11 @@ class Recipe:
             "" if self.degree is None else f"sh{self.degree}",
             "" if self.planes is None else f"planes{self.planes}",
             "" if self.lines is None else f"lines{self.lines}",
-            "" if self.storage == "exact" else self.storage,
+            ""
+            if self.storage == "exact"
+            else coded_name(self.step)
+            if self.storage == "coded"
+            else self.storage,
             "" if self.cutoffs == USUAL else f"cut{round(255 * self.cutoffs.alpha_min)}",
         ]
         return "-".join(part for part in parts if part)
@@ -75,7 +82,7 @@ class Recipe:
             "" if self.degree is None else f"harmonics up to degree {self.degree}",
             "" if self.planes is None else f"planes of {self.planes}x{self.planes}",
             "" if self.lines is None else f"lines of {self.lines} samples",
-            STORAGE_SUMMARIES[self.storage],
+            STORAGE_SUMMARIES[self.storage] + (f", steps times {self.step:g}" if self.step != 1 else ""),
             "" if self.cutoffs == USUAL else cutoffs,
         ]
         return "; ".join(part for part in parts if part)
@@ -83,34 +90,26 @@ class Recipe:
 
 COMMON = (
     *(Recipe(splats=fraction) for fraction in (0.75, 0.5, 0.25)),
-    *(Recipe(storage=storage) for storage in ("half", "8bit", "compact")),
+    *(Recipe(storage=storage) for storage in ("half", "8bit")),
+    *(Recipe(storage="coded", step=step) for step in STEPS),
     *(Recipe(cutoffs=cutoffs) for cutoffs in (EARLY, EARLIER)),
-    Recipe(splats=0.5, storage="compact"),
+    Recipe(splats=0.5, storage="coded"),
 )
 
 GA = (
     *COMMON,
     *(Recipe(degree=degree) for degree in (2, 1, 0)),
-    *(Recipe(degree=degree, storage="compact") for degree in (2, 1, 0)),
-    *(Recipe(splats=f, degree=1, storage="compact") for f in (0.75, 0.5, 0.25)),
+    *(Recipe(degree=degree, storage="coded") for degree in (2, 1, 0)),
+    *(Recipe(splats=f, degree=1, storage="coded") for f in (0.75, 0.5, 0.25)),
 )
 
 OURS = (
     *COMMON,
     *(Recipe(planes=resolution) for resolution in (64, 32)),
     Recipe(lines=16),
-    *(Recipe(planes=resolution, lines=16, storage="compact") for resolution in (64, 32)),
-    *(Recipe(splats=f, planes=64, lines=16, storage="compact") for f in (0.75, 0.5, 0.25)),
+    *(Recipe(planes=resolution, lines=16, storage="coded") for resolution in (64, 32)),
+    *(Recipe(splats=f, planes=64, lines=16, storage="coded") for f in (0.75, 0.5, 0.25)),
 )
-
-
-VIEWS = 64
-
-
-def training_views(clip: Clip, count: int = VIEWS) -> list[tuple[Camera, HeadPose]]:
-    """At most ``count`` training frames, evenly spread over their sorted keys."""
-    keys = evenly_with_ends(sorted(clip.splits["train"]), count)
-    return [(clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys]
 
 
 def contributions(avatar: SplatAvatar, views: Sequence[tuple[Camera, HeadPose]]) -> Tensor:
@@ -122,6 +121,11 @@ def most_contributing(weights: Tensor, fraction: float) -> Tensor:
     """Ascending indices of the given fraction of splats that contribute most; ties by index."""
     count = max(1, round(fraction * len(weights)))
     return torch.argsort(weights, descending=True, stable=True)[:count].sort().values
+
+
+def kept_rows(weights: Callable[[], Tensor], fraction: float, count: int) -> Tensor:
+    """The same for ``count`` splats, whose weights are computed only if some are left out."""
+    return torch.arange(count) if fraction >= 1 else most_contributing(weights(), fraction)
 
 
 Kind = Literal["half", "8bit"]

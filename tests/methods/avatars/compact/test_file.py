@@ -1,6 +1,7 @@
 """Compact avatars: what is kept, what is lost, what is refused."""
 
-from dataclasses import fields, replace
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,9 +14,7 @@ from headbench.methods.avatars.compact.container import read_content, write_cont
 from headbench.methods.avatars.compact.file import (
     COMPACT_FILE,
     encode,
-    exact_sizes,
     part_sizes,
-    write_compact,
 )
 from headbench.methods.avatars.compact.precision import EXACT, Precision
 from headbench.methods.avatars.compact.simplify import simplify, training_poses
@@ -30,11 +29,12 @@ from ...ours.toy import CASES, SMALL, store
 from ...toy_clip import first_view
 
 
-def compacted(folder, precision, poses=()):
+def compacted(folder, precision, poses=(), weights=None):
     """The avatar of a folder before, and after a compact file was written beside it."""
     before = OursAvatar.read(folder, "cpu", exact=True)
     field = simplify(before, poses, precision)
-    write_compact(folder / COMPACT_FILE, field, before.subject, read_shared_head(folder), precision)
+    content = encode(field, before.subject, read_shared_head(folder), precision, weights)
+    write_content(folder / COMPACT_FILE, content)
     return before, OursAvatar.read(folder, "cpu")
 
 
@@ -67,14 +67,17 @@ def test_rounding_stays_within_its_steps(case, clip, tmp_path):
     assert ((means - means2).abs() / size).max() <= 0.5 * precision.positions + 1e-4
     if case == "others":
         assert (quats - quats2).abs().max() <= 0.5 * precision.rotations + 1e-5
-    steps = {"sh_dc": precision.harmonics, "sh_rest": precision.harmonics, RESIDUAL: precision.colors}
-    for name, step in steps.items():
-        if name in one:
-            assert (one[name][order] - other[name]).abs().max() <= 0.5 * step + 1e-5
-    for name in ("color_weight_0", "line_direction_1"):
-        if name in one:
-            largest = one[name].abs().amax(1, keepdim=True)
-            assert ((one[name] - other[name]).abs() / largest).max() <= 0.5 * precision.networks + 1e-5
+    if "sh_dc" in one:
+        # Mean squared colour over all directions is the sum of squared coefficients over 4 pi.
+        squares = sum((one[n][order] - other[n]).flatten(1).square().sum(1) for n in ("sh_dc", "sh_rest"))
+        count = 3 * (1 + one["sh_rest"].shape[2])
+        assert (squares / (4 * math.pi)).mean() <= count * precision.harmonics**2
+    if RESIDUAL in one:
+        assert (one[RESIDUAL][order] - other[RESIDUAL]).abs().max() <= 2 * precision.colors
+    if "line_direction_1" in one:
+        weights = one["line_direction_1"]
+        largest = weights.abs().amax(1, keepdim=True)
+        assert ((weights - other["line_direction_1"]).abs() / largest).max() <= 2 * precision.networks
     assert np.abs(before.subject.static_offset - after.subject.static_offset).max() <= 0.5 * precision.subject
 
 
@@ -89,7 +92,7 @@ def test_defaults_cost_little_and_each_coarser_part_costs_more(case, clip, tmp_p
 
     assert -10 * np.log10(error(Precision())) > 35
     stored = part_sizes(read_content(folder / COMPACT_FILE))
-    for part in (field.name for field in fields(Precision)):
+    for part in EXACT.parts:
         if part not in ("subject", "lines") and part in stored:
             fine, coarse = (error(replace(EXACT, **{part: step})) for step in (0.01, 0.3))
             assert coarse > 2 * fine, part
@@ -105,7 +108,6 @@ def test_fewer_bytes_than_a_tenth_at_a_trained_avatars_numbers(clip, tmp_path):
     head = read_shared_head(folder)
     content = encode(simplify(before, [], Precision()), before.subject, head, Precision())
     assert sum(part_sizes(content).values()) < compact
-    assert sum(exact_sizes(before.field, before.subject).values()) < exact
 
 
 def test_splats_that_no_pose_shows_are_left_out_and_not_missed(clip, tmp_path):
@@ -143,27 +145,42 @@ def test_single_lines_of_zeros_cost_nothing(clip, tmp_path):
     folder = store(clip, tmp_path, change=lambda values: values["lines"][::2].zero_())
     before, after = compacted(folder, Precision())
     assert not after.field.tensors["lines"][::2].any()
-    np.testing.assert_allclose(after.field.tensors["lines"], before.field.tensors["lines"], atol=0.02)
+    np.testing.assert_allclose(after.field.tensors["lines"], before.field.tensors["lines"], atol=0.2)
     assert before.field.tensors["lines"].abs().max() > 1
     with safe_open(tmp_path / COMPACT_FILE, "np") as file:
         assert "line_direction_0" in file.keys()  # noqa: SIM118 - not a mapping
 
 
-def test_a_fit_stores_what_its_settings_say(clip, tmp_path):
-    config = replace(SMALL, splats=SplatTraining(min_settle=4), storage="compact")
-    method = Ours(config)
-    avatar = method.fit(clip, tmp_path, Budget(iterations=12), device="cpu", seed=0, progress=no_progress)
-    assert list(avatar.files()) == [tmp_path / COMPACT_FILE]
-    assert list(method.load(tmp_path, device="cpu").files()) == [tmp_path / COMPACT_FILE]
-    exact = OursAvatar.read(tmp_path, "cpu", exact=True)
+def test_a_fit_leaves_exact_files_and_a_coded_one_is_enough(clip, tmp_path):
+    method = Ours(replace(SMALL, splats=SplatTraining(min_settle=4)))
+    exact = method.fit(clip, tmp_path, Budget(iterations=12), device="cpu", seed=0, progress=no_progress)
+    assert {path.name for path in exact.files()} == {FIELD_FILE, "subject.npz"}
+    assert not (tmp_path / COMPACT_FILE).exists()
+    _, avatar = compacted(tmp_path, Precision(), training_poses(clip))
     camera, pose = first_view(clip)
     difference = avatar.render(camera, pose).rgb - exact.render(camera, pose).rgb
     assert 0 < np.mean(difference**2) < 1e-3
-    # The compact file and the shared head model are enough.
+    # The coded file and the shared head model are enough.
     (tmp_path / FIELD_FILE).unlink()
     (tmp_path / "subject.npz").unlink()
     alone = method.load(tmp_path, device="cpu")
+    assert list(alone.files()) == [tmp_path / COMPACT_FILE]
     np.testing.assert_array_equal(alone.render(camera, pose).rgb, avatar.render(camera, pose).rgb)
+
+
+def test_hidden_splats_are_rounded_more_coarsely(clip, tmp_path):
+    """Errors grow as visibility falls, and the coarser avatar takes fewer bytes."""
+    folder = store(clip, tmp_path, CASES["harmonics"], copies=8)
+    weights = np.where(
+        np.arange(len(OursAvatar.read(folder, "cpu", exact=True).neutral.means)) % 2, 1.0, 2.0**-8
+    )
+    before, after = compacted(folder, Precision(), weights=weights)
+    order = torch.argsort(before.field.tensors["splats"][:, -1], stable=True)
+    error = (before.field.tensors["splats"][order] - after.field.tensors["splats"])[:, 4:7].abs().amax(1)
+    assert error[::2].max() > 1.5 * error[1::2].max()
+    plain = (folder / COMPACT_FILE).stat().st_size
+    compacted(folder, Precision(step=4), weights=weights)
+    assert (folder / COMPACT_FILE).stat().st_size < plain
 
 
 def test_an_array_of_a_later_method_is_kept_as_it_is(clip, tmp_path):
@@ -171,10 +188,10 @@ def test_an_array_of_a_later_method_is_kept_as_it_is(clip, tmp_path):
     extra = torch.arange(6.0).view(2, 3)
     path, person = tmp_path / COMPACT_FILE, (before.subject, read_shared_head(tmp_path))
     with pytest.raises(ValueError, match="sorted by triangle"):
-        write_compact(path, before.field, *person, EXACT)
+        encode(before.field, *person, EXACT)
     tensors = simplify(before, [], EXACT).tensors
     field = before.field._replace(tensors={**tensors, "projection": extra})
-    write_compact(path, field, *person, Precision())
+    write_content(path, encode(field, *person, Precision()))
     found = OursAvatar.read(tmp_path, "cpu").field.tensors["projection"]
     assert torch.equal(found, extra)
 
@@ -203,7 +220,7 @@ def with_text(**text):
     ("change", "says"),
     [
         *((without(name), name) for name in ("triangles", "positions", "rotations", "logits", "log_scales")),
-        *((without(name), name) for name in ("plane_xy_steps", "plane_xz_used", "lines_kept", "line_bias_0")),
+        *((without(name), name) for name in ("plane_xy_mean", "plane_xz_used", "lines_kept", "line_bias_0")),
         *((without(name), name) for name in ("plane_box", "jaw_bases", "shape", "static_offset", "plane_yz")),
         (with_array("triangles", lambda a: a + np.uint8(200)), "triangle"),
         (with_array("triangles", lambda a: a.astype(np.float32)), "whole numbers"),
@@ -212,8 +229,10 @@ def with_text(**text):
         (with_array("logits", lambda a: np.full(a.shape, np.inf, np.float32)), "logits"),
         (with_array("lines_kept", lambda a: a[:-2]), "lines"),
         (with_array("lines", lambda a: a[..., :1]), "lines"),
+        (with_array("lines_samples", lambda a: a + np.uint32(1)), "lines"),
+        (with_array("classes", lambda a: a[1:]), "classes"),
         (with_array("plane_xy_used", lambda a: a[:-1]), "plane_xy"),
-        (with_array("plane_xy_steps", lambda a: a * np.float32(np.nan)), "plane_xy_steps"),
+        (with_array("plane_xy_mean", lambda a: a * np.float32(np.nan)), "plane_xy_mean"),
         (with_array("color_weight_0_steps", lambda a: a[1:]), "color_weight_0"),
         (with_array("plane_box", lambda a: a.astype(np.uint8)), "plane_box"),
         (with_array("shape", lambda a: a[1:]), "shape"),
@@ -236,3 +255,14 @@ def test_steps_outside_their_range_are_refused():
     for value in (-0.1, 1.0, float("nan")):
         with pytest.raises(ValueError, match="planes"):
             Precision(planes=value)
+    for value in (0.0, -1.0, 1e9, float("nan")):
+        with pytest.raises(ValueError, match="step"):
+            Precision(step=value)
+
+
+def test_one_factor_changes_all_steps():
+    half = Precision(step=0.5).scaled
+    assert half.step == 1
+    for part in half.parts:
+        assert getattr(half, part) == 0.5 * getattr(Precision(), part)
+    assert all(getattr(EXACT.scaled, part) == 0 for part in EXACT.parts)

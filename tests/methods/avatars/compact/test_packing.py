@@ -108,7 +108,7 @@ def tampered(path, change):
     """The file with its layout changed."""
     write_content(path, CONTENT)
     tensors = load_file(path)
-    layout = {"version": 1, "text": {"name": "x"}, "steps": {"s": 0.5}}
+    layout = {"version": 2, "text": {"name": "x"}, "steps": {"s": 0.5}}
     layout["arrays"] = {"a": ["u2", [2, 3]], "b": ["f4", [4]]}
     change(layout, tensors)
     save_file(tensors, path, {KEY: json.dumps(layout)})
@@ -117,7 +117,11 @@ def tampered(path, change):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda layout, _: layout.update(version=2), "version 1"),
+        (lambda layout, _: layout.update(version=3), "version 1"),
+        (lambda layout, _: layout.update(tables=[["a", "c"]]), "lists of names"),
+        (lambda layout, _: layout.update(tables=[["a"], ["a"]]), "lists of names"),
+        (lambda layout, _: layout.update(tables=["a"]), "lists of names"),
+        (lambda layout, _: layout.update(tables=[["a"]]), "stream"),
         (lambda layout, _: layout["arrays"].pop("a"), "no others"),
         (lambda layout, _: layout["arrays"].update(a=["u2", [2, 4]]), "16 bytes"),
         (lambda layout, _: layout["arrays"].update(a=["u2", [2**20, 2**20]]), "at most"),
@@ -140,6 +144,17 @@ def test_a_tampered_container_is_an_input_error(tmp_path, change, says):
     tampered(path, change)
     with pytest.raises(InputError, match=says):
         read_content(path)
+
+
+def test_a_file_of_version_1_is_read(tmp_path):
+    path = tmp_path / "x.safetensors"
+    streams = {name: np.frombuffer(pack(values), np.uint8) for name, values in CONTENT.arrays.items()}
+    arrays = {name: [values.dtype.str[1:], list(values.shape)] for name, values in CONTENT.arrays.items()}
+    layout = {"version": 1, "text": CONTENT.text, "steps": CONTENT.steps, "arrays": arrays}
+    save_file(streams, path, {KEY: json.dumps(layout)})
+    found = read_content(path)
+    for name, values in CONTENT.arrays.items():
+        np.testing.assert_array_equal(found.arrays[name], values)
 
 
 def test_another_safetensors_file_is_an_input_error(tmp_path):

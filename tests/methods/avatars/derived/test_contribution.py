@@ -3,7 +3,8 @@
 import numpy as np
 import torch
 
-from headbench.methods.avatars.derived.recipes import contributions, most_contributing, training_views
+from headbench.methods.avatars.derived.recipes import contributions, most_contributing
+from headbench.methods.avatars.views import squared_contribution, training_views
 from headbench.methods.shared.rendering import PosedSplats, view_of
 from headbench.methods.splats import rasterize
 
@@ -56,3 +57,18 @@ def test_views_are_of_training_alone_and_spread(clip):
     assert len(views) == 5
     assert {camera.id for camera, _ in views} <= cameras
     assert len(training_views(clip, 10_000)) == len(clip.splits["train"])
+
+
+def test_squared_contributions_are_mean_squares_of_weights(clip):
+    """Independent: splat i painted white and all others black, in the float64 reference."""
+    ball = Ball(12)
+    ((camera, _),) = training_views(clip, 1)
+    generator = torch.Generator().manual_seed(0)
+    found = torch.stack([squared_contribution(ball.posed, camera, generator) for _ in range(400)]).mean(0)
+    values = [torch.from_numpy(v).double() for v in vars(ball.posed).values() if v is not None]
+    view = view_of(camera, "cpu")
+    cameras = (view.world_to_camera.double(), view.K.double(), camera.width, camera.height)
+    colors = torch.eye(12, dtype=torch.float64)
+    images = rasterize(*values, colors, *cameras, backend="reference").image
+    expected = images.square().mean((0, 1))
+    torch.testing.assert_close(found.double(), expected, rtol=0.2, atol=1e-4 * float(expected.max()))

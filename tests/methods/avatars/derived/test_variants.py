@@ -53,7 +53,7 @@ def test_recipes_have_names_of_their_own():
     for recipes in (GA, OURS):
         assert len({recipe.name for recipe in recipes}) == len(recipes)
         assert all(recipe.summary and recipe.name for recipe in recipes)
-    assert Recipe(0.5, 1, storage="compact", cutoffs=EARLY).name == "splats50-sh1-compact-cut2"
+    assert Recipe(0.5, 1, storage="coded", cutoffs=EARLY).name == "splats50-sh1-coded-cut2"
 
 
 @pytest.mark.parametrize("kind", ["ga", "ours"])
@@ -76,7 +76,7 @@ def test_every_variant_is_read_back_from_smaller_own_files(kind, request, clip, 
         assert (size(avatar) < size(whole)) == changed
         quality[name] = psnr(picture(avatar, clip), expected)
     assert quality["half"] > 45
-    assert quality["compact"] > 25
+    assert quality["coded"] > 25
     assert quality["splats75"] >= quality["splats50"] >= quality["splats25"]
     assert quality["half"] > quality["8bit"]
     assert quality["cut2"] >= quality["cut4"]
@@ -112,4 +112,4 @@ def test_a_recipe_that_changes_nothing_is_left_out(clip, tmp_path):
     store(clip, tmp_path)  # 8 samples a plane, 6 a line
     names = set(by_name(ours_variants.variants, tmp_path, clip))
     assert not names & {"planes64", "planes32", "lines16"}
-    assert {"compact", "splats50"} <= names
+    assert {"coded", "splats50"} <= names

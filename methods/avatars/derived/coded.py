@@ -1,0 +1,59 @@
+"""Coded variants of trained avatars, for every native method: the same codec at several steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from ....bench.contracts import Avatar, Clip, Variant
+from ...shared.avatar_files import read_shared_head
+from ..compact.precision import Precision
+
+STEPS = (1.0, 0.25, 0.5, 2.0, 4.0)
+"""Factors of all quantisation steps."""
+CODED = "coded"
+"""Name of the variant with the default steps."""
+
+
+def coded_name(step: float) -> str:
+    """Name of a variant by the factor of its steps: "coded", "coded-x0.5"."""
+    return CODED if step == 1 else f"{CODED}-x{step:g}"
+
+
+def gbs_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
+    """The coded variants of an avatar of GaussianBlendshapes."""
+    return _variants("gbs.avatar", "GBSAvatar", folder, clip, device)
+
+
+def gha_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
+    """The coded variants of an avatar of Gaussian Head Avatar."""
+    return _variants("gha.avatar", "GHAAvatar", folder, clip, device)
+
+
+def insta_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
+    """The coded variants of an avatar of INSTA."""
+    return _variants("insta.avatar", "InstaAvatar", folder, clip, device)
+
+
+def _variants(module: str, name: str, folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
+    avatar_class = getattr(import_module(f"...{module}", __package__), name)
+    for step in STEPS:
+        summary = "quantised by visible effect, entropy-coded" + (
+            f", steps times {step:g}" if step != 1 else ""
+        )
+        yield Variant(
+            coded_name(step), summary, partial(make_coded, avatar_class, folder, clip, device, step)
+        )
+
+
+def make_coded(avatar_class: Any, folder: Path, clip: Clip, device: str, step: float, out: Path) -> Avatar:
+    """Write the coded form of the avatar of a folder; return the avatar that is read back."""
+    from ..compact.codecs import DRIVING_FILE, write_coded
+
+    avatar, head = avatar_class.read(folder, "cpu"), read_shared_head(folder)
+    write_coded(avatar, head, out, Precision(step=step), clip, folder / DRIVING_FILE)
+    coded: Avatar = avatar_class.read(out, device)
+    return coded
