@@ -473,6 +473,25 @@ class TrainingMetric(Protocol):
         """
 
 
+class TrueFrame(NamedTuple):
+    """Ground truth of one frame."""
+
+    rgb: ByteArray  #: (H, W, 3) 8-bit sRGB on the clip's background
+    mask: ByteArray  #: (H, W) 8-bit foreground coverage
+    face: BoolArray  #: (H, W) pixels in which the face is visible
+
+
+class GroundTruth(Protocol):
+    """A subject that can be pictured in any pose and view: that of a synthetic capture, see `DatasetSpec.truth`."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Hex digest of everything that a picture depends on besides camera and pose."""
+
+    def render(self, camera: Camera, pose: HeadPose) -> TrueFrame:
+        """Picture of the subject; the same for the same input."""
+
+
 def no_stage(name: str) -> None:
     """Ignore the end of a stage."""
 

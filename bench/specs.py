@@ -301,6 +301,8 @@ class DatasetSpec:
     capture's own files list them, all of them, by which official repositories number their renders; "" for none.
     ``pose_files`` names a function ``path -> {timestep: file}``: the file with the tracking parameters of each timestep;
     "" where timesteps have no files of their own.
+    ``truth`` names a function ``clip -> GroundTruth`` for clips of captures that this function made; it raises
+    `UnavailableError` for others. "" for none.
     ``needs`` is as that of a method, called with None for the config. ``errors`` names a function ``clip -> list of text``: what
     makes every result of the capture meaningless, which a run looks for before it trains; "" for none.
     """
@@ -312,6 +314,7 @@ class DatasetSpec:
     reads: bool = True
     listing: str = ""
     pose_files: str = ""
+    truth: str = ""
     needs: str = ""
     errors: str = ""
 

@@ -37,6 +37,7 @@ SYNTHETIC = DatasetSpec(
     summary="A ray-traced procedural head with exact tracking, written in the same layout.",
     implementation="headbench.datasets.synthetic.capture:synthesize",
     reads=False,
+    truth="headbench.datasets.synthetic.truth:SyntheticTruth",
     needs="headbench.datasets.synthetic.needs:needs",
 )
 

@@ -286,7 +286,7 @@ CASES = {
     ],
     "run extremes": [
         case(
-            "run extremes {demo} --out extremes --views 2 --dimensions 1 --sigmas 1",
+            "run extremes {demo} --out extremes --views 2 --dimensions 1 --samples 1 --path 2",
             *(EVERY_METHOD, "extremes/contact_sheet.png"),
         )
     ],

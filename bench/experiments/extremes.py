@@ -1,7 +1,8 @@
-"""``headbench run extremes``: views between and beyond the training cameras, expressions along principal components."""
+"""``headbench run extremes``: views between and beyond the training cameras, joint samples of expression and jaw."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -9,9 +10,11 @@ from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
+from scipy.special import ndtri
 
 from ..contracts import Avatar, Clip, FloatArray, FrameKey, HeadPose, Progress
 from ..engine.steps import Job
+from ..errors import UnavailableError
 from ..io.files import digest
 from ..protocol import Protocol
 from ..rows import Rows
@@ -19,6 +22,8 @@ from .stability import (
     EXPRESSION_LIMITS,
     VIEW_LIMITS,
     JudgedFrame,
+    LimitCheck,
+    Measures,
     ShownFrames,
     judge,
     judged_rows,
@@ -28,43 +33,72 @@ from .stability import (
     typical,
     write_frame,
 )
-from .viewpoints import Viewpoint, turntable
+from .truth import TRUTH_LIMITS, TruthJudge, TruthPair, TruthPictures, without_truth
+from .viewpoints import Viewpoint, common_target, turntable
 
+log = logging.getLogger(__name__)
 NO_VARIATION = 1e-9
 """A component whose deviation is below this share of the largest one is rounding, not expression."""
+VIEWS_PER_SAMPLE = 2
 
 
 @dataclass(frozen=True, eq=False)
-class ExpressionComponents:
-    """Principal components of expression coefficients: (E,) mean, (D, E) unit vectors by falling deviation,
-    and the (D,) standard deviation along each, all positive. D is less than requested if the training data
-    span less."""
+class PoseComponents:
+    """Principal components of expression and jaw together, each scaled to a total variance of 1 over the training poses.
+
+    Attributes
+    ----------
+    mean, low, high : FloatArray
+        (E + 3,) mean and range of expression and jaw.
+    directions : FloatArray
+        (D, E + 3) change of both along each component by one standard deviation, by falling deviation. D is less than
+        requested if the training poses span less.
+    reach : FloatArray
+        (2, D) least and largest number of standard deviations of a training pose along each component.
+    """
 
     mean: FloatArray
+    low: FloatArray
+    high: FloatArray
     directions: FloatArray
-    deviations: FloatArray
+    reach: FloatArray
 
     @classmethod
-    def of(cls, coefficients: FloatArray, dimensions: int) -> ExpressionComponents:
-        """Components of (T, E) coefficients, one row a timestep."""
-        mean = coefficients.mean(axis=0)
-        _, singular, directions = np.linalg.svd(coefficients - mean, full_matrices=False)
-        deviations = singular / np.sqrt(max(len(coefficients) - 1, 1))
-        scale = max(float(np.abs(coefficients).max(initial=0.0)), 1.0)
-        kept = np.flatnonzero(deviations > NO_VARIATION * scale)[:dimensions]
-        return cls(mean, directions[kept], deviations[kept])
+    def of(cls, poses: Sequence[HeadPose], dimensions: int) -> PoseComponents:
+        """Components of some poses."""
+        values = np.array([np.concatenate([pose.expression, pose.jaw]) for pose in poses], np.float64)
+        mean, jaw = values.mean(axis=0), np.arange(values.shape[1]) >= values.shape[1] - 3
+        variances = values.var(axis=0)
+        scale = np.where(jaw, np.sqrt(variances[jaw].sum()), np.sqrt(variances[~jaw].sum()))
+        scale[scale < NO_VARIATION] = 1.0  # what never changes is in no component
+        _, singular, axes = np.linalg.svd((values - mean) / scale, full_matrices=False)
+        deviations = singular / np.sqrt(max(len(values) - 1, 1))
+        kept = np.flatnonzero(deviations > NO_VARIATION)[:dimensions]
+        scores = ((values - mean) / scale) @ axes[kept].T / deviations[kept]
+        return cls(
+            mean,
+            values.min(axis=0),
+            values.max(axis=0),
+            deviations[kept, None] * axes[kept] * scale,
+            np.stack([scores.min(axis=0), scores.max(axis=0)]),
+        )
 
-    def at(self, component: int, sigmas: float) -> FloatArray:
-        """(E,) coefficients at a number of standard deviations along a component, counted from 0."""
-        return np.asarray(self.mean + sigmas * self.deviations[component] * self.directions[component])
+    def at(self, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(E,) expression and (3,) jaw at (D,) standard deviations along the components, within the range of training."""
+        inside = np.clip(sigmas, *self.reach)
+        values = np.clip(self.mean + inside @ self.directions, self.low, self.high)
+        return values[:-3], values[-3:]
 
 
-class ExtremePose(NamedTuple):
-    """A pose to render, such as ``pc3+2`` for component 3, or ``mean`` and 0 for the mean expression."""
+def joint_samples(count: int, dimensions: int, sigmas: float) -> FloatArray:
+    """(count, dimensions) standard normal numbers, at most ``sigmas`` from 0: a Latin hypercube, the same every time.
 
-    name: str
-    component: int
-    pose: HeadPose
+    Each number of a dimension is the middle quantile of another of ``count`` parts of equal probability, in random order
+    (McKay, Beckman, Conover, Technometrics 21(2), 1979).
+    """
+    rng = np.random.default_rng(0)
+    parts = np.stack([rng.permutation(count) for _ in range(dimensions)], axis=1)
+    return np.asarray(np.clip(ndtri((parts + 0.5) / count), -sigmas, sigmas))
 
 
 def training_poses(clip: Clip) -> list[HeadPose]:
@@ -78,50 +112,87 @@ def typical_pose(poses: Sequence[HeadPose]) -> HeadPose:
     return poses[int(np.argmin(np.linalg.norm(expressions - expressions.mean(axis=0), axis=1)))]
 
 
-def extremes(clip: Clip, dimensions: int, sigmas: Sequence[float]) -> list[ExtremePose]:
-    """The mean expression, then every step along every component; the rest of the pose stays the typical one's.
+TYPICAL, PATH = "typical", "path"
+
+
+class PlannedFrame(NamedTuple):
+    """A pose in a view, which is numbered. Poses are named "typical", "sample-01" and so on, and "path"."""
+
+    name: str
+    number: int
+    pose: HeadPose
+    view: int
+
+
+def sampled_poses(clip: Clip, dimensions: int, samples: int, sigmas: float) -> list[HeadPose]:
+    """The typical training pose, then poses with jointly sampled expression and jaw; all else stays the typical one's.
 
     Taken from training timesteps alone. Poses belong to no timestep, so that no avatar answers with tracking it
-    refined for one.
+    refined for one. Without variation in training there is no sample.
     """
     poses = training_poses(clip)
     base = replace(typical_pose(poses), timestep=None)
-    dtype = base.expression.dtype
-    components = ExpressionComponents.of(np.array([p.expression for p in poses], np.float64), dimensions)
-    expressions = [("mean", 0, components.mean)]
-    for index in range(len(components.deviations)):
-        expressions += [(f"pc{index + 1}{s:+g}", index + 1, components.at(index, s)) for s in sigmas]
-    return [
-        ExtremePose(name, number, replace(base, expression=expression.astype(dtype)))
-        for name, number, expression in expressions
-    ]
+    components = PoseComponents.of(poses, dimensions)
+    found = [base]
+    if len(components.directions):
+        for numbers in joint_samples(samples, len(components.directions), sigmas):
+            found.append(_with(base, *components.at(numbers)))
+    return found
+
+
+def path_poses(poses: Sequence[HeadPose], count: int) -> list[HeadPose]:
+    """A smooth sequence from the first of some poses through the next two, which slows down at each of them."""
+    ends = [np.concatenate([pose.expression, pose.jaw]) for pose in poses[:3]]
+    found = []
+    for place in np.linspace(0.0, len(ends) - 1, count) if len(ends) > 1 else ():
+        before = min(int(place), len(ends) - 2)
+        share = (1.0 - np.cos(np.pi * (place - before))) / 2.0
+        values = (1.0 - share) * ends[before] + share * ends[before + 1]
+        found.append(_with(poses[0], values[:-3], values[-3:]))
+    return found
+
+
+def _with(pose: HeadPose, expression: FloatArray, jaw: FloatArray) -> HeadPose:
+    """The pose with another expression and jaw, in its numbers' precision."""
+    return replace(pose, expression=expression.astype(pose.expression.dtype), jaw=jaw.astype(pose.jaw.dtype))
 
 
 TASK: Literal["extremes"] = "extremes"
-LIMITS = {"views": asdict(VIEW_LIMITS), "expressions": asdict(EXPRESSION_LIMITS)}
+LIMITS = {
+    "views": asdict(VIEW_LIMITS),
+    "expressions": asdict(EXPRESSION_LIMITS),
+    "truth": asdict(TRUTH_LIMITS),
+}
 
 
 @dataclass(frozen=True, eq=False)
 class ExtremesPlan:
-    """Views and expressions that the avatars of one clip are rendered with."""
+    """Views and poses that the avatars of one clip are rendered with.
+
+    The typical pose is seen in every view, each sample in `VIEWS_PER_SAMPLE`, and the path in the view from the front.
+    """
 
     views: Sequence[Viewpoint]
-    extremes: Sequence[ExtremePose]
+    frames: Sequence[PlannedFrame]
     fingerprint: str
 
     @classmethod
     def of(
-        cls, clip: Clip, views: int, beyond: float, dimensions: int, sigmas: Sequence[float]
+        cls, clip: Clip, views: int, beyond: float, dimensions: int, samples: int, sigmas: float, path: int
     ) -> ExtremesPlan:
-        """Choose views and expressions for a clip, from its training frames alone."""
+        """Choose views and poses for a clip, from its training frames alone."""
         cameras = [clip.cameras[name] for name in sorted({key.camera for key in clip.splits["train"]})]
-        sigmas = sorted(sigmas)
-        asked = (views, beyond, dimensions, sigmas)
-        return cls(
-            turntable(cameras, head_center(clip), views, beyond),
-            extremes(clip, dimensions, sigmas),
-            digest(TASK, 1, clip.fingerprint, asked, tuple(LIMITS.values()))[:12],
-        )
+        chosen = turntable(cameras, common_target(cameras, head_center(clip)), views, beyond)
+        poses = sampled_poses(clip, dimensions, samples, sigmas)
+        front = min(range(views), key=lambda index: abs(chosen[index].azimuth))
+        apart = max(1, views // VIEWS_PER_SAMPLE)
+        frames = [PlannedFrame(TYPICAL, 0, poses[0], view) for view in range(views)]
+        for number, pose in enumerate(poses[1:], 1):
+            seen = sorted({(number - 1 + apart * k) % views for k in range(VIEWS_PER_SAMPLE)})
+            frames += [PlannedFrame(f"sample-{number:02d}", number, pose, view) for view in seen]
+        frames += [PlannedFrame(PATH, n, pose, front) for n, pose in enumerate(path_poses(poses, path))]
+        asked = (views, beyond, dimensions, samples, sigmas, path)
+        return cls(chosen, frames, digest(TASK, 2, clip.fingerprint, asked, tuple(LIMITS.values()))[:12])
 
 
 def head_center(clip: Clip) -> FloatArray:
@@ -143,65 +214,94 @@ def protocols(jobs: Sequence[Job], **parameters: Any) -> dict[str, Protocol]:
 def drive(
     job: Job, avatar: Avatar, progress: Progress, **parameters: Any
 ) -> tuple[Rows, dict[str, Any], list[Path]]:
-    """Render and judge every pair of view and expression; the registered change "extremes".
+    """Render and judge every frame of the plan; the registered change "extremes".
 
-    The details have the record of the avatar: views, expressions and findings. The files are the frames that the contact
-    sheet shows.
+    The details have the record of the avatar: views, frames, truth and findings. The files are the frames that the contact
+    sheet shows and the truth of each.
     """
     plan = ExtremesPlan.of(job.form.clip, **parameters)
     files: list[Path] = []
-    details = {
-        "views": [
-            {"id": v.camera.id, "azimuth": round(v.azimuth, 2), "extrapolated": v.extrapolated}
-            for v in plan.views
-        ],
-        "expressions": [extreme.name for extreme in plan.extremes],
-    }
     keys = _shown(job, plan).keys
-    rows, record = judged_rows(job, keys, lambda: (_judged(job, avatar, plan, files, progress), details))
-    return Rows.of(rows), {"avatars": [record]}, files
+    rows, record = judged_rows(job, keys, lambda: _judged(job, avatar, plan, files, progress))
+    return Rows.of(rows), {"avatars": [record]}, list(dict.fromkeys(files))
 
 
 def _shown(job: Job, plan: ExtremesPlan) -> ShownFrames:
     return ShownFrames(
         job,
         [job.clip],
-        [_key(job, extreme, n, view) for n, extreme in enumerate(plan.extremes) for view in plan.views],
+        [_key(job, plan, frame) for frame in plan.frames],
         [(view.camera.width, view.camera.height) for view in plan.views],
-        (f"views and expressions of {job.clip.subject}", plan.fingerprint),
+        (f"views and poses of {job.clip.subject}", plan.fingerprint),
     )
 
 
-def _key(job: Job, extreme: ExtremePose, number: int, view: Viewpoint) -> FrameKey:
-    return FrameKey(job.clip.subject, extreme.name, number, view.camera.id)
+def _key(job: Job, plan: ExtremesPlan, frame: PlannedFrame) -> FrameKey:
+    return FrameKey(job.clip.subject, frame.name, frame.number, plan.views[frame.view].camera.id)
 
 
 def _judged(
     job: Job, avatar: Avatar, plan: ExtremesPlan, files: list[Path], report: Progress
-) -> list[JudgedFrame]:
-    """The mean expression first, since it is the reference of all others in its view."""
+) -> tuple[list[JudgedFrame], dict[str, Any]]:
+    """Frames and the avatar's record. The typical pose comes first, since it is the reference of all others in its view."""
     background = [float(v) for v in job.form.clip.background]
-    total = len(plan.extremes) * len(plan.views)
-    components = max(extreme.component for extreme in plan.extremes)
-    frames: list[JudgedFrame] = []
-    references = []
-    for number, extreme in enumerate(plan.extremes):
-        splats = splats_of(avatar, extreme.pose)
-        measured = []
-        for index, view in enumerate(plan.views):
-            frame, found = render_measured(avatar, view.camera, extreme.pose, background, splats)
-            measured.append(found)
-            # The contact sheet shows in each view every step along one component, which changes from view to view.
-            if not extreme.component or extreme.component == index % components + 1:
-                files += write_frame(job.cell.folder / f"{extreme.name}_{view.camera.id}.png", frame)
-            report(number * len(plan.views) + index + 1, total, TASK)
-        if number == 0:
-            references = measured
-            between = [m for m, view in zip(measured, plan.views) if not view.extrapolated]
-            middle = typical(between or measured)
-            checks = [judge(m, middle, VIEW_LIMITS) for m in measured]
+    truths: TruthPictures | None = None
+    missing = ""
+    try:
+        truths, scores = TruthPictures.of(job), TruthJudge(job.device)
+    except UnavailableError as error:
+        missing = str(error)
+        log.warning("%s: there is no truth to compare with: %s", job.name, error)
+    measured: list[Measures] = []
+    compared: list[TruthPair | None] = []
+    against: list[tuple[list[LimitCheck], list[LimitCheck]]] = []
+    shown = []
+    pose, splats = None, None
+    for index, frame in enumerate(plan.frames):
+        view = plan.views[frame.view]
+        if frame.pose is not pose:
+            pose, splats = frame.pose, splats_of(avatar, frame.pose)
+        rendered, found = render_measured(avatar, view.camera, frame.pose, background, splats)
+        measured.append(found)
+        sample, follows = frame.name not in (TYPICAL, PATH), frame.name == PATH and frame.number > 0
+        stem = f"{PATH}-{frame.number:02d}" if frame.name == PATH else frame.name
+        place = job.cell.folder / f"{stem}_{view.camera.id}.png"
+        entry: dict[str, Any] = {
+            "key": str(_key(job, plan, frame)),
+            "driven": place.relative_to(job.run).as_posix(),
+        }
+        files += write_frame(place, rendered)
+        if truths is None:
+            checks, response, flicker = without_truth(missing)
         else:
-            checks = [judge(m, r, EXPRESSION_LIMITS) for m, r in zip(measured, references)]
-        keys = [_key(job, extreme, number, view) for view in plan.views]
-        frames += [JudgedFrame(key, found) for key, found in zip(keys, checks)]
-    return frames
+            truth, own = truths.at(view.camera, frame.pose)
+            files += own
+            entry["truth"] = own[0].relative_to(job.run).as_posix()
+            compared.append(TruthPair.of(rendered, truth))
+            checks = scores.appearance(compared[-1], extrapolated=view.extrapolated)
+            response = scores.response(compared[-1], compared[frame.view])
+            flicker = scores.flicker(compared[-1], compared[-2 if follows else -1])
+        against.append((checks, [*([response] if sample else []), *([flicker] if follows else [])]))
+        shown.append(entry)
+        report(index + 1, len(plan.frames), TASK)
+    count = len(plan.views)
+    between = [m for m, view in zip(measured, plan.views) if not view.extrapolated]
+    middle = typical(between or measured[:count])
+    frames = []
+    for frame, found, (checks, changes) in zip(plan.frames, measured, against):
+        reference = middle if frame.name == TYPICAL else measured[frame.view]
+        limits = VIEW_LIMITS if frame.name == TYPICAL else EXPRESSION_LIMITS
+        frames.append(
+            JudgedFrame(_key(job, plan, frame), [*judge(found, reference, limits), *checks], changes)
+        )
+    for entry, judged in zip(shown, frames):
+        entry["values"] = {check.name: check.value for check in (*judged.checks, *judged.changes)}
+    details = {
+        "views": [
+            {"id": v.camera.id, "azimuth": round(v.azimuth, 2), "extrapolated": v.extrapolated}
+            for v in plan.views
+        ],
+        "shown": shown,
+        **({"no_truth": missing} if missing else {}),
+    }
+    return frames, details

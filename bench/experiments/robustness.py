@@ -26,7 +26,7 @@ RECORD_FILE = "record.json"
 
 
 def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -> CommandResult:
-    """Render a run's avatars in views and expressions beyond those of training; check stability limits.
+    """Render a run's avatars in views and poses beyond those of training; check them against truth and stability limits.
 
     Does not pass if a limit is broken or an avatar failed. A restart keeps finished work. Raises `InputError`
     for a folder that is not a finished run, and for a capture that is not the run's.
@@ -71,7 +71,9 @@ def _write_record(out: Path, drive: str, rows: Rows, settings: dict[str, Any]) -
     folder = RunFolder(out)
     manifest = folder.read_manifest()
     table = rows.select(method=ALL, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
-    without = table[table["timestep"] < 0].drop_duplicates(["subject", "method", "seed"])
+    without = table[(table["timestep"] < 0) & (table["task"] != "")].drop_duplicates(
+        ["subject", "method", "seed"]
+    )
     failed = without[["subject", "method", "seed", "reason"]].to_dict("records")
     places = {(each["subject"], each["method"], each["seed"]) for each in failed}
     avatars: list[dict[str, Any]] = []

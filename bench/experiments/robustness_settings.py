@@ -13,7 +13,8 @@ from ..executors.options import ExecutionOptions
 
 @dataclass(frozen=True)
 class ExtremesSettings(RunOptions, ExecutionOptions):
-    """Render a run's avatars in views and expressions beyond those of training; 1 where a limit is broken."""
+    """Render a run's avatars in new views and joint samples of expression and jaw; 1 where a limit is broken. Synthetic captures
+    have a path-traced truth for every pose and view."""
 
     run: tyro.conf.Positional[str]
     """Folder of a finished run."""
@@ -31,24 +32,31 @@ class ExtremesSettings(RunOptions, ExecutionOptions):
     """How far the turntable goes on beyond the outermost training cameras, degrees."""
 
     dimensions: int = 8
-    """Principal components of the training expressions."""
+    """Principal components of expression and jaw in training."""
 
-    sigmas: tuple[float, ...] = (-3.0, -2.0, -1.0, 1.0, 2.0, 3.0)
-    """How far along each component, in standard deviations."""
+    samples: int = 24
+    """Poses drawn jointly along all components, each seen in two views."""
+
+    sigmas: float = 3.0
+    """Largest distance along a component, in standard deviations; never beyond the range of training."""
+
+    path: int = 12
+    """Frames of a sequence through two of the poses, for flicker; 0: none."""
 
     def __post_init__(self) -> None:
-        if self.views < 1 or self.dimensions < 1 or not self.sigmas:
-            raise ValueError("views, dimensions and sigmas: at least one of each")
+        for name, least in (("views", 1), ("dimensions", 1), ("samples", 1), ("path", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} is {getattr(self, name)}; at least {least}")
         if not 0.0 <= self.beyond < 180.0:
             raise ValueError(f"beyond is {self.beyond}; from 0 to less than 180 degrees")
-        if len(set(self.sigmas)) != len(self.sigmas) or 0.0 in self.sigmas:
-            raise ValueError("sigmas: each once, and without 0, which is always rendered")
+        if not 0.0 < self.sigmas <= 10.0:
+            raise ValueError(f"sigmas is {self.sigmas}; above 0, at most 10")
 
     @property
     def parameters(self) -> dict[str, Any]:
         """Of the registered change "extremes"."""
-        chosen = {"views": self.views, "beyond": self.beyond, "dimensions": self.dimensions}
-        return {**chosen, "sigmas": list(self.sigmas)}
+        names = ("views", "beyond", "dimensions", "samples", "sigmas", "path")
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ CURVE = CommandSpec(
 EXTREMES_COMMAND = CommandSpec(
     name="run extremes",
     group="compare",
-    summary="Render views and expressions beyond training; check stability limits.",
+    summary="Render views and poses beyond training; check against truth and stability limits.",
     settings="headbench.bench.experiments.robustness_settings:ExtremesSettings",
     function="headbench.bench.experiments.robustness:extremes_run",
 )
@@ -89,13 +89,23 @@ MEASURES = (
 )
 """What `stability.Measures` has of a frame, against limits."""
 
+AGAINST_TRUTH = (
+    MetricSpec("psnr", "PSNR", "dB", True, 2, ""),
+    MetricSpec("lpips", "LPIPS", "", False, 4, ""),
+    MetricSpec("iou", "Overlap of masks", "ratio", True, 3, ""),
+    MetricSpec("colour", "Colour of the face", "CIEDE2000", False, 2, ""),
+    MetricSpec("response", "Response", "ratio", True, 2, "", kind="avatar"),
+    MetricSpec("flicker", "Flicker", "levels", False, 3, "", kind="avatar"),
+)
+"""What `truth.TruthJudge` has of a frame, against limits that follow from the truth."""
+
 EXTREMES = ConditionSpec(
     name="extremes",
-    summary="Renders views and expressions beyond those of training; checks stability limits.",
+    summary="Renders new views and poses; checks them against the truth of synthetic captures, and stability limits.",
     kind="drive",
     implementation="headbench.bench.experiments.extremes:drive",
     protocols="headbench.bench.experiments.extremes:protocols",
-    metrics=MEASURES,
+    metrics=(*MEASURES, *AGAINST_TRUTH),
 )
 
 REENACT = ConditionSpec(

@@ -1,6 +1,6 @@
-"""Robustness tests without ground truth: measures of one frame, their limits, and the files of a test.
+"""Robustness tests: measures of one frame without ground truth, their limits, and the files of a test.
 
-Every limit is relative to a frame of the same avatar that is not extreme, so that hair, which is translucent, or a
+Every limit of these measures is relative to a frame of the same avatar that is not extreme, so that hair, which is translucent, or a
 low resolution, whose edges are, does not count against it.
 """
 
@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, fields, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +33,7 @@ from ..errors import UnavailableError
 from ..io.images import quantise, write_png
 from ..io.provenance import RENDER
 from ..protocol import Protocol, TaskWithoutTruth, make_protocol_without_truth, protocol_name
+from ..registry import get
 from ..rows import Row
 
 log = logging.getLogger(__name__)
@@ -79,21 +80,43 @@ VIEW_LIMITS = Limits(coverage=(0.5, 2.0), translucent_rise=0.2)
 
 @dataclass(frozen=True)
 class LimitCheck:
-    """One measure of one frame and its limits. ``value`` is None where it cannot be measured, ``absent`` says why."""
+    """One measure of one frame over a region, and its limits. ``value`` is None where it cannot be measured, ``absent`` says
+    why."""
 
     measure: str
     value: float | None
     lower: float
     upper: float
     absent: str = "the avatar gives no splats"
+    region: str = FULL
 
     @property
     def passed(self) -> bool:
         """Whether the limits hold; a value that is not a number breaks them."""
         return self.value is None or self.lower <= self.value <= self.upper
 
+    @property
+    def outcome(self) -> tuple[str, str]:
+        """Status and reason of its row."""
+        if self.value is None:
+            return "missing", self.absent
+        return ("ok", "") if self.passed else ("failed", str(self))
+
+    @property
+    def name(self) -> str:
+        """Measure and region: "psnr", or "psnr face"."""
+        return self.measure if self.region == FULL else f"{self.measure} {self.region}"
+
+    @property
+    def worst_first(self) -> float:
+        """Orders values: the nearest to a limit, or the farthest beyond it, first."""
+        value = math.nan if self.value is None else self.value
+        if self.upper == math.inf:
+            return value
+        return -value if self.lower <= 0.0 else -abs(math.log(value)) if value > 0.0 else -math.inf
+
     def __str__(self) -> str:
-        return f"{self.measure} is {self.value:.3g}, limits {self.lower:.3g} to {self.upper:.3g}"
+        return f"{self.name} is {self.value:.3g}, limits {self.lower:.3g} to {self.upper:.3g}"
 
 
 def measure(frame: Frame, camera: Camera, splats: Splats | None = None) -> Measures:
@@ -166,15 +189,16 @@ def _ratio(value: float | None, reference: float | None) -> float | None:
 
 @dataclass(frozen=True)
 class JudgedFrame:
-    """A rendered frame; ``checks`` are in the order of `Measures`, followed by others."""
+    """A rendered frame, its checks, and those of its change from another frame, which not every frame has."""
 
     key: FrameKey
     checks: Sequence[LimitCheck]
+    changes: Sequence[LimitCheck] = ()
 
     @property
     def broken(self) -> list[LimitCheck]:
         """The limits that do not hold."""
-        return [check for check in self.checks if not check.passed]
+        return [check for check in (*self.checks, *self.changes) if not check.passed]
 
 
 class ShownFrames(NamedTuple):
@@ -216,8 +240,10 @@ def judged_rows(
         frames, details = judged()
     except UnavailableError as error:
         log.warning("%s is missing: %s", job.name, error)
-        absent = [LimitCheck(field.name, None, 0.0, 0.0, str(error)) for field in fields(Measures)]
-        frames, details = [JudgedFrame(key, absent) for key in keys], {"missing": str(error)}
+        specs = get("conditions", job.condition.drive.name).metrics
+        absent = {spec: LimitCheck(spec.name, None, 0.0, 0.0, str(error)) for spec in specs}
+        checks, changes = ([absent[s] for s in specs if s.per_frame is each] for each in (True, False))
+        frames, details = [JudgedFrame(key, checks, changes) for key in keys], {"missing": str(error)}
     record = {**_summary(job, frames), **details, "protocol": protocol.hash}
     return _rows(job, protocol, frames), record
 
@@ -245,38 +271,58 @@ def write_frame(path: Path, frame: Frame) -> list[Path]:
 
 
 def _rows(job: Job, protocol: Protocol, frames: Sequence[JudgedFrame]) -> list[Row]:
-    """Rows as every measurement leaves them; a broken limit has status "failed" and says which."""
+    """Rows as every measurement leaves them; a broken limit has status "failed" and says which.
+
+    Changes have one row for the avatar: the mean over its frames, which fails if one of them does.
+    """
     method = job.method.spec
+    whose = (method.name, method.version, job.seed)
     rows = []
     for frame in frames:
+        place = (*whose, protocol.task, *frame.key)
         for check in frame.checks:
-            value, outcome = check.value, ("ok", "")
-            if value is None:
-                value, outcome = math.nan, ("missing", check.absent)
-            elif not check.passed:
-                outcome = ("failed", str(check))
-            where = (method.name, method.version, job.seed, protocol.task, *frame.key)
-            row = Row(*where, FULL, check.measure, value, protocol.hash, *outcome)
-            rows.append(replace(row, condition=job.condition.name))
-    return rows
+            value = math.nan if check.value is None else check.value
+            rows.append(Row(*place, check.region, check.measure, value, protocol.hash, *check.outcome))
+    of_avatar = (*whose, "", job.clip.subject, "", -1, "")
+    for checks in _by_name(check for frame in frames for check in frame.changes).values():
+        known = [check.value for check in checks if check.value is not None]
+        mean = float(np.mean(known)) if known else math.nan
+        broken = [check for check in checks if not check.passed]
+        status, reason = broken[0].outcome if broken else ("ok", "") if known else checks[0].outcome
+        if broken:
+            reason = f"{len(broken)} of {len(checks)} frames; the first: {reason}"
+        rows.append(Row(*of_avatar, FULL, checks[0].measure, mean, "", status, reason))
+    return [replace(row, condition=job.condition.name) for row in rows]
+
+
+def _by_name(checks: Iterable[LimitCheck]) -> dict[str, list[LimitCheck]]:
+    named: dict[str, list[LimitCheck]] = {}
+    for check in checks:
+        named.setdefault(check.name, []).append(check)
+    return named
 
 
 def _summary(job: Job, frames: Sequence[JudgedFrame]) -> dict[str, Any]:
-    """How many frames of an avatar there are, which break limits, and the range of every measure."""
+    """How many frames of an avatar there are, which break limits, and mean, worst value and failed frames of every measure."""
     broken = [frame for frame in frames if frame.broken]
-    by_measure = zip(*(frame.checks for frame in frames))
+    by_measure = _by_name(check for frame in frames for check in (*frame.checks, *frame.changes))
     return {
         "subject": job.clip.subject,
         "method": job.method.spec.name,
         "seed": job.seed,
         "frames": len(frames),
         "frames_broken": len(broken),
-        "ranges": {checks[0].measure: _range([check.value for check in checks]) for checks in by_measure},
+        "measures": {name: _measured(checks) for name, checks in by_measure.items()},
         "broken": [{"key": str(f.key), "limits": [str(check) for check in f.broken]} for f in broken],
     }
 
 
-def _range(values: Sequence[float | None]) -> tuple[float | None, float | None]:
-    """Least and largest finite value; None without any."""
-    finite = [v for v in values if v is not None and math.isfinite(v)]
-    return (min(finite), max(finite)) if finite else (None, None)
+def _measured(checks: Sequence[LimitCheck]) -> dict[str, float | int | None]:
+    """Mean, worst and number of finite values of a measure, and how many break a limit."""
+    known = [check for check in checks if check.value is not None and math.isfinite(check.value)]
+    return {
+        "mean": float(np.mean([check.value for check in known])) if known else None,
+        "worst": min(known, key=lambda check: check.worst_first).value if known else None,
+        "frames": len(known),
+        "failed": sum(not check.passed for check in checks),
+    }

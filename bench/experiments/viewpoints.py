@@ -11,6 +11,8 @@ from ..contracts import Camera, FloatArray
 from ..errors import InputError
 
 NEAR_M = 1e-6
+NEAR_AXES = 1e-3
+"""Weight of the distance from the head's centre against that from the axes of cameras, which may be one or parallel."""
 LEAST_SPREAD = 0.15
 """Ratio of the singular values of the cameras' right axes from which on they determine the upward direction."""
 
@@ -98,6 +100,19 @@ def turntable(
             )
         )
     return views
+
+
+def common_target(cameras: Sequence[Camera], center: FloatArray) -> FloatArray:
+    """(3,) point that cameras look at: the nearest to all of their axes, and of those nearly as near, to ``center`` (3,), metres.
+
+    Views that face it have the training pictures' section of the scene.
+    """
+    matrix, wanted = NEAR_AXES * np.eye(3), NEAR_AXES * np.asarray(center, np.float64)
+    for camera in cameras:
+        axis = camera.world_to_camera[2, :3]
+        across = (np.eye(3) - np.outer(axis, axis)) / len(cameras)
+        matrix, wanted = matrix + across, wanted + across @ camera.center
+    return np.asarray(np.linalg.solve(matrix, wanted))
 
 
 def look_at(position: FloatArray, target: FloatArray, up: FloatArray) -> FloatArray:

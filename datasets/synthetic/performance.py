@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
+from scipy.optimize import nnls
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose
 from ...bench.errors import InputError
@@ -80,6 +81,26 @@ class Translation:
             None if self.eyelids is None else (values @ self.eyelids).astype(np.float32).astype(np.float64)
         )
         return HeadPose(self.head_model, **stored, eyelids=eyelids, subject=subject, timestep=timestep)
+
+    def activations(self, pose: HeadPose) -> Activations:
+        """Controls of a pose: those from 0 up whose expression and eyelids are nearest to its own, with the tongue inside.
+
+        The inverse of `pose` where that expression needs no negative control; jaw, gaze and rigid motion are exact.
+        """
+        matrix, wanted = self.expression, np.asarray(pose.expression, np.float64)
+        if self.eyelids is not None and pose.eyelids is not None:
+            matrix, wanted = np.hstack([matrix, self.eyelids]), np.concatenate([wanted, pose.eyelids])
+        values, _ = nnls(matrix.T, wanted)
+        return {
+            **dict(zip(EXPRESSION_CONTROLS, values.tolist())),
+            **dict(zip(("jaw_open", "jaw_side", "jaw_roll"), pose.jaw / [_JAW_OPEN, _JAW_SIDE, _JAW_ROLL])),
+            "gaze_left": float(pose.eyes[[1, 4]].mean()) / _GAZE_SIDE,
+            "gaze_up": -float(pose.eyes[[0, 3]].mean()) / _GAZE_UP,
+            **dict(zip(("head_nod", "head_turn", "head_tilt"), pose.rotation)),
+            **dict(zip(("neck_nod", "neck_turn"), pose.neck)),
+            **dict(zip(("sway_x", "sway_y", "sway_z"), pose.translation)),
+            "tongue_out": 0.0,
+        }
 
 
 Kind = Literal["full", "parts", "natural", "expressions", "still"]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...bench.contracts import ByteArray, FloatArray, HeadPose
+from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose
 from .history import SkinState, over_time
 from .lag import follow
 from .panels import PanelTracer, panels, rig_middle
@@ -71,7 +71,7 @@ class CaptureRenderer:
             for camera in cameras:
                 frames[camera].append(self._tracer.image(plan.cameras[camera], seeds[camera]))
         for camera in cameras:
-            image, mask = self._developed(camera, seeds[camera], *exposed(frames[camera]))
+            image, mask = self._developed(plan.cameras[camera], seeds[camera], *exposed(frames[camera]))
             plan.writer.write_frame(sequence, timestep, camera, image, mask)
 
     def sub_frames(self, sequence: str, timestep: int) -> FloatArray:
@@ -112,24 +112,37 @@ class CaptureRenderer:
             self._tracer.move(name, mesh.vertices, mesh.albedo, mesh.gloss)
 
     def render(self, camera: str, seed: int) -> tuple[ByteArray, ByteArray]:
-        """(H, W, 3) 8-bit image on the capture's background and (H, W) foreground mask, without motion in an exposure."""
-        return self._developed(camera, seed, *self._tracer.image(self._plan.cameras[camera], seed))
+        """`render_view` of one of the capture's own cameras."""
+        return self.render_view(self._plan.cameras[camera], seed)
+
+    def render_view(
+        self, view: Camera, seed: int, background: FloatArray | None = None
+    ) -> tuple[ByteArray, ByteArray]:
+        """(H, W, 3) 8-bit image on a background (3,), by default the capture's, and (H, W) foreground mask, without motion in an exposure.
+
+        A camera that is not of the rig has no response of its own (`--camera-colour`).
+        """
+        return self._developed(view, seed, *self._tracer.image(view, seed), background)
 
     def _developed(
-        self, camera: str, seed: int, rgb: FloatArray, alpha: FloatArray
+        self,
+        view: Camera,
+        seed: int,
+        rgb: FloatArray,
+        alpha: FloatArray,
+        background: FloatArray | None = None,
     ) -> tuple[ByteArray, ByteArray]:
         settings, found = self._plan.settings, None
-        if settings.camera_colour:
-            rgb = draw_response(settings.camera_colour, settings.seed, SERIALS.index(camera))(rgb)
+        if settings.camera_colour and view.id in SERIALS:
+            rgb = draw_response(settings.camera_colour, settings.seed, SERIALS.index(view.id))(rgb)
         if settings.mask_error:
-            metre = float(self._plan.cameras[camera].K[0, 0]) / CAMERA_DISTANCE
-            hair = self.hair_pixels(camera)
-            found = matte(alpha, hair, settings.mask_error, metre, seed)
-        return develop(rgb, alpha, np.asarray(self._plan.writer.plan.background), found)
+            metre = float(view.K[0, 0]) / CAMERA_DISTANCE
+            found = matte(alpha, self.hair_pixels(view), settings.mask_error, metre, seed)
+        ground = self._plan.writer.plan.background if background is None else background
+        return develop(rgb, alpha, np.asarray(ground), found)
 
-    def hair_pixels(self, camera: str) -> FloatArray:
+    def hair_pixels(self, view: Camera) -> FloatArray:
         """(H, W) in [0, 1] how far pixels belong to hair on the head in the present pose."""
-        view = self._plan.cameras[camera]
         skin, locks = (self._posed[name].vertices for name in ("skin", "hair"))
         faces = self._fixed["skin"].faces
         grown = self._subject.hair_share[faces].mean(axis=1) > 0.5

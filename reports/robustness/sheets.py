@@ -43,17 +43,17 @@ def robustness_report(folder: Path) -> CommandResult:
 def write_extremes_sheet(
     folder: Path, avatars: Sequence[Mapping[str, Any]], width: int = EXTREMES_WIDTH
 ) -> None:
-    """Draw the sheet of avatars that ``headbench run extremes`` rendered into a folder: a column a view, a row a step.
+    """Draw the sheet of avatars that ``headbench run extremes`` rendered into a folder: a column a view, then the path.
 
-    Views beyond the training cameras have an orange frame, frames that break a limit a red one. In every view the
-    expression goes along one component, named above its column, from the mean in the first row outwards.
+    The truth, where there is one, is above each render. Views beyond the training cameras have an orange frame, frames that
+    break a limit a red one. The typical pose comes first, sampled poses below it.
     """
     write_sheet(
         folder / SHEET_FILE,
-        [_extremes_section(folder, avatar, width) for avatar in avatars],
-        title="Novel views and expressions",
-        subtitle="Turntable between the training cameras; every column goes along one principal component of the "
-        "training expressions, in steps of its standard deviation. No ground truth.",
+        [section for avatar in avatars for section in _extremes_sections(folder, avatar, width)],
+        title="Novel views and poses",
+        subtitle="Turntable between the training cameras and beyond; joint samples of expression and jaw along the principal "
+        "components of training; a path through two of them. Truth: the person of the synthetic capture, path-traced.",
         marks={EXTRAPOLATED: "view beyond the training cameras", BROKEN: "a limit is broken"},
         label_width=66,
     )
@@ -99,29 +99,45 @@ def write_reenact_sheet(
     )
 
 
-def _extremes_section(folder: Path, avatar: Mapping[str, Any], width: int) -> SheetSection:
-    cell = folder / avatar["subject"] / avatar["method"] / f"seed-{avatar['seed']}"
-    views, names = avatar["views"], avatar["expressions"]
-    components = max((_component(name) for name in names), default=0)
+def _extremes_sections(folder: Path, avatar: Mapping[str, Any], width: int) -> list[SheetSection]:
+    """The turntable, whose columns are views, and the path, whose columns are time."""
+    views = {view["id"]: view for view in avatar["views"]}
     broken = {item["key"] for item in avatar["broken"]}
+    columns: dict[str, list[Mapping[str, Any]]] = {name: [] for name in views}
+    path: list[Mapping[str, Any]] = []
+    for frame in avatar["shown"]:
+        _, sequence, _, camera = frame["key"].split("/")
+        (path if sequence == "path" else columns[camera]).append(frame)
 
-    def tile(index: int, view: Mapping[str, Any], step: str) -> Tile:
-        name = f"pc{index % components + 1}{step}" if step else "mean"
-        key = f"{avatar['subject']}/{name}/{names.index(name):05d}/{view['id']}"
-        mark = BROKEN if key in broken else EXTRAPOLATED if view["extrapolated"] else ""
-        return Tile(_picture(cell / f"{name}_{view['id']}.png", width), mark=mark)
+    def rows(frames: Sequence[Mapping[str, Any] | None], label: str) -> list[TileRow]:
+        """The truth of some frames, if there is one, and below it their renders; None leaves a gap."""
+        made = []
+        for name, shown in (("truth", "truth"), ("render", "driven")):
+            if all(frame is None or shown in frame for frame in frames):
+                tiles = [Tile("") if frame is None else tile(frame, shown) for frame in frames]
+                made.append(TileRow([label, name], tiles))
+        return made
 
-    heads = [
-        f"{view['azimuth']:+.0f}°" + (f", pc{index % components + 1}" if components else "")
-        for index, view in enumerate(views)
-    ]
-    rows = [
-        TileRow([f"{step} s.d." if step else "mean"], [tile(i, view, step) for i, view in enumerate(views)])
-        for step in _steps(names)
-    ]
+    def tile(frame: Mapping[str, Any], shown: str) -> Tile:
+        _, sequence, _, camera = frame["key"].split("/")
+        mark = BROKEN if shown == "driven" and frame["key"] in broken else ""
+        mark = mark or (EXTRAPOLATED if views[camera]["extrapolated"] else "")
+        return Tile(_picture(folder / frame[shown], width), sequence if shown == "driven" else "", mark)
+
+    made = []
+    for index in range(max(map(len, columns.values()))):
+        frames = [column[index] if index < len(column) else None for column in columns.values()]
+        made += rows(frames, "samples" if index else "typical")
+    title = f"{avatar['method']}, subject {avatar['subject']}, seed {avatar['seed']}"
     found = f"{avatar['frames_broken']} of {avatar['frames']} frames break a limit"
-    title = f"{avatar['method']}, subject {avatar['subject']}, seed {avatar['seed']}: {found}"
-    return SheetSection(title, heads, rows)
+    sections = [
+        SheetSection(f"{title}: {found}", [f"{view['azimuth']:+.0f}°" for view in views.values()], made)
+    ]
+    lines = [path[start : start + len(views)] for start in range(0, len(path), len(views))]
+    if lines:
+        made = [row for line in lines for row in rows(line, "path")]
+        sections.append(SheetSection(f"{title}: path", [""] * len(views), made))
+    return sections
 
 
 def _picture(path: Path, width: int) -> Any:
@@ -134,32 +150,27 @@ def _picture(path: Path, width: int) -> Any:
     return cv2.resize(image, size, interpolation=method)
 
 
-def _component(name: str) -> int:
-    """Number of the component in ``pc3+2``, 0 for the mean."""
-    return 0 if name == "mean" else int(name[2:].replace("-", "+").split("+")[0])
-
-
-def _steps(names: Sequence[str]) -> list[str]:
-    """The mean (as ""), then the steps of the first component: small ones first, each with its opposite."""
-    steps = [name[3:] for name in names if _component(name) == 1]
-    return ["", *sorted(steps, key=lambda step: (abs(float(step)), -float(step)))]
-
-
-def table(summaries: Sequence[Mapping[str, Any]]) -> str:
-    """Summaries for a terminal."""
-    names = ("coverage", "translucent", "largest_splat", "mean_opacity")
-    form = "{:<10} {:<16} {:>4} {:>6} {:>6}  {:>13} {:>13} {:>13} {:>13}".format
-    lines = [form("subject", "method", "seed", "frames", "broken", *(n.replace("_", " ") for n in names))]
-    for s in summaries:
-        ranges = [s["ranges"][name] for name in names]
-        shown = ["-" if low is None else f"{low:.2f} to {high:.2f}" for low, high in ranges]
-        lines.append(form(s["subject"], s["method"], s["seed"], s["frames"], s["frames_broken"], *shown))
-        if "missing" in s:
-            lines.append(f"  missing: {s['missing']}")
-        if s.get("identity") is not None:
-            known = [f"{name} {value:.1f}" for name, value in s["identity"].items() if value is not None]
+def table(avatars: Sequence[Mapping[str, Any]]) -> str:
+    """Mean and worst value and failed frames of every measure of each avatar, for a terminal."""
+    lines = []
+    form = "  {:<16} {:>10} {:>10} {:>7} {:>7}".format
+    for avatar in avatars:
+        title = f"{avatar['subject']} {avatar['method']} seed {avatar['seed']}"
+        lines.append(f"{title}: {avatar['frames_broken']} of {avatar['frames']} frames break a limit")
+        if "missing" in avatar:
+            lines.append(f"  missing: {avatar['missing']}")
+            continue
+        if "no_truth" in avatar:
+            lines.append(f"  not compared with the truth: {avatar['no_truth']}")
+        lines.append(form("measure", "mean", "worst", "failed", "frames"))
+        for name, found in avatar["measures"].items():
+            if found["frames"] or found["failed"]:
+                values = ("-" if found[key] is None else f"{found[key]:.3f}" for key in ("mean", "worst"))
+                lines.append(form(name.replace("_", " "), *values, found["failed"], found["frames"]))
+        if avatar.get("identity") is not None:
+            known = [f"{name} {value:.1f}" for name, value in avatar["identity"].items() if value is not None]
             lines.append(f"  colour difference from the subject's recordings (CIEDE2000): {', '.join(known)}")
-        lines += [f"  {b['key']}: {'; '.join(b['limits'])}" for b in s["broken"][:5]]
-        if len(s["broken"]) > 5:
-            lines.append(f"  and {len(s['broken']) - 5} more; all are in {RECORD_FILE}")
+        lines += [f"  {b['key']}: {'; '.join(b['limits'])}" for b in avatar["broken"][:5]]
+        if len(avatar["broken"]) > 5:
+            lines.append(f"  and {len(avatar['broken']) - 5} more; all are in {RECORD_FILE}")
     return "\n".join(lines)

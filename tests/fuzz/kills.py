@@ -59,7 +59,7 @@ WRITERS = [
     Writer("report split", "run", "report run --split"),
     Writer("bundle", "run", "bundle run --out out.zip --by Somebody --renders"),
     Writer("leaderboard", "run", "report leaderboard bundles --out out"),
-    Writer("extremes", "run", "run extremes run --views 1 --dimensions 1 --methods ga ours"),
+    Writer("extremes", "run", "run extremes run --views 1 --samples 1 --path 0 --methods ga ours"),
     Writer("reenact", "two_subjects", "run reenact run --frames 1"),
     Writer("pareto", "run", "report pareto run --out out"),
     Writer("speed", "timed", "run speed run", MEASURED_TABLES),

@@ -185,7 +185,7 @@ COMMANDS = tuple(
         ("run verify", "run", "verify run", CELLS, 3),
         ("bundle verify", "run", "verify bundles/renders.zip --data capture", ("bundles/renders.zip",), 4),
         ("leaderboard", "run", "report leaderboard bundles --out out", ("bundles/*.zip",), 4),
-        ("run extremes", "run", "run extremes run --views 1 --dimensions 1", CELLS, 3),
+        ("run extremes", "run", "run extremes run --views 1 --samples 1 --path 0", CELLS, 3),
         ("run sweep", "run", "run sweep run --methods ga --variants half", CELLS, 3),
         ("run reenact", "two_subjects", "run reenact run --frames 1", ("**/*",), 3),
         ("run continued", "run", "run --config config.json", CELLS, 3),

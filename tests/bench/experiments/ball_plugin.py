@@ -15,7 +15,8 @@ SIZE = (24, 30)
 
 
 class BallClip:
-    """Five cameras around a head whose vertices are the corners of a cube; expressions vary along two directions."""
+    """Five cameras around a head whose vertices are the corners of a cube; two coefficients of the expression and the jaw
+    vary, one at a time."""
 
     static_offset = np.zeros((8, 3))
     shape = np.zeros(1)
@@ -48,8 +49,9 @@ class BallClip:
         zero = np.zeros(3)
         expressions = [[-1, 0, 0.5], [1, 0, 0.5], [0, -0.2, 0.5], [0, 0.2, 0.5], [0, 0, 0.5], [1, 0.2, 0.5]]
         self.poses = {
-            t: HeadPose("ball", np.array(e), zero, zero, zero, np.zeros(6), place, None, self.subject, t)
+            t: HeadPose("ball", np.array(e), zero, zero, jaw, np.zeros(6), place, None, self.subject, t)
             for t, e in enumerate(expressions)
+            for jaw in [np.array([0.3 * (t == 3), 0.0, 0.0])]
         }
 
         def keys(sequence, timesteps, cameras):
@@ -72,14 +74,19 @@ def find(root):
     return sorted(path for path in root.iterdir() if path.name.startswith("ball"))
 
 
+def is_extreme(pose):
+    """Whether the first coefficient passes 1.5, or 0.3 with the jaw open, which training has on their own alone."""
+    return abs(pose.expression[0]) > (0.3 if pose.jaw[0] > 0.1 else 1.5)
+
+
 class Ball:
-    """A ball at the pose's translation. ``bursts`` names what happens where the first coefficient passes 1.5."""
+    """A ball at the pose's translation. ``bursts`` names what happens in an extreme pose."""
 
     def __init__(self, path, bursts=""):
         self.path, self.bursts = path, bursts
 
     def render(self, camera, pose, background=(1.0, 1.0, 1.0)):
-        extreme = abs(pose.expression[0]) > 1.5
+        extreme = is_extreme(pose)
         center = camera.world_to_camera @ [*pose.translation, 1.0]
         radius = RADIUS * (3.0 if extreme and self.bursts == "size" else 1.0)
         v, u = np.mgrid[: camera.height, : camera.width] + 0.5
@@ -99,7 +106,7 @@ class Splatty(Ball):
     """Gives splats too, one of which grows."""
 
     def splats(self, pose, camera=None):
-        grown = 0.2 if abs(pose.expression[0]) > 1.5 else 0.002
+        grown = 0.2 if is_extreme(pose) else 0.002
         return SimpleNamespace(
             means=np.asarray(pose.translation, np.float32)[None],
             quats=np.array([[1.0, 0, 0, 0]]),

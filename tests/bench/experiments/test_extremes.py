@@ -7,38 +7,63 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
+from scipy.stats import norm
 from sklearn.decomposition import PCA
 
 from headbench.bench.contracts import FrameKey, HeadPose
 from headbench.bench.errors import InputError
 from headbench.bench.experiments import robustness
-from headbench.bench.experiments.extremes import ExpressionComponents, extremes, typical_pose
+from headbench.bench.experiments.extremes import (
+    ExtremesPlan,
+    PoseComponents,
+    joint_samples,
+    path_poses,
+    sampled_poses,
+    typical_pose,
+)
 from headbench.bench.experiments.robustness import RECORD_FILE, extremes_run
 from headbench.bench.experiments.robustness_settings import ExtremesSettings
+from headbench.bench.experiments.specs import AGAINST_TRUTH
+from headbench.bench.experiments.specs import MEASURES as STABILITY
 from headbench.bench.io.images import read_png
 from headbench.bench.io.lock import LOCK_FILE, locked
 from headbench.reports.robustness.sheets import BROKEN, EXTRAPOLATED, SHEET_FILE
 
-VIEWS, COMPONENTS, STEPS = 6, 2, 6
+VIEWS, SAMPLES, PATH_FRAMES = 6, 5, 4
+FRAMES = VIEWS + 2 * SAMPLES + PATH_FRAMES
+MEASURES = 5 + 6  # of stability in every frame, and of appearance against the truth
 
 
 def settings(folder, **changes):
-    return ExtremesSettings(str(folder), trust=True, views=VIEWS, **changes)
+    how = {"views": VIEWS, "samples": SAMPLES, "path": PATH_FRAMES, **changes}
+    return ExtremesSettings(str(folder), trust=True, **how)
+
+
+def extreme_frames(balls, tmp_path):
+    """Keys of the frames whose pose the plug-in takes for extreme, without the subject."""
+    clip = balls.BallClip(tmp_path / "data" / "ball-a")
+    plan = ExtremesPlan.of(clip, **settings("").parameters)
+    frames = {
+        (frame.name, frame.number, plan.views[frame.view].camera.id): balls.is_extreme(frame.pose)
+        for frame in plan.frames
+    }
+    assert 0 < sum(frames.values()) < len(frames)
+    return {key for key, extreme in frames.items() if extreme}
 
 
 def colours(path):
     return {to_hex(colour / 255) for colour in np.unique(read_png(path).reshape(-1, 3), axis=0)}
 
 
-def test_a_stable_avatar_passes_and_every_pair_has_its_rows(ball_run):
+def test_a_stable_avatar_passes_and_every_frame_has_its_rows(ball_run):
     folder = ball_run("BALL", "FLOOR")
     found = extremes_run(settings(folder))
     assert found.passed
     rows = pd.read_parquet(folder / "extremes" / "rows.parquet")
-    frames = VIEWS * (1 + COMPONENTS * STEPS)  # the third coefficient never varies: no third component
     assert set(rows["method"]) == {"ball"}
-    assert set(rows["task"]) == {"extremes"}
-    assert len(rows) == 2 * 5 * frames  # subjects, measures
+    of_frames, of_avatars = rows[rows["task"] == "extremes"], rows[rows["task"] == ""]
+    assert len(of_frames) == 2 * MEASURES * FRAMES  # subjects
+    assert sorted(of_avatars["metric"]) == ["flicker"] * 2 + ["response"] * 2
     coverage = rows[rows["metric"] == "coverage"]
     assert coverage["status"].eq("ok").all()
     assert coverage["value"].between(0.9, 1.1).all()
@@ -50,12 +75,27 @@ def test_a_stable_avatar_passes_and_every_pair_has_its_rows(ball_run):
     assert [v["azimuth"] for v in views] == pytest.approx(np.linspace(-90, 90, VIEWS), abs=0.01)
     assert [v["extrapolated"] for v in views] == [True, False, False, False, False, True]
     (protocol,) = record["protocols"]  # all subjects, methods of equal needs: one comparison
-    assert set(rows["protocol"]) == {protocol["hash"]} == {a["protocol"] for a in record["avatars"]}
+    assert set(of_frames["protocol"]) == {protocol["hash"]} == {a["protocol"] for a in record["avatars"]}
     assert protocol["id"] == "extremes/canonical/1"
-    keys = rows[["subject", "sequence", "timestep", "camera"]].drop_duplicates()
+    keys = of_frames[["subject", "sequence", "timestep", "camera"]].drop_duplicates()
     assert {tuple(key) for key in protocol["keys"]} == set(keys.itertuples(index=False, name=None))
     shown = colours(folder / "extremes" / SHEET_FILE)
     assert EXTRAPOLATED in shown
+
+
+def test_without_a_truth_it_says_so_and_judges_stability(ball_run):
+    folder = ball_run("BALL")
+    found = extremes_run(settings(folder))
+    assert found.passed
+    assert (
+        "not compared with the truth: Subject ball-a is recorded; only a synthetic capture has" in found.text
+    )
+    rows = pd.read_parquet(folder / "extremes" / "rows.parquet")
+    missing = rows[rows["metric"].isin([metric.name for metric in AGAINST_TRUTH])]
+    assert set(missing["metric"]) == {metric.name for metric in AGAINST_TRUTH}
+    assert set(missing["status"]) == {"missing"}
+    assert missing["reason"].str.contains("headbench synth").all()
+    assert not (folder / "extremes" / "truth").exists()
 
 
 @pytest.mark.parametrize("others", [(), ("BALL",)])
@@ -68,7 +108,7 @@ def test_avatars_that_render_lists_alone_are_missing(ball_run, others):
     missing = rows[rows["method"] == "listed"]
     assert set(missing["status"]) == {"missing"}
     assert missing["reason"].str.contains("in lists alone").all()
-    assert len(missing) == 2 * 5 * VIEWS * (1 + COMPONENTS * STEPS)
+    assert set(missing["metric"]) == {metric.name for metric in (*STABILITY, *AGAINST_TRUTH)}
     assert (folder / "extremes" / SHEET_FILE).exists() == bool(others)
 
 
@@ -86,41 +126,45 @@ def test_rows_that_are_there_are_kept(ball_run):
     assert (folder / "extremes" / "rows.parquet").read_bytes() == before
 
 
-def test_a_burst_is_found_where_it_is_and_nowhere_else(ball_run):
+def test_a_burst_where_jaw_and_expression_act_together_is_found(ball_run, balls, tmp_path):
     folder = ball_run("BURSTING", "BALL")
     found = extremes_run(settings(folder))
     assert not found.passed
     rows = pd.read_parquet(folder / "extremes" / "rows.parquet")
     failed = rows[rows["status"] == "failed"]
-    # The first coefficient has a deviation of 0.82 about 0: two and three of them are beyond 1.5.
-    assert set(failed["sequence"]) == {"pc1-3", "pc1-2", "pc1+2", "pc1+3"}
+    frames = extreme_frames(balls, tmp_path)
+    keys = failed[failed["subject"] == "ball-a"][["sequence", "timestep", "camera"]]
+    assert set(keys.itertuples(index=False, name=None)) == frames
     assert set(failed["method"]) == {"bursting"}
     assert set(failed["metric"]) == {"coverage"}
-    assert len(failed) == 2 * 4 * VIEWS
     assert failed["value"].gt(2).all()  # the larger ball fills the frame
     assert failed["reason"].str.contains("limits 0.8 to 1.25").all()
     record = json.loads((folder / "extremes" / RECORD_FILE).read_text())
-    by_method = {(a["subject"], a["method"]): a["frames_broken"] for a in record["avatars"]}
-    assert by_method["ball-a", "bursting"] == 4 * VIEWS
-    assert by_method["ball-a", "ball"] == 0
+    by_method = {(a["subject"], a["method"]): a for a in record["avatars"]}
+    assert by_method["ball-a", "bursting"]["frames_broken"] == len(frames)
+    coverage = by_method["ball-a", "bursting"]["measures"]["coverage"]
+    assert coverage["failed"] == len(frames)
+    assert coverage["frames"] == FRAMES
+    assert coverage["worst"] == failed[failed["subject"] == "ball-a"]["value"].max()
+    assert by_method["ball-a", "ball"]["frames_broken"] == 0
 
 
-def test_values_that_are_no_numbers_break_a_limit(ball_run):
+def test_values_that_are_no_numbers_break_a_limit(ball_run, balls, tmp_path):
     folder = ball_run("BROKEN")
     found = extremes_run(settings(folder))
     assert not found.passed
     assert "non_finite is" in found.text
-    first = folder / "extremes" / "ball-a" / "broken" / "seed-0"
-    assert not (first / "pc1+3_turntable-00.png").exists()
-    assert (first / "pc1+1_turntable-00.png").exists()
+    written = {path.name for path in (folder / "extremes" / "ball-a" / "broken" / "seed-0").glob("*.png")}
+    assert len(written) == FRAMES - len(extreme_frames(balls, tmp_path))
+    assert "typical_turntable-00.png" in written
 
 
-def test_a_splat_that_grows_is_found_in_the_splats_alone(ball_run):
+def test_a_splat_that_grows_is_found_in_the_splats_alone(ball_run, balls, tmp_path):
     folder = ball_run("SPLATTY")
     rows = extremes_run(settings(folder)) and pd.read_parquet(folder / "extremes" / "rows.parquet")
     failed = rows[rows["status"] == "failed"]
     assert set(failed["metric"]) == {"largest_splat"}
-    assert set(failed["sequence"]) == {"pc1-3", "pc1-2", "pc1+2", "pc1+3"}
+    assert len(failed) == 2 * len(extreme_frames(balls, tmp_path))
     # three deviations of 0.2 m, focal length 100 pixels, 1 m away, 30 pixels high
     assert np.allclose(failed["value"], 3 * 0.2 * 100 / 30, rtol=0.01)
     assert BROKEN in colours(folder / "extremes" / SHEET_FILE)
@@ -155,7 +199,9 @@ def test_a_run_of_trivial_baselines_has_nothing_to_test(ball_run):
     assert extremes_run(settings(folder, methods=("floor",))).passed
 
 
-@pytest.mark.parametrize("changes", [{"views": 0}, {"beyond": 180.0}, {"sigmas": (0.0, 1.0)}, {"sigmas": ()}])
+@pytest.mark.parametrize(
+    "changes", [{"views": 0}, {"beyond": 180.0}, {"sigmas": 0.0}, {"samples": 0}, {"path": -1}]
+)
 def test_settings_without_meaning_are_refused(changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
         ExtremesSettings("run", **changes)
@@ -189,56 +235,89 @@ def test_its_folder_is_locked_and_no_link_out_of_the_run(ball_run, tmp_path):
 
 
 @pytest.fixture
-def coefficients():
+def values():
+    """Expression (12) and jaw (3) of 40 timesteps, correlated."""
     rng = np.random.default_rng(3)
-    return rng.normal(size=(40, 12)) @ rng.normal(size=(12, 12)) + rng.normal(size=12)
+    return rng.normal(size=(40, 15)) @ rng.normal(size=(15, 15)) + rng.normal(size=15)
 
 
-def clip_of(coefficients, held_out=None):
+def poses_of(values):
     zero = np.zeros(3)
-    rows = coefficients if held_out is None else np.vstack([coefficients, held_out])
-    poses = {
+    return {
         t: HeadPose(
-            "m", row.astype(np.float32), zero + t, zero, zero + 2 * t, np.zeros(6), zero, None, "s", t
+            "m", row[:-3].astype(np.float32), zero + t, zero, row[-3:], np.zeros(6), zero, None, "s", t
         )
-        for t, row in enumerate(rows)
+        for t, row in enumerate(values)
     }
-    keys = tuple(FrameKey("s", "EMO", t, c) for t in range(len(coefficients)) for c in "ab")
-    return SimpleNamespace(subject="s", poses=poses, splits={"train": keys})
 
 
-def test_components_are_those_of_scikit_learn(coefficients):
-    ours, theirs = ExpressionComponents.of(coefficients, 5), PCA(5).fit(coefficients)
-    assert np.allclose(ours.mean, theirs.mean_)
-    assert np.allclose(ours.deviations**2, theirs.explained_variance_)
-    assert np.allclose(np.abs((ours.directions * theirs.components_).sum(axis=1)), 1.0)
-    step = ours.at(2, -3.0) - theirs.mean_
-    assert np.allclose(theirs.transform([ours.at(2, -3.0)])[0][[0, 1, 3, 4]], 0, atol=1e-9)
-    assert np.isclose(np.linalg.norm(step), 3 * np.sqrt(theirs.explained_variance_[2]))
+def clip_of(values, held_out=None):
+    rows = values if held_out is None else np.vstack([values, held_out])
+    keys = tuple(FrameKey("s", "EMO", t, c) for t in range(len(values)) for c in "ab")
+    return SimpleNamespace(subject="s", poses=poses_of(rows), splits={"train": keys})
 
 
-def test_directions_without_variation_are_left_out(coefficients):
-    flat = coefficients.copy()
+def joined(pose):
+    return np.concatenate([pose.expression, pose.jaw])
+
+
+def test_components_are_those_of_scikit_learn(values):
+    """Of expression and jaw, each divided by the root of its total variance."""
+    scale = np.repeat([np.sqrt(values[:, :12].var(0).sum()), np.sqrt(values[:, 12:].var(0).sum())], [12, 3])
+    found, theirs = PoseComponents.of([*poses_of(values).values()], 5), PCA(5).fit(values / scale)
+    assert np.allclose(found.mean / scale, theirs.mean_, atol=1e-6)
+    ours = found.directions / scale
+    assert np.allclose(np.linalg.norm(ours, axis=1) ** 2, theirs.explained_variance_, rtol=1e-5)
+    cosines = (ours * theirs.components_).sum(axis=1) / np.linalg.norm(ours, axis=1)
+    assert np.allclose(np.abs(cosines), 1.0, atol=1e-6)
+    scores = theirs.transform(values / scale) / np.sqrt(theirs.explained_variance_) * np.sign(cosines)
+    assert np.allclose(found.reach, [scores.min(axis=0), scores.max(axis=0)], atol=1e-4)
+
+
+def test_directions_without_variation_are_left_out(values):
+    flat = values.copy()
     flat[:, 3:] = 1.5
-    assert len(ExpressionComponents.of(flat, 8).deviations) == 3
-    assert len(ExpressionComponents.of(np.full((5, 4), 0.3), 8).deviations) == 0
+    assert len(PoseComponents.of([*poses_of(flat).values()], 8).directions) == 3
+    still = clip_of(np.full((5, 15), 0.3))
+    poses = sampled_poses(still, 8, 4, 3.0)
+    assert len(poses) == 1
+    assert path_poses(poses, 4) == []
 
 
-def test_every_step_along_every_component_after_the_mean(coefficients):
-    found = extremes(clip_of(coefficients), 2, (-3.0, 1.0))
-    assert [e.name for e in found] == ["mean", "pc1-3", "pc1+1", "pc2-3", "pc2+1"]
-    assert np.allclose(found[0].pose.expression, coefficients.mean(axis=0), atol=1e-5)
-    assert all(e.pose.timestep is None and e.pose.expression.dtype == np.float32 for e in found)
-    assert len({e.pose.rotation.tobytes() for e in found}) == 1
+def test_samples_vary_every_component_and_the_jaw_together(values):
+    numbers = joint_samples(64, 8, 3.0)
+    middles = norm.ppf((np.arange(64) + 0.5) / 64)
+    assert np.allclose(np.sort(numbers, axis=0), middles[:, None])
+    assert np.abs(np.corrcoef(numbers.T) - np.eye(8)).max() < 0.4
+    assert np.array_equal(joint_samples(64, 8, 3.0), numbers)
+    assert np.abs(joint_samples(64, 8, 0.5)).max() == 0.5
+    clip = clip_of(values)
+    base, *samples = sampled_poses(clip, 8, 16, 3.0)
+    assert np.array_equal(base.expression, typical_pose([*clip.poses.values()]).expression)
+    assert all(pose.timestep is None and pose.expression.dtype == np.float32 for pose in samples)
+    assert {pose.rotation.tobytes() for pose in samples} == {base.rotation.tobytes()}
+    found = np.array([joined(pose) for pose in samples])
+    assert (found.std(axis=0) > 0.3 * values.std(axis=0)).all()
+    within = (found >= values.min(axis=0) - 1e-5) & (found <= values.max(axis=0) + 1e-5)
+    assert within.all()
 
 
-def test_held_out_expressions_have_no_say(coefficients):
-    with_others = clip_of(coefficients, held_out=100 * np.ones((9, 12)))
-    for a, b in zip(extremes(clip_of(coefficients), 8, (3.0,)), extremes(with_others, 8, (3.0,))):
-        assert np.array_equal(a.pose.expression, b.pose.expression)
+def test_a_path_is_smooth_and_passes_the_samples(values):
+    poses = sampled_poses(clip_of(values), 8, 4, 3.0)
+    path = np.array([joined(pose) for pose in path_poses(poses, 41)])
+    for frame, pose in ((0, poses[0]), (20, poses[1]), (40, poses[2])):
+        assert np.allclose(path[frame], joined(pose), atol=1e-5)
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    assert steps[[0, 19, 20, 39]].max() < 0.2 * steps.max()
 
 
-def test_the_typical_pose_is_a_real_one(coefficients):
-    poses = list(clip_of(coefficients).poses.values())
-    distances = np.linalg.norm(coefficients - coefficients.mean(axis=0), axis=1)
+def test_held_out_poses_have_no_say(values):
+    with_others = clip_of(values, held_out=100 * np.ones((9, 15)))
+    pairs = zip(sampled_poses(clip_of(values), 8, 3, 3.0), sampled_poses(with_others, 8, 3, 3.0))
+    assert all(np.array_equal(joined(a), joined(b)) for a, b in pairs)
+
+
+def test_the_typical_pose_is_a_real_one(values):
+    poses = list(clip_of(values).poses.values())
+    distances = np.linalg.norm(values[:, :12] - values[:, :12].mean(axis=0), axis=1)
     assert typical_pose(poses) is poses[int(distances.argmin())]

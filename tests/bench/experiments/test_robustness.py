@@ -17,7 +17,7 @@ CELLS = {
 
 def driven(command, folder, **changes):
     if command == "extremes":
-        how = {"views": 2, "dimensions": 1, "sigmas": (-3.0, 1.0)}
+        how = {"views": 2, "samples": 3, "path": 2}
         return extremes_run(ExtremesSettings(str(folder), trust=True, **how, **changes))
     return reenact_run(ReenactSettings(str(folder), trust=True, **changes))
 

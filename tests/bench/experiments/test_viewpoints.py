@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
-from headbench.bench.experiments.viewpoints import look_at, turntable
+from headbench.bench.experiments.viewpoints import common_target, look_at, turntable
 
 CENTER = np.array([0.1, 1.5, -0.2])
 UP = np.array([0.0, 1.0, 0.0])
@@ -121,3 +121,15 @@ def test_every_view_is_a_rigid_camera_that_sees_the_head(angles, count, beyond):
 def test_no_cameras_or_one_in_the_head_are_refused(rig):
     with pytest.raises(InputError):
         turntable(rig, CENTER, 4, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("azimuths", "expected"),
+    [
+        ([-40, 0, 40], CENTER),  # where the axes meet
+        ([0], CENTER - [0.0, 0.0, 0.1]),  # the point of the axis that is nearest to the head's centre
+    ],
+)
+def test_the_common_target_is_where_the_cameras_look(azimuths, expected):
+    head = CENTER + [0.0, -0.1, -0.1]
+    assert np.allclose(common_target([camera(a) for a in azimuths], head), expected, atol=1e-3)

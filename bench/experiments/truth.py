@@ -1,0 +1,241 @@
+"""Comparison of an avatar in new poses and views with the ground truth that a synthetic capture has for them.
+
+No limit is a number of decibels that fits one capture. The truth itself gives the limits of each frame: what a blurred copy of it
+scores, and how far it is from the subject's typical pose or from the frame before.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from skimage.color import deltaE_ciede2000
+
+from ..contracts import ByteArray, Camera, FloatArray, Frame, GroundTruth, HeadPose, TrueFrame
+from ..engine.scoring import FULL, make_metric
+from ..engine.steps import Job
+from ..errors import InputError, UnavailableError
+from ..io.files import digest
+from ..io.images import quantise, read_png, write_png
+from ..io.provenance import SYNTHETIC
+from ..registry import get, resolve
+from .stability import LimitCheck
+
+FOLDER = "truth"
+FACE = "face"
+POSE_FIELDS = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids")
+LEAST_CHANGE = 2.0
+"""Change of the truth, root mean square in 8-bit levels, below which it says little of how an avatar changes."""
+NOT_FINITE, NO_FACE = "the frame is not finite", "no face in view"
+
+
+@dataclass(frozen=True)
+class TruthLimits:
+    """How far a frame may be from the truth.
+
+    Attributes
+    ----------
+    blur, blur_beyond : float
+        PSNR and LPIPS are at least those of the truth blurred by a Gaussian of this share of the image's height; the second
+        in views beyond the training cameras, where no training frame shows the hair.
+    iou : float
+        Least overlap of alpha and the true mask.
+    colour : float
+        Largest CIEDE2000 difference of the face's mean colours.
+    response : float
+        Least part of the truth's change from the typical pose that the avatar shows.
+    flicker : float
+        Largest flicker, as a part of the truth's change, which is the flicker of an avatar that stands still.
+    """
+
+    blur: float = 0.015
+    blur_beyond: float = 0.04
+    iou: float = 0.9
+    colour: float = 5.0
+    response: float = 0.25
+    flicker: float = 1.0
+
+
+TRUTH_LIMITS = TruthLimits()
+
+
+class TruthPictures:
+    """Pictures of a `GroundTruth`, kept in a folder under names that follow from what they show.
+
+    Methods share them. ``height`` is that of the pictures, pixels: a method that works on larger images is compared at the
+    capture's size.
+    """
+
+    def __init__(self, source: GroundTruth, folder: Path, height: int) -> None:
+        self._source, self._folder, self._height = source, folder, height
+
+    @classmethod
+    def of(cls, job: Job) -> TruthPictures:
+        """Those of a cell's subject in the head model of its method. Raises `UnavailableError` where there is no truth."""
+        clip = job.form.clip
+        place = f"truth of {clip.fingerprint}"
+        if place not in job.kept:
+            job.kept[place] = resolve(get("datasets", "synthetic").truth)(clip)
+        return cls(job.kept[place], job.run / FOLDER, next(iter(job.clip.cameras.values())).height)
+
+    def at(self, camera: Camera, pose: HeadPose) -> tuple[TrueFrame, list[Path]]:
+        """The truth of a frame, rendered unless it is in the folder, and its files."""
+        view = camera.resized(round(camera.width * self._height / camera.height), self._height)
+        given = (getattr(pose, name) for name in POSE_FIELDS)
+        shown = [
+            np.asarray(values, np.float64)
+            for values in (view.K, view.world_to_camera, *given)
+            if values is not None
+        ]
+        name = digest(self._source.fingerprint, view.width, view.height, pose.head_model, *shown)[:20]
+        files = [self._folder / f"{name}.png", self._folder / f"{name}-mask.png"]
+        try:
+            mask, face, _ = np.moveaxis(read_png(files[1]), 2, 0)
+            return TrueFrame(read_png(files[0]), mask, face > 0), files
+        except InputError:  # not there, or damaged
+            truth = self._source.render(view, pose)
+        layers = [truth.mask, 255 * truth.face.astype(np.uint8), np.zeros_like(truth.mask)]
+        write_png(files[0], truth.rgb, SYNTHETIC)
+        write_png(files[1], np.stack(layers, axis=2), SYNTHETIC)
+        return truth, files
+
+
+class TruthPair(NamedTuple):
+    """A rendered frame at the size of the truth: (H, W, 3) 8-bit sRGB and (H, W) alpha."""
+
+    picture: ByteArray
+    alpha: FloatArray
+    truth: TrueFrame
+
+    @classmethod
+    def of(cls, frame: Frame, truth: TrueFrame) -> TruthPair | None:
+        """None for a frame that is not finite."""
+        rgb, alpha = np.asarray(frame.rgb, np.float32), np.asarray(frame.alpha, np.float32)
+        if not (np.isfinite(rgb).all() and np.isfinite(alpha).all()):
+            return None
+        height, width = truth.mask.shape
+        if alpha.shape != (height, width):
+            rgb, alpha = (
+                np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+                for values in (rgb, alpha)
+            )
+        return cls(quantise(rgb), alpha, truth)
+
+
+class TruthJudge:
+    """Measures frames against the truth, each with its limit. A metric that is not available is missing, with the reason."""
+
+    def __init__(self, device: str = "cpu", limits: TruthLimits = TRUTH_LIMITS) -> None:
+        self._limits = limits
+        self._psnr, self._lpips, self._flicker = (
+            make_metric(get("metrics", name), device) for name in ("psnr", "lpips", "flicker")
+        )
+
+    def appearance(self, frame: TruthPair | None, *, extrapolated: bool = False) -> list[LimitCheck]:
+        """PSNR and LPIPS of frame and face, overlap of alpha and mask, colour of the face."""
+        if frame is None:
+            return [_absent(name, region, NOT_FINITE) for name, region in APPEARANCE]
+        truth, limits = frame.truth, self._limits
+        sigma = len(truth.rgb) * (limits.blur_beyond if extrapolated else limits.blur)
+        blurred = np.asarray(cv2.GaussianBlur(truth.rgb, (0, 0), sigma), np.uint8)
+        bounds = self._scores(blurred, truth)
+        checks = []
+        for (name, region), value in self._scores(frame.picture, truth).items():
+            bound = bounds[name, region]
+            if isinstance(value, str) or isinstance(bound, str):
+                checks.append(_absent(name, region, str(value)))
+            else:
+                low, high = (bound, math.inf) if name == "psnr" else (0.0, bound)
+                checks.append(LimitCheck(name, value, low, high, region=region))
+        return [*checks, self._overlap(frame), self._colour(frame)]
+
+    def response(self, frame: TruthPair | None, reference: TruthPair | None) -> LimitCheck:
+        """Part of the truth's change between two poses in one view that the avatar shows.
+
+        The slope of the least-squares line through 0 of the avatar's differences over the truth's, over the pixels of the face
+        in either frame: 0 for an avatar that does not move, 1 for one that moves as the truth, whatever both frames share.
+        """
+        if frame is None or reference is None:
+            return _absent("response", FULL, NOT_FINITE)
+        face = frame.truth.face | reference.truth.face
+        wanted = _difference(frame.truth.rgb, reference.truth.rgb)[face]
+        if not face.any() or _rms(wanted) < LEAST_CHANGE:
+            return _absent("response", FULL, "the truth hardly changes in this view")
+        shown = _difference(frame.picture, reference.picture)[face]
+        slope = float((shown * wanted).sum() / np.square(wanted).sum())
+        return LimitCheck("response", slope, self._limits.response, math.inf)
+
+    def flicker(self, frame: TruthPair | None, before: TruthPair | None) -> LimitCheck:
+        """The metric `flicker` of two neighbours in time."""
+        if frame is None or before is None:
+            return _absent("flicker", FULL, NOT_FINITE)
+        value = self._flicker(frame.picture, frame.truth.rgb, before.picture, before.truth.rgb)
+        change = max(LEAST_CHANGE, _rms(_difference(frame.truth.rgb, before.truth.rgb)))
+        return LimitCheck("flicker", value, 0.0, self._limits.flicker * change)
+
+    def _scores(self, picture: ByteArray, truth: TrueFrame) -> dict[tuple[str, str], float | str]:
+        """Values of PSNR and LPIPS by metric and region, or the reason for a missing one."""
+        faces = self._psnr.in_regions(picture, truth.rgb, {FACE: truth.face})
+        scores: dict[tuple[str, str], float | str] = {
+            ("psnr", FULL): self._psnr(picture, truth.rgb),
+            ("psnr", FACE): faces.get(FACE, NO_FACE),
+        }
+        for region, pixels in ((FULL, np.ones_like(truth.face)), (FACE, truth.face)):
+            left, top, width, height = cv2.boundingRect(pixels.astype(np.uint8))
+            part = np.s_[top : top + height, left : left + width]
+            try:
+                scores["lpips", region] = self._lpips(picture[part], truth.rgb[part]) if width else NO_FACE
+            except UnavailableError as error:
+                scores["lpips", region] = error.note
+        return scores
+
+    def _overlap(self, frame: TruthPair) -> LimitCheck:
+        """Intersection over union of alpha and true mask, with parts of pixels."""
+        true = frame.truth.mask / 255.0
+        union = float(np.maximum(frame.alpha, true).sum())
+        value = float(np.minimum(frame.alpha, true).sum()) / union if union else 1.0
+        return LimitCheck("iou", value, self._limits.iou, math.inf)
+
+    def _colour(self, frame: TruthPair) -> LimitCheck:
+        """CIEDE2000 difference of the face's mean colours."""
+        if not frame.truth.face.any():
+            return _absent("colour", FULL, NO_FACE)
+        means = [_lab(image)[frame.truth.face].mean(axis=0) for image in (frame.picture, frame.truth.rgb)]
+        return LimitCheck("colour", float(deltaE_ciede2000(*means)), 0.0, self._limits.colour)
+
+
+APPEARANCE = (
+    ("psnr", FULL),
+    ("psnr", FACE),
+    ("lpips", FULL),
+    ("lpips", FACE),
+    ("iou", FULL),
+    ("colour", FACE),
+)
+"""Measures and regions of `TruthJudge.appearance`."""
+
+
+def _absent(name: str, region: str, reason: str) -> LimitCheck:
+    return LimitCheck(name, None, -math.inf, math.inf, reason, region)
+
+
+def without_truth(reason: str) -> tuple[list[LimitCheck], LimitCheck, LimitCheck]:
+    """Appearance, response and flicker of a frame that there is no truth for."""
+    appearance = [_absent(name, region, reason) for name, region in APPEARANCE]
+    return appearance, _absent("response", FULL, reason), _absent("flicker", FULL, reason)
+
+
+def _difference(image: ByteArray, other: ByteArray) -> FloatArray:
+    return np.subtract(image, other, dtype=np.float64)
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.square(values).mean()))
+
+
+def _lab(image: ByteArray) -> FloatArray:
+    return np.asarray(cv2.cvtColor(image.astype(np.float32) / 255.0, cv2.COLOR_RGB2Lab))

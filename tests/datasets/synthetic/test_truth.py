@@ -1,0 +1,107 @@
+"""The truth of a capture in other poses and views: at the capture's own it is the capture's picture."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import StepRecord
+from headbench.bench.errors import UnavailableError
+from headbench.bench.registry import get, resolve
+from headbench.datasets.open import open_clip
+from headbench.datasets.synthetic.capture import synthesize
+from headbench.datasets.synthetic.performance import EXPRESSION_CONTROLS
+from headbench.datasets.synthetic.plan import FRONTAL
+from headbench.datasets.synthetic.truth import SyntheticTruth
+
+
+def captured(out, **settings):
+    (path,) = synthesize(out, cameras=2, timesteps=4, size=(48, 70), workers=1, **settings)
+    return open_clip(path)
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    """A capture whose expression never changes, so that the state of the skin has no history."""
+    return captured(tmp_path_factory.mktemp("still"), performance="still", camera_colour=1.0, mask_error=1.0)
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    return captured(tmp_path_factory.mktemp("moving"), performance="full", seed=5)
+
+
+def decibels(a, b):
+    return -10 * np.log10(((a.astype(float) - b) ** 2).mean() / 255**2)
+
+
+def test_at_a_frame_of_the_capture_it_has_its_bytes(still):
+    truth = resolve(get("datasets", "synthetic").truth)(still)
+    key = still.splits["novel_view"][1]
+    seed = truth._plan.render_seed(key.sequence, key.timestep, key.camera)
+    picture, mask, face = truth.render(still.cameras[key.camera], still.poses[key.timestep], seed)
+    assert np.array_equal(picture, still.image(key))
+    assert np.array_equal(mask, still.mask(key))
+    assert np.array_equal(face, still.region_masks(key, ["face"])["face"])
+
+
+def test_expressions_of_the_capture_look_as_there(moving):
+    """Up to the noise of sampling, 43 dB, and what folds and blood remember; another expression is far away."""
+    truth = SyntheticTruth(moving)
+    keys = [key for key in moving.splits["train"] if key.camera != FRONTAL]
+    far = max(keys[1:], key=lambda key: -decibels(moving.image(key), moving.image(keys[0])))
+    for key in (keys[0], far):
+        picture, mask, _ = truth.render(moving.cameras[key.camera], moving.poses[key.timestep])
+        assert decibels(picture, moving.image(key)) > 37
+        assert np.abs(mask.astype(int) - moving.mask(key)).mean() < 1.0
+    assert decibels(moving.image(keys[0]), moving.image(far)) < 30
+
+
+def test_what_it_stands_on_is_the_clips(still):
+    red = replace(still, background=np.array([1.0, 0.0, 0.0]))
+    picture, mask, _ = SyntheticTruth(red).render(still.cameras[FRONTAL], still.poses[0])
+    assert (picture[mask == 0] == [255, 0, 0]).all()
+    assert SyntheticTruth(red).fingerprint != SyntheticTruth(still).fingerprint
+
+
+def test_controls_follow_from_a_pose(geometry):
+    rng = np.random.default_rng(2)
+    controls = {name: float(rng.uniform(0, 1)) for name in EXPRESSION_CONTROLS} | {"mouth_right": 0.0}
+    others = dict.fromkeys(
+        ("jaw_open", "jaw_side", "jaw_roll", "gaze_left", "gaze_up", "head_turn", "head_nod", "head_tilt"),
+        0.3,
+    )
+    others |= dict.fromkeys(("neck_turn", "neck_nod", "sway_x", "sway_y", "sway_z"), 0.1)
+    pose = geometry.translation.pose({**controls, **others}, "900", None)
+    found = geometry.translation.activations(pose)
+    assert {name: found[name] for name in others} == pytest.approx(others, abs=1e-6)
+    again = geometry.translation.pose(found, "900", None)
+    assert np.allclose(again.expression, pose.expression, atol=1e-5)
+
+
+def without(clip, **changes):
+    step = clip.steps[0]
+    made = {**step.parameters["synthetic"], **changes.pop("synthetic", {})}
+    parameters = {**step.parameters, "synthetic": made if changes.pop("made", True) else {}}
+    return replace(clip, steps=(replace(step, parameters=parameters), *clip.steps[1:]), **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"made": False}, "only a synthetic capture"),
+        ({"synthetic": {"edition": 2}}, "is of edition 2.*Make the capture again"),
+        ({"synthetic": {"head": "ict-facekit"}}, "procedural head"),
+        ({"head": "procedural2020"}, "poses of procedural2020.*with that head model"),
+        ({"steps": (StepRecord("mask_below_neck", {}, ""),)}, "below the neck"),
+    ],
+)
+def test_a_clip_without_a_truth_says_why(still, changes, reason):
+    if "steps" in changes:
+        clip = replace(still, steps=(*still.steps, *changes["steps"]))
+    elif "head" in changes:
+        clip = replace(still, head=replace(still.head, version=changes["head"]))
+    else:
+        clip = without(still, **changes)
+    with pytest.raises(UnavailableError, match=reason):
+        SyntheticTruth(clip)
