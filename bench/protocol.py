@@ -32,7 +32,8 @@ TASK_TITLES: Mapping[str, str] = {
 }
 
 TaskWithoutTruth = Literal["cross_reenactment", "extremes"]
-"""Tasks without ground truth, which measure the stability of an avatar and whose appearance it keeps."""
+"""Tasks without recorded ground truth, which measure the stability of an avatar and whose appearance it keeps. Extremes of
+synthetic captures have a truth that is rendered for them."""
 
 
 @dataclass(frozen=True)

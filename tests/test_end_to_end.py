@@ -179,6 +179,8 @@ GATE = "compare plain --baseline baseline.json"
 RECORD = "export nersemble {capture} --out recording"
 PREPARE = "prepare nersemble --root recording/recording --tracking recording/tracking --head recording/head_model.npz"
 
+FINDS_FAULTS = ("run extremes",)
+"""Commands that end with 1: avatars trained for two iterations do not look like the person."""
 EVERY_METHOD = "(?s)ga .*gbs .*gha .*insta .*ours "
 
 # In the order in which they run: some need what an earlier one left.
@@ -392,7 +394,7 @@ def test_the_command_works_from_another_directory(command, run, elsewhere, monke
     for words, prints, leaves in CASES[command]:
         code = cli.main(words.format(**places).split())
         printed = capsys.readouterr()
-        assert code == 0, printed.err
+        assert code == (command in FINDS_FAULTS), printed.err
         assert re.search(prints, printed.out), printed.out
         for name in leaves:
             assert (elsewhere / name).stat().st_size > 0

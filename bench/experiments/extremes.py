@@ -232,8 +232,17 @@ def _shown(job: Job, plan: ExtremesPlan) -> ShownFrames:
         [job.clip],
         [_key(job, plan, frame) for frame in plan.frames],
         [(view.camera.width, view.camera.height) for view in plan.views],
-        (f"views and poses of {job.clip.subject}", plan.fingerprint),
+        (f"views and poses of {job.clip.subject}", digest(plan.fingerprint, _truth(job)[1])[:12]),
     )
+
+
+def _truth(job: Job) -> tuple[TruthPictures | None, str]:
+    """The truth of a cell's subject and its fingerprint; without a truth None and the reason."""
+    try:
+        truths = TruthPictures.of(job)
+    except UnavailableError as error:
+        return None, str(error)
+    return truths, truths.fingerprint
 
 
 def _key(job: Job, plan: ExtremesPlan, frame: PlannedFrame) -> FrameKey:
@@ -245,13 +254,12 @@ def _judged(
 ) -> tuple[list[JudgedFrame], dict[str, Any]]:
     """Frames and the avatar's record. The typical pose comes first, since it is the reference of all others in its view."""
     background = [float(v) for v in job.form.clip.background]
-    truths: TruthPictures | None = None
-    missing = ""
-    try:
-        truths, scores = TruthPictures.of(job), TruthJudge(job.device)
-    except UnavailableError as error:
-        missing = str(error)
-        log.warning("%s: there is no truth to compare with: %s", job.name, error)
+    truths, missing = _truth(job)
+    scores = TruthJudge(job.device)
+    if truths is None:
+        log.warning("%s: there is no truth to compare with: %s", job.name, missing)
+    elif count := truths.missing([(plan.views[frame.view].camera, frame.pose) for frame in plan.frames]):
+        log.info("%s: path-tracing %d pictures of the truth, 0.2 s or more each", job.name, count)
     measured: list[Measures] = []
     compared: list[TruthPair | None] = []
     against: list[tuple[list[LimitCheck], list[LimitCheck]]] = []
@@ -302,6 +310,6 @@ def _judged(
             for v in plan.views
         ],
         "shown": shown,
-        **({"no_truth": missing} if missing else {}),
+        **({} if truths else {"no_truth": missing}),
     }
     return frames, details

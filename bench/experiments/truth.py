@@ -7,6 +7,7 @@ scores, and how far it is from the subject's typical pose or from the frame befo
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -82,26 +83,38 @@ class TruthPictures:
             job.kept[place] = resolve(get("datasets", "synthetic").truth)(clip)
         return cls(job.kept[place], job.run / FOLDER, next(iter(job.clip.cameras.values())).height)
 
-    def at(self, camera: Camera, pose: HeadPose) -> tuple[TrueFrame, list[Path]]:
-        """The truth of a frame, rendered unless it is in the folder, and its files."""
-        view = camera.resized(round(camera.width * self._height / camera.height), self._height)
-        given = (getattr(pose, name) for name in POSE_FIELDS)
-        shown = [
-            np.asarray(values, np.float64)
-            for values in (view.K, view.world_to_camera, *given)
-            if values is not None
-        ]
-        name = digest(self._source.fingerprint, view.width, view.height, pose.head_model, *shown)[:20]
-        files = [self._folder / f"{name}.png", self._folder / f"{name}-mask.png"]
+    @property
+    def fingerprint(self) -> str:
+        """Hex digest of what the pictures depend on besides camera and pose."""
+        return self._source.fingerprint
+
+    def missing(self, frames: Iterable[tuple[Camera, HeadPose]]) -> int:
+        """How many pictures of some frames are not in the folder."""
+        files = {self._files(self._view(camera), pose) for camera, pose in frames}
+        return sum(not (picture.exists() and mask.exists()) for picture, mask in files)
+
+    def at(self, camera: Camera, pose: HeadPose) -> tuple[TrueFrame, tuple[Path, Path]]:
+        """The truth of a frame, rendered unless it is in the folder, and its files: picture, and mask and face."""
+        view = self._view(camera)
+        files = picture, masks = self._files(view, pose)
         try:
-            mask, face, _ = np.moveaxis(read_png(files[1]), 2, 0)
-            return TrueFrame(read_png(files[0]), mask, face > 0), files
+            mask, face, _ = np.moveaxis(read_png(masks), 2, 0)
+            return TrueFrame(read_png(picture), mask, face > 0), files
         except InputError:  # not there, or damaged
             truth = self._source.render(view, pose)
         layers = [truth.mask, 255 * truth.face.astype(np.uint8), np.zeros_like(truth.mask)]
-        write_png(files[0], truth.rgb, SYNTHETIC)
-        write_png(files[1], np.stack(layers, axis=2), SYNTHETIC)
+        write_png(picture, truth.rgb, SYNTHETIC)
+        write_png(masks, np.stack(layers, axis=2), SYNTHETIC)
         return truth, files
+
+    def _view(self, camera: Camera) -> Camera:
+        return camera.resized(round(camera.width * self._height / camera.height), self._height)
+
+    def _files(self, view: Camera, pose: HeadPose) -> tuple[Path, Path]:
+        given = (view.K, view.world_to_camera, *(getattr(pose, name) for name in POSE_FIELDS))
+        shown = [np.asarray(values, np.float64) for values in given if values is not None]
+        name = digest(self.fingerprint, view.width, view.height, pose.head_model, *shown)[:20]
+        return self._folder / f"{name}.png", self._folder / f"{name}-mask.png"
 
 
 class TruthPair(NamedTuple):

@@ -10,12 +10,20 @@ import numpy as np
 
 from ...bench.contracts import Camera, Clip, HeadPose, TrueFrame
 from ...bench.engine.captures import synthesis_arguments
-from ...bench.errors import InputError, UnavailableError
+from ...bench.errors import UnavailableError
 from ...bench.io.files import digest
 from ..region_masks import HeadRegions, select
 from .history import over_time
 from .panels import KERNEL, default_samples, sample_count
-from .plan import EDITION, FIRST_SUBJECT, SubjectPlan, SyntheticSettings, load_geometry, plan_subject
+from .plan import (
+    EDITION,
+    FIRST_SUBJECT,
+    PROCEDURAL,
+    SubjectPlan,
+    SyntheticSettings,
+    load_geometry,
+    plan_subject,
+)
 from .renderer import CaptureRenderer
 
 _HELD_SECONDS = 60.0
@@ -45,10 +53,10 @@ class SyntheticTruth:
     """
 
     def __init__(self, clip: Clip) -> None:
-        KERNEL.load()
         self._posed: HeadPose | None = None
         self._subject, self._background = clip.subject, np.asarray(clip.background, np.float64)
         self._settings = _settings(clip)
+        KERNEL.load()
         self._geometry = load_geometry(self._settings.head)
         made = self._geometry.head.version
         if clip.head.version != made:
@@ -106,10 +114,13 @@ def _settings(clip: Clip) -> SyntheticSettings:
             "Make the capture again with this version (`headbench synth`).",
             f"the capture is of edition {recorded.get('edition', 1)}, not {EDITION}",
         )
-    try:
-        given = synthesis_arguments([asdict(step) for step in clip.steps], clip.subject)
-    except InputError as error:
-        raise UnavailableError(str(error), "", "the capture's settings cannot be read") from error
+    if recorded.get("head") not in PROCEDURAL:
+        raise UnavailableError(
+            f"The capture has the head model {recorded.get('head')}, whose file it does not name.",
+            "Use a capture of the procedural head.",
+            "the capture is not of the procedural head",
+        )
+    given = synthesis_arguments([asdict(step) for step in clip.steps], clip.subject)
     size = given["size"]
     wanted = given["samples_per_pixel"]
     values = {field.name: given[field.name] for field in fields(SyntheticSettings)}

@@ -142,7 +142,9 @@ def test_pictures_are_rendered_once_and_again_if_damaged(tmp_path):
     camera = Camera("c", 16, 20, np.diag([20.0, 20.0, 1.0]), np.eye(4))
     pose = SimpleNamespace(head_model="m", expression=np.zeros(3), jaw=np.zeros(3), eyelids=None)
     pose = SimpleNamespace(**vars(pose), rotation=None, neck=None, eyes=None, translation=None)
+    assert truths.missing([(camera, pose), (camera, pose)]) == 1
     first, files = truths.at(camera, pose)
+    assert truths.missing([(camera, pose)]) == 0
     second, same = truths.at(replace(camera, id="another"), pose)
     assert asked == [(8, 10)]  # at the capture's size
     assert files == same
