@@ -19,13 +19,14 @@ from ....bench.specs import CommandResult
 from ...ours.avatar import OursAvatar
 from ...ours.storage import StoredField
 from ...shared.avatar_files import read_shared_head, save_shared_head
+from ...shared.capacity import training_poses
 from ...shared.losses import picture_ssim, psnr, squared_error
 from ...shared.subject_mesh import SubjectMesh
 from .container import Content, write_content
 from .file import COMPACT_FILE, decode, encode, exact_sizes, part_sizes
 from .precision import EXACT, Precision
 from .settings import CompactSettings
-from .simplify import simplify, training_poses
+from .simplify import simplify
 
 SIMPLIFIED, WHOLE = "left out", "all"
 
