@@ -30,16 +30,17 @@ from ..shared.avatar_files import (
     TRACKED,
     RefinedTracking,
     Subject,
+    clip_mesh,
     finish_fit,
     read_shared_head,
     read_subject,
 )
+from ..shared.capacity import CapacityPlan, CapacityPlanner
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import USUAL, Cutoffs, PlacedSplats, StoredSplatAvatar, View
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
-from ..shared.sizes import Size, halves
 from ..shared.splat_training import BoundTraining, ShadedSplats
 from ..shared.subject_mesh import BoundedCache, SubjectMesh
 from .config import GAConfig
@@ -192,17 +193,15 @@ class GA(TrainedMethod[GAConfig, GAAvatar]):
     name, version = SPEC.name, SPEC.version
     config_class, avatar_class = GAConfig, GAAvatar
 
-    def _sizes(self, clip: Clip, config: GAConfig) -> tuple[Size, ...]:
-        degrees = tuple(degree for degree in (2, 1, 0) if degree < config.sh_degree)
-        splats = halves(config.splats.max_splats, len(clip.head.faces))
-        return (
-            Size("sh_degree", degrees, lambda avatar: occupied_degree(avatar.splat_tensors["sh_rest"])),
-            Size("splats.max_splats", splats, lambda avatar: len(avatar.binding)),
-        )
+    def _planned(self, clip: Clip, config: GAConfig, device: str) -> CapacityPlan:
+        mesh = clip_mesh(clip, device)
+        planner = CapacityPlanner(clip, mesh, config.capacity)
+        planner.splats("splats.max_splats", config.splats.max_splats, len(mesh.faces))
+        return planner.plan()
 
     def _train(self, fit: Fit, config: GAConfig) -> None:
         clip, subject = fit.clip, Subject.of(fit.clip)
-        mesh = SubjectMesh(clip.head, subject.shape, subject.static_offset, fit.device)
+        mesh = clip_mesh(clip, fit.device)
         appearance = GAAppearance(mesh, clip, config, fit.device, fit.seed)
         sampler = ShuffledEpochs(len(clip.splits["train"]), fit.seed)
         training = BoundTraining(

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from ...bench.contracts import Clip
-from ..shared.avatar_files import Subject, finish_fit
+from ..shared.avatar_files import Subject, clip_mesh, finish_fit
+from ..shared.capacity import CapacityPlan, CapacityPlanner
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.schedule import ShuffledEpochs
-from ..shared.sizes import Size, halves
 from .avatar import GBSAvatar
 from .config import GBSConfig
 from .points import SurfacePoints, padded_offset, with_mouth
@@ -23,24 +23,17 @@ from .storage import AVATAR_FILE, write_avatar
 from .training import GBSTraining
 
 
-def _splats(avatar: GBSAvatar) -> int:
-    return len(avatar.stored.neutral["sh_rest"])
-
-
 class GBS(TrainedMethod[GBSConfig, GBSAvatar]):
     """The method: see the module."""
 
     name, version = SPEC.name, SPEC.version
     config_class, avatar_class = GBSConfig, GBSAvatar
 
-    def _sizes(self, clip: Clip, config: GBSConfig) -> tuple[Size, ...]:
-        degrees = tuple(degree for degree in (1, 0) if degree < config.difference_sh_degree)
-        expressions = min(config.expressions, clip.head.expression_basis.shape[2])
-        return (
-            Size("expressions", (*halves(expressions, 1, 3), 0) if expressions else ()),
-            Size("difference_sh_degree", degrees),
-            Size("splats.max_splats", halves(config.splats.max_splats, config.samples), _splats),
-        )
+    def _planned(self, clip: Clip, config: GBSConfig, device: str) -> CapacityPlan:
+        planner = CapacityPlanner(clip, clip_mesh(clip, device), config.capacity)
+        planner.expressions("expressions", config.expressions)
+        planner.splats("splats.max_splats", config.splats.max_splats, config.samples)
+        return planner.plan()
 
     def _train(self, fit: Fit, config: GBSConfig) -> None:
         clip, seed = fit.clip, fit.seed

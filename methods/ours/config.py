@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ..shared.config import SplatTraining
+from ..shared.config import Capacity, SplatTraining
 
 Dynamic = Literal["opacity", "position", "rotation", "scale", "color"]
 """Attribute of a splat that an expression may change."""
@@ -182,16 +182,11 @@ class Sampling:
 
 
 @dataclass(frozen=True)
-class PlannedCapacity:
-    """Size of the avatar.
+class PlannedCapacity(Capacity):
+    """Size of the avatar: see `Capacity`.
 
     Attributes
     ----------
-    mode : Literal['fixed', 'auto']
-        "fixed" uses the configured sizes. "auto" uses them as upper limits and chooses smaller ones
-        that the training data support (`capacity.plan_capacity`).
-    tolerance : float
-        Pixels; smaller motion of the surface is ignored.
     detail : float
         Samples of the planes per pixel, along the longest side of their box. 1 keeps PSNR and LPIPS;
         0.5 keeps only PSNR, in half the bytes.
@@ -199,14 +194,13 @@ class PlannedCapacity:
         Sizes that "auto" does not change.
     """
 
-    mode: Literal["fixed", "auto"] = "fixed"
-    tolerance: float = 0.25
     detail: float = 1.0
     keep: tuple[Planned, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.tolerance > 0 or not self.detail > 0:
-            raise ValueError("tolerance (pixels) and detail must be above 0")
+        super().__post_init__()
+        if not self.detail > 0:
+            raise ValueError(f"detail must be above 0, found {self.detail}")
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ arXiv 2504.14967. Everything else is as in GaussianAvatars (`shared.splat_traini
 
 from __future__ import annotations
 
-import logging
 from typing import Any
 
 import numpy as np
@@ -15,20 +14,24 @@ from ...bench.contracts import Clip
 from ...datasets.head.arrays import faces_in_region
 from ...datasets.steps.clusters import cluster_expressions
 from ...datasets.steps.jaw_bases import leaks
-from ..shared.avatar_files import SUBJECT_FILE, Subject, finish_fit, save_shared_head, write_subject
+from ..shared.avatar_files import (
+    SUBJECT_FILE,
+    Subject,
+    clip_mesh,
+    finish_fit,
+    save_shared_head,
+    write_subject,
+)
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.schedule import Sampler, ShuffledEpochs, Weighted, balanced_weights
 from ..shared.splat_training import BoundTraining
-from ..shared.subject_mesh import SubjectMesh
 from .appearance import OursAppearance, outer_layers_start
 from .avatar import OursAvatar
-from .capacity import CapacityPlan, plan_capacity
+from .capacity import OursPlan, plan_capacity
 from .config import OursConfig
 from .spec import OURS, OURS_PLUS
 from .storage import FIELD_FILE, write_field
-
-log = logging.getLogger(__name__)
 
 
 class Ours(TrainedMethod[OursConfig, OursAvatar]):
@@ -36,26 +39,20 @@ class Ours(TrainedMethod[OursConfig, OursAvatar]):
 
     name, version = OURS.name, OURS.version
     config_class, avatar_class = OursConfig, OursAvatar
-    _plan: CapacityPlan | None = None
+    _plan: OursPlan | None = None
 
     def _resolved(self, clip: Clip, device: str) -> tuple[OursConfig, Any]:
-        """The configuration with planned sizes, if any. The digest covers the sizes and not the measurements for them,
-        whose last digits depend on the number of threads."""
         config, lines = self.config, self.config.lines
         if config.sampling.balanced or (lines.enabled and (config.penalty.weight or lines.bounds == "face")):
             faces_in_region(clip.head, "face")  # raises before long work if the region is missing
-        if config.capacity.mode == "fixed":
-            self._plan = None
-            return config, config
-        self._plan = plan_capacity(clip, _mesh(clip, device), config)
-        planned = self._plan.apply(config)
-        return planned, (config, planned)
+        return super()._resolved(clip, device)
+
+    def _planned(self, clip: Clip, config: OursConfig, device: str) -> OursPlan:
+        return plan_capacity(clip, clip_mesh(clip, device), config)
 
     def _train(self, fit: Fit, config: OursConfig) -> None:
         clip, out, device, plan = fit.clip, fit.out, fit.device, self._plan
-        if plan is not None:
-            log.info("%s", plan.summary())
-        mesh = _mesh(clip, device)
+        mesh = clip_mesh(clip, device)
         within = None if plan is None else plan.box(device)
         appearance = OursAppearance(mesh, clip, config, device, fit.seed, lines_within=within)
         sampler, start = self._sampler(clip, fit.seed), outer_layers_start(mesh, clip, config, device)
@@ -83,7 +80,6 @@ class Ours(TrainedMethod[OursConfig, OursAvatar]):
             splats=len(training.binding),
             jaw_bases=len(appearance.jaw_bases),
             leaks=leaks(config.lines.jaw_bases_variant) if len(appearance.jaw_bases) else (),
-            capacity=None if plan is None else plan.record(),
         )
 
     def _sampler(self, clip: Clip, seed: int) -> Sampler:
@@ -100,8 +96,3 @@ class OursPlus(Ours):
     """The method with the additions of `spec.ADDITIONS`, which its presets have."""
 
     name, version = OURS_PLUS.name, OURS_PLUS.version
-
-
-def _mesh(clip: Clip, device: str) -> SubjectMesh:
-    subject = Subject.of(clip)
-    return SubjectMesh(clip.head, subject.shape, subject.static_offset, device)

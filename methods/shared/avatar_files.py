@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from ...bench.io.documents import read_json
 from ...bench.io.files import atomic_path, digest, write_json
 from ...datasets.head.arrays import STORED, HeadArrays, read_head, save_head
 from .loop import Fit, TrainingSummary
+from .subject_mesh import SubjectMesh
 
 RECORDED_LOSSES = 200  # maximum number of losses in an avatar's record
 _SIZES = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
@@ -38,6 +39,12 @@ class Subject:
         """The subject of a clip in float32, as stored."""
         shape, offset = np.asarray(clip.shape, np.float32), np.asarray(clip.static_offset, np.float32)
         return cls(clip.subject, clip.head.version, shape, offset)
+
+
+def clip_mesh(clip: Clip, device: str) -> SubjectMesh:
+    """The mesh of a clip's subject, from values in float32, as stored."""
+    subject = Subject.of(clip)
+    return SubjectMesh(clip.head, subject.shape, subject.static_offset, device)
 
 
 def head_arrays(head: HeadAsset) -> HeadArrays:
@@ -167,8 +174,8 @@ def is_finished(folder: Path, run: str) -> bool:
 def write_record(fit: Fit, summary: TrainingSummary, **more: Any) -> None:
     """Write the record of a run. It is the last file of a fit: its presence marks a complete avatar."""
     done: dict[str, Any] = {"iterations": summary.iterations, "planned_iterations": summary.planned}
-    if fit.trials:
-        done["trials"] = [asdict(trial) for trial in fit.trials]
+    if fit.capacity is not None:
+        done["capacity"] = fit.capacity
     if summary.losses:
         done["losses"] = [[at, float(f"{value:.4g}")] for at, value in thinned(summary.losses)]
     write_json(

@@ -139,25 +139,18 @@ class Capacity:
     Attributes
     ----------
     mode : Literal['fixed', 'auto']
-        "fixed" uses the configured sizes. "auto" uses them as upper limits: short trainings without
-        the ends of the training sequences try smaller ones (`sizes.choose_sizes`), which takes time
-        beyond the budget.
-    share : float
-        Fraction of the budget for each of these trainings; at least 500 iterations.
-    tolerance_db, tolerance_ssim : float
-        Allowed loss of PSNR and SSIM on the held-out timesteps.
+        "fixed" uses the configured sizes. "auto" uses them as upper limits and chooses smaller ones
+        from cameras, poses and pictures of the training split (`capacity.CapacityPlanner`).
+    tolerance : float
+        Pixels; smaller motion of the surface is ignored.
     """
 
     mode: Literal["fixed", "auto"] = "fixed"
-    share: float = 0.25
-    tolerance_db: float = 0.05
-    tolerance_ssim: float = 0.0005
+    tolerance: float = 0.25
 
     def __post_init__(self) -> None:
-        if not 0 < self.share <= 1:
-            raise ValueError(f"share must lie in (0, 1], found {self.share}")
-        if self.tolerance_db < 0 or self.tolerance_ssim < 0:
-            raise ValueError("tolerance_db and tolerance_ssim must not be negative")
+        if not self.tolerance > 0:
+            raise ValueError(f"tolerance must be above 0 pixels, found {self.tolerance}")
 
 
 PAPER_ITERATIONS = 600_000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -67,8 +67,8 @@ class Fit:
         Digest of everything that affects training; a checkpoint with another digest is refused.
     clock : Callable
         Clock in seconds with any origin, for budgets in seconds.
-    trials : Sequence[Any]
-        The sizes tried before, for the record.
+    capacity : Mapping[str, Any] | None
+        The planned sizes, for the record.
     """
 
     clip: Clip
@@ -79,7 +79,7 @@ class Fit:
     progress: Progress
     run: str
     clock: Callable[[], float] = time.monotonic
-    trials: Sequence[Any] = ()
+    capacity: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)

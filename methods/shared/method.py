@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
+import logging
 import time
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -13,9 +11,10 @@ from ...bench.contracts import Budget, Clip, Progress
 from ...bench.machine import use_device
 from ..splats import cuda
 from .avatar_files import is_finished, run_digest
+from .capacity import CapacityPlan
 from .loop import CHECKPOINT, Fit, check_budget, check_training_split
-from .sizes import FOLDER, Size, choose_sizes
 
+log = logging.getLogger(__name__)
 Config = TypeVar("Config")
 Avatar = TypeVar("Avatar")
 
@@ -32,6 +31,7 @@ class TrainedMethod(Generic[Config, Avatar]):
     config_class: ClassVar[Any]
     avatar_class: ClassVar[Any]
     draws_splats: ClassVar[bool] = True
+    _plan: CapacityPlan | None = None
 
     def __init__(self, config: Config | None = None):
         self.config: Config = config or self.config_class()
@@ -51,8 +51,11 @@ class TrainedMethod(Generic[Config, Avatar]):
         config, settings = self._resolved(clip, device)
         run = run_digest(self.name, self.version, settings, clip, budget, seed)
         if not is_finished(out, run):
-            work = Fit(clip, out, budget, device, seed, progress, run, self._clock)
-            self._train(*self._sized(work, config))
+            plan = self._plan
+            if plan is not None:
+                log.info("%s", plan.summary())
+            record = None if plan is None else plan.record()
+            self._train(Fit(clip, out, budget, device, seed, progress, run, self._clock, record), config)
         self._remove_training_files(out)
         return self.load(out, device=device)
 
@@ -70,31 +73,26 @@ class TrainedMethod(Generic[Config, Avatar]):
         return avatar
 
     def _resolved(self, clip: Clip, device: str) -> tuple[Any, Any]:
-        """The configuration to train with, and the part of it that identifies the run."""
-        return self.config, self.config
+        """The configuration to train with, and the part of it that identifies the run.
 
-    def _sizes(self, clip: Clip, config: Any) -> Sequence[Size]:
-        """The sizes to try if ``config.capacity`` is "auto"."""
-        return ()
+        With planned sizes the latter has the sizes and not the measurements for them, whose last digits depend on the number
+        of threads.
+        """
+        config: Any = self.config
+        if getattr(config, "capacity", None) is None or config.capacity.mode == "fixed":
+            self._plan = None
+            return config, config
+        self._plan = self._planned(clip, config, device)
+        planned = self._plan.apply(config)
+        return planned, (config, planned)
 
-    def _sized(self, fit: Fit, config: Any) -> tuple[Fit, Any]:
-        """The fit and its configuration with the sizes chosen by trials, if any."""
-        sizes = [size for size in self._sizes(fit.clip, config) if size.values]
-        if not sizes or config.capacity.mode == "fixed":
-            return fit, config
-        fixed = replace(config, capacity=replace(config.capacity, mode="fixed"))
-
-        def train(candidate: Any, clip: Clip, folder: Path, budget: Budget, progress: Progress) -> Any:
-            method = type(self)(candidate)
-            return method.fit(clip, folder, budget, device=fit.device, seed=fit.seed, progress=progress)
-
-        config, trials = choose_sizes(fit, fixed, config.capacity, sizes, train)
-        return replace(fit, trials=trials), config
+    def _planned(self, clip: Clip, config: Any, device: str) -> CapacityPlan:
+        """The sizes for a clip if ``config.capacity`` is "auto"."""
+        raise NotImplementedError
 
     def _remove_training_files(self, out: Path) -> None:
         """Remove files that a finished avatar no longer needs, also after a kill before this step."""
         (out / CHECKPOINT).unlink(missing_ok=True)
-        shutil.rmtree(out / FOLDER, ignore_errors=True)
 
     def _train(self, fit: Fit, config: Any) -> None:
         raise NotImplementedError

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -81,6 +81,33 @@ def toy_pose(head: HeadArrays, rng: np.random.Generator, timestep: int | None, s
     )
 
 
+def splat_pictures(
+    mesh: SubjectMesh, waves: float = 60.0
+) -> Callable[[HeadPose, Camera], tuple[np.ndarray, np.ndarray]]:
+    """Draws 8-bit image and mask of a pose on white: an opaque splat per triangle, whose colours are waves in space, radians a metre."""
+    faces = len(mesh.faces)
+    center = mesh.canonical[mesh.faces].mean(1).numpy()
+    colors = torch.from_numpy(0.5 + 0.5 * np.sin(waves * center + np.array([0.0, 2.0, 4.0]))).float()
+    log_scales = torch.log(torch.tensor([0.4, 0.05, 0.4])).expand(faces, 3)
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(faces, 4)
+
+    def draw(pose: HeadPose, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        frames = mesh.frames(mesh.posed(mesh.arguments([pose])))
+        world = to_world(frames, torch.arange(faces), torch.zeros(faces, 3), log_scales, quats)
+        rendering = rasterize(
+            *(*world, torch.full((faces,), 0.95), colors),
+            *(camera.world_to_camera, camera.K, camera.width, camera.height),
+            background=np.ones(3),
+        )
+        image, mask = (
+            np.round(each.clamp(0, 1).numpy() * 255).astype(np.uint8)
+            for each in (rendering.image, rendering.alpha)
+        )
+        return image, mask
+
+    return draw
+
+
 def toy_clip(
     head: HeadArrays,
     *,
@@ -96,36 +123,19 @@ def toy_clip(
     shape = rng.standard_normal(head.shape_basis.shape[2]) * 0.5
     offset = np.zeros_like(head.template)
     mesh = SubjectMesh(head, shape, offset, "cpu")
-    faces = len(head.faces)
-    center = mesh.canonical[mesh.faces].mean(1).numpy()
-    colors = torch.from_numpy(0.5 + 0.5 * np.sin(60 * center + np.array([0.0, 2.0, 4.0]))).float()
+    draw = splat_pictures(mesh)
     rig = toy_cameras(cameras, width, height)
     names = list(rig)
     count = timesteps + held_out
     poses = {t: toy_pose(head, rng, t, "toy") for t in range(count)}
     background = np.ones(3)
-    log_scales = torch.log(torch.tensor([0.4, 0.05, 0.4])).expand(faces, 3)
     images, masks = {}, {}
     splits: dict[str, list[FrameKey]] = {"train": [], "novel_view": [], "self_reenactment": []}
     for t, pose in poses.items():
-        frames = mesh.frames(mesh.posed(mesh.arguments([pose])))
-        quats = torch.tensor([1.0, 0, 0, 0]).expand(faces, 4)
-        world = to_world(frames, torch.arange(faces), torch.zeros(faces, 3), log_scales, quats)
         for name, camera in rig.items():
             sequence = "TRAIN" if t < timesteps else "FREE"
             key = FrameKey("toy", sequence, t, name)
-            rendering = rasterize(
-                *world,
-                torch.full((faces,), 0.95),
-                colors,
-                camera.world_to_camera,
-                camera.K,
-                width,
-                height,
-                background=background,
-            )
-            images[key] = np.round(rendering.image.clamp(0, 1).numpy() * 255).astype(np.uint8)
-            masks[key] = np.round(rendering.alpha.clamp(0, 1).numpy() * 255).astype(np.uint8)
+            images[key], masks[key] = draw(pose, camera)
             split = "self_reenactment" if t >= timesteps else "novel_view" if name == names[-1] else "train"
             splits[split].append(key)
     return ToyClip(

@@ -27,6 +27,7 @@ from ...insta.avatar import TABLE as GRID
 from ...insta.field import Architecture
 from ...ours.avatar import OursAvatar
 from ...shared.avatar_files import SUBJECT_FILE, read_subject, save_shared_head
+from ...shared.capacity import training_poses
 from ...shared.tensor_files import read_safetensors
 from ..views import importance, training_views
 from .blended import encode_blended
@@ -35,7 +36,7 @@ from .container import Content, write_content
 from .file import COMPACT_FILE, encode
 from .networks import encode_networks
 from .precision import Precision
-from .simplify import simplify, training_poses
+from .simplify import simplify
 
 DRIVING_FILE = "driving.npz"
 """Driving signal beside the avatars of some methods, which is not part of their size."""

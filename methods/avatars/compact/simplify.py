@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from ....bench.contracts import Clip, HeadPose
+from ....bench.contracts import HeadPose
 from ...ours.avatar import OursAvatar
 from ...ours.storage import PER_SPLAT, SPLAT_WIDTHS, StoredField
 from ...splats.constants import ALPHA_MIN
@@ -47,11 +47,6 @@ def simplify(avatar: OursAvatar, poses: Iterable[HeadPose], precision: Precision
         tensors = {name: value for name, value in tensors.items() if name not in lines}
         tensors["jaw_bases"] = tensors["jaw_bases"][:0]
     return StoredField(tensors, field.dynamic)
-
-
-def training_poses(clip: Clip) -> list[HeadPose]:
-    """The poses of a clip's training frames, in order of time."""
-    return [clip.poses[timestep] for timestep in sorted({key.timestep for key in clip.splits["train"]})]
 
 
 def _visible(avatar: OursAvatar, poses: Iterable[HeadPose]) -> Tensor:

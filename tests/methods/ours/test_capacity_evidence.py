@@ -11,14 +11,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from headbench.datasets.steps.jaw_bases import IDENTITY, farthest_quaternions, jaw_quaternions, jaw_weights
-from headbench.methods.ours.capacity import (
-    displacement_without,
-    jaw_lever,
-    largest_displacements,
-    leading_directions,
-    pixel_footprint,
-    spanning_jaw_bases,
-)
+from headbench.methods.ours.capacity import jaw_lever, largest_displacements, spanning_jaw_bases
+from headbench.methods.shared.capacity import displacement_without, leading_directions, pixel_footprint
 from headbench.methods.shared.subject_mesh import SubjectMesh
 
 from ..toy_clip import toy_clip, toy_pose

@@ -17,12 +17,13 @@ from headbench.methods.avatars.compact.file import (
     part_sizes,
 )
 from headbench.methods.avatars.compact.precision import EXACT, Precision
-from headbench.methods.avatars.compact.simplify import simplify, training_poses
+from headbench.methods.avatars.compact.simplify import simplify
 from headbench.methods.ours.avatar import OursAvatar
 from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.method import Ours
 from headbench.methods.ours.storage import FIELD_FILE, RESIDUAL
 from headbench.methods.shared.avatar_files import read_shared_head
+from headbench.methods.shared.capacity import training_poses
 from headbench.methods.shared.config import SplatTraining
 
 from ...ours.toy import CASES, SMALL, store
