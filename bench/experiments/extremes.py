@@ -227,22 +227,23 @@ def drive(
 
 
 def _shown(job: Job, plan: ExtremesPlan) -> ShownFrames:
+    truths, _ = _truth(job)
+    fingerprint = digest(plan.fingerprint, truths.fingerprint if truths else "")[:12]
     return ShownFrames(
         job,
         [job.clip],
         [_key(job, plan, frame) for frame in plan.frames],
         [(view.camera.width, view.camera.height) for view in plan.views],
-        (f"views and poses of {job.clip.subject}", digest(plan.fingerprint, _truth(job)[1])[:12]),
+        (f"views and poses of {job.clip.subject}", fingerprint),
     )
 
 
 def _truth(job: Job) -> tuple[TruthPictures | None, str]:
-    """The truth of a cell's subject and its fingerprint; without a truth None and the reason."""
+    """The truth of a cell's subject, or None and the reason why there is none."""
     try:
-        truths = TruthPictures.of(job)
+        return TruthPictures.of(job), ""
     except UnavailableError as error:
         return None, str(error)
-    return truths, truths.fingerprint
 
 
 def _key(job: Job, plan: ExtremesPlan, frame: PlannedFrame) -> FrameKey:

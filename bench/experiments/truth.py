@@ -50,7 +50,7 @@ class TruthLimits:
     response : float
         Least part of the truth's change from the typical pose that the avatar shows.
     flicker : float
-        Largest flicker, as a part of the truth's change, which is the flicker of an avatar that stands still.
+        Largest flicker in units of the truth's change, which is the flicker of an avatar that stands still.
     """
 
     blur: float = 0.015
@@ -58,7 +58,7 @@ class TruthLimits:
     iou: float = 0.9
     colour: float = 5.0
     response: float = 0.25
-    flicker: float = 1.0
+    flicker: float = 1.5
 
 
 TRUTH_LIMITS = TruthLimits()

@@ -186,14 +186,17 @@ def test_the_response_is_the_share_of_the_change_that_is_shown(judge, pair, shar
     assert check.passed == (share > TRUTH_LIMITS.response)
 
 
-def test_flicker_passes_up_to_that_of_standing_still(judge, pair):
+def test_flicker_is_limited_by_that_of_standing_still(judge, pair):
     before, after = pair
     change = np.sqrt(((after.rgb.astype(float) - before.rgb) ** 2).mean())
     still = judge.flicker(shown(after, before.rgb), shown(before, before.rgb))
     assert still.value == pytest.approx(change)
     assert still.upper == pytest.approx(TRUTH_LIMITS.flicker * change)
-    wild = shown(after, 255 - after.rgb), shown(before, before.rgb)
-    assert not judge.flicker(*wild).passed
+    assert still.passed
+    opposite = np.clip(128.0 - (after.rgb.astype(float) - before.rgb), 0, 255)
+    wrong = judge.flicker(shown(after, opposite), shown(before, np.full_like(before.rgb, 128)))
+    assert wrong.value == pytest.approx(2 * change, rel=0.01)
+    assert not wrong.passed
 
 
 def test_overlap_and_colour_are_those_counted_by_hand(judge):
