@@ -18,8 +18,9 @@ from ..bench.audit.bundle import without_paths
 from ..bench.engine.scoring import FULL
 from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
+from ..bench.experiments.robustness import RECORD_FILE
 from ..bench.experiments.suite_settings import EQUAL, LARGE_RUN, NONE, RUN, SEEDS_RUN, TRACKED
-from ..bench.io.files import write_bytes, write_text
+from ..bench.io.files import write_bytes, write_json, write_text
 from ..bench.io.images import encode_image, read_png
 from ..bench.manifest import Manifest
 from ..bench.protocol import TASK_TITLES
@@ -28,6 +29,8 @@ from .runs import RunSet
 from .statistics.command import equivalence_text
 from .statistics.comparisons import PairedComparison, compare
 from .statistics.primary import primary_comparisons
+from .suite.extremes import FOLDER as EXTREMES
+from .suite.extremes import read_extremes
 from .suite.suite import suite_report, suite_runs
 from .table_report import Columns, table_of, table_text
 from .writers import to_markdown
@@ -57,7 +60,10 @@ def publish_suite(out: Path, root: Path) -> None:
     """Copy manifest and rows of a suite's run to the repository ``root``, and write its tables and block."""
     target = root / SUITE
     for run in chain.from_iterable(suite_runs(out, base) for base in (RUN, SEEDS_RUN, LARGE_RUN)):
-        _copy(RunFolder(run), RunFolder(target / run.relative_to(out)))
+        place = target / run.relative_to(out)
+        _copy(RunFolder(run), RunFolder(place))
+        if avatars := read_extremes([run]):
+            write_json(place / EXTREMES / RECORD_FILE, {"avatars": avatars})
     write_text(target / RESULTS, suite_results(target))
     _write(root / PAGES["suite"], "suite", suite_block(target))
 

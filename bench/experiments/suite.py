@@ -16,6 +16,8 @@ from ..executors.settings import check_executor
 from ..io.files import write_text
 from ..registry import discover, get, resolve
 from ..specs import CommandResult, MethodSpec
+from .robustness import extremes_run
+from .robustness_settings import ExtremesSettings
 from .suite_settings import (
     ALL,
     AS_TRACKED,
@@ -96,6 +98,9 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
             rows = run(own, execution)
             runs.append(Path(own.out))
             failed += rows.failed
+            if part is config and settings.extremes and not all(method.spec.trivial for method, _ in cells):
+                how = {name: getattr(settings, name) for name in ("executor", "workers", "set")}
+                extremes_run(ExtremesSettings(own.out, **how), progress)
             ends.append(closing(runs[-1], rows))
             text = resolve(get("reports", "suite").implementation)(out, OURS)
             write_text(out / "results.md", text)

@@ -79,6 +79,10 @@ class SuiteSettings(ExecutionOptions):
     """At most this many subjects, from the first, are also trained with two further seeds, without conditions, in runs of their own;
     `results.md` then has the variance between and within subjects."""
 
+    extremes: bool = True
+    """Render the avatars of every subject in new poses and views, too, as `headbench run extremes` does; a broken limit is a result, not a
+    failure."""
+
     cameras: int = 16
     """Views of each, the held-out one included."""
 

@@ -16,6 +16,7 @@ from ..statistics.primary import PAIR, primary_section
 from ..table_report import Columns, table_of
 from ..writers import to_markdown
 from .ablations import ablation_table
+from .extremes import extremes_section, read_extremes
 from .tracked import DROP_MEANING, condition_table, drop_table
 from .variance import variance_section
 
@@ -59,6 +60,8 @@ def suite_report(folder: Path, method: str) -> str:
     """
     runs, large, seeds = (suite_runs(folder, base) for base in (RUN, LARGE_RUN, SEEDS_RUN))
     text = _tables(RunSet.read(runs), method, primary=True)
+    if section := extremes_section(read_extremes(runs)):
+        text += f"\n{section}\n"
     if seeds:
         names = [run.name for run in seeds]
         both = RunSet.read([*(run for run in runs if run.name in names), *seeds])

@@ -37,7 +37,7 @@ def test_the_suite_makes_subjects_and_tables_by_region_and_part(tmp_path, capsys
     tables += ["Cost", "Speed"]
     assert large == [f"{title} (exploratory)" for title in tables]
     tracked = [f"Tracked from images{region} (exploratory)" for region in ("", ", face")]
-    assert usual == ["Primary endpoints", *large, *tracked]
+    assert usual == ["Primary endpoints", *large, *tracked, "New poses and views (exploratory)"]
     assert text.count("2 subjects") >= len(large)
     assert "32 x 32 pixels" in text.split("\n# ")[1]
     assert text.count("first - second") >= 2 * len(large)
@@ -52,7 +52,7 @@ def asked(monkeypatch, tmp_path):
     """What a suite with some options makes: (arguments of the capture, configuration of the run) of each run, in order."""
 
     def plan(*options):
-        captures, runs = [], []
+        captures, runs, driven = [], [], []
 
         def capture(out, **given):
             captures.append(given | {"out": out})
@@ -67,7 +67,12 @@ def asked(monkeypatch, tmp_path):
             module, "run", lambda config, execution: runs.append(config) or SimpleNamespace(failed=[])
         )
         monkeypatch.setattr(module, "closing", lambda run, rows: "")
+        monkeypatch.setattr(module, "extremes_run", lambda settings, progress: driven.append(settings.run))
         assert cli.main(["run", "suite", "--out", str(tmp_path / "s"), *options]) == 0
+        usual = [
+            run.out for run in runs if Path(run.out).parent.name == "run" and run.methods != ("mean-image",)
+        ]
+        assert driven == ([] if "--no-extremes" in options else usual)
         return list(zip(captures, runs, strict=True))
 
     return plan
@@ -137,7 +142,9 @@ def test_every_subject_has_a_run_and_the_first_also_large_images(asked):
     ]
     names = [[condition.name for condition in run.conditions] for _, run in found]
     assert names == [["", "tracked", "no-lines"], [""], *[["", "tracked", "no-lines"]] * 2]
-    later = asked(*options, "--subjects", "3", "--first", "3", "--large", "0", "--repeated", "3")
+    later = asked(
+        *options, "--subjects", "3", "--first", "3", "--large", "0", "--repeated", "3", "--no-extremes"
+    )
     assert [(capture["only"], run.seeds) for capture, run in later] == [(2, (0,)), (2, (1, 2))]
     assert [condition.name for condition in later[1][1].conditions] == [""]
 
