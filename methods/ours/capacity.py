@@ -17,7 +17,7 @@ from ...datasets.head.arrays import JOINT_NAMES, faces_in_region
 from ...datasets.steps.jaw_bases import IDENTITY, farthest_quaternions, jaw_quaternions
 from ..ops.planes import Bounds
 from ..shared.capacity import CapacityPlan, CapacityPlanner
-from ..shared.evidence import CONFIRMED
+from ..shared.evidence import JAW
 from ..shared.subject_mesh import SubjectMesh, centroid_displacements
 from .config import OursConfig, Planned
 from .field import PLANE_MARGIN, line_box, plane_box
@@ -57,7 +57,7 @@ class OursPlan(CapacityPlan):
 
     def summary(self) -> str:
         """As `CapacityPlan.summary`, and whether nothing is dynamic."""
-        return super().summary() + "" * self.lines + "; nothing is dynamic, no lines" * (not self.lines)
+        return super().summary() + "; nothing is dynamic, no lines" * (not self.lines)
 
 
 def plan_capacity(clip: Clip, mesh: SubjectMesh, config: OursConfig) -> OursPlan:
@@ -116,11 +116,9 @@ class _Planner(CapacityPlanner):
         rest = metres / self.pixel
         numbers = {"lever_m": lever, "left_out_px": rest}
         reason = f"without further bases the jaw moves the surface by {rest:.2f} px at most"
-        if chosen and self.motion is not None:
-            numbers["agreement"] = self.motion.agreement(self.motion.jaw)
-            if numbers["agreement"] < CONFIRMED:
-                chosen, reason = 0, "in pictures the jaw's tracked motion is noise of the tracker"
-            reason += f" (agreement {numbers['agreement']:.1f})"
+        if chosen:
+            confirmed, evidence = self.confirmed(JAW, numbers)
+            chosen, reason = chosen * confirmed, reason + evidence
         self._decide("lines.jaw_bases", configured, chosen, reason, **numbers)
         return chosen
 

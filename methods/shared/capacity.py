@@ -105,37 +105,31 @@ class CapacityPlanner:
         return CapacityPlan(self._capacity.tolerance, self.pixel, tuple(self.decisions))
 
     def expressions(self, name: str, configured: int) -> int:
-        """Decide the number of leading expression directions: those that move the surface visibly, and that pictures confirm."""
+        """Decide the number of leading expression directions: those that move the surface visibly, none if this is noise."""
         basis = np.asarray(self._clip.head.expression_basis)
         coefficients = np.array([pose.expression for pose in self._poses], dtype=np.float64)
         needed = leading_directions(coefficients, basis, self._capacity.tolerance * self.pixel)
         needed = min(needed, configured, basis.shape[2])
-        chosen, evidence, numbers = self._confirmed(needed)
-        rest = displacement_without(coefficients, basis, chosen) / self.pixel
-        total = displacement_without(coefficients, basis, 0) / self.pixel
-        reason = f"tracked expressions move the surface by up to {total:.2f} px, {rest:.2f} px without these{evidence}"
-        self._decide(
-            name, configured, chosen, reason, moved_px=total, left_out_px=rest, needed=needed, **numbers
-        )
+        total, rest = (displacement_without(coefficients, basis, kept) / self.pixel for kept in (0, needed))
+        reason = f"tracked expressions move the surface by up to {total:.2f} px, {rest:.2f} px without these"
+        numbers = {"moved_px": total, "left_out_px": rest, "needed": float(needed)}
+        confirmed, evidence = self.confirmed(slice(0, needed), numbers) if needed else (True, "")
+        chosen = needed if confirmed else 0
+        self._decide(name, configured, chosen, reason + evidence, **numbers)
         return chosen
 
-    def _confirmed(self, needed: int) -> tuple[int, str, dict[str, float]]:
-        """How many of the leading directions pictures confirm, in words, and the agreement of all and of those left out."""
-        motion = self.motion if needed else None
-        if motion is None:
-            return needed, "", {}
-        every = motion.agreement(slice(0, needed))
-        tails = [motion.agreement(slice(first, needed)) for first in range(needed)]
-        chosen = (
-            1 + max(first for first, tail in enumerate(tails) if tail >= CONFIRMED)
-            if every >= CONFIRMED
-            else 0
-        )
-        rest = tails[chosen] if chosen < needed else 0.0
-        numbers = {"agreement": every, "agreement_left_out": rest}
-        if not chosen:
-            return 0, f"; in pictures this is noise of the tracker (agreement {every:.1f})", numbers
-        return chosen, f"; pictures confirm them (agreement {every:.1f}, {rest:.1f} of the others)", numbers
+    def confirmed(self, columns: slice, numbers: dict[str, float]) -> tuple[bool, str]:
+        """Whether pictures confirm tracked motion, and in words; its agreement is added to ``numbers``.
+
+        Too few timesteps confirm everything. Directions of expression are confirmed together: pictures show single trailing
+        ones too weakly, and leaving out those that they do not confirm loses quality.
+        """
+        if self.motion is None:
+            return True, ""
+        agreement = numbers["agreement"] = self.motion.agreement(columns)
+        if agreement >= CONFIRMED:
+            return True, f"; pictures confirm this motion (agreement {agreement:.1f})"
+        return False, f"; in pictures this is noise of the tracker (agreement {agreement:.1f})"
 
     @cached_property
     def motion(self) -> PictureMotion | None:

@@ -37,6 +37,8 @@ FLOOR = 0.2
 """Tracked coefficients that move the face by less than this fraction of the most moving one count less, since they are less exact."""
 CONFIRMED = 2.0
 """Standard deviations above chance from which motion is confirmed (docs/explanation/methods/ours.md has the measured values)."""
+JAW = slice(-3, None)
+"""Columns of the jaw's rotation; those of the expression come before."""
 _STEP = 0.02  # radians, of the finite differences by jaw rotation
 
 
@@ -54,16 +56,11 @@ class PictureMotion:
     tracked: FloatArray
     pictured: FloatArray
 
-    @property
-    def jaw(self) -> slice:
-        """Columns of the jaw's rotation; those of the expression come before."""
-        return slice(self.tracked.shape[1] - 3, None)
-
     def agreement(self, columns: slice) -> float:
         """How many standard deviations tracked and pictured coefficients agree above chance.
 
         Chance is their agreement if one of both is moved by some timesteps, cyclically, which keeps what both have in common
-        with their neighbours in time. 0 for coefficients that do not move.
+        with their neighbours in time. 0 for coefficients that do not move, and for pictures without any contrast.
         """
         tracked, pictured = self.tracked[:, columns], self.pictured[:, columns]
         spread, other = tracked.std(axis=0), pictured.std(axis=0)
@@ -74,7 +71,9 @@ class PictureMotion:
         count = len(tracked)
         shifts = np.arange(3, count - 2)
         by_chance = [float((np.roll(pictured, shift, axis=0) * tracked).sum()) for shift in shifts]
-        return float(((pictured * tracked).sum() - np.mean(by_chance)) / np.std(by_chance))
+        spread_by_chance = float(np.std(by_chance))
+        above = float((pictured * tracked).sum() - np.mean(by_chance))
+        return above / spread_by_chance if spread_by_chance > 0 else 0.0
 
 
 def picture_motion(clip: Clip, mesh: SubjectMesh, pixel: float) -> PictureMotion | None:

@@ -103,7 +103,7 @@ def test_motion_is_kept_whatever_the_tracking_error(full, tracker, level):
     assert expressions > 20
     assert jaw_bases == 2
     noisy, noisy_jaw = kept(performer.tracked(tracker, level))
-    assert noisy >= 0.8 * expressions
+    assert noisy >= expressions
     assert noisy_jaw >= jaw_bases
 
 
