@@ -8,7 +8,7 @@ from pathlib import Path
 from ..comparison import closing
 from ..condition import PLAIN, Condition, Named
 from ..contracts import Progress, no_progress
-from ..engine.config import RunConfig, parse_size, resolve_cells, resolve_metrics
+from ..engine.config import RunConfig, coded_conditions, parse_size, resolve_cells, resolve_metrics
 from ..engine.run import check_settings, run
 from ..errors import InputError
 from ..executors.settings import check_executor
@@ -51,7 +51,7 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
         preset=settings.preset,
         seeds=settings.seeds,
         regions=REGIONS,
-        conditions=(PLAIN, *conditions, *ablations),
+        conditions=(PLAIN, *coded_conditions(methods), *conditions, *ablations),
         isolation=settings.isolation,
     )
     cells = resolve_cells(config)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.condition import PLAIN
 from headbench.bench.engine.config import resolve_method
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.experiments import suite as module
@@ -98,7 +99,11 @@ def test_the_stored_suite_can_be_made_again_by_its_options(asked):
 )
 def test_tracking_from_images_is_a_condition_of_methods(asked, options, tracked):
     ((_, config),) = asked(*options, "--large", "0")
-    found = {condition.clip.name: condition.methods for condition in config.conditions}
+    found = {
+        condition.clip.name: condition.methods
+        for condition in config.conditions
+        if condition.clip or condition == PLAIN
+    }
     assert found == {"": ()} | ({} if tracked is None else {"tracked": tracked})
 
 
@@ -111,7 +116,7 @@ def test_large_images_are_a_run_of_the_first_subjects(asked):
     assert len({usual["out"], large["out"], run.out, own.out}) == 4
     assert asked("--methods", "ours", "--subjects", "1")[1][0]["subjects"] == 1
     assert own.methods == run.methods
-    assert [condition.name for condition in run.conditions] == ["", "tracked", "no-lines"]
+    assert [condition.name for condition in run.conditions] == ["", "coded", "tracked", "no-lines"]
     assert [condition.name for condition in own.conditions] == [""]
 
 
