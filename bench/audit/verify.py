@@ -550,7 +550,7 @@ def _measure_again(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> p
         scratch = Cell(Path(name))
         (scratch.folder / "renders").symlink_to((job.cell.folder / "renders").resolve())
         rows = measure(replace(job, cell=scratch), avatar, stable)
-    return rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    return rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL, condition=ALL)
 
 
 def _values(
