@@ -8,18 +8,20 @@ import shlex
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from .condition import PLAIN
 from .configuration import build, merge, parse_assignments, with_homes
 from .contracts import Progress
 from .engine.config import (
     DemoConfig,
     RunConfig,
     build_run_config,
+    coded_conditions,
     demo_run_config,
     resolve_methods,
     resolve_metrics,
@@ -76,6 +78,8 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
     config = build(DemoConfig, given["capture"], "--set", "capture.")
     device = str(values.get("device", RunConfig.device))
     comparison = build_run_config(merge(demo_run_config(config, device), values), "--set")
+    if "conditions" not in values:
+        comparison = replace(comparison, conditions=(PLAIN, *coded_conditions(comparison.methods)))
     # Errors before the capture is made, which takes minutes.
     resolve_methods(comparison)
     resolve_metrics(comparison)

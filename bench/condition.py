@@ -72,7 +72,8 @@ class Condition:
     clip : Named
         Change of the clip that the method is trained on; the frames that are scored stay those of the run.
     derive : Named
-        Change of a trained avatar without training, such as fewer splats. The avatar is that of the run's ``source``.
+        Change of a trained avatar without training, such as fewer splats. The avatar is that of the run's ``source`` or,
+        without one, that of the plain comparison in the same run.
     drive : Named
         Poses and views to render in place of the scored frames, judged without ground truth.
     """

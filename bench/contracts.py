@@ -256,6 +256,15 @@ class Avatar(Protocol):
         """
 
 
+@runtime_checkable
+class CodedAvatar(Avatar, Protocol):
+    """An avatar that can be stored through a codec, which rounds and compresses its files. Optional."""
+
+    @property
+    def codec(self) -> str:
+        """Name of the codec that its files went through with its steps; "" for files as they were trained."""
+
+
 class Variant(NamedTuple):
     """An avatar that can be derived from a trained one without training, such as one with fewer splats."""
 

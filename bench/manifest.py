@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +30,8 @@ class MethodRecord:
     """A method as it ran under a condition; see `ResolvedMethod.record`.
 
     ``needs`` are those of a form other than the clip's own. ``code`` is the digest of its code, see `bench.source`; None for a
-    folder of images, which has none.
+    folder of images, which has none. ``codec`` is that of the measured avatars (`CodedAvatar`), "" for files as trained, several
+    separated by semicolons; None in records of runs that did not note it, and before an avatar is measured.
     """
 
     name: str
@@ -42,6 +43,7 @@ class MethodRecord:
     needs: dict[str, Any] | None = None
     code: str | None = None
     condition: str = ""
+    codec: str | None = field(default=None, compare=False)
 
     @property
     def label(self) -> str:

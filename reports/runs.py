@@ -21,6 +21,7 @@ from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, joined_protocol, miss
 from ..bench.rows import ALL, Rows
 from ..bench.specs import MetricSpec
 from .cameras import EXPLAINED, SPLIT_TASK, unseen_cameras
+from .coded import check_codecs, with_coded
 
 
 @dataclass(frozen=True)
@@ -204,7 +205,14 @@ class RunSet:
 
     @classmethod
     def of_runs(cls, runs: tuple[RunData, ...], labels: Sequence[Mapping[str, str]]) -> RunSet:
-        """Runs that were read, with the label of each run's methods by name. Raises `InputError` as `read` does."""
+        """Runs that were read, with the label of each run's methods by name. Raises `InputError` as `read` does.
+
+        Coded avatars are columns of their methods, see `with_coded`.
+        """
+        if runs:
+            check_codecs([run.manifest for run in runs], runs[0].folder.manifest)
+        changed = [with_coded(run.manifest, run.rows) for run in runs]
+        runs = tuple(replace(run, manifest=m, rows=rows) for run, (m, rows) in zip(runs, changed))
         rows = Rows.joined([run.rows.renamed(own) for run, own in zip(runs, labels)])
         rows.check()
         records = {

@@ -79,7 +79,11 @@ def quality(folder: RunFolder):
 
 
 def test_every_cell_of_the_comparison_is_there(run):
-    rows = pd.read_parquet(run.rows)
+    every = pd.read_parquet(run.rows)
+    coded = every[(every["condition"] == "coded") & every["metric"].isin(["psnr", "storage"])]
+    assert set(coded["method"]) == {"ga", "gbs", "gha", "insta", "ours"}
+    assert (coded["status"] == "ok").all()
+    rows = every[every["condition"] == ""]
     assert set(rows["method"]) == METHODS
     assert set(rows["metric"]) == {s.name for s in resolve_metrics(RunConfig("", ""))}
     measured = rows[rows["metric"] != "lpips"]  # whose weights may not be at hand

@@ -15,10 +15,10 @@ from typing import Any, Self
 
 import pandas as pd
 
-from ..condition import Condition
+from ..condition import Condition, Named
 from ..contracts import Avatar, Clip, FrameKey, Progress, no_progress
 from ..engine.captures import Plugins, open_run_clips, synthesis_arguments
-from ..engine.config import RunOptions, resolve_cells
+from ..engine.config import CODED, RunOptions, resolve_cells
 from ..engine.jobs import load, make_jobs
 from ..engine.steps import DIGESTS, Job, measure, recorded_frames
 from ..engine.store import Cell, RunFolder
@@ -491,14 +491,15 @@ def _verify_cell(job: Job, opened: _Opened) -> Findings:
     digests = {**(state.get("files", {}) if state and trained else {}), **recorded_frames(job)}
     changed = list(_files(job, digests, found))
     found.mismatches += changed
-    if not method.implementation or job.condition.derive:
+    coded = job.condition.derive == Named("variant", {"name": CODED})  # which methods read as their own
+    if not method.implementation or (job.condition.derive and not coded):
         avatar: Avatar = NoAvatar()
     else:
         made_of = "none" if state is None else state["fingerprint"]
         record = str(job.cell.folder / "fit.json")
         if made_of != job.fit_fingerprint:
             found.mismatches.append(Mismatch(record, "fingerprint", job.fit_fingerprint[:12], made_of[:12]))
-        avatar = load(job)
+        avatar = job.create().load(job.cell.avatar, device=job.device) if coded else load(job)
         names = [job.cell.name(path) for path in avatar.files() if path.is_relative_to(job.cell.folder)]
         unknown = [name for name in names if name not in digests]
         found.mismatches += [Mismatch(record, f"files, {name}", "a digest", "none") for name in unknown]
@@ -549,7 +550,7 @@ def _measure_again(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> p
         scratch = Cell(Path(name))
         (scratch.folder / "renders").symlink_to((job.cell.folder / "renders").resolve())
         rows = measure(replace(job, cell=scratch), avatar, stable)
-    return rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    return rows.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL, condition=ALL)
 
 
 def _values(

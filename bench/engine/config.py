@@ -119,12 +119,12 @@ class RunConfig:
             changed = replace(condition, methods=(), drive=Named()) != PLAIN
             if changed and not condition.name:
                 raise ValueError("conditions: a name for each one that changes something; found none")
-            if condition.derive and not self.source:
-                raise ValueError(
-                    f"conditions: {condition.name} derives avatars; source has to name their run"
-                )
-            if self.source and (condition.settings or condition.clip or condition.part != 1):
-                expected = "nothing is trained with a source; derive or drive alone"
+            if condition.derive and not self.source and PLAIN not in self.conditions:
+                expected = "the plain comparison beside it, or a source that names their run"
+                raise ValueError(f"conditions: {condition.name} derives avatars; {expected}")
+            trains = condition.settings or condition.clip or condition.part != 1
+            if trains and (self.source or condition.derive):
+                expected = "nothing is trained with a source or for a derived avatar; derive or drive alone"
                 raise ValueError(f"conditions, {condition.name}: {expected}")
         if len({condition.drive.name for condition in self.conditions}) > 1:
             raise ValueError(
@@ -462,13 +462,24 @@ class DemoConfig:
 def demo_run_config(config: DemoConfig, device: str) -> dict[str, Any]:
     """Settings of the comparison, as `RunConfig` fields, of the methods that compute on ``device``."""
     specs = {name: plugin.spec for name, plugin in discover("methods").items() if plugin.spec}
+    methods = tuple(n for n, spec in specs.items() if spec.demo and spec.computes_on(device))
     return {
         "data": str(config.capture_folder),
         "out": config.out,
-        "methods": tuple(n for n, spec in specs.items() if spec.demo and spec.computes_on(device)),
+        "methods": methods,
         "preset": config.preset,
         "seeds": (config.seed,),
     }
+
+
+CODED = "coded"
+"""Name of the condition, and of the variant that it derives, of avatars stored through the one codec of all methods."""
+
+
+def coded_conditions(methods: Collection[str]) -> tuple[Condition, ...]:
+    """The condition `CODED` for the methods that derive variants; none if none of them does."""
+    able = tuple(spec.name for spec in (get("methods", name) for name in methods) if spec.variants)
+    return (Condition(CODED, able, derive=Named("variant", {"name": CODED})),) if able else ()
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -21,7 +21,7 @@ from .captures import changed, open_run_clips, run_configuration
 from .config import ResolvedMethod, RunConfig, RunOptions, resolve_cells
 from .scoring import check_regions
 from .steps import Job, derive, drive, fit, measure, render, stored_rows
-from .store import RunFolder
+from .store import Cell, RunFolder
 
 
 def make_jobs(
@@ -39,7 +39,7 @@ def make_jobs(
     cells : Sequence[tuple[ResolvedMethod, Condition]]
         See `resolve_cells`.
     folder : RunFolder
-        Run folder of the cells.
+        Run folder of the cells. Those that derive the avatar of another cell of this run come last.
     out : Path, optional
         Locked folder for results of slow adaptations of clips; those stored in ``folder`` are copied
         there first, since commands that read a run do not write to it. Default: ``folder`` itself.
@@ -53,9 +53,15 @@ def make_jobs(
     forms = _Forms(config, folder, RunFolder(out or folder.root))
     forms.plan([(clip, method, condition) for clip in clips for method, condition in cells])
     source = RunFolder(Path(config.source)) if config.source else None
+
+    def source_of(clip: Clip, method: ResolvedMethod, condition: Condition, seed: int) -> Cell | None:
+        """The cell whose avatar is used: of the source, or the plain one of this run; None for a training."""
+        origin = source or (folder if condition.derive else None)
+        return None if origin is None else origin.cell(clip.subject, method.spec.name, seed)
+
     hidden = tuple(Path(text) for text in (config.data, config.source, str(folder.root)) if text)
     kept: dict[str, Any] = {}
-    return [
+    jobs = [
         Job(
             clip,
             method,
@@ -70,7 +76,7 @@ def make_jobs(
             forms.of(clip, method, condition),
             regions[clip.subject],
             condition,
-            None if source is None else source.cell(clip.subject, method.spec.name, seed),
+            source_of(clip, method, condition, seed),
             config,
             hidden=hidden if method.is_isolated(config.isolation) else None,
             kept=kept,
@@ -79,6 +85,7 @@ def make_jobs(
         for method, condition in cells
         for seed in config.seeds
     ]
+    return sorted(jobs, key=lambda job: job.follows)  # stable
 
 
 class _Forms:

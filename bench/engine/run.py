@@ -153,9 +153,18 @@ def _run(
     folder.write_rows(rows)
     folder.speed_pass.unlink(missing_ok=True)
     seconds = round(time.perf_counter() - start, 3)
+    methods = tuple(replace(method, codec=_codec(method.label, jobs)) for method in manifest.methods)
+    manifest = replace(manifest, methods=methods)
     done = replace(manifest, status="done", seconds=seconds, peak_memory_bytes=peak_memory_bytes())
     done.write(folder.manifest)
     return rows
+
+
+def _codec(label: str, jobs: Sequence[Job]) -> str | None:
+    """Codecs of the measured avatars of a method and condition, see `MethodRecord`."""
+    steps = [job.cell.step("measure") for job in jobs if job.label == label]
+    found = {str(step["codec"]) for step in steps if step is not None and "codec" in step}
+    return "; ".join(sorted(found)) if found else None
 
 
 def _planned(

@@ -21,6 +21,7 @@ from ..contracts import (
     Camera,
     CheckedMethod,
     Clip,
+    CodedAvatar,
     Frame,
     FrameKey,
     HeadPose,
@@ -116,6 +117,11 @@ class Job:
         return self.cell.folder.parents[2]
 
     @property
+    def follows(self) -> bool:
+        """Whether its avatar is derived from that of another cell of the same run, which is worked on before."""
+        return self.source is not None and self.source.folder.parents[2] == self.run
+
+    @property
     def label(self) -> str:
         """Label of the method and its condition in tables and folder names."""
         return label_of(self.method.spec.name, self.condition.name)
@@ -144,7 +150,7 @@ class Job:
         """
         refuse_links(self.cell.folder)
         self.cell.drop_damaged_records()
-        if self.source is not None:
+        if self.source is not None and not self.follows:
             source_digest(self)
         state = self.cell.step("fit")
         if state is None or state.get("fingerprint") == self.fit_fingerprint:
@@ -293,6 +299,16 @@ def source_digest(job: Job) -> str:
     if capture not in (None, job.form.clip.fingerprint):
         raise InputError(record, "origin.capture", "an avatar of this capture", "one of another")
     return digest(state["fingerprint"], state.get("files"))
+
+
+def _source_now(job: Job) -> str:
+    """`source_digest`; "" where the cell of this run that the avatar is derived from has none yet."""
+    try:
+        return source_digest(job)
+    except InputError:
+        if not job.follows:
+            raise
+        return ""
 
 
 def derive(job: Job) -> Avatar:
@@ -561,6 +577,7 @@ def measure(
         fingerprints=known | fingerprints,
         details=details,
         rows=digest_file(job.cell.rows),
+        codec=avatar.codec if isinstance(avatar, CodedAvatar) else "",
         **record,
     )
     return result
@@ -589,7 +606,7 @@ def stored_rows(job: Job, metrics: Sequence[MetricSpec], *, retry: bool = False)
         return _driven_before(job, retry)
     fitted = job.cell.step("fit")
     made_of = digest(job.fit_fingerprint, _avatar_record(job))
-    if job.source is not None and fitted is not None and fitted.get("derived_from") != source_digest(job):
+    if job.source is not None and fitted is not None and fitted.get("derived_from") != _source_now(job):
         return None
     if fitted is None or not job.cell.is_done("fit", job.fit_fingerprint):
         return None

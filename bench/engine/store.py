@@ -69,6 +69,8 @@ class StepState(TypedDict, total=False):
         Values before a repeated measurement, each with its time, machine and load.
     derived_from : str
         Digest of the trained avatar from which this one was derived without training.
+    codec : str
+        Codec of the measured avatar, see `CodedAvatar`.
     """
 
     fingerprint: Required[str]
@@ -91,6 +93,7 @@ class StepState(TypedDict, total=False):
     load: dict[str, Any]
     earlier: list[dict[str, Any]]
     derived_from: str
+    codec: str
 
 
 STAGES = ("fit", "digests", "measure")

@@ -57,16 +57,19 @@ def execute(
         if job.cell.is_done("fit", job.fit_fingerprint) and not job.cell.damage(trained_files(job)):
             log_kept(job)
 
-    def left(wanted: Sequence[MetricSpec]) -> list[Task]:
+    def left(wanted: Sequence[MetricSpec], follows: Sequence[bool] = (False, True)) -> list[Task]:
         return [
             task
             for task in tasks
-            if task.place not in failures and stored_rows(places[task.place], wanted, retry=True) is None
+            if task.place not in failures
+            and places[task.place].follows in follows
+            and stored_rows(places[task.place], wanted, retry=True) is None
         ]
 
     failures = _failed_before(folder)
     schedule = Schedule("cells", lambda task: stored_rows(places[task.place], steady) is not None, execution)
-    failures |= schedule.run_all(left(steady))
+    for follows in (False, True):  # what is derived from an avatar waits for its training
+        failures |= schedule.run_all(left(steady, (follows,)))
     if len(steady) < len(metrics):
         write_json(folder.speed_pass, {"failed": failures})
         whole = replace(

@@ -9,7 +9,14 @@ from pathlib import Path
 from ..comparison import closing
 from ..condition import PLAIN, Condition, Named
 from ..contracts import Progress, no_progress
-from ..engine.config import RunConfig, parse_size, resolve_cells, resolve_methods, resolve_metrics
+from ..engine.config import (
+    RunConfig,
+    coded_conditions,
+    parse_size,
+    resolve_cells,
+    resolve_methods,
+    resolve_metrics,
+)
 from ..engine.run import check_settings, run
 from ..errors import InputError
 from ..executors.settings import check_executor
@@ -61,13 +68,14 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
         regions=REGIONS,
         isolation=settings.isolation,
     )
-    config = replace(plain, conditions=(PLAIN, *_conditions(settings, plain)))
+    coded = (PLAIN, *coded_conditions(methods))
+    config = replace(plain, conditions=(*coded, *_conditions(settings, plain)))
     cells = resolve_cells(config)
     resolve_metrics(config)
     check_executor(execution, config.device)
     check_settings(cell for cell in cells if not cell[0].is_isolated(config.isolation))
     width, height = parse_size(settings.size)
-    large = replace(plain, data=str(out / "capture-large"), out=str(out / LARGE_RUN), conditions=(PLAIN,))
+    large = replace(plain, data=str(out / "capture-large"), out=str(out / LARGE_RUN), conditions=coded)
     seeds = tuple(max(settings.seeds) + further for further in (1, 2))
     more_seeds = replace(plain, out=str(out / SEEDS_RUN), seeds=seeds, conditions=(PLAIN,))
     failed: list[str] = []

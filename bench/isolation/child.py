@@ -19,6 +19,7 @@ from ..contracts import (
     Avatar,
     ByteArray,
     CheckedMethod,
+    CodedAvatar,
     FloatArray,
     FrameKey,
     IntArray,
@@ -131,7 +132,9 @@ class _Method:
         self._avatar = avatar = self._method.load(Path(path), device=device)
         shared = [str(file) for file in avatar.shared_files()] if isinstance(avatar, SharingAvatar) else None
         files = [str(file) for file in avatar.files()]
-        return {"splats": isinstance(avatar, SplatAvatar), "files": files, "shared": shared}, {}
+        codec = avatar.codec if isinstance(avatar, CodedAvatar) else ""
+        found = {"splats": isinstance(avatar, SplatAvatar), "files": files, "shared": shared, "codec": codec}
+        return found, {}
 
     def render(self, camera: Any, pose: Any, background: Any) -> Any:
         assert self._avatar is not None

@@ -109,7 +109,7 @@ class IsolatedMethod:
         try:
             found, _ = process.call("load", path=str(path), device=device)
             kind = IsolatedSplats if found["splats"] else IsolatedAvatar
-            return kind(process, path, found["files"], found["shared"])
+            return kind(process, path, found["files"], found["shared"], str(found["codec"]))
         except BaseException:
             process.__exit__()
             raise
@@ -121,8 +121,10 @@ class IsolatedMethod:
 class IsolatedAvatar:
     """An `Avatar` in a process of its own, which ends with it."""
 
-    def __init__(self, process: _Process, folder: Path, files: Sequence[str], shared: Sequence[str] | None):
-        self.process, self._files = process, tuple(map(Path, files))
+    def __init__(
+        self, process: _Process, folder: Path, files: Sequence[str], shared: Sequence[str] | None, codec: str
+    ):
+        self.process, self._files, self.codec = process, tuple(map(Path, files)), codec
         if shared is not None:  # then it is a `SharingAvatar`
             self.shared_files = lambda: tuple(map(Path, shared))
         for path in self._files:

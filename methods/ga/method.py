@@ -15,7 +15,6 @@ from torch import Tensor
 
 from ...bench.contracts import Clip, FloatArray, HeadPose
 from ..avatars.compact.bound import read_bound
-from ..avatars.compact.file import COMPACT_FILE
 from ..ops.harmonics import (
     coefficient_count,
     harmonic_colors,
@@ -26,6 +25,7 @@ from ..ops.harmonics import (
 from ..ops.mesh import TriangleFrames
 from ..ops.splats import activate, to_world
 from ..shared.avatar_files import (
+    COMPACT_FILE,
     SUBJECT_FILE,
     TRACKED,
     RefinedTracking,

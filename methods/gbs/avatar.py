@@ -9,10 +9,9 @@ import torch
 
 from ...bench.contracts import FloatArray, HeadPose, no_stage
 from ..avatars.compact.blended import read_blended
-from ..avatars.compact.file import COMPACT_FILE
 from ..avatars.harmonics import turn_harmonics
 from ..ops.harmonics import sh_degree
-from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
+from ..shared.avatar_files import COMPACT_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
 from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
 from .blendshapes import PointMotions, PosedAttributes, Rig, apply_pose
 from .storage import AVATAR_FILE, Stored, read_avatar

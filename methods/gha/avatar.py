@@ -20,10 +20,16 @@ from ...bench.io.arrays import Member
 from ...bench.io.documents import parse_json
 from ...bench.io.files import write_bytes
 from ...bench.native.dispatch import to_device
-from ..avatars.compact.container import read_content
-from ..avatars.compact.file import COMPACT_FILE
+from ..avatars.compact.container import codec_of, read_content
 from ..avatars.compact.networks import as_tensors, read_networks
-from ..shared.avatar_files import SUBJECT_FILE, RefinedTracking, Subject, read_shared_head, read_subject
+from ..shared.avatar_files import (
+    COMPACT_FILE,
+    SUBJECT_FILE,
+    RefinedTracking,
+    Subject,
+    read_shared_head,
+    read_subject,
+)
 from ..shared.rendering import Drawn, LastPose, PosedSplats, posed_splats, read_back
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from ..shared.threads import torch_on_one_thread
@@ -120,6 +126,11 @@ class GHAAvatar:
     def files(self) -> Sequence[Path]:
         """The tensors and the subject."""
         return self._files
+
+    @property
+    def codec(self) -> str:
+        """The codec of the files, see `CodedAvatar`."""
+        return codec_of(self._files)
 
     def _posed(self, pose: HeadPose) -> FeatureSplats:
         return self._last(pose if self._corrected is None else self._corrected(pose), no_stage)

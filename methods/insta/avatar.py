@@ -17,10 +17,10 @@ from ...bench.errors import HeadbenchError, InputError
 from ...bench.io.arrays import Member, read_arrays
 from ...bench.io.documents import parse_json, read_json
 from ...bench.native.dispatch import fits
-from ..avatars.compact.container import Arrays, Content, read_content
-from ..avatars.compact.file import COMPACT_FILE, decode_subject
+from ..avatars.compact.container import Arrays, Content, codec_of, read_content
+from ..avatars.compact.file import decode_subject
 from ..avatars.compact.networks import as_tensors, read_networks
-from ..shared.avatar_files import SUBJECT_FILE, read_shared_head, read_subject, write_arrays
+from ..shared.avatar_files import COMPACT_FILE, SUBJECT_FILE, read_shared_head, read_subject, write_arrays
 from ..shared.subject_mesh import SubjectMesh, pose_key
 from ..shared.threads import threads
 from . import kernel
@@ -115,6 +115,11 @@ class InstaAvatar:
     def files(self) -> Sequence[Path]:
         """Field, settings and subject, or the coded file."""
         return self._files
+
+    @property
+    def codec(self) -> str:
+        """The codec of the files, see `CodedAvatar`."""
+        return codec_of(self._files)
 
     def _posed(self, pose: HeadPose) -> PosedSurface:
         """The surface of a pose; the last one is cached, since several cameras often render one pose."""

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from ...bench.contracts import HeadPose
 from ...bench.native.dispatch import to_device
-from ..avatars.compact.file import COMPACT_FILE, read_compact
+from ..avatars.compact.file import read_compact
 from ..ops.harmonics import harmonic_shader
 from ..ops.planes import ENCODING_SIZE, Bounds, Shader, shader
 from ..ops.splats import activate, to_world
-from ..shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
+from ..shared.avatar_files import COMPACT_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
 from ..shared.rendering import USUAL, Cutoffs, LastPose, PlacedSplats, StoredSplatAvatar
 from ..shared.subject_mesh import KnownPoses, SubjectMesh
 from .appearance import driving_coefficients

@@ -20,6 +20,8 @@ from ...datasets.head.arrays import STORED, HeadArrays, read_head, save_head
 from .loop import Fit, TrainingSummary
 from .subject_mesh import SubjectMesh
 
+COMPACT_FILE = "compact.safetensors"
+"""The coded file of an avatar (`avatars.compact`), which stands in place of the files of its training."""
 RECORDED_LOSSES = 200  # maximum number of losses in an avatar's record
 _SIZES = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
 TRACKED = ("expression", "rotation", "neck", "jaw", "eyes", "translation")

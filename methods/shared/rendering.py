@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ...bench.contracts import Camera, FloatArray, Frame, HeadPose, no_stage
 from ...bench.native.dispatch import is_cuda, on_host, to_device
+from ..avatars.compact.container import codec_of
 from ..ops.splats import WorldSplats
 from ..splats import rasterize
 from ..splats.constants import ALPHA_MIN, TRANSMITTANCE_MIN
@@ -254,6 +255,11 @@ class StoredSplatAvatar:
     def files(self) -> Sequence[Path]:
         """The files of the avatar."""
         return self._stored
+
+    @property
+    def codec(self) -> str:
+        """The codec of the files, see `CodedAvatar`."""
+        return codec_of(self._stored)
 
     def shared_files(self) -> Sequence[Path]:
         """The head model."""

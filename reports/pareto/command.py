@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.errors import InputError
 from ...bench.io.files import check_output_folder, write_text
 from ...bench.specs import CommandResult
 from .settings import ParetoSettings
 
 if TYPE_CHECKING:
     from .points import ParetoPoint
+    from .rates import RateDifference
 
 
 COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
@@ -21,11 +23,15 @@ COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
 
 def pareto_runs(settings: ParetoSettings, progress: Progress = no_progress) -> CommandResult:
     """Plot quality against size and frame time of finished runs, with the Pareto front, and write CSV."""
-    return pareto(settings.runs, Path(settings.out), settings.task, settings.metric, settings.time)
+    out = Path(settings.out)
+    return pareto(settings.runs, out, settings.task, settings.metric, settings.time, settings.reference)
 
 
-def pareto(runs: Sequence[str], out: Path, task: str, metric_name: str = "", time: str = "") -> CommandResult:
-    """Write ``points.csv`` and ``pareto.png`` of finished runs. Raises `InputError` for runs that cannot be compared."""
+def pareto(
+    runs: Sequence[str], out: Path, task: str, metric_name: str = "", time: str = "", reference: str = ""
+) -> CommandResult:
+    """Write ``points.csv`` and ``pareto.png`` of finished runs, and ``rates.csv`` and ``rate_distortion.png`` if they have
+    coded avatars at several steps. Raises `InputError` for runs that cannot be compared."""
     from ..writers import csv_text
     from .plot import write_plot
     from .points import ParetoPoint, front_of, read_points
@@ -46,14 +52,52 @@ def pareto(runs: Sequence[str], out: Path, task: str, metric_name: str = "", tim
         labels["milliseconds"] = f"{time.replace('_', ' ').capitalize()}, ms"
     quality = f"{metric.label}{unit}, {task.replace('_', ' ')}"
     write_plot(out / "pareto.png", points, labels, quality, higher_is_better=rising)
+    rates = _rates(runs, out, task, reference)
     data = {
         "out": out,
         "points": [asdict(point) for point in points],
         "fronts": fronts,
         "left_out": left_out,
         "note": note,
+        "rates": [asdict(rate) for rate in rates],
     }
-    return CommandResult(_text(points, fronts, left_out, metric.label, metric.digits, note), data)
+    text = _text(points, fronts, left_out, metric.label, metric.digits, note)
+    return CommandResult("\n".join([text, *map(_rate_text, rates)]), data)
+
+
+def _rates(runs: Sequence[str], out: Path, task: str, reference: str) -> list[RateDifference]:
+    """Write the files of rate and distortion; return the differences to the reference, none with fewer than two steps."""
+    from ..runs import RunData
+    from ..writers import csv_text
+    from .plot import write_rates
+    from .rates import rate_differences, read_rates
+
+    points, metrics = read_rates([RunData.read(Path(run)) for run in runs], task)
+    methods = list(dict.fromkeys(point.method for point in points))
+    if reference and reference not in methods:
+        raise InputError("command line", "--reference", ", ".join(methods) or "coded avatars", reference)
+    if not metrics or len({point.variant for point in points if point.variant}) < 2:
+        return []
+    names = [metric.name for metric in metrics]
+    lines: list[list[object]] = [["method", "variant", "subject", "megabytes", *names]]
+    for point in points:
+        for subject, size in point.megabytes.items():
+            values = [point.quality[name].get(subject, "") for name in names]
+            lines.append([point.method, point.variant, subject, size, *values])
+    write_text(out / "rates.csv", csv_text(lines))
+    write_rates(out / "rate_distortion.png", points, metrics, task)
+    return rate_differences(points, metrics, reference or methods[0])
+
+
+def _rate_text(rate: RateDifference) -> str:
+    """A line of the report."""
+    name = f"BD-rate by {rate.metric}, {rate.method} against {rate.reference}:"
+    if rate.percent is None:
+        return f"{name} none ({rate.reason})"
+    bounds = "no interval with fewer than 3 subjects"
+    if rate.low is not None and rate.high is not None:
+        bounds = f"95 % interval over {rate.subjects} subjects {rate.low:+.1f} to {rate.high:+.1f} %"
+    return f"{name} {rate.percent:+.1f} % ({bounds})"
 
 
 def _text(

@@ -9,8 +9,10 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.transforms import Bbox
 
+from ...bench.specs import MetricSpec
 from ..plots import GREY, cost_axis, plot_file, show_missing, start_axes
 from .points import ParetoPoint, front_of
+from .rates import RatePoint
 
 MARKER = 7.0
 """Diameter of a point, in points of 1/72 inch."""
@@ -52,6 +54,32 @@ def write_plot(
         figure.draw_without_rendering()  # compute the layout before placing labels
         for axes, cost in plots:
             label_points(axes, points, cost, list(itertools.chain(*fronts[cost])))
+
+
+def write_rates(path: Path, points: Sequence[RatePoint], metrics: Sequence[MetricSpec], task: str) -> None:
+    """Draw quality over megabytes for the steps of the codec, a curve for each method and a panel for each metric.
+
+    Sizes are on a logarithmic axis. Squares are avatars as trained.
+    """
+    note = "Lines: one codec at several steps, means over subjects; squares: as trained."
+    names = list(dict.fromkeys(point.method for point in points))
+    with plot_file(path, (6.2 * len(metrics), 4.9), 200, names, note, line="-") as (figure, colours):
+        for axes, metric in zip(figure.subplots(1, len(metrics), squeeze=False)[0], metrics):
+            unit = f", {metric.unit}" if metric.unit else ""
+            axes.set(xlabel="Size, MB")
+            start_axes(axes, f"{metric.label}{unit}, {task.replace('_', ' ')}")
+            for name, colour in colours.items():
+                own = {point.variant: point.mean(metric.name) for point in points if point.method == name}
+                trained = own.pop("", None)
+                curve = sorted(value for value in own.values() if value is not None)
+                if curve:
+                    axes.plot(*zip(*curve), "o-", color=colour, markersize=MARKER - 2, linewidth=1)
+                if trained is not None:
+                    axes.plot(*trained, "s", color=colour, markerfacecolor="white", markersize=MARKER)
+            if axes.lines:
+                cost_axis(axes)
+            else:
+                show_missing(axes, "not measured in these runs")
 
 
 def _draw(

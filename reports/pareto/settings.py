@@ -15,7 +15,7 @@ class ParetoSettings:
     """Folders of finished runs: every method in each is a point, such as the settings of a sweep."""
 
     out: str
-    """Folder to write: points.csv and pareto.png."""
+    """Folder to write: points.csv and pareto.png; with coded avatars also rates.csv and rate_distortion.png."""
 
     task: str = "novel_view"
     """Task whose frames give the quality."""
@@ -25,6 +25,9 @@ class ParetoSettings:
 
     time: str = ""
     """Metric of frame time, in ms: latency_p50 (default, or 1 / frames per second), processor_time, ..."""
+
+    reference: str = ""
+    """Method that BD-rates compare with, if the runs have coded avatars at several steps; default: the first."""
 
     def __post_init__(self) -> None:
         if not self.runs:

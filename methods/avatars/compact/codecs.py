@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from ....bench.contracts import Avatar, Clip, FloatArray, HeadAsset, HeadPose, SplatAvatar
 from ....bench.errors import InputError
 from ....bench.io.arrays import Member, read_arrays
-from ....bench.io.files import read_bytes
+from ....bench.io.files import digest, read_bytes
 from ...ga.method import GAAvatar
 from ...gbs.avatar import GBSAvatar
 from ...gha.avatar import AVATAR_FILE as GHA_FILE
@@ -26,18 +27,20 @@ from ...insta.avatar import OCCUPIED, SETTINGS, SETTINGS_FILE, InstaAvatar, read
 from ...insta.avatar import TABLE as GRID
 from ...insta.field import Architecture
 from ...ours.avatar import OursAvatar
-from ...shared.avatar_files import SUBJECT_FILE, read_subject, save_shared_head
+from ...shared.avatar_files import COMPACT_FILE, SUBJECT_FILE, read_subject, save_shared_head
 from ...shared.capacity import training_poses
 from ...shared.tensor_files import read_safetensors
 from ..views import importance, training_views
 from .blended import encode_blended
 from .bound import encode_bound
-from .container import Content, write_content
-from .file import COMPACT_FILE, encode
+from .container import CODEC, Content, write_content
+from .file import encode
 from .networks import encode_networks
 from .precision import Precision
 from .simplify import simplify
 
+CODEC_VERSION = 2
+"""Raised when the same avatar and steps give other files."""
 DRIVING_FILE = "driving.npz"
 """Driving signal beside the avatars of some methods, which is not part of their size."""
 MAX_SETTINGS = 2**20
@@ -55,7 +58,15 @@ def encode_avatar(avatar: Avatar, head: HeadAsset, precision: Precision, clip: C
         raise InputError("avatar", "", f"one of {methods}", f"a {type(avatar).__name__}")
     if any(path.name == COMPACT_FILE for path in avatar.files()):
         raise InputError(avatar.files()[0], "", "the files of a training", "a coded avatar")
-    return encoder(avatar, head, precision, clip)
+    content = encoder(avatar, head, precision, clip)
+    return replace(content, text={**content.text, CODEC: codec_name(precision)})
+
+
+def codec_name(precision: Precision) -> str:
+    """Name of the codec with its steps: "2, steps x1", and a digest of the single steps where they are not the defaults."""
+    name = f"{CODEC_VERSION}, steps x{precision.step:g}"
+    own = replace(precision, step=1.0)
+    return name if own == Precision() else f"{name} ({digest(asdict(own))[:8]})"
 
 
 def write_coded(

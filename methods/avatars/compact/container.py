@@ -27,6 +27,7 @@ from ....bench.errors import InputError
 from ....bench.io.arrays import Member
 from ....bench.io.documents import parse_json
 from ....bench.io.files import write_bytes
+from ...shared.avatar_files import COMPACT_FILE
 from ...shared.tensor_files import check_tensors, read_safetensors
 from . import entropy
 
@@ -129,6 +130,20 @@ def read_content(path: Path) -> Content:
             dtype, shape = expected[name]
             raise InputError(path, name, f"{dtype} of shape {tuple(shape)}", str(error)) from error
     return Content({name: arrays[name] for name in layout["arrays"]}, layout["text"], layout["steps"])
+
+
+CODEC = "codec"
+"""Key of the text that names the codec and its steps, see `CodedAvatar`."""
+
+
+def codec_of(files: Sequence[Path]) -> str:
+    """Codec of an avatar's files; "" for those of a training. Raises `InputError` for a damaged coded file."""
+    path = next((path for path in files if path.name == COMPACT_FILE), None)
+    if path is None:
+        return ""
+    _, metadata = read_safetensors(path)
+    text = parse_json(metadata.get(KEY, "{}"), path, KEY).get("text", {})
+    return str(text.get(CODEC, "1")) if isinstance(text, dict) else "1"
 
 
 def _table_shape(shape: Sequence[int]) -> tuple[int, int]:

@@ -25,8 +25,6 @@ from .encoding import (
 )
 from .precision import Precision
 
-COMPACT_FILE = "compact.safetensors"
-
 PARTS: Mapping[str, tuple[str, ...]] = {
     "positions": ("positions",),
     "scales": ("log_scales",),

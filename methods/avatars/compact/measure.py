@@ -18,11 +18,11 @@ from ....bench.errors import InputError
 from ....bench.io.images import quantise
 from ....bench.protocol import evenly_with_ends
 from ....bench.specs import CommandResult
-from ...shared.avatar_files import read_shared_head
+from ...shared.avatar_files import COMPACT_FILE, read_shared_head
 from ...shared.losses import picture_ssim, psnr, squared_error
 from ..export import neutral_pose
 from .codecs import DRIVING_FILE, ENCODERS, write_coded
-from .file import COMPACT_FILE, part_sizes
+from .file import part_sizes
 from .precision import EXACT, Precision
 from .settings import CompactSettings
 

@@ -14,6 +14,7 @@ from ...ga.method import GAAvatar
 from ...ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
 from ...ops.harmonics import coefficient_count
 from ...shared.avatar_files import (
+    COMPACT_FILE,
     SUBJECT_FILE,
     Subject,
     read_shared_head,
@@ -25,7 +26,6 @@ from ...shared.subject_mesh import SubjectMesh
 from ..compact.bound import TRIANGLES, read_bound
 from ..compact.codecs import encode_avatar
 from ..compact.container import write_content
-from ..compact.file import COMPACT_FILE
 from ..compact.precision import Precision
 from ..views import training_views
 from .recipes import GA, Recipe, contributions, kept_rows, read_reduced, write_reduced

@@ -13,11 +13,17 @@ from torch import Tensor
 from ....bench.contracts import Clip, HeadAsset, Variant
 from ...ours.avatar import OursAvatar
 from ...ours.storage import FIELD_FILE, PER_SPLAT, StoredField, checked_field, read_field, save_field
-from ...shared.avatar_files import SUBJECT_FILE, read_shared_head, save_shared_head, write_subject
+from ...shared.avatar_files import (
+    COMPACT_FILE,
+    SUBJECT_FILE,
+    read_shared_head,
+    save_shared_head,
+    write_subject,
+)
 from ...shared.subject_mesh import SubjectMesh
 from ..compact.codecs import encode_avatar
 from ..compact.container import write_content
-from ..compact.file import COMPACT_FILE, read_compact
+from ..compact.file import read_compact
 from ..compact.precision import Precision
 from ..views import training_views
 from .recipes import (

@@ -52,7 +52,11 @@ def test_a_condition_that_cannot_be_had_is_refused(config, toy, condition, match
         ({"conditions": [{"name": "c", "budget": "2"}]}, "above 0 and at most 1"),
         ({"conditions": [{"name": "c", "budget": "1/0"}]}, "above 0 and at most 1"),
         ({"conditions": [{"name": "c", "budget": "1e-999999999"}]}, "above 0 and at most 1"),
-        ({"conditions": [{"name": "c", "derive": {"name": "variant"}}]}, "source has to name"),
+        ({"conditions": [{"name": "c", "derive": {"name": "variant"}}]}, "or a source that names"),
+        (
+            {"conditions": [{}, {"name": "c", "derive": {"name": "variant"}, "budget": "1/2"}]},
+            "nothing is trained",
+        ),
         ({"conditions": [{"name": "c", "budget": "1/2"}], "source": "run"}, "nothing is trained"),
         ({"conditions": [{"name": "c", "clip": {"name": "cameras"}}], "source": "run"}, "nothing is trained"),
         ({"conditions": "c"}, "a group of settings"),

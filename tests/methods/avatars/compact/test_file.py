@@ -11,18 +11,14 @@ from safetensors import safe_open
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.methods.avatars.compact.container import read_content, write_content
-from headbench.methods.avatars.compact.file import (
-    COMPACT_FILE,
-    encode,
-    part_sizes,
-)
+from headbench.methods.avatars.compact.file import encode, part_sizes
 from headbench.methods.avatars.compact.precision import EXACT, Precision
 from headbench.methods.avatars.compact.simplify import simplify
 from headbench.methods.ours.avatar import OursAvatar
 from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.method import Ours
 from headbench.methods.ours.storage import FIELD_FILE, RESIDUAL
-from headbench.methods.shared.avatar_files import read_shared_head
+from headbench.methods.shared.avatar_files import COMPACT_FILE, read_shared_head
 from headbench.methods.shared.capacity import training_poses
 from headbench.methods.shared.config import SplatTraining
 

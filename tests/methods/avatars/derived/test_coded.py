@@ -10,7 +10,6 @@ from headbench.bench.errors import InputError
 from headbench.bench.registry import get, resolve
 from headbench.methods.avatars.compact.codecs import encode_avatar, write_coded
 from headbench.methods.avatars.compact.container import read_content, write_content
-from headbench.methods.avatars.compact.file import COMPACT_FILE
 from headbench.methods.avatars.compact.precision import EXACT, Precision
 from headbench.methods.avatars.derived.coded import STEPS, coded_name
 from headbench.methods.ga.config import GAConfig
@@ -22,7 +21,7 @@ from headbench.methods.gha.method import GHA
 from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.method import Insta
 from headbench.methods.ours.method import Ours
-from headbench.methods.shared.avatar_files import read_shared_head
+from headbench.methods.shared.avatar_files import COMPACT_FILE, read_shared_head
 from headbench.methods.shared.config import SplatTraining
 
 from ...gha.small import SMALL as SMALL_GHA

@@ -1,0 +1,162 @@
+"""Rate and distortion of coded avatars over codec steps, and the Bjontegaard difference of rates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from ...bench.engine.config import CODED
+from ...bench.specs import MetricSpec
+from ..aggregate import subject_means, whole_images
+from ..runs import RunData
+from ..statistics.bootstrap import SequencePairs, SubjectPairs, interval
+from .points import SIZE, pareto_front
+
+Curve = Sequence[tuple[float, float]]
+"""Megabytes and quality at each step of the codec."""
+LEAST_POINTS = 3
+"""Number of steps that make a curve."""
+METRICS = ("psnr", "lpips")
+
+
+@dataclass(frozen=True)
+class RatePoint:
+    """A method's coded avatars at one step (``variant``), or those as trained (""): megabytes and quality by subject."""
+
+    method: str
+    variant: str
+    megabytes: Mapping[str, float]
+    quality: Mapping[str, Mapping[str, float]]  # by metric and subject
+
+    def mean(self, metric: str) -> tuple[float, float] | None:
+        """Megabytes and quality, means over subjects; None where a subject has no value."""
+        values = self.quality.get(metric, {})
+        if not self.megabytes or set(values) != set(self.megabytes):
+            return None
+        return float(np.mean([*self.megabytes.values()])), float(np.mean([*values.values()]))
+
+
+@dataclass(frozen=True)
+class RateDifference:
+    """Bjontegaard difference of a method to a reference, percent; negative: fewer bytes at equal quality.
+
+    ``low`` and ``high`` are the 95 % interval over subjects, None with fewer than three; ``reason`` says why there is no
+    ``percent``.
+    """
+
+    method: str
+    reference: str
+    metric: str
+    percent: float | None
+    low: float | None = None
+    high: float | None = None
+    subjects: int = 0
+    reason: str = ""
+
+
+def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], list[MetricSpec]]:
+    """Coded avatars of runs at their steps, and the metrics of `METRICS` that the runs have; empty without coded ones."""
+    points: list[RatePoint] = []
+    metrics = [m for m in runs[0].metrics if m.name in METRICS and m.per_frame] if runs else []
+    for run in runs:
+        derived = {c.name for c in run.manifest.configuration.conditions if c.derive}
+        steps = {name for name in derived if name == CODED or name.startswith(f"{CODED}-x")}
+        for record in run.manifest.methods:
+            if record.trivial or (record.condition and record.condition not in steps):
+                continue
+            sizes = _by_subject(run, record.label, SIZE, "")
+            quality = {metric.name: _by_subject(run, record.label, metric.name, task) for metric in metrics}
+            points.append(RatePoint(record.name, record.condition, sizes, quality))
+    coded = {point.method for point in points if point.variant}
+    return [point for point in points if point.method in coded], metrics
+
+
+def _by_subject(run: RunData, label: str, metric: str, task: str) -> dict[str, float]:
+    """Mean of a metric by subject; subjects with missing values are left out."""
+    rows = whole_images(run.rows, label, metric, task)
+    bad = set(rows[rows["status"] != "ok"]["subject"])
+    return subject_means(rows[~rows["subject"].isin(bad)])
+
+
+def curve_of(points: Sequence[RatePoint], method: str, metric: str, subject: str) -> Curve:
+    """Megabytes and quality of a method's coded avatars of one subject, by rising size."""
+    own = [p for p in points if p.method == method and p.variant and subject in p.megabytes]
+    values = [(p.megabytes[subject], p.quality[metric][subject]) for p in own if subject in p.quality[metric]]
+    return sorted(values)
+
+
+def rate_difference(reference: Curve, other: Curve, *, higher_is_better: bool = True) -> float | None:
+    """Mean difference of ln(megabytes) at equal quality, over the qualities that both curves reach.
+
+    Bjontegaard's difference of rates (G. Bjontegaard, "Calculation of average PSNR differences between RD-curves", ITU-T
+    VCEG-M33, 2001) with piecewise cubic Hermite interpolation of the logarithm of the rate in place of one cubic, as in
+    ITU-T HSTP-VID-WPOM (2020), section 4.2. exp(result) - 1 is the BD-rate. Points that another point of the same curve
+    beats are left out, so that quality rises with the rate.
+
+    None with fewer than `LEAST_POINTS` points on a curve, and for curves without a common quality.
+    """
+    rates = []
+    for curve in (reference, other):
+        sizes = [size for size, _ in curve]
+        qualities = [quality if higher_is_better else -quality for _, quality in curve]
+        front = pareto_front(sizes, qualities)
+        kept = {qualities[i]: math.log(sizes[i]) for i in front}
+        if len(kept) < LEAST_POINTS:
+            return None
+        rates.append((np.array([*kept]), np.array([*kept.values()])))
+    low = max(float(quality[0]) for quality, _ in rates)
+    high = min(float(quality[-1]) for quality, _ in rates)
+    if not low < high:
+        return None
+    one, two = (float(PchipInterpolator(*rate).integrate(low, high)) for rate in rates)
+    return (two - one) / (high - low)
+
+
+def rate_differences(
+    points: Sequence[RatePoint], metrics: Sequence[MetricSpec], reference: str
+) -> list[RateDifference]:
+    """The difference of every method to the reference in every metric: mean over subjects, with a bootstrap interval."""
+    methods = [name for name in dict.fromkeys(point.method for point in points) if name != reference]
+    subjects = sorted({subject for point in points for subject in point.megabytes})
+    found = []
+    for metric in metrics:
+        for method in methods:
+            values = {
+                subject: rate_difference(
+                    curve_of(points, reference, metric.name, subject),
+                    curve_of(points, method, metric.name, subject),
+                    higher_is_better=metric.higher_is_better,
+                )
+                for subject in subjects
+            }
+            found.append(_difference(method, reference, metric.name, values))
+    return found
+
+
+def _difference(
+    method: str, reference: str, metric: str, values: Mapping[str, float | None]
+) -> RateDifference:
+    lacking = [subject for subject, value in values.items() if value is None]
+    if lacking or not values:
+        reason = (
+            f"{len(lacking)} of {len(values)} subjects have fewer than {LEAST_POINTS} steps of rising quality, or curves "
+            "without a common quality"
+        )
+        return RateDifference(method, reference, metric, None, reason=reason)
+    known = {subject: float(value) for subject, value in values.items() if value is not None}
+    pairs = [
+        SubjectPairs(name, (SequencePairs(np.array([[value]]), np.zeros((1, 1)), np.ones(1)),))
+        for name, value in known.items()
+    ]
+    bounds = interval(pairs)
+    mean = _percent(float(np.mean([*known.values()])))
+    low, high = (None, None) if bounds is None else (_percent(bounds[0]), _percent(bounds[1]))
+    return RateDifference(method, reference, metric, mean, low, high, len(known))
+
+
+def _percent(logarithm: float) -> float:
+    return 100 * math.expm1(logarithm)

@@ -1,0 +1,93 @@
+"""Avatars derived from those of the same run: their order, what a kill leaves, what a failed training means for them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from headbench.bench.condition import PLAIN, Condition, Named
+from headbench.bench.engine import run as runner
+from headbench.bench.engine.run import planned_jobs
+from headbench.bench.engine.store import RunFolder
+from headbench.bench.executors.settings import Execution
+from headbench.bench.rows import ALL
+
+DARK = Condition("dark", ("varying",), derive=Named("variant", {"name": "dark"}))
+
+
+@pytest.fixture
+def deriving(config, toy):
+    toy.MADE.clear()
+    # The condition is named first, so that the order of the cells is not that of the settings.
+    return replace(config, methods=("toy_plugin:VARYING", "toy_plugin:METHOD"), conditions=(DARK, PLAIN))
+
+
+def table(rows):
+    return rows.labelled().select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+
+
+def qualities(rows, label):
+    own = table(rows)
+    return own[(own["method"] == label) & (own["metric"] == "psnr")]
+
+
+def test_derived_cells_follow_all_trainings(deriving, toy):
+    labels = [job.label for job in planned_jobs(deriving)]
+    assert labels.index("varying+dark") > max(labels.index(name) for name in ("varying", "toy"))
+    rows = runner.run(deriving)
+    assert len(toy.FITS) == 2 * len({job.clip.subject for job in planned_jobs(deriving)})
+    assert set(qualities(rows, "varying+dark")["status"]) == {"ok"}
+    other = Path(deriving.out) / "trained"
+    dark = runner.run(
+        replace(deriving, out=str(other), conditions=(PLAIN,), settings={"varying": {"level": 0.25}})
+    )
+    assert qualities(rows, "varying+dark")["value"].tolist() == qualities(dark, "varying")["value"].tolist()
+    codecs = {method.label: method.codec for method in RunFolder(Path(deriving.out)).read_manifest().methods}
+    assert codecs == dict.fromkeys(("varying+dark", "varying", "toy"), "")
+
+
+def test_workers_derive_after_training(deriving, toy, tmp_path):
+    inline = runner.run(deriving)
+    workers = runner.run(
+        replace(deriving, out=str(tmp_path / "workers")), Execution("processes", workers=2, threads=1)
+    )
+    assert (
+        qualities(inline, "varying+dark")["value"].tolist()
+        == qualities(workers, "varying+dark")["value"].tolist()
+    )
+
+
+def test_a_run_killed_before_it_derives_continues(deriving, toy, monkeypatch):
+    def killed(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("headbench.bench.engine.jobs.derive", killed)
+        with pytest.raises(KeyboardInterrupt):
+            runner.run(deriving)
+    trained = len(toy.FITS)
+    rows = runner.run(deriving)
+    assert len(toy.FITS) == trained
+    assert set(qualities(rows, "varying+dark")["status"]) == {"ok"}
+    made = len(toy.MADE)
+    runner.run(deriving)
+    assert len(toy.MADE) == made  # what is finished stays
+
+
+def test_a_damaged_derived_avatar_is_derived_again(deriving, toy):
+    runner.run(deriving)
+    made, trained = len(toy.MADE), len(toy.FITS)
+    (RunFolder(Path(deriving.out)).cell("subject1", "varying+dark", 0).avatar / "level.txt").write_text("0.9")
+    rows = runner.run(deriving)
+    assert (len(toy.MADE), len(toy.FITS)) == (made + 1, trained)
+    assert set(qualities(rows, "varying+dark")["status"]) == {"ok"}
+
+
+def test_a_failed_training_fails_what_is_derived(deriving, toy):
+    failing = replace(deriving, settings={"varying": {"fail": True}})
+    for execution in (None, Execution("processes", workers=1, threads=1)):
+        rows = runner.run(failing, execution)
+        derived = qualities(rows, "varying+dark")
+        assert set(derived["status"]) == {"failed"}
+        assert derived["reason"].str.contains("expected a trained avatar").all()
+        assert set(qualities(rows, "toy")["status"]) == {"ok"}
