@@ -28,6 +28,8 @@ from .transform import (
 
 FLOOR = 1e-4
 """Splats smaller than this, in canonical units, are placed as finely as one of this size."""
+FINER = 0.5
+"""Factor of the steps of weights: here the whole appearance passes through the networks, and they are few of the bytes."""
 GEOMETRY = {"points": 3, "log_scales": 3, "quats": 4, "opacities": 1}
 """Columns of a table of splats with features, as `gha.avatar.write_avatar` stores it; features follow."""
 
@@ -78,7 +80,7 @@ def encode_networks(
             arrays[f"plain/{name}"] = values.astype(np.float32)
         else:
             rows = values.reshape(len(values), -1)
-            arrays |= encode_matrix(f"matrix/{name}", rows, precision.networks)
+            arrays |= encode_matrix(f"matrix/{name}", rows, FINER * precision.networks)
     person = encode_subject(subject, precision)
     return Content({**arrays, **person.arrays}, {**person.text, **(text or {})}, {**steps, **person.steps})
 
