@@ -164,7 +164,9 @@ def suite_block(folder: Path) -> str:
         f", not counting {minutes.count(None)} that were interrupted and continued" if None in minutes else ""
     )
     shown = runs.only([*runs.ranked, *runs.trivial]).shared
-    columns = Columns((*SHOWN, "storage", "fps"))
+    of_avatars = ("storage", "storage_coded", "coded_change", "fps", "fps_one_thread")
+    measured = {spec.name for spec in runs.metrics if "comparison" in spec.tables}
+    columns = Columns((*SHOWN, *(name for name in of_avatars if name in measured)))
     return (
         f"{to_markdown(table_of(shown, columns=columns)).strip()}\n\n{conclusions(shown)}\n\n"
         f"[SSIM, tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "

@@ -43,8 +43,11 @@ def known_metrics(config: RunConfig | None = None) -> dict[str, MetricSpec]:
         for plugin in discover(group).values():  # type: ignore[arg-type]
             found |= {} if plugin.spec is None else {metric.name: metric for metric in plugin.spec.metrics}
     for plugin in discover("metrics").values():
-        if plugin.spec is not None:
-            found.setdefault(plugin.spec.name, plugin.spec)
+        # A condition may give a name to what it measures in another way, without an implementation.
+        if plugin.spec is not None and not (
+            plugin.spec.name in found and found[plugin.spec.name].implementation
+        ):
+            found[plugin.spec.name] = plugin.spec
     for name in () if config is None else config.metrics:
         if ":" in name:
             spec: MetricSpec = get("metrics", name)

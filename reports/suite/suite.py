@@ -28,7 +28,14 @@ MEANINGS = {
     "model, the neck's rotation merged into the head's, no static offset, one video",
 }
 AVATAR_TABLES = {
-    "cost": ("training_processor", "training_iterations", "training_time", "storage"),
+    "cost": (
+        "training_processor",
+        "training_iterations",
+        "training_time",
+        "storage",
+        "storage_coded",
+        "coded_change",
+    ),
     "speed": ("fps", "fps_one_thread", "fps_without_head", "processor_time"),
 }
 """Metrics of the tables without frames, by layout."""
