@@ -240,6 +240,11 @@ class Manifest:
             for name in ("needs", "code", "condition"):
                 if not method[name]:
                     del method[name]
+            if method["codec"] is None:
+                del method["codec"]
+        for condition in record["configuration"]["conditions"]:
+            if not condition["as_tracked"]:
+                del condition["as_tracked"]
         for clip in record["clips"]:
             if not clip["training_cameras"]:
                 del clip["training_cameras"]

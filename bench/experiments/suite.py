@@ -106,7 +106,8 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
             rows = run(own, execution)
             runs.append(Path(own.out))
             failed += rows.failed
-            if part is config and settings.extremes and not all(method.spec.trivial for method, _ in cells):
+            trained = any(not method.spec.trivial for method, _ in cells)
+            if part is config and trained and place < settings.extremes:
                 how = {name: getattr(settings, name) for name in ("executor", "workers", "set")}
                 extremes_run(ExtremesSettings(own.out, **how), progress)
             ends.append(closing(runs[-1], rows))

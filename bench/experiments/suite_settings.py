@@ -79,9 +79,9 @@ class SuiteSettings(ExecutionOptions):
     """At most this many subjects, from the first, are also trained with two further seeds, without conditions, in runs of their own;
     `results.md` then has the variance between and within subjects."""
 
-    extremes: bool = True
-    """Render the avatars of every subject in new poses and views, too, as `headbench run extremes` does; a broken limit is a result, not a
-    failure."""
+    extremes: int = 10
+    """Avatars of at most this many subjects, from the first, are also rendered in new poses and views, as by `headbench run extremes`; a
+    broken limit is a result, not a failure."""
 
     cameras: int = 16
     """Views of each, the held-out one included."""
@@ -112,7 +112,7 @@ class SuiteSettings(ExecutionOptions):
             if NONE in names and len(names) > 1:
                 where = f"--{option.replace('_', '-')}"
                 raise InputError("command line", where, f"names of methods, or {NONE}", " ".join(names))
-        for name, least in (("large", 0), ("repeated", 0), ("first", 1)):
+        for name, least in (("large", 0), ("repeated", 0), ("extremes", 0), ("first", 1)):
             if getattr(self, name) < least:
                 raise InputError("command line", f"--{name}", f"at least {least}", str(getattr(self, name)))
         if self.first > self.subjects:

@@ -115,14 +115,9 @@ def make_run(toy, tmp_path):
     """Run a toy comparison over two subjects into a folder of that name; changes are settings of the run."""
 
     def make(name, methods=("toy_plugin:METHOD",), subjects=("subject1", "subject2"), **changes):
+        data = tmp_path / ("data" if len(subjects) > 1 else f"data-{subjects[0]}")
         settings = {"metrics": ("toy_plugin:ERROR", "toy_plugin:FILES"), "reader": "toy_plugin:READER"}
-        return run_on(
-            tmp_path / "data" / "-".join(subjects),
-            tmp_path / name,
-            *methods,
-            subjects=subjects,
-            **settings | changes,
-        ).root
+        return run_on(data, tmp_path / name, *methods, subjects=subjects, **settings | changes).root
 
     return make
 

@@ -72,7 +72,7 @@ def asked(monkeypatch, tmp_path):
         usual = [
             run.out for run in runs if Path(run.out).parent.name == "run" and run.methods != ("mean-image",)
         ]
-        assert driven == ([] if "--no-extremes" in options else usual)
+        assert driven == ([] if "--extremes" in options else usual)
         return list(zip(captures, runs, strict=True))
 
     return plan
@@ -120,7 +120,8 @@ ONE = ("--subjects", "1", "--large", "0")
 )
 def test_conditions_of_tracking_have_methods(asked, options, conditions):
     ((_, config),) = asked(*options, *ONE, "--equal-iterations", "none")
-    assert {each.name: each.methods for each in config.conditions} == {"": (), **conditions}
+    coded = {"coded": tuple(name for name in config.methods if name != "mean-image")}
+    assert {each.name: each.methods for each in config.conditions} == {"": (), **coded, **conditions}
 
 
 def test_equal_iterations_are_those_of_ours(asked):
@@ -128,7 +129,7 @@ def test_equal_iterations_are_those_of_ours(asked):
     ((_, config),) = asked(*given, *ONE)
     cells = {(m.spec.name, c.name): m.budget.iterations for m, c in resolve_cells(config)}
     assert cells["insta", "equal-iterations"] == cells["ours", ""] != cells["insta", ""]
-    assert {name for name, condition in cells if condition} == {"insta"}
+    assert {name for name, condition in cells if condition == "equal-iterations"} == {"insta"}
 
 
 def test_every_subject_has_a_run_and_the_first_also_large_images(asked):
@@ -141,9 +142,10 @@ def test_every_subject_has_a_run_and_the_first_also_large_images(asked):
         *("run/01", "run-large/01", "run/02", "run/03")
     ]
     names = [[condition.name for condition in run.conditions] for _, run in found]
-    assert names == [["", "tracked", "no-lines"], [""], *[["", "tracked", "no-lines"]] * 2]
+    every = ["", "coded", "tracked", "no-lines"]
+    assert names == [every, ["", "coded"], every, every]
     later = asked(
-        *options, "--subjects", "3", "--first", "3", "--large", "0", "--repeated", "3", "--no-extremes"
+        *options, "--subjects", "3", "--first", "3", "--large", "0", "--repeated", "3", "--extremes", "0"
     )
     assert [(capture["only"], run.seeds) for capture, run in later] == [(2, (0,)), (2, (1, 2))]
     assert [condition.name for condition in later[1][1].conditions] == [""]
