@@ -31,8 +31,7 @@ class SuiteSettings(ExecutionOptions):
     """The whole benchmark: makes the suite's synthetic subjects, trains and measures methods on all, writes result tables.
 
     Subjects differ in shape, skin, hair and performance. Each is captured, trained and measured in a run of its own, so that finished
-    subjects can be kept apart from a machine. Every method has the same processor time with the preset `fast`. Started again after
-    a kill it continues. Takes hours.
+    subjects can be kept apart from a machine. Started again after a kill it continues. Takes hours.
     """
 
     out: str
