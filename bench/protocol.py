@@ -145,30 +145,24 @@ def make_protocols(
 def joined_protocol(protocols: Sequence[Protocol]) -> Protocol:
     """The protocol of one task over the clips of several, the same as if one run had scored all of them.
 
-    Raises `InputError` for protocols that differ in more than their clips, and for different frames or fingerprints of one subject.
+    A subject of two of them has the same frames and capture in both. Raises `InputError` for protocols that differ in more than
+    their clips.
     """
     first = protocols[0]
-    by_subject: dict[str, tuple[Any, ...]] = {}
-    for protocol in dict.fromkeys(protocols):
-        if replace(protocol, keys=(), excluded=(), clips=()) != replace(
-            first, keys=(), excluded=(), clips=()
-        ):
+    for protocol in protocols:
+        if _without_clips(protocol) != _without_clips(first):
             expected = f"the same task, size, background, quantisation and metric profile as {first.hash}"
             raise InputError("protocols", first.task, expected, protocol.hash)
-        for clip in protocol.clips:
-            own = tuple(
-                tuple(key for key in keys if key.subject == clip[0])
-                for keys in (protocol.keys, (key for key, _ in protocol.excluded))
-            )
-            if by_subject.setdefault(clip[0], (clip, *own)) != (clip, *own):
-                expected = f"one set of frames and one capture of {clip[0]}"
-                raise InputError("protocols", first.task, expected, "two", "Score the same frames.")
     return replace(
         first,
         keys=tuple(sorted({key for protocol in protocols for key in protocol.keys})),
         excluded=tuple(sorted({each for protocol in protocols for each in protocol.excluded})),
         clips=tuple(sorted({clip for protocol in protocols for clip in protocol.clips})),
     )
+
+
+def _without_clips(protocol: Protocol) -> Protocol:
+    return replace(protocol, keys=(), excluded=(), clips=())
 
 
 def missing_tasks(tasks: Sequence[str], done: Container[str]) -> dict[str, str]:

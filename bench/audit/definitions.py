@@ -39,15 +39,14 @@ def known_metrics(config: RunConfig | None = None) -> dict[str, MetricSpec]:
     Of ``config``, metrics that it names by their module are included too; the caller has checked that it may import them.
     """
     found: dict[str, MetricSpec] = {}
-    for group in ("profiles", "conditions"):
-        for plugin in discover(group).values():  # type: ignore[arg-type]
-            found |= {} if plugin.spec is None else {metric.name: metric for metric in plugin.spec.metrics}
-    for plugin in discover("metrics").values():
-        # A condition may give a name to what it measures in another way, without an implementation.
-        if plugin.spec is not None and not (
-            plugin.spec.name in found and found[plugin.spec.name].implementation
-        ):
-            found[plugin.spec.name] = plugin.spec
+    # Conditions first: they may give a registered name to what they measure in another way.
+    for plugin in discover("conditions").values():
+        found |= {} if plugin.spec is None else {metric.name: metric for metric in plugin.spec.metrics}
+    found |= {
+        plugin.spec.name: plugin.spec for plugin in discover("metrics").values() if plugin.spec is not None
+    }
+    for profile in discover("profiles").values():
+        found |= {} if profile.spec is None else {metric.name: metric for metric in profile.spec.metrics}
     for name in () if config is None else config.metrics:
         if ":" in name:
             spec: MetricSpec = get("metrics", name)

@@ -15,10 +15,10 @@ from typing import Any, Self
 
 import pandas as pd
 
-from ..condition import Condition, Named
+from ..condition import Condition
 from ..contracts import Avatar, Clip, FrameKey, Progress, no_progress
 from ..engine.captures import Plugins, open_run_clips, synthesis_arguments
-from ..engine.config import CODED, RunOptions, resolve_cells
+from ..engine.config import CODED_VARIANT, RunOptions, resolve_cells
 from ..engine.jobs import load, make_jobs
 from ..engine.steps import DIGESTS, Job, measure, recorded_frames
 from ..engine.store import Cell, RunFolder
@@ -491,7 +491,7 @@ def _verify_cell(job: Job, opened: _Opened) -> Findings:
     digests = {**(state.get("files", {}) if state and trained else {}), **recorded_frames(job)}
     changed = list(_files(job, digests, found))
     found.mismatches += changed
-    coded = job.condition.derive == Named("variant", {"name": CODED})  # which methods read as their own
+    coded = job.condition.derive == CODED_VARIANT  # which methods read as their own
     if not method.implementation or (job.condition.derive and not coded):
         avatar: Avatar = NoAvatar()
     else:

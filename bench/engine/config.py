@@ -474,12 +474,13 @@ def demo_run_config(config: DemoConfig, device: str) -> dict[str, Any]:
 
 CODED = "coded"
 """Name of the condition, and of the variant that it derives, of avatars stored through the one codec of all methods."""
+CODED_VARIANT = Named("variant", {"name": CODED})
 
 
 def coded_conditions(methods: Collection[str]) -> tuple[Condition, ...]:
     """The condition `CODED` for the methods that derive variants; none if none of them does."""
     able = tuple(spec.name for spec in (get("methods", name) for name in methods) if spec.variants)
-    return (Condition(CODED, able, derive=Named("variant", {"name": CODED})),) if able else ()
+    return (Condition(CODED, able, derive=CODED_VARIANT),) if able else ()
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -56,7 +56,7 @@ class SuiteSettings(ExecutionOptions):
     subject; each method one more training."""
 
     levels: tuple[float, ...] = ()
-    """Train the methods of --tracked once more for each of these levels of simulated tracking errors (see `headbench synth`), as
+    """Train the methods of --tracked a further time for each of these levels of simulated tracking errors (see `headbench synth`), as
     conditions such as `tracking-3`."""
 
     equal_iterations: tuple[str, ...] = ()

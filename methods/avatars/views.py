@@ -26,14 +26,19 @@ def contribution(splats: Splats, camera: Camera) -> Tensor:
     derivative of the sum of a one-channel image by the splat's colour. Used as importance for pruning by Fang and
     Wang, "Mini-Splatting", ECCV 2024, section 4.
     """
+    image, colors = _in_ones(splats, camera, 1)
+    (weights,) = torch.autograd.grad(image.sum(), colors)
+    return weights[:, 0]
+
+
+def _in_ones(splats: Splats, camera: Camera, channels: int) -> tuple[Tensor, Tensor]:
+    """(H, W, channels) image of splats whose colours are 1, and the (N, channels) colours, by which it can be derived."""
     view = view_of(camera, "cpu")
     geometry = splats.means, splats.quats, splats.scales, splats.opacities
     means, quats, scales, opacities = (torch.tensor(np.asarray(values, np.float32)) for values in geometry)
-    colors = torch.ones(len(means), 1, requires_grad=True)
+    colors = torch.ones(len(means), channels, requires_grad=True)
     where = view.world_to_camera, view.K, camera.width, camera.height
-    image = rasterize(means, quats, scales, opacities, colors, *where).image
-    (weights,) = torch.autograd.grad(image.sum(), colors)
-    return weights[:, 0]
+    return rasterize(means, quats, scales, opacities, colors, *where).image, colors
 
 
 VIEWS = 64
@@ -52,12 +57,7 @@ def squared_contribution(splats: Splats, camera: Camera, generator: torch.Genera
     derivatives of sums of pixels with random signs, since all other products of weights have the expectation 0 (M.
     Hutchinson, Communications in Statistics 18, 1989); three channels are three draws.
     """
-    view = view_of(camera, "cpu")
-    geometry = splats.means, splats.quats, splats.scales, splats.opacities
-    means, quats, scales, opacities = (torch.tensor(np.asarray(values, np.float32)) for values in geometry)
-    colors = torch.ones(len(means), 3, requires_grad=True)
-    where = view.world_to_camera, view.K, camera.width, camera.height
-    image = rasterize(means, quats, scales, opacities, colors, *where).image
+    image, colors = _in_ones(splats, camera, 3)
     signs = 2.0 * torch.randint(0, 2, image.shape, generator=generator) - 1.0
     (weights,) = torch.autograd.grad((image * signs).sum(), colors)
     return (weights**2).mean(1) / (camera.width * camera.height)

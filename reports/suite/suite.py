@@ -22,11 +22,20 @@ from .variance import variance_section
 
 LARGE = "Images of twice the size"
 LEVEL_START = LEVEL.partition("{")[0]
-MEANINGS = {
-    TRACKED: "trained and driven with tracking that was estimated from the images, otherwise with the capture's own",
-    AS_TRACKED: "given the capture's own head model, neck, static offset and views, otherwise those of its publication: another head "
-    "model, the neck's rotation merged into the head's, no static offset, one video",
+CONDITION_TEXTS = {
+    TRACKED: (
+        "Tracked from images",
+        "trained and driven with tracking that was estimated from the images, otherwise with the capture's own",
+    ),
+    AS_TRACKED: (
+        "Capture not converted",
+        (
+            "given the capture's own head model, neck, static offset and views, otherwise those of its publication: another head "
+            "model, the neck's rotation merged into the head's, no static offset, one video"
+        ),
+    ),
 }
+"""Title of the section of a condition, and what methods are under it; all others are levels of tracking errors."""
 AVATAR_TABLES = {
     "cost": (
         "training_processor",
@@ -142,10 +151,12 @@ def _machines(runs: RunSet) -> str:
 def _condition_section(runs: RunSet, condition: str, changed: Mapping[str, str], region: str) -> str:
     """Values with and without a condition, the drop from novel views to other tasks, and paired differences."""
     level = condition.removeprefix(LEVEL_START)
-    titles = {TRACKED: "Tracked from images", AS_TRACKED: "Capture not converted"}
-    title = titles.get(condition, f"Tracking errors of level {level}")
-    simulated = f"trained and driven with simulated tracking errors of level {level}"
-    meaning = f"Under the condition `{condition}`, methods are {MEANINGS.get(condition, simulated)}."
+    of_level = (
+        f"Tracking errors of level {level}",
+        f"trained and driven with simulated tracking errors of level {level}",
+    )
+    title, what = CONDITION_TEXTS.get(condition, of_level)
+    meaning = f"Under the condition `{condition}`, methods are {what}."
     tables = (drop_table(runs), condition_table(runs, changed, title))
     texts = [
         f"## {_title(title, region)} (exploratory)",

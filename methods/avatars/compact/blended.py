@@ -19,6 +19,7 @@ from ...shared.tensor_files import check_sizes
 from .container import Arrays, Content, coded, narrow, read_content
 from .encoding import (
     C0,
+    COARSEST_SHAPE,
     decode_harmonics,
     decode_shapes,
     encode_harmonics,
@@ -101,7 +102,7 @@ def encode_blended(
             table / units,
             np.eye(table.shape[1]),
             DIFFERENCE_STEP,
-            np.minimum(classes[owners], 2),
+            np.minimum(classes[owners], COARSEST_SHAPE),
             of_rows,
             centred=False,
         )
@@ -147,7 +148,9 @@ def read_blended(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Sto
         differences = arrays.floats("exact_differences", len(owners), None)
     else:
         scales = arrays.floats("difference_units", len(moved_by))
-        differences = decode_vectors(arrays, "differences", DIFFERENCE_STEP, np.minimum(classes[owners], 2))
+        differences = decode_vectors(
+            arrays, "differences", DIFFERENCE_STEP, np.minimum(classes[owners], COARSEST_SHAPE)
+        )
         precision = Precision(**{part: arrays.step(part) for part in (*PARTS, "harmonics")})
         size = splat_size(shapes["log_scales"].T, FLOOR)
         differences = differences * _units(precision, size, owners, scales[expressions], differences.shape[1])

@@ -9,18 +9,22 @@ from pathlib import Path
 from typing import Any
 
 from ....bench.contracts import Avatar, Clip, Variant
+from ....bench.engine.config import CODED
 from ...shared.avatar_files import read_shared_head
 from ..compact.precision import Precision
 
 STEPS = (1.0, 0.25, 0.5, 2.0, 4.0)
 """Factors of all quantisation steps."""
-CODED = "coded"
-"""Name of the variant with the default steps."""
 
 
 def coded_name(step: float) -> str:
     """Name of a variant by the factor of its steps: "coded", "coded-x0.5"."""
     return CODED if step == 1 else f"{CODED}-x{step:g}"
+
+
+def coded_summary(step: float) -> str:
+    """Description of that variant."""
+    return "quantised by visible effect, entropy-coded" + (f", steps times {step:g}" if step != 1 else "")
 
 
 def gbs_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
@@ -41,12 +45,8 @@ def insta_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
 def _variants(module: str, name: str, folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
     avatar_class = getattr(import_module(f"...{module}", __package__), name)
     for step in STEPS:
-        summary = "quantised by visible effect, entropy-coded" + (
-            f", steps times {step:g}" if step != 1 else ""
-        )
-        yield Variant(
-            coded_name(step), summary, partial(make_coded, avatar_class, folder, clip, device, step)
-        )
+        make = partial(make_coded, avatar_class, folder, clip, device, step)
+        yield Variant(coded_name(step), coded_summary(step), make)
 
 
 def make_coded(avatar_class: Any, folder: Path, clip: Clip, device: str, step: float, out: Path) -> Avatar:

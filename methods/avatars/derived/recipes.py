@@ -17,14 +17,13 @@ from ...ours.field import PLANES
 from ...shared.rendering import USUAL, Cutoffs
 from ...shared.tensor_files import read_safetensors
 from ..views import contribution
-from .coded import STEPS, coded_name
+from .coded import STEPS, coded_name, coded_summary
 
 Storage = Literal["exact", "half", "8bit", "coded"]
-STORAGE_SUMMARIES: dict[Storage, str] = {
+STORAGE_SUMMARIES: Mapping[Storage, str] = {
     "exact": "",
     "half": "16-bit floats",
     "8bit": "8 bits between each column's extremes",
-    "coded": "quantised by visible effect, entropy-coded",
 }
 # Both avatars of a capture at 144x208 (20,000 splats, 2,000 iterations) lost 0.3 and 0.8 dB, and twice their LPIPS, by
 # the earlier ones, for no measurable processor time; hence no other variant has them.
@@ -64,11 +63,7 @@ class Recipe:
             "" if self.degree is None else f"sh{self.degree}",
             "" if self.planes is None else f"planes{self.planes}",
             "" if self.lines is None else f"lines{self.lines}",
-            ""
-            if self.storage == "exact"
-            else coded_name(self.step)
-            if self.storage == "coded"
-            else self.storage,
+            {"exact": "", "coded": coded_name(self.step)}.get(self.storage, self.storage),
             "" if self.cutoffs == USUAL else f"cut{round(255 * self.cutoffs.alpha_min)}",
         ]
         return "-".join(part for part in parts if part)
@@ -82,7 +77,7 @@ class Recipe:
             "" if self.degree is None else f"harmonics up to degree {self.degree}",
             "" if self.planes is None else f"planes of {self.planes}x{self.planes}",
             "" if self.lines is None else f"lines of {self.lines} samples",
-            STORAGE_SUMMARIES[self.storage] + (f", steps times {self.step:g}" if self.step != 1 else ""),
+            coded_summary(self.step) if self.storage == "coded" else STORAGE_SUMMARIES[self.storage],
             "" if self.cutoffs == USUAL else cutoffs,
         ]
         return "; ".join(part for part in parts if part)

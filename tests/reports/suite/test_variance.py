@@ -1,4 +1,4 @@
-"""The variance between and within subjects, against numbers drawn with known deviations and by hand."""
+"""The variance between and within subjects, against drawn numbers of known deviations and a small example."""
 
 import numpy as np
 import pytest
