@@ -29,6 +29,7 @@ from .suite_settings import (
     ALL,
     AS_TRACKED,
     EQUAL,
+    EQUAL_TO,
     LARGE_RUN,
     LEVEL,
     NONE,
@@ -36,6 +37,7 @@ from .suite_settings import (
     SEED,
     SEEDS_RUN,
     TRACKED,
+    TRACKED_METHODS,
     SuiteSettings,
 )
 
@@ -131,8 +133,8 @@ def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:
     iterations = {
         method.spec.name: method.budget.iterations for method in resolved if not method.spec.trivial
     }
-    if (count := iterations.get(OURS)) is not None:
-        others = tuple(name for name, own in iterations.items() if own not in (None, count))
+    if (count := iterations.get(EQUAL_TO)) is not None:
+        others = tuple(name for name in TRACKED_METHODS if iterations.get(name) not in (None, count))
         asked = settings.equal_iterations or others
         names = tuple(name for name in asked if name != NONE)
         found.append(Condition(EQUAL, names, {"budget": {"iterations": count}}))

@@ -17,9 +17,10 @@ ALL, NONE = "all", "none"
 
 TRACKED, LEVEL, AS_TRACKED, EQUAL = "tracked", "tracking-{:g}", "as-tracked", "equal-iterations"
 """Names of conditions: tracking estimated from the images; simulated tracking errors of a level; the capture's own tracking for a
-method that otherwise gets it converted; as many iterations as "ours" has."""
+method that otherwise gets it converted; as many iterations as `EQUAL_TO` has."""
+EQUAL_TO = "ga"
 TRACKED_METHODS = ("ga", "gbs", "ours", "ours-plus")
-"""Methods that have the first two conditions where none are named."""
+"""Methods that have these conditions, except the third, where none are named."""
 
 RUN, LARGE_RUN, SEEDS_RUN = "run", "run-large", "run-seeds"
 """Folders of a suite's runs, each with a folder for each subject; those of the second have images of twice the size, those of the
@@ -60,8 +61,8 @@ class SuiteSettings(ExecutionOptions):
     conditions such as `tracking-3`."""
 
     equal_iterations: tuple[str, ...] = ()
-    """Methods trained a second time, with as many iterations as ours, as condition `equal-iterations`; or "none". Default: all that have
-    other numbers of iterations."""
+    """Methods trained a second time, with as many iterations as ga, as condition `equal-iterations`; or "none". Default: gbs, ours and
+    ours-plus, if they run and have other numbers of iterations."""
 
     subjects: int = 10
     """Number of the suite's subjects, from the first. Significant differences require 6 subjects for two
@@ -85,7 +86,7 @@ class SuiteSettings(ExecutionOptions):
     cameras: int = 16
     """Views of each, the held-out one included."""
 
-    timesteps: int = 160
+    timesteps: int = 96
     """Of each subject; a quarter is held out."""
 
     size: str = "275x401"

@@ -58,7 +58,7 @@ SHORT_PRESETS: dict[str, dict[str, Any]] = {
         "motion_steps": 200,
     },
     "demo": {"budget": {"iterations": 1_500}, **SHORT},
-    "fast": {"budget": {"iterations": 4_000}, **SHORT, "max_points": 20_000, "sr_widths": (32, 16)},
+    "fast": {"budget": {"iterations": 600}, **SHORT, "max_points": 20_000, "sr_widths": (32, 16)},
 }
 
 

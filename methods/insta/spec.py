@@ -49,7 +49,7 @@ INSTA = MethodSpec(
         "smoke": {"budget": {"iterations": 40}, **SHORT},
         "demo": {"budget": {"iterations": 400}, **SHORT},
         "fast": {
-            "budget": {"iterations": 3_000},
+            "budget": {"iterations": 1_050},
             **SHORT,
             "log2_table": 17,
             "finest_resolution": 768,

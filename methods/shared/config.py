@@ -169,12 +169,16 @@ SHORT_SPLATS: Mapping[str, Any] = {
 and rotation (`docs/explanation/methods/ga.md`)."""
 
 
-def splat_presets(short: Mapping[str, Any], paper: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Presets of a mesh-bound method from its own settings for short and published runs, with budgets and splat settings."""
+def splat_presets(short: Mapping[str, Any], paper: Mapping[str, Any], fast: int) -> dict[str, dict[str, Any]]:
+    """Presets of a mesh-bound method from its own settings for short and published runs, with budgets and splat settings.
+
+    ``fast`` is the number of iterations of that preset, in which all native methods take about the same processor time
+    (`docs/explanation/suite.md`).
+    """
     return {
         "smoke": {"budget": {"iterations": 60}, **short, "splats": SHORT_SPLATS},
         "demo": {"budget": {"iterations": 2_000}, **short, "splats": {**SHORT_SPLATS, "max_splats": 20_000}},
-        "fast": {"budget": {"iterations": 4_000}, **short, "splats": {**SHORT_SPLATS, "max_splats": 40_000}},
+        "fast": {"budget": {"iterations": fast}, **short, "splats": {**SHORT_SPLATS, "max_splats": 40_000}},
         **{
             name: {"budget": {"iterations": iterations}, **paper, "splats": {"split_variant": "official"}}
             for name, iterations in (("gpu", GPU_ITERATIONS), ("paper", PAPER_ITERATIONS))

@@ -103,7 +103,8 @@ def _tables(read: RunSet, method: str, *, primary: bool) -> str:
     sections += [_section(title, runs.of(part), method) for title, part in parts.items()]
     if equal := by_condition.get(EQUAL, {}):
         budgets = {name: whole.records[label].budget.get("iterations") for name, label in plain.items()}
-        same = {name: plain[name] for name, budget in budgets.items() if budget == budgets[method]}
+        count = whole.records[next(iter(equal.values()))].budget.get("iterations")
+        same = {name: plain[name] for name, budget in budgets.items() if budget == count}
         labels = [label for label in ({**same, **equal}).values() if label not in whole.trivial]
         sections.append(_section("Equal iterations", whole.only(labels).shared.without_conditions, method))
     for layout, names in AVATAR_TABLES.items():

@@ -39,7 +39,7 @@ from .networks import encode_networks
 from .precision import Precision
 from .simplify import simplify
 
-CODEC_VERSION = 2
+CODEC_VERSION = 3
 """Raised when the same avatar and steps give other files."""
 DRIVING_FILE = "driving.npz"
 """Driving signal beside the avatars of some methods, which is not part of their size."""

@@ -18,17 +18,17 @@ class Precision:
     step: float = 1.0
     """Factor of all steps: a coarser or finer codec with the same balance."""
 
-    positions: float = 0.1
+    positions: float = 0.07
     """Step of local positions, in the splat's own size (geometric mean of its three standard deviations)."""
 
-    scales: float = 0.06
-    """Step of log-scales: 0.06 is an error of at most 3 %."""
+    scales: float = 0.04
+    """Step of log-scales: 0.04 is an error of at most 2 %."""
 
-    rotations: float = 0.03
-    """Step of the three smaller components of unit quaternions: 0.03 is an error of about 1 degree."""
+    rotations: float = 0.018
+    """Step of the three smaller components of unit quaternions: 0.018 is an error of about 0.6 degrees."""
 
-    opacities: float = 0.15
-    """Step of opacity logits: an opacity is off by 0.019 at most."""
+    opacities: float = 0.1
+    """Step of opacity logits: an opacity is off by 0.0125 at most."""
 
     harmonics: float = 0.008
     """Step of colours by spherical harmonics, in colour: root mean square over directions, see `colour_metric`."""
@@ -36,7 +36,7 @@ class Precision:
     colors: float = 0.008
     """Step of the separate colours of splats, added to those of the planes."""
 
-    planes: float = 0.02
+    planes: float = 0.008
     """Step of the colour contribution of the channels of a plane, in [0, 1], as weighted by the colour network."""
 
     lines: float = 0.008

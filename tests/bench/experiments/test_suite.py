@@ -124,12 +124,12 @@ def test_conditions_of_tracking_have_methods(asked, options, conditions):
     assert {each.name: each.methods for each in config.conditions} == {"": (), **coded, **conditions}
 
 
-def test_equal_iterations_are_those_of_ours(asked):
-    given = ("--methods", "mean-image", "ours", "insta", "--preset", "smoke", "--tracked", "none")
+def test_equal_iterations_are_those_of_ga(asked):
+    given = ("--methods", "mean-image", "ga", "ours", "insta", "--preset", "fast", "--tracked", "none")
     ((_, config),) = asked(*given, *ONE)
     cells = {(m.spec.name, c.name): m.budget.iterations for m, c in resolve_cells(config)}
-    assert cells["insta", "equal-iterations"] == cells["ours", ""] != cells["insta", ""]
-    assert {name for name, condition in cells if condition == "equal-iterations"} == {"insta"}
+    assert cells["ours", "equal-iterations"] == cells["ga", ""] != cells["ours", ""]
+    assert {name for name, condition in cells if condition == "equal-iterations"} == {"ours"}
 
 
 def test_every_subject_has_a_run_and_the_first_also_large_images(asked):
