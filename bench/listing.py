@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
 from .contracts import Progress
-from .registry import Group, discover
+from .registry import Group, discover, resolve
 from .specs import CommandResult
 
 
@@ -27,15 +27,18 @@ class ListSettings:
             "conditions",
             "benchmarks",
             "commands",
+            "papers",
         ]
     ]
-    """What to list; datasets are readers, and what makes captures."""
+    """What to list; datasets are readers, and what makes captures; papers those in whose form tables can be printed."""
 
 
 def list_installed(settings: ListSettings, progress: Progress) -> CommandResult:
-    """List what is installed: methods, presets, metrics, their profiles, readers, reports, benchmarks, commands."""
+    """List what is installed: methods, presets, metrics, their profiles, readers, reports, benchmarks, commands, papers."""
+    if settings.what == "papers":
+        return _shown(resolve("headbench.reports.papers:listed")())
     group: Group = "methods" if settings.what == "presets" else settings.what
-    entries = []
+    entries: list[dict[str, Any]] = []
     for name, plugin in discover(group).items():
         known = {} if plugin.spec is None else asdict(plugin.spec)
         entries.append({"origin": plugin.origin, "error": plugin.error, **known, "name": name})
@@ -50,6 +53,11 @@ def list_installed(settings: ListSettings, progress: Progress) -> CommandResult:
             for entry in entries
             for preset, values in entry.get("presets", {}).items()
         ]
+    return _shown(entries)
+
+
+def _shown(entries: list[dict[str, Any]]) -> CommandResult:
+    """A line for each entry."""
     width = max((len(entry["name"]) for entry in entries), default=0)
     shown = [f"broken: {entry['error']}" if entry["error"] else entry["summary"] for entry in entries]
     lines = [f"{entry['name']:<{width}}  {text}" for entry, text in zip(entries, shown)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -28,10 +28,11 @@ class TableSettings:
     """Aligned columns, Markdown, CSV, LaTeX (booktabs), a page of HTML, or JSON. Default: by the suffix of --out; without
     it text on a terminal, else md."""
     layout: str = "comparison"
-    """Which table: comparison, speed (latency, throughput, stages), cost (storage, training), or the paper's: paper-1
-    (all methods), paper-3 (INSTA and ours), paper-4 (what an expression may change: a run each)."""
-    published: bool = False
-    """Add columns with the figures that papers printed, where a layout has some."""
+    """Which table: comparison, speed (latency, throughput, stages) or cost (storage, training)."""
+    paper: Annotated[str | None, tyro.conf.arg(name="as")] = None
+    """Paper in the form of whose tables the runs are shown, with the rows that it printed below: `headbench list papers`."""
+    number: Annotated[str | None, tyro.conf.arg(name="table")] = None
+    """With --as: the number of the table. Default: all that were read in full, or quoted in full texts."""
     region: str = "full"
     """Region of the frames to show instead of the whole, such as face."""
     sequences: tuple[str, ...] = ()

@@ -23,10 +23,7 @@ from .statistics.comparisons import LEVEL, BestSet, best_set
 
 @dataclass(frozen=True)
 class Column:
-    """One metric of one task (``task`` "" for a metric of the avatar as a whole).
-
-    ``published`` columns hold the values printed in a paper, after the measured column.
-    """
+    """One metric of one task (``task`` "" for a metric of the avatar as a whole)."""
 
     task: str
     title: str
@@ -35,7 +32,6 @@ class Column:
     unit: str
     digits: int
     higher_is_better: bool
-    published: bool = False
 
     @property
     def arrow(self) -> str:
@@ -48,8 +44,8 @@ class TableCell:
     """A value, or the reason why it is missing.
 
     ``status`` is "ok", "claimed" (a value that was not verified, in a leaderboard), "missing" (could not or was not
-    measured), "failed" (the method ended in an error), "published" (a paper's figure, not measured) or "none" (no paper's
-    figure). ``rank`` is 1 for all that may be the best, then 2,
+    measured), "failed" (the method ended in an error), "published" (printed in a paper, not measured) or "none" (not printed
+    there). ``rank`` is 1 for all that may be the best, then 2,
     3, ... for the next displayed values; None where nothing is ranked.
     """
 
@@ -94,7 +90,7 @@ class Table:
 
     ``marking`` says what the ranks mean, and by which test (``tested``: whether there is one), ``part`` which part of
     the frames the values are of, "" for all, ``missing`` why a task has no columns, ``name`` the layout, ``cameras`` what
-    seen and unseen cameras are, or why they are not shown apart.
+    seen and unseen cameras are, or why they are not shown apart, ``printed`` where values of a paper are from.
     """
 
     columns: tuple[Column, ...]
@@ -110,6 +106,7 @@ class Table:
     name: str = ""
     tested: bool = False
     cameras: str = ""
+    printed: str = ""
 
     @property
     def titled(self) -> bool:
@@ -147,7 +144,7 @@ class Table:
         seeds = spread if self.seeds > 1 else "one seed"
         parts.append(f"Mean over frames, then sequences, then subjects; {seeds}.")
         parts += [self.marking] if self.marking else []
-        parts += [PUBLISHED] if self.has_published else []
+        parts += [self.printed] if self.printed else []
         if self.machine and self.has_speed:
             parts.append(f"Speed measured on {self.machine}.")
         return tuple(parts)
@@ -172,15 +169,10 @@ class Table:
             places = ["second underlined", *(["third in italics"] if 3 in ranks else [])]
             digits = [] if self.tested else ["by the digits shown"]
             parts.append(", ".join([best, *places, *digits]) + ".")
-        parts += [PUBLISHED] if self.has_published else []
+        parts += [self.printed] if self.printed else []
         if self.machine and self.has_speed:
             parts.append(f"Speed on {self.machine}.")
         return " ".join(parts)
-
-    @property
-    def has_published(self) -> bool:
-        """Whether a column has figures from papers."""
-        return any(column.published for column in self.columns)
 
     @property
     def has_speed(self) -> bool:
@@ -188,7 +180,6 @@ class Table:
         return any(column.metric == "fps" for column in self.columns)
 
 
-PUBLISHED = "Columns headed published: figures from papers, of other data and code, not comparable."
 AVATAR_TITLE = "Avatar"
 TITLES = {"speed": "Speed", "cost": "Storage and training"}
 """Titles of layouts whose columns belong to no task."""

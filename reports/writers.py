@@ -31,8 +31,7 @@ def to_markdown(table: Table) -> str:
         tasks += [escape_markdown(title), *[""] * (count - 1)]
     for column in table.columns:
         unit = f" ({escape_markdown(column.unit)})" if column.unit else ""
-        measured = f"**{escape_markdown(column.label)}**{unit} {column.arrow}"
-        names.append("*published*" if column.published else measured)
+        names.append(f"**{escape_markdown(column.label)}**{unit} {column.arrow}")
     lines = [tasks, names]
     for title, rows in table.groups:
         if table.titled:
@@ -69,7 +68,7 @@ def to_text(table: Table, *, styled: bool = False) -> str:
     names = ["Method"]
     for column in table.columns:
         unit = f" ({column.unit})" if column.unit else ""
-        names.append("published" if column.published else f"{column.label}{unit} {column.arrow}".rstrip())
+        names.append(f"{column.label}{unit} {column.arrow}".rstrip())
     lines: list[list[str]] = []
     marks: dict[tuple[int, int], int] = {}
     for title, rows in table.groups:
@@ -175,8 +174,7 @@ def to_latex(table: Table) -> str:
     names = ["Method"]
     for column in table.columns:
         unit = rf"\,({escape_latex(column.unit)})" if column.unit else ""
-        measured = f"{escape_latex(column.label)}{unit} {escape_latex(column.arrow)}"
-        names.append(r"\tabpublished{\scriptsize published}" if column.published else measured)
+        names.append(f"{escape_latex(column.label)}{unit} {escape_latex(column.arrow)}")
     body: list[str] = []
     for index, (title, rows) in enumerate(table.groups):
         body += [r"\midrule"] if index else []
@@ -256,22 +254,21 @@ def to_csv(table: Table) -> str:
 
     Columns: method, version, group; per column of the table the value (``novel_view/psnr``, empty where there is
     none), its rank (``.../rank``), its status (``.../status``) and, with several seeds, its standard deviation from
-    seed to seed as displayed (``.../spread``), or for a published column the paper's figure alone; notes; protocol.
+    seed to seed as displayed (``.../spread``); notes; protocol.
     """
     header = ["method", "version", "group"]
     extras = ["rank", "status", *(["spread"] if table.seeds > 1 else [])]
     for column in table.columns:
         name = column_name(column)
-        header += [name] if column.published else [name, *(f"{name}/{extra}" for extra in extras)]
+        header += [name, *(f"{name}/{extra}" for extra in extras)]
     lines: list[list[object]] = [[*header, "notes", "protocol"]]
     protocol = " ".join(f"{task.task}={task.protocol_hash}" for task in table.tasks)
     for title, rows in table.groups:
         for row in rows:
             line: list[object] = [row.method, row.version, title]
-            for column, cell in zip(table.columns, row.cells):
+            for cell in row.cells:
                 line.append("" if cell.value is None else repr(cell.value))
-                if not column.published:
-                    line += [str(cell.rank or ""), cell.status, cell.spread][: len(extras)]
+                line += [str(cell.rank or ""), cell.status, cell.spread][: len(extras)]
             notes = sorted({cell.note for cell in row.cells if cell.note is not None})
             lines.append([*line, " ".join(table.notes[note] for note in notes), protocol])
     return csv_text(lines)
@@ -302,9 +299,8 @@ def _without_formula(value: object) -> object:
 
 
 def column_name(column: Column) -> str:
-    """``task/metric``, or the metric alone for one of the avatar as a whole; ``.../published`` for a paper's."""
-    name = f"{column.task}/{column.metric}" if column.task else column.metric
-    return f"{name}/published" if column.published else name
+    """``task/metric``, or the metric alone for one of the avatar as a whole."""
+    return f"{column.task}/{column.metric}" if column.task else column.metric
 
 
 def to_json(table: Table) -> str:

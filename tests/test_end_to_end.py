@@ -162,7 +162,6 @@ FORMATS = {
 LAYOUTS = {
     "speed": "(?s)Raster.*ours",
     "cost": "(?s)Per primitive.*ours",
-    **dict.fromkeys(("paper-1", "paper-3", "paper-4"), FORMATS["md"]),
 }
 
 
@@ -202,11 +201,11 @@ CASES = {
             "suite/run-large/01/rows.parquet",
         )
     ],
-    "list": [case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets")],
+    "list": [case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets", "papers")],
     "table": [
         *(case(f"table {{demo}} --format {name}", mark) for name, mark in FORMATS.items()),
         *(case(f"table {{demo}} --layout {layout}", mark) for layout, mark in LAYOUTS.items()),
-        case("table {demo} --layout paper-4 --published", "Published"),
+        case("table {demo} --as tensorial-2025 --table 4", "Printed in Table 4"),
         case("table {demo} plain", "one seed"),
         case("table {demo} --columns psnr novel_view --digits 1 --out t.tex", "t.tex", "t.tex"),
         case("table {demo} --region face --sequences FREE", "Region: face. Sequences: FREE."),

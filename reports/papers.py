@@ -1,0 +1,282 @@
+"""Tables that papers printed, as data: a file for each paper in `published`, and measured tables in the form of a printed one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from ..bench.configuration import build
+from ..bench.errors import InputError
+from ..bench.io.documents import read_yaml
+from ..bench.manifest import MethodRecord
+from ..bench.protocol import TASK_TITLES
+from ..bench.registry import discover, unknown
+from ..bench.specs import MetricSpec
+from .runs import RunSet
+from .tables import Table, TableCell, TableRow, build_table
+
+FOLDER = Path(__file__).with_name("published")
+
+TASKS = ("novel_view", "self_reenactment", "cross_reenactment")
+OF_FRAMES = {
+    "psnr": ("PSNR", "dB", True),
+    "ssim": ("SSIM", "", True),
+    "ms_ssim": ("MS-SSIM", "", True),
+    "lpips": ("LPIPS", "", False),
+    "l1": ("L1", "", False),
+    "l2": ("L2", "", False),
+    "csim": ("CSIM", "", True),
+    "akd": ("AKD", "", False),
+    "aed": ("AED", "", False),
+    "apd": ("APD", "", False),
+    "jod": ("JOD", "", True),
+    "fid": ("FID", "", False),
+}
+OF_AVATARS = {
+    "storage": ("Storage", "MB", False),
+    "fps": ("Speed", "FPS", True),
+    "training_time": ("Training", "s", False),
+}
+"""Metrics that papers print: label, unit, and whether higher values are better; first those of a task, then the others."""
+
+COMPARABLE = ("A", "B")
+"""Grades of tables that are printed beside measurements."""
+
+
+@dataclass(frozen=True)
+class PrintedRow:
+    """A row of a printed table.
+
+    Attributes
+    ----------
+    name : str
+        As printed.
+    values : dict[str, str]
+        As printed, by ``task/metric``, or ``metric`` for one of the avatar as a whole.
+    method : str
+        Name of the method here; "" if it is none of the registered ones.
+    settings : dict[str, Any]
+        Settings that a measured method of this row has, by dotted name.
+    """
+
+    name: str
+    values: dict[str, str]
+    method: str = ""
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse values that are not numbers as text, and unknown metrics."""
+        if not self.values:
+            raise ValueError("values: at least one; found none")
+        for key, value in self.values.items():
+            task, _, metric = key.rpartition("/")
+            known = metric in (OF_FRAMES if task else OF_AVATARS) and (not task or task in TASKS)
+            if not known:
+                expected = f"TASK/METRIC of {', '.join(TASKS)} and {', '.join(OF_FRAMES)}; or {', '.join(OF_AVATARS)}"
+                raise ValueError(f"values: {expected}; found {key}")
+            if not isinstance(value, str) or not re.fullmatch(r"-?\d*\.?\d+", value):
+                raise ValueError(f"values, {key}: a number as printed, in quotes; found {value!r}")
+
+    def is_of(self, record: MethodRecord) -> bool:
+        """Whether a measured method, as in a run's manifest, is the one of this row."""
+
+        def setting(name: str) -> Any:
+            value: Any = record.config
+            for part in name.split("."):
+                value = value.get(part) if isinstance(value, Mapping) else None
+            return value
+
+        return record.name == self.method and all(setting(n) == value for n, value in self.settings.items())
+
+
+@dataclass(frozen=True)
+class PrintedTable:
+    """A table of a paper.
+
+    Attributes
+    ----------
+    table : str
+        What the paper calls it, such as "Table 3".
+    data : str
+        Subjects or data set.
+    conditions : str
+        What the figures depend on: size, split, mask, definitions of metrics, iterations, hardware.
+    grade : Literal['A', 'B', 'C']
+        How it was read. "A": in the paper's full text or supplement, or in its authors' repository; "B": as the full text of
+        another paper quotes it; "C": in a summary.
+    read : str
+        Where it was read.
+    rows : tuple[PrintedRow, ...]
+        All rows that were read.
+    """
+
+    table: str
+    data: str
+    conditions: str
+    grade: Literal["A", "B", "C"]
+    read: str
+    rows: tuple[PrintedRow, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse tables without rows, and two rows of one name."""
+        names = [row.name for row in self.rows]
+        if not names or len(set(names)) != len(names):
+            raise ValueError(f"rows: at least one, each name once; found {', '.join(names) or 'none'}")
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Keys of the values of all rows, in the order of the file."""
+        return tuple(dict.fromkeys(key for row in self.rows for key in row.values))
+
+    def decimals(self, metric: str) -> int:
+        """Most decimals that a value of a metric is printed with."""
+        values = [v for row in self.rows for key, v in row.values.items() if key.rpartition("/")[2] == metric]
+        return max(len(value.partition(".")[2]) for value in values)
+
+
+@dataclass(frozen=True)
+class Paper:
+    """A paper and its tables of results; ``arxiv`` is its number there, None without one."""
+
+    title: str
+    venue: str
+    arxiv: str | None
+    tables: tuple[PrintedTable, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse a paper without tables."""
+        if self.arxiv is not None and not re.fullmatch(r"\d{4}\.\d{4,5}", self.arxiv):
+            raise ValueError(f"arxiv: a number such as 2504.14967, in quotes, or null; found {self.arxiv!r}")
+        if not self.tables:
+            raise ValueError("tables: at least one; found none")
+
+    @property
+    def citation(self) -> str:
+        """Title, venue and number."""
+        return ", ".join(
+            [self.title, self.venue, *([f"arXiv {self.arxiv}"] if self.arxiv is not None else [])]
+        )
+
+
+def read_paper(path: Path) -> Paper:
+    """Read the file of a paper. Raises `InputError` for keys, values or tables that the schema does not have."""
+    return build(Paper, read_yaml(path), str(path))
+
+
+@cache
+def papers() -> dict[str, Paper]:
+    """All papers by name."""
+    return {path.stem: read_paper(path) for path in sorted(FOLDER.glob("*.yaml"))}
+
+
+def paper_named(name: str) -> Paper:
+    """Look up a paper. Raises `InputError` for an unknown one."""
+    if name not in papers():
+        raise unknown("command line", "--as", name, papers())
+    return papers()[name]
+
+
+def printed_tables(name: str, number: str | None) -> tuple[PrintedTable, ...]:
+    """The tables of a paper that may stand beside measurements, or the one of a number. Raises `InputError` if there is none."""
+    tables = [table for table in paper_named(name).tables if table.grade in COMPARABLE]
+    found = [table for table in tables if number is None or table.table.rpartition(" ")[2] == number]
+    if not found:
+        offered = ", ".join(dict.fromkeys(table.table for table in tables)) or "none of them read in full"
+        raise InputError("command line", "--table", f"a table of {name}: {offered}", str(number))
+    return tuple(found)
+
+
+def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
+    """A table with the columns of a printed one: measured methods, then the printed rows, which are not ranked.
+
+    Values are means over all cameras, as papers print them. Methods have the names that the paper gives them. Raises
+    `InputError` if the runs have no task of the table.
+    """
+    metrics = _metrics(runs, printed)
+    asked = {key.rpartition("/")[0] for key in printed.keys} - {""}
+    tasks = [task for task in TASKS if task in asked and task in runs.tasks]
+    if asked and not tasks:
+        raise InputError(runs.runs[0].folder.root, "tasks", " or ".join(sorted(asked)), ", ".join(runs.tasks))
+    names = {label: _name(runs.records[label], label, printed) for label in runs.ranked}
+    measured = build_table(
+        runs.rows,
+        metrics,
+        list(names),
+        tasks,
+        protocol_ids=runs.protocol_ids,
+        image_size=runs.image_size,
+        machine=runs.machine,
+        part=runs.part,
+        keys=runs.keys,
+        name=f"{name}-{printed.table.rpartition(' ')[2]}",
+    ).mapped(lambda row: replace(row, method=names[row.method]))
+    rows = tuple(TableRow(row.name, "", True, _cells(row, measured)) for row in printed.rows)
+    title = f"Printed in {printed.table} of the paper, on {printed.data} (not comparable)"
+    absent = [TASK_TITLES[task] for task in TASKS if task in asked and task not in tasks]
+    missing = [f"{task} is printed, but not measured here." for task in absent]
+    said = f"Printed values: {paper_named(name).citation}; {printed.conditions}; read in {printed.read} (grade {printed.grade})."
+    return replace(
+        measured,
+        groups=(*measured.groups, (title, rows)),
+        missing=(*measured.missing, *missing),
+        printed=said,
+    )
+
+
+def _metrics(runs: RunSet, printed: PrintedTable) -> list[MetricSpec]:
+    """The metrics of a printed table with its decimals, whether the runs have them or not."""
+    known = {spec.name: spec for spec in runs.metrics}
+    used = {key.rpartition("/")[2]: bool(key.rpartition("/")[0]) for key in printed.keys}
+    found = []
+    for metric, of_frames in used.items():
+        label, unit, higher = (OF_FRAMES if of_frames else OF_AVATARS)[metric]
+        plugin = discover("metrics").get(metric)
+        spec = known.get(metric) or (plugin.spec if plugin is not None else None)
+        spec = spec or MetricSpec(metric, label, unit, higher, 0, "", kind="frame" if of_frames else "avatar")
+        found.append(replace(spec, digits=printed.decimals(metric)))
+    return found
+
+
+def _name(record: MethodRecord, label: str, printed: PrintedTable) -> str:
+    for row in printed.rows:
+        if row.method and row.is_of(record):
+            return f"{row.name}{label.removeprefix(record.name)}"
+    return label
+
+
+def _cells(row: PrintedRow, table: Table) -> tuple[TableCell, ...]:
+    texts = [row.values.get(f"{c.task}/{c.metric}" if c.task else c.metric) for c in table.columns]
+    none = TableCell("none", None, "")
+    return tuple(none if text is None else TableCell("published", float(text), text) for text in texts)
+
+
+def listed() -> list[dict[str, Any]]:
+    """Name, citation and tables of every paper, for ``headbench list papers``."""
+    return [
+        {
+            "name": name,
+            "error": "",
+            "summary": f"{paper.citation}: {', '.join(f'{table.table} ({table.grade})' for table in paper.tables)}",
+            **asdict(paper),
+        }
+        for name, paper in papers().items()
+    ]
+
+
+def counts() -> dict[str, dict[str, int]]:
+    """Numbers of tables, rows and values of all papers, by grade."""
+    tables = [table for paper in papers().values() for table in paper.tables]
+    found = {}
+    for grade in ("A", "B", "C"):
+        own = [table for table in tables if table.grade == grade]
+        rows = [row for table in own for row in table.rows]
+        found[grade] = {
+            "tables": len(own),
+            "rows": len(rows),
+            "values": sum(len(row.values) for row in rows),
+        }
+    return found

@@ -1,0 +1,150 @@
+"""Printed tables as data, and runs in their form."""
+
+import json
+
+import pytest
+import yaml
+
+from headbench.bench.errors import InputError
+from headbench.bench.registry import discover
+from headbench.reports import papers as module
+from headbench.reports.papers import FOLDER, as_printed, counts, papers, printed_tables, read_paper
+from headbench.reports.runs import RunSet
+from headbench.reports.table_report import table_text
+
+from .test_layouts import GEOMETRY, OPACITY
+
+PAPER = "tensorial-2025"
+
+
+def shown(runs, number):
+    (printed,) = printed_tables(PAPER, number)
+    return as_printed(RunSet.read(runs), PAPER, printed)
+
+
+def test_measured_methods_stand_above_the_printed_rows_with_its_names(write_run):
+    values = {"ours": 33.0, "mine": 32.0, "insta": 28.0, "mean-image": 17.0}
+    folder = write_run("a", values, {"ours": OPACITY})
+    table = shown([folder], "3")
+    (_, measured), (title, printed) = table.groups
+    assert [row.method for row in measured] == ["Ours", "mine", "INSTA"]
+    assert title == "Printed in Table 3 of the paper, on nine NeRSemble subjects (not comparable)"
+    assert [(row.method, row.trivial) for row in printed] == [("INSTA", True), ("Ours", True)]
+    keys = [f"{column.task}/{column.metric}".lstrip("/") for column in table.columns]
+    assert dict(zip(keys, (cell.text for cell in printed[1].cells))) == {
+        "novel_view/psnr": "32.97",
+        "novel_view/ssim": "0.95",
+        "novel_view/lpips": "0.059",
+        "self_reenactment/psnr": "28.07",
+        "self_reenactment/ssim": "0.93",
+        "self_reenactment/lpips": "0.077",
+        "storage": "10",
+        "fps": "300",
+    }
+    assert {(cell.status, cell.rank) for row in printed for cell in row.cells} == {("published", None)}
+    assert measured[0].cells[0].text == "33.00"  # the decimals of the printed values
+    assert measured[0].cells[0].rank == 1
+    assert "arXiv 2504.14967" in table.caption
+    assert "grade A" in table.caption
+
+
+def test_settings_decide_which_printed_row_a_method_is(write_run):
+    opacity = write_run("opacity", {"ours": 35.0}, {"ours": OPACITY})
+    geometry = write_run("geometry", {"ours": 36.0, "ga": 30.0}, {"ours": GEOMETRY})
+    (_, measured), _ = shown([opacity, geometry], "4").groups
+    names = [row.method for row in measured]
+    assert names == ["opacity (dynamic=opacity)", "others (dynamic=position+rotation+scale)", "ga"]
+    other = write_run("b", {"ours": 33.0}, {"ours": {"lines": {"dynamic": ["color"]}}})
+    assert shown([other], "4").groups[0][1][0].method == "ours"
+
+
+def test_printed_metrics_that_a_run_lacks_are_missing_with_a_reason(write_run, tmp_path, monkeypatch):
+    paper = yaml.safe_load((FOLDER / f"{PAPER}.yaml").read_text())
+    paper["tables"][0]["rows"][0]["values"] = {"novel_view/csim": "0.91", "cross_reenactment/csim": "0.6"}
+    (tmp_path / "other.yaml").write_text(yaml.safe_dump(paper))
+    monkeypatch.setattr(module, "papers", lambda: {"other": read_paper(tmp_path / "other.yaml")})
+    (printed,) = printed_tables("other", "3")
+    table = as_printed(RunSet.read([write_run("a", {"ga": 30.0})]), "other", printed)
+    csim = [column.metric for column in table.columns].index("csim")
+    cell = table.rows[0].cells[csim]
+    assert (cell.status, cell.text) == ("missing", "–")
+    assert table.notes[cell.note]
+    assert "Cross-reenactment is printed, but not measured here." in table.caption
+
+
+@pytest.mark.parametrize("format", ["text", "md", "latex", "html", "csv", "json"])
+def test_every_format_has_measured_and_printed_values(write_run, format):
+    folder = write_run("a", {"ours": 33.25})
+    text = table_text([folder], format, paper=PAPER, number="3")
+    assert "33.25" in text
+    assert "32.97" in text
+    assert "32.97" not in table_text([folder], format)
+
+
+def test_all_tables_follow_each_other_where_a_format_allows_it(write_run):
+    folder = write_run("a", {"ours": 33.0})
+    text = table_text([folder], "md", paper=PAPER)
+    for table in printed_tables(PAPER, None):
+        assert f"Printed in {table.table} of" in text
+    with pytest.raises(InputError, match="--table: expected one of Table .*, for a file of format json"):
+        table_text([folder], "json", paper=PAPER)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"paper": "tensorial"}, "--as: expected one of .*Did you mean 'tensorial-2025'"),
+        ({"paper": PAPER, "number": "77"}, "--table: expected a table of tensorial-2025: .*, found 77"),
+        ({"number": "3"}, "--table: expected --as PAPER beside it"),
+        ({"paper": PAPER, "layout": "cost"}, "--as: expected no --layout"),
+        ({"paper": PAPER, "digits": ("2",)}, "--as: expected no --layout, --columns or --digits"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(write_run, options, message):
+    with pytest.raises(InputError, match=message):
+        table_text([write_run("a", {"ours": 33.0})], "md", **options)
+
+
+def test_every_file_of_a_paper_has_the_schema_and_known_methods():
+    assert papers()
+    methods = {name for name, plugin in discover("methods").items() if plugin.spec}
+    for name, paper in papers().items():
+        assert name == name.lower()
+        for table in paper.tables:
+            used = {row.method for row in table.rows} - {""}
+            assert used <= methods | {"rgbavatar", "flashavatar"}, (name, table.table)
+            assert all(text for text in (table.data, table.conditions, table.read))
+    assert counts()["A"]["values"] > 0
+
+
+CHANGES = [
+    (lambda p: p.update(titel="x"), "titel: expected one of .*Did you mean 'title'"),
+    (lambda p: p.pop("venue"), "venue: expected a value, found nothing"),
+    (lambda p: p.update(arxiv="25.1"), "arxiv: a number such as 2504.14967"),
+    (lambda p: p["tables"][0].update(grade="D"), r"tables\[0\]\.grade"),
+    (lambda p: p["tables"][0].update(rows=[]), "rows: at least one, each name once; found none"),
+    (lambda p: p["tables"][0]["rows"][0].update(values={}), "values: at least one; found none"),
+    (lambda p: p["tables"][0]["rows"][0]["values"].update(psnr="3"), "values: TASK/METRIC of .*; found psnr"),
+    (
+        lambda p: p["tables"][0]["rows"][0]["values"].update(fps=25),
+        "values, fps: a number as printed, in quotes; found 25",
+    ),
+    (lambda p: p["tables"][0]["rows"][0]["values"].update({"drive/psnr": "3"}), "found drive/psnr"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), CHANGES, ids=[m[:24] for _, m in CHANGES])
+def test_a_file_with_a_wrong_key_or_value_is_refused(tmp_path, change, message):
+    paper = yaml.safe_load((FOLDER / f"{PAPER}.yaml").read_text())
+    change(paper)
+    (tmp_path / "paper.yaml").write_text(yaml.safe_dump(paper))
+    with pytest.raises(InputError, match=message):
+        read_paper(tmp_path / "paper.yaml")
+
+
+def test_the_listing_has_every_paper_with_its_tables(capsys):
+    from headbench.bench import cli
+
+    assert cli.main(["list", "papers", "--json"]) == 0
+    (entry,) = [e for e in json.loads(capsys.readouterr().out) if e["name"] == PAPER]
+    assert "CVPR 2025, arXiv 2504.14967" in entry["summary"]
