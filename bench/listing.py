@@ -8,7 +8,7 @@ from typing import Any, Literal
 import tyro
 
 from .contracts import Progress
-from .registry import Group, discover, resolve
+from .registry import Group, discover, get, resolve
 from .specs import CommandResult
 
 
@@ -36,7 +36,7 @@ class ListSettings:
 def list_installed(settings: ListSettings, progress: Progress) -> CommandResult:
     """List what is installed: methods, presets, metrics, their profiles, readers, reports, benchmarks, commands, papers."""
     if settings.what == "papers":
-        return _shown(resolve("headbench.reports.papers:listed")())
+        return _shown(resolve(get("reports", "papers").implementation)())
     group: Group = "methods" if settings.what == "presets" else settings.what
     entries: list[dict[str, Any]] = []
     for name, plugin in discover(group).items():

@@ -100,7 +100,7 @@ class PrintedTable:
     Attributes
     ----------
     table : str
-        What the paper calls it, such as "Table 3".
+        What the paper calls it, such as "Table 3", or "Table 3 (left part)".
     data : str
         Subjects or data set.
     conditions : str
@@ -122,10 +122,17 @@ class PrintedTable:
     rows: tuple[PrintedRow, ...]
 
     def __post_init__(self) -> None:
-        """Refuse tables without rows, and two rows of one name."""
+        """Refuse tables without a number or rows, and two rows of one name."""
+        if not re.fullmatch(r"Table \S+( \(.*\))?", self.table):
+            raise ValueError(f'table: "Table" with its number, and a part in brackets; found {self.table!r}')
         names = [row.name for row in self.rows]
         if not names or len(set(names)) != len(names):
             raise ValueError(f"rows: at least one, each name once; found {', '.join(names) or 'none'}")
+
+    @property
+    def number(self) -> str:
+        """Number in the paper."""
+        return self.table.split(" ")[1]
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -183,7 +190,7 @@ def paper_named(name: str) -> Paper:
 def printed_tables(name: str, number: str | None) -> tuple[PrintedTable, ...]:
     """The tables of a paper that may stand beside measurements, or the one of a number. Raises `InputError` if there is none."""
     tables = [table for table in paper_named(name).tables if table.grade in COMPARABLE]
-    found = [table for table in tables if number is None or table.table.rpartition(" ")[2] == number]
+    found = [table for table in tables if number is None or table.number == number]
     if not found:
         offered = ", ".join(dict.fromkeys(table.table for table in tables)) or "none of them read in full"
         raise InputError("command line", "--table", f"a table of {name}: {offered}", str(number))
@@ -212,7 +219,7 @@ def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
         machine=runs.machine,
         part=runs.part,
         keys=runs.keys,
-        name=f"{name}-{printed.table.rpartition(' ')[2]}",
+        name=f"{name}-{printed.number}",
     ).mapped(lambda row: replace(row, method=names[row.method]))
     rows = tuple(TableRow(row.name, "", True, _cells(row, measured)) for row in printed.rows)
     title = f"Printed in {printed.table} of the paper, on {printed.data} (not comparable)"

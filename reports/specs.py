@@ -17,6 +17,13 @@ TABLE_TEXT = ReportSpec(
     writes=False,
 )
 
+PAPERS = ReportSpec(
+    name="papers",
+    summary="The papers in whose form tables can be printed, with their tables.",
+    implementation="headbench.reports.papers:listed",
+    writes=False,
+)
+
 CONTACT_SHEET = ReportSpec(
     name="contact-sheet",
     summary="Some frames of each task side by side: ground truth, renders and error maps of all methods, as PNG.",
