@@ -94,6 +94,7 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy bench datasets methods metrics reports
 	$(BIN)/python -m pytest -q tests/test_architecture.py
+	$(BIN)/python -m headbench.reports.papers
 
 fuzz: setup
 	$(BIN)/python -m headbench.tests.fuzz --seed $(SEED) --seconds $(SECONDS)

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import tyro
 
 from .contracts import Progress
+from .named_protocol import named_protocols
 from .registry import Group, discover, get, resolve
 from .specs import CommandResult
 
@@ -28,15 +29,20 @@ class ListSettings:
             "benchmarks",
             "commands",
             "papers",
+            "protocols",
         ]
     ]
-    """What to list; datasets are readers, and what makes captures; papers those in whose form tables can be printed."""
+    """What to list; datasets are readers, and what makes captures; papers and protocols those
+    that tables can be printed in the form of, and by."""
 
 
 def list_installed(settings: ListSettings, progress: Progress) -> CommandResult:
-    """List what is installed: methods, presets, metrics, their profiles, readers, reports, benchmarks, commands, papers."""
+    """List what is installed: methods, presets, metrics, their profiles, readers, reports, benchmarks, commands, papers, protocols."""
     if settings.what == "papers":
         return _shown(resolve(get("reports", "papers").implementation)())
+    if settings.what == "protocols":
+        protocols = {name: asdict(protocol) for name, protocol in named_protocols().items()}
+        return _shown([{"name": n, "summary": p["title"], "error": "", **p} for n, p in protocols.items()])
     group: Group = "methods" if settings.what == "presets" else settings.what
     entries: list[dict[str, Any]] = []
     for name, plugin in discover(group).items():

@@ -389,6 +389,61 @@ class Rows:
         places = np.concatenate([np.empty(0, int), *(np.flatnonzero(metric == name) for name in names)])
         return Rows(self._table.take(places).reset_index(drop=True))
 
+    def with_metrics(self, names: Mapping[str, str]) -> Rows:
+        """The rows of some metrics alone, each under another name."""
+        table = self._table[self._table["metric"].isin(list(names))]
+        renamed = pd.Series([names[str(name)] for name in table["metric"]], table.index, dtype="str")
+        return Rows(table.assign(metric=renamed))
+
+    def of_frames(self, tasks: Mapping[str, Collection[tuple[str, str, int, str]]]) -> Rows:
+        """The rows of some frames of some tasks, and those of avatars as a whole.
+
+        Rows that stand for all frames of one of the tasks because a method failed stay.
+        """
+        table = self._table
+        kept = table["task"] == ""
+        for task, frames in tasks.items():
+            own = table["task"] == task
+            inside = pd.MultiIndex.from_frame(table[FRAME]).isin(list(frames))
+            kept |= own & (inside | (table["timestep"] < 0))
+        return Rows(table[kept])
+
+    def as_one_sequence(self) -> Rows:
+        """The same rows, all frames of a subject and task in one sequence, so that every frame has the same weight.
+
+        Timesteps are numbered anew, sorted by sequence and timestep.
+        """
+        table = self._table
+        own = (table["task"] != "") & (table["timestep"] >= 0)
+        place = table.loc[own].groupby(["task", "subject"])[["sequence", "timestep"]]
+        numbers = pd.Series(table["timestep"], copy=True)
+        for _, group in place:
+            order = pd.MultiIndex.from_frame(group)
+            numbers[group.index] = order.unique().sort_values().get_indexer(order)
+        sequence = table["sequence"].mask(own, "").astype("str")
+        return Rows(table.assign(sequence=sequence, timestep=numbers))
+
+    def pooled(self, count: int, decibels: Collection[str]) -> Rows:
+        """The same rows, whose means over frames are those of batches of ``count`` frames in their order.
+
+        Every frame has the value of its batch: the mean, or for metrics in ``decibels`` (peak signal-to-noise ratios) that of the
+        mean squared error. In a last batch of fewer frames values are scaled, so that all batches have the same weight.
+        Groups are those of method, seed, task, subject and metric; rows without a value stay.
+        """
+        table = self._table
+        own = table[(table["task"] != "") & (table["timestep"] >= 0) & (table["status"] == "ok")]
+        values = table["value"].copy()
+        groups = ["method", "condition", "seed", "task", "subject", "metric", "region"]
+        for key, group in own.sort_values(FRAME).groupby(groups, sort=False):
+            numbers = group["value"].to_numpy()
+            error = key[5] in decibels  # type: ignore[index]
+            batch = np.arange(len(numbers)) // count
+            sizes = np.bincount(batch)
+            means = np.bincount(batch, 10 ** (-numbers / 10) if error else numbers) / sizes
+            means = -10 * np.log10(means) if error else means
+            values[group.index] = (means * len(numbers) / (len(sizes) * sizes))[batch]
+        return Rows(table.assign(value=values))
+
     def check(self) -> None:
         """Raise `InputError` for rows that repeat a frame, and for a method of several versions."""
         rows = self._table

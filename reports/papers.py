@@ -100,7 +100,7 @@ class PrintedTable:
     Attributes
     ----------
     table : str
-        What the paper calls it, such as "Table 3", or "Table 3 (left part)".
+        What the paper calls it, such as "Table 3", "Table 3 (left part)", or what it is of where its number was not read.
     data : str
         Subjects or data set.
     conditions : str
@@ -122,17 +122,16 @@ class PrintedTable:
     rows: tuple[PrintedRow, ...]
 
     def __post_init__(self) -> None:
-        """Refuse tables without a number or rows, and two rows of one name."""
-        if not re.fullmatch(r"Table \S+( \(.*\))?", self.table):
-            raise ValueError(f'table: "Table" with its number, and a part in brackets; found {self.table!r}')
+        """Refuse tables without rows, and two rows of one name."""
         names = [row.name for row in self.rows]
         if not names or len(set(names)) != len(names):
             raise ValueError(f"rows: at least one, each name once; found {', '.join(names) or 'none'}")
 
     @property
     def number(self) -> str:
-        """Number in the paper."""
-        return self.table.split(" ")[1]
+        """Number in the paper; where it is not known, what the table is called."""
+        found = re.match(r"Tables? ([0-9A-Z]+)", self.table)
+        return found[1] if found else self.table
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -222,7 +221,7 @@ def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
         name=f"{name}-{printed.number}",
     ).mapped(lambda row: replace(row, method=names[row.method]))
     rows = tuple(TableRow(row.name, "", True, _cells(row, measured)) for row in printed.rows)
-    title = f"Printed in {printed.table} of the paper, on {printed.data} (not comparable)"
+    title = f"Printed in {printed.table} of the paper (not comparable): {printed.data}"
     absent = [TASK_TITLES[task] for task in TASKS if task in asked and task not in tasks]
     missing = [f"{task} is printed, but not measured here." for task in absent]
     said = f"Printed values: {paper_named(name).citation}; {printed.conditions}; read in {printed.read} (grade {printed.grade})."
@@ -287,3 +286,11 @@ def counts() -> dict[str, dict[str, int]]:
             "values": sum(len(row.values) for row in rows),
         }
     return found
+
+
+if __name__ == "__main__":  # for `make check`
+    from ..bench.named_protocol import named_protocols
+
+    print(f"{len(papers())} papers, {len(named_protocols())} protocols")
+    for grade, numbers in counts().items():
+        print(f"grade {grade}: {', '.join(f'{number} {what}' for what, number in numbers.items())}")

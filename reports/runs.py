@@ -169,7 +169,8 @@ class RunSet:
     "" before `by_camera`. ``records`` has the method's entry of
     the manifest by label; ``trivial`` has labels of trivial baselines. ``keys`` has the frames of each task
     in the protocol, including those without values. ``shown`` has, by label, the first run of the method and
-    its name there, whose renders are shown.
+    its name there, whose renders are shown. ``protocol`` is the name of the protocol by which rows were chosen, see
+    `protocols.under`, "" for none.
     """
 
     runs: tuple[RunData, ...]
@@ -182,6 +183,7 @@ class RunSet:
     shown: Mapping[str, tuple[RunData, str]]
     part: str = ""
     cameras: str = ""
+    protocol: str = ""
 
     @classmethod
     def read(cls, folders: Sequence[Path], part: FrameSelection = WHOLE) -> RunSet:
@@ -245,8 +247,8 @@ class RunSet:
 
     @cached_property
     def by_camera(self) -> Self:
-        """The same runs with self-reenactment at seen and at unseen cameras as two tasks, or as one where unknown."""
-        if SPLIT_TASK not in self.tasks:
+        """The same runs with self-reenactment at seen and at unseen cameras as two tasks, or as one where unknown or by a protocol."""
+        if SPLIT_TASK not in self.tasks or self.protocol:
             return self
         keys = self.keys[SPLIT_TASK]
         unseen, reason = unseen_cameras([run.manifest for run in self.runs], keys)

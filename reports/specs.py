@@ -84,6 +84,14 @@ TABLE_COMMAND = CommandSpec(
     function="headbench.reports.table_command:print_table",
 )
 
+PROTOCOLS = CommandSpec(
+    name="protocols",
+    group="compare",
+    summary="Table what each choice of an evaluation is worth for stored rows: pixels, metrics, cameras, means, whole protocols.",
+    settings="headbench.reports.protocols:ProtocolsSettings",
+    function="headbench.reports.protocols:protocols_command",
+)
+
 COMPARE = CommandSpec(
     name="compare",
     group="compare",

@@ -33,6 +33,8 @@ class TableSettings:
     """Paper in the form of whose tables the runs are shown, with the rows that it printed below: `headbench list papers`."""
     number: Annotated[str | None, tyro.conf.arg(name="table")] = None
     """With --as: the number of the table. Default: all that were read in full, or quoted in full texts."""
+    protocol: str | None = None
+    """Published protocol by which frames, pixels, metrics and means are chosen from the rows: a name of `headbench list protocols`."""
     region: str = "full"
     """Region of the frames to show instead of the whole, such as face."""
     sequences: tuple[str, ...] = ()

@@ -19,6 +19,7 @@ from ..bench.specs import MetricSpec
 from ..bench.streams import on_terminal
 from .cameras import SPLIT_TASK
 from .papers import as_printed, printed_tables
+from .protocols import chosen
 from .runs import WHOLE, FrameSelection, RunSet
 from .tables import AVATAR_TITLE, TITLES, RowGroup, Table, build_table
 from .writers import WRITERS, to_text
@@ -137,6 +138,7 @@ def table_text(
     layout: str = COMPARISON,
     paper: str | None = None,
     number: str | None = None,
+    protocol: str | None = None,
     region: str = WHOLE.region,
     sequences: tuple[str, ...] = (),
     columns: tuple[str, ...] = (),
@@ -146,14 +148,18 @@ def table_text(
 
     Without a format it is "text" if standard output is a terminal, else "md".
     ``paper`` names one of `papers`, in the form of whose tables (or of the one of a ``number``) the runs are shown, in place of a
-    layout; ``region`` and ``sequences`` are those of `FrameSelection`,
+    layout; ``protocol`` names one of `named_protocols`, which selects frames, pixels and metrics; ``region`` and ``sequences`` are those of `FrameSelection`,
     ``columns`` and ``digits`` those of `Columns`. Raises `InputError` for a format, a layout, columns or runs that do not fit.
     """
     styled = format is None and on_terminal()
     format = format or ("text" if styled else "md")
     if format not in (*WRITERS, "text"):
         raise InputError("table", "format", f"one of {', '.join(WRITERS)}, text", repr(format))
-    runs = RunSet.read(run_folders, FrameSelection(region, sequences))
+    part = FrameSelection(region, sequences)
+    if protocol is not None and part != WHOLE:
+        expected = "no --region or --sequences beside it, which it decides"
+        raise InputError("command line", "--protocol", expected, part.text)
+    runs = chosen(RunSet.read(run_folders, part), protocol)
     if paper is None:
         if number is not None:
             raise InputError("command line", "--table", "--as PAPER beside it", "no paper")

@@ -201,14 +201,19 @@ CASES = {
             "suite/run-large/01/rows.parquet",
         )
     ],
-    "list": [case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets", "papers")],
+    "list": [case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets", "papers", "protocols")],
     "table": [
         *(case(f"table {{demo}} --format {name}", mark) for name, mark in FORMATS.items()),
         *(case(f"table {{demo}} --layout {layout}", mark) for layout, mark in LAYOUTS.items()),
         case("table {demo} --as tensorial-2025 --table 4", "Printed in Table 4"),
+        case("table {demo} --protocol suite", "Protocol suite: The suite of headbench"),
         case("table {demo} plain", "one seed"),
         case("table {demo} --columns psnr novel_view --digits 1 --out t.tex", "t.tex", "t.tex"),
         case("table {demo} --region face --sequences FREE", "Region: face. Sequences: FREE."),
+    ],
+    "protocols": [
+        case("protocols {demo}", "pixels: face.*"),
+        case("protocols {demo} --methods ga --out p.md", "p.md", "p.md"),
     ],
     "report": [
         case("report {demo} --out report.html --max-mb 5", "frames with pictures", "report.html"),

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 from ..condition import PLAIN
 from ..contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
@@ -29,6 +30,7 @@ from ..io.files import (
 )
 from ..io.images import probe_image, read_pixels, write_png
 from ..io.lock import locked
+from ..named_protocol import check_capture, needed
 from ..protocol import Protocol, make_protocols
 from ..registry import discover, get, resolve
 from ..rows import Rows
@@ -145,17 +147,20 @@ def _open(settings: EvaluateSettings, heads: Mapping[str, str]) -> tuple[RunConf
             used=("metrics",),
         )
     else:
+        asked: dict[str, Any] = {} if settings.protocol is None else needed(settings.protocol, {})
         config = capture_configuration(
             str(settings.clip),
             settings.out,
             settings.reader,
             settings.head,
-            tasks=settings.tasks,
+            **{"tasks": settings.tasks, **asked},
             metrics=settings.metrics
             or tuple(n for n in default_names("metrics") if settings.avatar or get("metrics", n).per_frame),
             frames_per_task=settings.frames_per_task,
         )
         clips = open_clips(config)
+        for clip in clips if settings.protocol is not None else []:
+            check_capture(str(settings.protocol), clip)
     config = replace(
         config,
         out=settings.out,

@@ -134,6 +134,9 @@ class EvaluateSettings(ExecutionOptions):
     metrics: tuple[str, ...] = ()
     """By which metrics of frames; default: those of `headbench run`. Not with --like."""
 
+    protocol: str | None = None
+    """Published protocol, as for `headbench run`. Not with --like."""
+
     reader: str = ""
     """Which dataset reader opens the capture; default: the one that finds it. Not with --like."""
 
@@ -148,7 +151,7 @@ class EvaluateSettings(ExecutionOptions):
     """Largest number of frames scored per subject and task, evenly spaced; default: all. Not with --like."""
 
     dependent = (
-        DependentOptions(("tasks", "metrics", "reader", "frames_per_task"), "like", False),
+        DependentOptions(("tasks", "metrics", "protocol", "reader", "frames_per_task"), "like", False),
         DependentOptions(("trust",), "like"),
         DependentOptions(("method",), "avatar"),
         DependentOptions(("names", "any_background"), "avatar", False),

@@ -22,13 +22,16 @@ def shown(runs, number):
     return as_printed(RunSet.read(runs), PAPER, printed)
 
 
-def test_measured_methods_stand_above_the_printed_rows_with_its_names(write_run):
+def test_measured_methods_stand_above_the_printed_rows(write_run):
     values = {"ours": 33.0, "mine": 32.0, "insta": 28.0, "mean-image": 17.0}
     folder = write_run("a", values, {"ours": OPACITY})
     table = shown([folder], "3")
     (_, measured), (title, printed) = table.groups
     assert [row.method for row in measured] == ["Ours", "mine", "INSTA"]
-    assert title == "Printed in Table 3 of the paper, on nine NeRSemble subjects (not comparable)"
+    assert title == (
+        "Printed in Table 3 of the paper (not comparable): "
+        "nine NeRSemble subjects (074 104 165 175 210 218 264 302 304)"
+    )
     assert [(row.method, row.trivial) for row in printed] == [("INSTA", True), ("Ours", True)]
     keys = [f"{column.task}/{column.metric}".lstrip("/") for column in table.columns]
     assert dict(zip(keys, (cell.text for cell in printed[1].cells))) == {
@@ -48,17 +51,21 @@ def test_measured_methods_stand_above_the_printed_rows_with_its_names(write_run)
     assert "grade A" in table.caption
 
 
-def test_settings_decide_which_printed_row_a_method_is(write_run):
+def test_settings_decide_the_printed_row_of_a_method(write_run):
     opacity = write_run("opacity", {"ours": 35.0}, {"ours": OPACITY})
     geometry = write_run("geometry", {"ours": 36.0, "ga": 30.0}, {"ours": GEOMETRY})
     (_, measured), _ = shown([opacity, geometry], "4").groups
     names = [row.method for row in measured]
-    assert names == ["opacity (dynamic=opacity)", "others (dynamic=position+rotation+scale)", "ga"]
+    assert names == [
+        "Ours, opacity (dynamic=opacity)",
+        "Ours, position rotation scale (dynamic=position+rotation+scale)",
+        "ga",
+    ]
     other = write_run("b", {"ours": 33.0}, {"ours": {"lines": {"dynamic": ["color"]}}})
     assert shown([other], "4").groups[0][1][0].method == "ours"
 
 
-def test_printed_metrics_that_a_run_lacks_are_missing_with_a_reason(write_run, tmp_path, monkeypatch):
+def test_printed_metrics_that_a_run_lacks_are_missing(write_run, tmp_path, monkeypatch):
     paper = yaml.safe_load((FOLDER / f"{PAPER}.yaml").read_text())
     paper["tables"][0]["rows"][0]["values"] = {"novel_view/csim": "0.91", "cross_reenactment/csim": "0.6"}
     (tmp_path / "other.yaml").write_text(yaml.safe_dump(paper))
@@ -81,7 +88,7 @@ def test_every_format_has_measured_and_printed_values(write_run, format):
     assert "32.97" not in table_text([folder], format)
 
 
-def test_all_tables_follow_each_other_where_a_format_allows_it(write_run):
+def test_all_tables_of_a_paper_follow_each_other(write_run):
     folder = write_run("a", {"ours": 33.0})
     text = table_text([folder], "md", paper=PAPER)
     for table in printed_tables(PAPER, None):
@@ -105,7 +112,7 @@ def test_options_that_do_not_fit_are_refused(write_run, options, message):
         table_text([write_run("a", {"ours": 33.0})], "md", **options)
 
 
-def test_every_file_of_a_paper_has_the_schema_and_known_methods():
+def test_every_paper_has_the_schema_and_known_methods():
     assert papers()
     methods = {name for name, plugin in discover("methods").items() if plugin.spec}
     for name, paper in papers().items():

@@ -1,0 +1,172 @@
+"""Protocols by name: how a paper or a benchmark evaluates, as data in `protocols`, a file for each.
+
+A run scores all frames of its captures, by every definition and region that it is asked for. A named protocol selects among these
+rows; it needs no rendering.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, cast
+
+from .configuration import build
+from .contracts import Clip, TaskName
+from .errors import InputError
+from .io.documents import read_yaml
+from .registry import unknown
+
+FOLDER = Path(__file__).with_name("protocols")
+
+
+@dataclass(frozen=True)
+class TaskFrames:
+    """The frames of a task that a protocol scores.
+
+    Attributes
+    ----------
+    cameras : Literal['all', 'seen', 'unseen']
+        All cameras, or those with or without training frames in the capture.
+    sequences : tuple[str, ...]
+        Beginnings of the names of sequences, such as "FREE"; () all held-out ones.
+    last : int | None
+        Only this many timesteps at the end of each sequence.
+    """
+
+    cameras: Literal["all", "seen", "unseen"] = "all"
+    sequences: tuple[str, ...] = ()
+    last: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a number of timesteps below 1."""
+        if self.last is not None and self.last < 1:
+            raise ValueError(f"last: at least 1, or null for all; found {self.last}")
+
+
+@dataclass(frozen=True)
+class NamedProtocol:
+    """How a paper or a benchmark evaluates.
+
+    ``tasks``, ``region``, ``profile``, ``average`` and ``pooled`` select and combine values; the other fields say what the published
+    figures were obtained with, and tables print how a run differs.
+
+    Attributes
+    ----------
+    title, source : str
+        Paper or benchmark, and where its protocol was read.
+    tasks : Mapping[str, TaskFrames]
+        Scored frames by task: novel_view, self_reenactment.
+    region : str
+        Pixels that PSNR and SSIM are of: "full", "foreground", "face" or another region of the captures.
+    profile : str
+        Metric profile, see ``headbench list profiles``.
+    average : Literal['sequences', 'frames']
+        Whether every sequence of a subject has the same weight, or every frame.
+    pooled : int | None
+        Frames over which a value is taken, with one mean squared error for PSNR; None for single frames.
+    subjects, training, test : str
+        Subjects, and the sequences that are trained on and held out.
+    size : str
+        WIDTHxHEIGHT of the images, "" if it varies.
+    iterations : int | None
+        Of the training of the paper's own method.
+    tracker, head_model : str
+        What the driving signal was estimated with.
+    """
+
+    title: str
+    source: str
+    tasks: dict[str, Any]
+    region: str = "full"
+    profile: str = "canonical"
+    average: Literal["sequences", "frames"] = "frames"
+    pooled: int | None = None
+    subjects: str = ""
+    training: str = ""
+    test: str = ""
+    size: str = ""
+    iterations: int | None = None
+    tracker: str = ""
+    head_model: str = ""
+
+    def __post_init__(self) -> None:
+        """Read the tasks; refuse unknown ones, and batches of less than one frame."""
+        frames = {}
+        for task, value in self.tasks.items():
+            if task not in ("novel_view", "self_reenactment"):
+                raise ValueError(f"tasks: novel_view or self_reenactment; found {task}")
+            given = (
+                value if isinstance(value, TaskFrames) else build(TaskFrames, value or {}, f"tasks.{task}")
+            )
+            frames[task] = given
+        if not frames:
+            raise ValueError("tasks: at least one; found none")
+        if self.pooled is not None and self.pooled < 1:
+            raise ValueError(f"pooled: at least 1, or null; found {self.pooled}")
+        object.__setattr__(self, "tasks", frames)
+
+    @property
+    def frames(self) -> Mapping[str, TaskFrames]:
+        """Scored frames by task."""
+        return self.tasks
+
+
+def read_protocol(path: Path) -> NamedProtocol:
+    """Read the file of a protocol. Raises `InputError` for keys or values that it cannot have."""
+    return build(NamedProtocol, read_yaml(path), str(path))
+
+
+@cache
+def named_protocols() -> dict[str, NamedProtocol]:
+    """All protocols by name."""
+    return {path.stem: read_protocol(path) for path in sorted(FOLDER.glob("*.yaml"))}
+
+
+def protocol_named(name: str) -> NamedProtocol:
+    """Look up a protocol. Raises `InputError` for an unknown one."""
+    if name not in named_protocols():
+        raise unknown("command line", "--protocol", name, named_protocols())
+    return named_protocols()[name]
+
+
+def needed(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a run that measures what a protocol selects: tasks, profile and region beside the usual ones.
+
+    ``settings`` are those that are given; they decide. Raises `InputError` for one that leaves out what the protocol needs.
+    """
+    protocol = protocol_named(name)
+    wanted: dict[str, tuple[str, ...]] = {
+        "tasks": tuple(protocol.frames),
+        "metric_profiles": tuple(dict.fromkeys(("canonical", protocol.profile))),
+        "regions": () if protocol.region == "full" else tuple(dict.fromkeys(("face", protocol.region))),
+    }
+    found: dict[str, Any] = {}
+    for key, values in wanted.items():
+        given = settings.get(key)
+        if given is None:
+            found |= {key: values} if values else {}
+        elif lacking := set(values) - {*given} - {"canonical", "face"}:
+            raise InputError(
+                "settings", key, f"{', '.join(sorted(lacking))}, by protocol {name}", ", ".join(given)
+            )
+    return found
+
+
+def check_capture(name: str, clip: Clip) -> None:
+    """Raise `InputError` if a capture has no frames of a task of a protocol, or none of its cameras or sequences."""
+    for task, wanted in protocol_named(name).frames.items():
+        keys = clip.splits.get(cast(TaskName, task), ())
+        trained = {key.camera for key in clip.splits["train"]}
+        seen = {key.camera in trained for key in keys}
+        sequences = sorted({key.sequence for key in keys})
+        place = f"clip {clip.subject}"
+        if not keys:
+            raise InputError(place, f"splits.{task}", f"at least one frame, by protocol {name}", "none")
+        if wanted.cameras != "all" and (wanted.cameras == "seen") not in seen:
+            expected = f"{wanted.cameras} cameras in {task}, by protocol {name}"
+            raise InputError(place, "cameras", expected, ", ".join(sorted({key.camera for key in keys})))
+        if wanted.sequences and not any(each.startswith(wanted.sequences) for each in sequences):
+            expected = f"{' or '.join(wanted.sequences)} in {task}, by protocol {name}"
+            raise InputError(place, "sequences", expected, ", ".join(sequences))

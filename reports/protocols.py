@@ -1,0 +1,258 @@
+"""Stored rows under named protocols, and what each difference between protocols is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from ..bench.contracts import FrameKey, Progress
+from ..bench.engine.scoring import FULL
+from ..bench.errors import InputError
+from ..bench.io.files import check_writable, write_text
+from ..bench.named_protocol import NamedProtocol, TaskFrames, named_protocols, protocol_named
+from ..bench.protocol import TASK_TITLES
+from ..bench.registry import get
+from ..bench.specs import CommandResult, MetricSpec
+from .aggregate import summarise
+from .cameras import unseen_cameras
+from .runs import RunSet
+
+CANONICAL = "canonical"
+QUALITY = {"psnr": 2, "lpips": 4}
+"""Metrics whose change is tabled, and their decimals."""
+
+
+def under(runs: RunSet, name: str, protocol: NamedProtocol) -> RunSet:
+    """Runs as a protocol scores them: its frames, pixels, definitions of metrics and means.
+
+    Raises `InputError` for what the runs or their captures lack: a task, cameras, a sequence, a region, a metric profile.
+    """
+    source = runs.runs[0].folder.rows
+    tasks = tuple(task for task in protocol.frames if task in runs.tasks)
+    if not tasks:
+        raise InputError(
+            source, "tasks", f"{' or '.join(protocol.frames)}, by protocol {name}", ", ".join(runs.tasks)
+        )
+    keys = {task: _frames(runs, task, protocol.frames[task], name) for task in tasks}
+    if protocol.region != FULL and protocol.region not in runs.rows.regions:
+        expected = f"{protocol.region}, by protocol {name}"
+        remedy = f"`headbench run --protocol {name}` measures it."
+        raise InputError(source, "regions", expected, ", ".join(sorted(runs.rows.regions)), remedy)
+    metrics, names = _metrics(runs, name, protocol)
+    rows = runs.rows.of_part(protocol.region, (), FULL).of_frames(keys).with_metrics(names)
+    if protocol.average == "frames":
+        rows = rows.as_one_sequence()
+    if protocol.pooled is not None:
+        rows = rows.pooled(protocol.pooled, {spec.name for spec in metrics if spec.unit == "dB"})
+    # With one mean over all frames, their sequences and timesteps are not those of the rows any more.
+    found = {task: frozenset(own) for task, own in keys.items()} if protocol.average == "sequences" else {}
+    shown = " ".join([f"Protocol {name}: {protocol.title}.", *differences(runs, protocol)])
+    present = tuple(spec for spec in metrics if spec.name in rows.metrics)
+    return replace(runs, rows=rows, tasks=tasks, metrics=present, keys=found, part=shown, protocol=name)
+
+
+def _frames(runs: RunSet, task: str, wanted: TaskFrames, name: str) -> list[FrameKey]:
+    """The frames of a task. Raises `InputError` if there are none of its cameras or sequences."""
+    source, keys = runs.runs[0].folder.rows, sorted(runs.keys[task])
+    if wanted.cameras != "all" and task != "novel_view":  # whose cameras are unseen
+        unseen, reason = unseen_cameras([run.manifest for run in runs.runs], keys)
+        inside = [
+            key for key in keys if ((key.subject, key.camera) in unseen) == (wanted.cameras == "unseen")
+        ]
+        if not inside or not unseen:
+            expected = f"{wanted.cameras} cameras in {task}, by protocol {name}"
+            raise InputError(
+                source, "cameras", expected, reason or f"{len({key.camera for key in keys})} others"
+            )
+        keys = inside
+    if wanted.sequences:
+        of = sorted({key.sequence for key in keys})
+        keys = [key for key in keys if key.sequence.startswith(wanted.sequences)]
+        if not keys:
+            expected = f"{' or '.join(wanted.sequences)}, held out, by protocol {name}"
+            raise InputError(source, "sequences", expected, ", ".join(of))
+    if wanted.last is not None:
+        times: dict[tuple[str, str], list[int]] = {}
+        for key in keys:
+            times.setdefault((key.subject, key.sequence), []).append(key.timestep)
+        kept = {place: set(sorted(set(own))[-wanted.last :]) for place, own in times.items()}
+        keys = [key for key in keys if key.timestep in kept[key.subject, key.sequence]]
+    return keys
+
+
+def _metrics(runs: RunSet, name: str, protocol: NamedProtocol) -> tuple[list[MetricSpec], dict[str, str]]:
+    """The metrics by the protocol's definitions, under their usual names, and the names of their rows."""
+    defined = {metric.name for metric in get("profiles", CANONICAL).metrics}
+    metrics, names = [], {}
+    for spec in runs.metrics:
+        bare, _, profile = spec.name.partition("@")
+        of_profile = bare in defined and (profile or CANONICAL) == protocol.profile
+        if of_profile or (bare not in defined and not profile):
+            names[spec.name] = bare
+            label = spec.label.removesuffix(f" ({profile})") if profile else spec.label
+            tables = ("comparison",) if profile else spec.tables
+            metrics.append(replace(spec, name=bare, label=label, tables=tables, profile=CANONICAL))
+    if not any(spec.per_frame for spec in metrics):
+        source = runs.runs[0].folder.rows
+        expected = f"metrics of profile {protocol.profile}, by protocol {name}"
+        remedy = f"`headbench run --protocol {name}` measures them."
+        raise InputError(source, "metrics", expected, ", ".join(sorted(runs.rows.metrics)), remedy)
+    return metrics, names
+
+
+def differences(runs: RunSet, protocol: NamedProtocol) -> list[str]:
+    """How runs differ from what the published figures of a protocol were obtained with: sentences."""
+    found = []
+    synthetic = all(
+        clip.steps and "synthetic" in clip.steps[0].get("parameters", {})
+        for run in runs.runs
+        for clip in run.manifest.clips
+    )
+    subjects = len({clip.subject for run in runs.runs for clip in run.manifest.clips})
+    if protocol.subjects and synthetic:
+        found.append(f"Subjects: {subjects} synthetic, there {protocol.subjects}.")
+    sizes = {p.resolution for run in runs.runs for p in run.manifest.protocols.values()}
+    if protocol.size and sizes != {protocol.size}:
+        found.append(f"Pixels: {', '.join(sorted(sizes))}, there {protocol.size}.")
+    budgets = sorted(
+        {
+            n
+            for record in runs.records.values()
+            if (n := record.budget.get("iterations")) and not record.trivial
+        }
+    )
+    if protocol.iterations is not None and budgets and budgets != [protocol.iterations]:
+        most = f"{budgets[0]:,}" + (f" to {budgets[-1]:,}" if len(budgets) > 1 else "")
+        found.append(f"Iterations: {most}, there {protocol.iterations:,}.")
+    return found
+
+
+@dataclass(frozen=True)
+class ProtocolsSettings:
+    """Change of every metric by each choice of an evaluation alone, and under whole protocols, from stored rows."""
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of runs, best ones made with `headbench run --protocol NAME`, which have the profiles and regions."""
+    methods: tuple[str, ...] = ()
+    """Only these methods; default: all that are ranked."""
+    out: str | None = None
+    """File to write the Markdown to, instead of printing it."""
+
+
+USUAL = "usual"
+"""What every choice is compared with: all frames and pixels, the mean over frames, the canonical metrics."""
+NAMED = "protocol "
+
+
+def choices(runs: RunSet) -> dict[str, NamedProtocol]:
+    """The usual protocol, those that differ from it in one choice, and the named ones."""
+    tasks: dict[str, Any] = {
+        task: TaskFrames() for task in ("novel_view", "self_reenactment") if task in runs.tasks
+    }
+    usual = NamedProtocol("the usual one", "", dict(tasks))
+    found = {USUAL: usual}
+    regions = sorted(runs.rows.regions - {FULL})
+    found |= {f"pixels: {region}": replace(usual, region=region) for region in regions}
+    profiles = dict.fromkeys(spec.profile for spec in runs.metrics if spec.profile != CANONICAL)
+    found |= {f"metrics: {profile}": replace(usual, profile=profile) for profile in profiles}
+    found["pooled: 16 frames"] = replace(usual, pooled=16)
+    found["mean: over sequences"] = replace(usual, average="sequences")
+    if "self_reenactment" in tasks:
+        starts = sorted({key.sequence.partition("-")[0] for key in runs.keys["self_reenactment"]})
+        some = {f"cameras: {cameras}": TaskFrames(cameras) for cameras in ("seen", "unseen")}
+        some |= {f"sequences: {start}": TaskFrames(sequences=(start,)) for start in starts if len(starts) > 1}
+        found |= {name: replace(usual, tasks={"self_reenactment": frames}) for name, frames in some.items()}
+    return found | {f"{NAMED}{name}": protocol for name, protocol in named_protocols().items()}
+
+
+def protocols_command(settings: ProtocolsSettings, progress: Progress) -> CommandResult:
+    """Table what each choice of a protocol is worth in dB and LPIPS, for every method of runs.
+
+    Raises `InputError` for runs that do not belong together, and for unknown methods.
+    """
+    if settings.out is not None:
+        check_writable(Path(settings.out), "--out")
+    runs = RunSet.read([Path(run) for run in settings.runs])
+    for method in settings.methods:
+        if method not in runs.methods:
+            raise InputError("command line", "--methods", f"some of {', '.join(runs.methods)}", method)
+    runs = runs.only(settings.methods or runs.ranked)
+    values: dict[str, dict[str, float]] = {}
+    refused: dict[str, str] = {}
+    for label, protocol in choices(runs).items():
+        try:
+            own = under(runs, label.removeprefix(NAMED), protocol)
+        except InputError as error:
+            refused[label] = f"{error.key}: expected {error.expected}"
+            continue
+        values[label] = _means(own)
+    text = _text(runs.methods, values, refused)
+    data = {"values": values, "refused": refused}
+    if settings.out is None:
+        return CommandResult(text, data)
+    write_text(Path(settings.out), f"{text}\n")
+    return CommandResult(settings.out, {**data, "out": settings.out})
+
+
+def _means(runs: RunSet) -> dict[str, float]:
+    """Mean of each metric by "method task metric"."""
+    found = {}
+    for method in runs.methods:
+        for task in runs.tasks:
+            for metric in QUALITY:
+                value = summarise(runs.rows, method, metric, task).value
+                if value is not None:
+                    found[f"{method} {task} {metric}"] = value
+    return found
+
+
+def _text(
+    methods: Sequence[str], values: Mapping[str, Mapping[str, float]], refused: Mapping[str, str]
+) -> str:
+    """A table for each task: values under the usual protocol, then differences from them."""
+    parts = []
+    base = values[USUAL]
+    for task in ("novel_view", "self_reenactment"):
+        columns = [(m, metric) for m in methods for metric in QUALITY if f"{m} {task} {metric}" in base]
+        if not columns:
+            continue
+        head = ["", *(f"{method} {metric.upper()}" for method, metric in columns)]
+        lines = [head, [":--", *("--:" for _ in columns)]]
+        for label, own in values.items():
+            cells = []
+            for method, metric in columns:
+                key = f"{method} {task} {metric}"
+                if key not in own:
+                    cells.append("–")
+                elif label == USUAL:
+                    cells.append(f"{own[key]:.{QUALITY[metric]}f}")
+                else:
+                    cells.append(f"{own[key] - base[key]:+.{QUALITY[metric]}f}")
+            if set(cells) != {"–"}:
+                lines.append([label, *cells])
+        table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        spans = [
+            max(found) - min(found)
+            for m in methods
+            if (found := [own[key] for own in values.values() if (key := f"{m} {task} psnr") in own])
+        ]
+        spread = f"The same avatars differ by up to {max(spans, default=0):.1f} dB between these rows."
+        parts.append(f"### {TASK_TITLES[task]}\n\n{table}\n\n{spread}")
+    parts.append(
+        'The row "usual" has values: all frames and pixels, the mean over frames and then subjects, the canonical metrics. The others '
+        "have differences from it: rows of protocols with all of their choices, other rows with one."
+    )
+    if refused:
+        parts.append(
+            "\n".join(["Not possible with these rows:", "", *(f"- {k}: {v}" for k, v in refused.items())])
+        )
+    return "\n\n".join(parts)
+
+
+def chosen(runs: RunSet, name: str | None) -> RunSet:
+    """The runs under the protocol of a name, None for as they are."""
+    return runs if name is None else under(runs, name, protocol_named(name))
