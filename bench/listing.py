@@ -35,11 +35,19 @@ class ListSettings:
     """What to list; datasets are readers, and what makes captures; papers and protocols those
     that tables can be printed in the form of, and by."""
 
+    cite: bool = False
+    """With methods: their sources, BibTeX entries, and the figures that papers printed for them."""
+
+    def __post_init__(self) -> None:
+        """Refuse citations of anything but methods."""
+        if self.cite and self.what != "methods":
+            raise ValueError(f"--cite is for methods; found {self.what}")
+
 
 def list_installed(settings: ListSettings, progress: Progress) -> CommandResult:
     """List what is installed: methods, presets, metrics, their profiles, readers, reports, benchmarks, commands, papers, protocols."""
-    if settings.what == "papers":
-        return _shown(resolve(get("reports", "papers").implementation)())
+    if settings.what == "papers" or settings.cite:
+        return _shown(resolve(get("reports", "citations" if settings.cite else "papers").implementation)())
     if settings.what == "protocols":
         protocols = {name: asdict(protocol) for name, protocol in named_protocols().items()}
         return _shown([{"name": n, "summary": p["title"], "error": "", **p} for n, p in protocols.items()])

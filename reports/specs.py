@@ -24,6 +24,13 @@ PAPERS = ReportSpec(
     writes=False,
 )
 
+CITATIONS = ReportSpec(
+    name="citations",
+    summary="Source, citation and printed figures of every registered method.",
+    implementation="headbench.reports.method_cards:citations",
+    writes=False,
+)
+
 CONTACT_SHEET = ReportSpec(
     name="contact-sheet",
     summary="Some frames of each task side by side: ground truth, renders and error maps of all methods, as PNG.",

@@ -201,7 +201,10 @@ CASES = {
             "suite/run-large/01/rows.parquet",
         )
     ],
-    "list": [case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets", "papers", "protocols")],
+    "list": [
+        *(case(f"list {what}", r"\w") for what in (*SPEC_TYPES, "presets", "papers", "protocols")),
+        case("list methods --cite", "(?s)32.97 dB.*claimed.*31.28 dB.*run by others"),
+    ],
     "table": [
         *(case(f"table {{demo}} --format {name}", mark) for name, mark in FORMATS.items()),
         *(case(f"table {{demo}} --layout {layout}", mark) for layout, mark in LAYOUTS.items()),

@@ -31,6 +31,7 @@ from headbench.bench.executors.settings import Execution
 from headbench.bench.registry import discover, resolve
 from headbench.bench.specs import COMMAND_GROUPS
 from headbench.datasets.lint.catalogue import GROUPS, RULES
+from headbench.reports.method_cards import printed_figures
 
 OBJECT_TYPES = {
     "lint": "lint code",
@@ -372,6 +373,7 @@ def method_pages() -> dict[str, str]:
             *(f"- {name}: {value}" for name, value in facts),
             "",
         ]
+        parts += card_parts(spec)
         parts += ["## Presets\n", "Settings that a preset changes; the others have the defaults below.\n"]
         parts += [table(*preset_rows(spec)), "## Settings\n"]
         parts.append(f"In `--set settings.{name}.KEY=VALUE`, or under `settings: {name}:` in a YAML file.\n")
@@ -384,6 +386,41 @@ def method_pages() -> dict[str, str]:
     lines += ["```{toctree}\n:hidden:\n", *own("methods"), "```\n"]
     pages["methods/index"] = "\n".join(lines)
     return pages
+
+
+def card_parts(spec: Any) -> list[str]:
+    """Source, citation and printed figures of a method."""
+    if not spec.source:
+        return []
+    parts = ["## Source\n", escaped(spec.source), ""]
+    parts += [f"```bibtex\n{spec.bibtex.strip()}\n```\n"] if spec.bibtex else []
+    figures = printed_figures(spec)
+    if figures:
+        keys = [k for k in PRINTED if any(k in figure.values for figure in figures)]
+        rows = [
+            (
+                f"{figure.paper}, {escaped(figure.table)}",
+                "its own paper" if figure.own else "run by others",
+                escaped(figure.data),
+                *(figure.values.get(key, "") for key in keys),
+            )
+            for figure in figures
+        ]
+        parts += [
+            "## Printed figures\n",
+            "As papers printed them, on their own data and by their own protocols.",
+        ]
+        parts += ["Not comparable with each other or with measurements here.\n"]
+        parts += [table(("table", "by", "data", *(PRINTED[key] for key in keys)), rows), ""]
+    return parts
+
+
+PRINTED = {
+    f"{task}/{metric}": f"{title} {metric.upper()}"
+    for task, title in (("novel_view", "novel view"), ("self_reenactment", "self-reenactment"))
+    for metric in ("psnr", "ssim", "lpips")
+} | {"storage": "MB", "fps": "FPS"}
+"""Columns of the printed figures of a method."""
 
 
 def run_settings_page() -> str:

@@ -1,0 +1,86 @@
+"""Cards of registered methods: source, citation, and the figures that papers printed for them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from ..bench.registry import discover
+from ..bench.specs import MethodSpec
+from .papers import COMPARABLE, papers
+
+
+@dataclass(frozen=True)
+class PrintedFigures:
+    """What a paper printed for a method; ``own``: whether it is the method's own paper. Values by "task/metric", as printed."""
+
+    paper: str
+    table: str
+    data: str
+    grade: str
+    own: bool
+    values: dict[str, str]
+
+
+def printed_figures(spec: MethodSpec) -> list[PrintedFigures]:
+    """Rows of a method in all stored tables that were read or quoted in full texts, those of its own paper first; without ablations."""
+    numbers = {*re.findall(r"\d{4}\.\d{4,5}", spec.source)}
+    found = []
+    for name, paper in papers().items():
+        for table in paper.tables:
+            if table.grade not in COMPARABLE or "ablation" in table.table:
+                continue
+            for row in table.rows:
+                if row.method == spec.name:
+                    own = paper.arxiv in numbers
+                    found.append(PrintedFigures(name, table.table, table.data, table.grade, own, row.values))
+    return sorted(found, key=lambda figures: not figures.own)
+
+
+def citations() -> list[dict[str, Any]]:
+    """A card for every registered method, for ``headbench list methods --cite``: ``summary`` has its text."""
+    cards = []
+    for name, plugin in discover("methods").items():
+        spec = plugin.spec
+        if not isinstance(spec, MethodSpec) or not spec.source:
+            continue
+        figures = printed_figures(spec)
+        lines = [spec.summary, f"Source: {spec.source}"]
+        code = (
+            "of headbench, written from the paper"
+            if spec.native
+            else "of the authors, in a checkout of yours"
+        )
+        lines.append(f"Code: {code}")
+        lines += [f"Printed: {figure_text(figure)}" for figure in figures]
+        lines += [spec.bibtex.strip()] if spec.bibtex else []
+        text = "\n".join(lines).replace("\n", "\n  ")
+        cards.append(
+            {
+                "name": name,
+                "error": "",
+                "summary": f"{text}\n",
+                "source": spec.source,
+                "bibtex": spec.bibtex.strip(),
+                "native": spec.native,
+                "printed": [vars(figure) for figure in figures],
+            }
+        )
+    return cards
+
+
+SHOWN = {"novel_view/psnr": "novel view", "self_reenactment/psnr": "self-reenactment", "fps": "speed"}
+UNITS = {"fps": "FPS"}
+
+
+def figure_text(figures: PrintedFigures) -> str:
+    """PSNR and speed of a printed row in words, with who printed them."""
+    shown = [
+        f"{label} {figures.values[key]} {UNITS.get(key, 'dB')}"
+        for key, label in SHOWN.items()
+        if key in figures.values
+    ]
+    by = "claimed" if figures.own else "run by others"
+    said = ", ".join(shown) or "other metrics"
+    return f"{said} ({by}: {figures.paper}, {figures.table}, {figures.data}, grade {figures.grade})"
