@@ -451,6 +451,13 @@ class TemporalMetric(Protocol):
         each."""
 
 
+class SequenceMetric(Protocol):
+    """One number for the frames of a sequence at one camera, in the order of time (`MetricSpec.kind` "sequence")."""
+
+    def __call__(self, images: Sequence[ByteArray], targets: Sequence[ByteArray]) -> float:
+        """Compare images with the ground truth; (H, W, 3) 8-bit each, as many as there are scored frames."""
+
+
 class Measurement(NamedTuple):
     """One number for an avatar as a whole, and auxiliary values of the measurement.
 

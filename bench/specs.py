@@ -192,7 +192,7 @@ MAX_DIGITS = 12
 """Decimals shown in tables."""
 
 
-MetricKind = Literal["frame", "regional", "temporal", "avatar", "training"]
+MetricKind = Literal["frame", "regional", "temporal", "sequence", "avatar", "training"]
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,8 @@ class MetricSpec:
     implementation : str
         "package.module:function" for the given ``kind``; a class is instantiated without arguments.
     kind : MetricKind
-        "frame", a `Metric`; "regional", a `RegionalMetric`; "temporal", a `TemporalMetric`; "avatar",
+        "frame", a `Metric`; "regional", a `RegionalMetric`; "temporal", a `TemporalMetric`; "sequence", a
+        `SequenceMetric`, whose value is that of each of the frames; "avatar",
         an `AvatarMetric`; "training", a `TrainingMetric`.
     detail : str
         Key of the measurement's details that holds the value, in ``unit``; "" for the main value.
@@ -245,7 +246,7 @@ class MetricSpec:
     @property
     def per_frame(self) -> bool:
         """Whether every frame has a value; otherwise the avatar has one."""
-        return self.kind in ("frame", "regional", "temporal")
+        return self.kind in ("frame", "regional", "temporal", "sequence")
 
     def __post_init__(self) -> None:
         """Refuse values that tables cannot show or results cannot be read with."""

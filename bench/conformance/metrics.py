@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..contracts import ByteArray, Camera, Frame, HeadPose, Measurement
-from ..engine.scoring import make_metric
+from ..engine.scoring import compared_over_time, make_metric
 from ..errors import UnavailableError
 from ..io.files import check_name
 from ..specs import MetricSpec
@@ -52,7 +52,7 @@ def check_metric(spec: MetricSpec) -> list[str]:
         with attempt(breaches, "measuring"):
             breaches += check(metric, spec)
         return breaches
-    compare = _over_time(metric) if spec.kind == "temporal" else metric
+    compare = compared_over_time(metric, spec.kind)
     for part in (_value_breaches, _repeat_breaches, _input_breaches):
         with attempt(breaches, "comparing two images"):
             breaches += part(compare, spec)
@@ -86,15 +86,6 @@ def _frozen(value: Any) -> ByteArray:
 
 def _noisy(image: ByteArray, sigma: float, seed: int = 1) -> ByteArray:
     return _frozen(image + np.random.default_rng(seed).normal(0, sigma, image.shape))
-
-
-def _over_time(metric: Any) -> Compare:
-    """A temporal metric as a frame metric: the neighbouring frame is rendered without error."""
-    return lambda image, truth: metric(image, truth, _neighbour(truth), _neighbour(truth))
-
-
-def _neighbour(truth: ByteArray) -> ByteArray:
-    return np.roll(truth, 1, axis=1)
 
 
 def _value_breaches(compare: Compare, spec: MetricSpec) -> Iterator[str]:

@@ -31,7 +31,7 @@ from . import adaptation
 from .captures import open_clips, relative_paths
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
 from .jobs import make_jobs, run_cell
-from .scoring import make_metric
+from .scoring import compared_over_time, make_metric
 from .steps import Job, failed_rows, reason_of, steps_ahead
 from .store import RunFolder
 from .tasks import execute, machine_of
@@ -345,7 +345,7 @@ def warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
         if not spec.per_frame:
             continue
         try:
-            value = metric(image, image, image, image) if spec.kind == "temporal" else metric(image, image)
+            value = compared_over_time(metric, spec.kind)(image, image)
         except UnavailableError as error:
             log.warning("%s will be missing: %s", spec.label, error)
         else:

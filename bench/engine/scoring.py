@@ -10,6 +10,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ..contracts import ByteArray, Clip, FrameKey, Progress, RegionalClip, no_progress
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..io.files import check_name
@@ -99,7 +101,7 @@ def score_frames(
     scored: dict[str, list[Score]] = {}
     metrics = {spec.name: make_metric(spec, device) for spec in specs}
     at_once = [
-        spec for spec in specs if spec.kind != "temporal" and not hasattr(metrics[spec.name], "batched")
+        spec for spec in specs if spec.kind not in STREAMS and not hasattr(metrics[spec.name], "batched")
     ]
     rest = [spec for spec in specs if spec not in at_once]
     total, done = (bool(at_once) + len(rest)) * len(keys), 0
@@ -113,7 +115,7 @@ def score_frames(
                 done += 1
                 progress(done, total, "frames")
         for spec in rest:
-            stream = _temporal if spec.kind == "temporal" else _batched
+            stream = STREAMS.get(spec.kind, _batched)
             scored[spec.name] = []
             for score in stream(keys, frames, spec, metrics[spec.name], pool):
                 scored[spec.name].append(score)
@@ -188,6 +190,40 @@ def _temporal(
             return _missing(spec, key, error.note)
 
     yield from _ahead(pool, score, keys)
+
+
+def _sequences(
+    keys: Sequence[FrameKey], frames: ScoredFrames, spec: MetricSpec, metric: Any, pool: ThreadPoolExecutor
+) -> Iterator[Score]:
+    """Scores of a metric that compares all frames of a sequence at a camera at once; each of them has its value."""
+    values: dict[tuple[str, str, str], float | str] = {}
+    for key in keys:
+        place = key.subject, key.sequence, key.camera
+        if place not in values:
+            own = sorted(other for other in keys if (other.subject, other.sequence, other.camera) == place)
+            images, truths = (
+                list(_ahead(pool, frames.render, own)),
+                list(_ahead(pool, frames.clip.image, own)),
+            )
+            try:
+                values[place] = float(metric(images, truths))
+            except UnavailableError as error:
+                values[place] = error.note
+        value = values[place]
+        yield _missing(spec, key, value) if isinstance(value, str) else Score(spec.name, key, FULL, value)
+
+
+STREAMS = {"temporal": _temporal, "sequence": _sequences}
+"""How the frames of a metric that compares several at once are scored, by its kind."""
+
+
+def compared_over_time(metric: Any, kind: str) -> Callable[[ByteArray, ByteArray], float]:
+    """A metric of any kind of frames as one of single images: a neighbour in time is rendered without error, or nothing moves."""
+    if kind == "temporal":
+        return lambda image, truth: metric(image, truth, np.roll(truth, 1, axis=1), np.roll(truth, 1, axis=1))
+    if kind == "sequence":
+        return lambda image, truth: metric([image], [truth])
+    return metric  # type: ignore[no-any-return]
 
 
 def _ahead(

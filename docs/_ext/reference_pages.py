@@ -528,6 +528,7 @@ def metric_entry(name: str, spec: Any) -> str:
 KINDS = {
     "regional": "measured for each frame and region",
     "temporal": "measured for each frame and its predecessor",
+    "sequence": "measured for all frames of a sequence at a camera together",
 }
 
 

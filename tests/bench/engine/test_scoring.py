@@ -57,6 +57,14 @@ class Batched(Difference):
             yield self(image, truth)
 
 
+def video(images, truths):
+    """Number of frames, in the order of time."""
+    levels = [int(truth[0, 0, 0]) for truth in truths]
+    assert levels == sorted(levels)
+    assert len(images) == len(truths)
+    return len(images)
+
+
 def change(image, truth, other_image, other_truth):
     return float(image.astype(float).mean() - other_image.astype(float).mean())
 
@@ -139,12 +147,19 @@ def test_a_temporal_metric_sees_the_neighbouring_frame(spec):
     assert "neighbouring" in scored[3].reason
 
 
+def test_all_frames_of_a_sequence_have_the_value_of_their_video(spec):
+    scored = score_frames(KEYS, FRAMES, [spec("v", "video", kind="sequence")])["v"]
+    assert [s.value for s in scored] == [3.0, 3.0, 3.0, 1.0]
+    assert [s.key for s in scored] == KEYS
+
+
 @pytest.mark.parametrize(
     ("implementation", "fields", "reason"),
     [
         ("unavailable", {}, "no weights. Get some."),
         ("noted", {}, "Weights missing."),
         ("noted", {"kind": "temporal"}, "Weights missing."),
+        ("noted", {"kind": "sequence"}, "Weights missing."),
         ("NotedBatches", {}, "Weights missing."),
     ],
 )
