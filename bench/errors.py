@@ -97,6 +97,10 @@ def is_damage(error: BaseException) -> bool:
     return not machine and (cause is None or is_damage(cause))
 
 
+class LeftOutError(HeadbenchError):
+    """A frame that a metric cannot judge, such as one without a face for a metric of faces: left out of means and counted."""
+
+
 class UnavailableError(HeadbenchError):
     """An optional component (a package, weights, a compiler) is missing; the message says how to get it.
 

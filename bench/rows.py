@@ -65,6 +65,9 @@ class Row:
     condition: str = ""
 
 
+LEFT_OUT = "left out: "
+"""Beginning of the reason of a missing value that means leave out, see `LeftOutError`."""
+
 COLUMNS = tuple(f.name for f in fields(Row))
 WHOLE, NUMBERS = ("seed", "timestep", "threads"), ("seed", "timestep", "value", "threads", "other_cores")
 TEXTS = tuple(name for name in COLUMNS if name not in NUMBERS)

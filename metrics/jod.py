@@ -22,11 +22,7 @@ from .pairs import check_pair
 DISPLAY = "standard_4k"
 RATE = 24.3
 """Frames per second of the NeRSemble benchmark's videos of avatars; captures do not record theirs."""
-PACKAGES = ("pyfvvdp", "imageio", "ffmpeg")
-REMEDY = (
-    "If its licence (CC BY-NC 4.0: no commercial use) suits you, install it: "
-    "pip install --no-deps pyfvvdp==1.2.2 && pip install imageio ffmpeg-python."
-)
+REMEDY = "If its licence (CC BY-NC 4.0: no commercial use) suits you, install it: pip install pyfvvdp==1.2.2."
 
 JOD = MetricSpec(
     name="jod",
@@ -62,18 +58,19 @@ class Jod:
 
 @cache
 def _program() -> Any:
-    lacking = [name for name in PACKAGES if find_spec(name) is None]
-    if lacking:
-        raise UnavailableError(f"JOD needs the Python package {', '.join(lacking)}.", REMEDY)
     before = list(sys.path)
     try:
         import pyfvvdp
+    except ImportError as error:
+        raise UnavailableError(
+            f"JOD needs the Python package {error.name}; it is not installed.", REMEDY
+        ) from error
     finally:
         sys.path[:] = before  # which it extends by its own folder
     return pyfvvdp.fvvdp(display_name=DISPLAY, heatmap=None, quiet=True)
 
 
 def needs(config: Any, device: str) -> Iterator[Need]:
-    """The package pyfvvdp and what it imports."""
-    found = all(find_spec(name) is not None for name in PACKAGES)
+    """The package pyfvvdp."""
+    found = find_spec("pyfvvdp") is not None
     yield Need("pyfvvdp, for JOD", "installed" if found else "", REMEDY, required=False)

@@ -9,12 +9,12 @@ from typing import Literal
 import pandas as pd
 
 from ..bench.engine.scoring import FULL
-from ..bench.rows import ALL, FRAME, Rows
+from ..bench.rows import ALL, FRAME, LEFT_OUT, Rows
 
 
 @dataclass(frozen=True)
 class Aggregate:
-    """A mean; if it is missing, ``value`` is None and ``reason`` states why.
+    """A mean; if it is missing, ``value`` is None and ``reason`` states why. Beside a value, ``reason`` says what was left out.
 
     ``spread`` is the standard deviation of the mean from seed to seed; None with one seed.
     """
@@ -26,8 +26,16 @@ class Aggregate:
 
 
 def whole_images(rows: Rows, method: str, metric: str, task: str) -> pd.DataFrame:
-    """One metric of one method over whole images and all seeds; ``task`` "" for one of the avatar as a whole."""
-    return rows.select(method=method, metric=metric, task=task, region=FULL, seeds=ALL)
+    """One metric of one method over whole images and all seeds; ``task`` "" for one of the avatar as a whole.
+
+    Frames that the metric left out are not among them, unless all are.
+    """
+    found = rows.select(method=method, metric=metric, task=task, region=FULL, seeds=ALL)
+    missing = (found["status"] == "missing").to_numpy()
+    if not missing.any():
+        return found
+    kept = ~(missing & found["reason"].str.startswith(LEFT_OUT).to_numpy())
+    return found[kept] if kept.any() else found
 
 
 def summarise(rows: Rows, method: str, metric: str, task: str) -> Aggregate:
@@ -48,13 +56,16 @@ def summarise(rows: Rows, method: str, metric: str, task: str) -> Aggregate:
                 reason = f"{len(without)} of {len(mine)} values {status}: {reason}"
             return Aggregate(status, None, reason)  # type: ignore[arg-type]
     expected = len(rows.frames(task, FULL) if task else rows.subjects) * len(rows.seeds(method))
-    gap = expected - len(mine)
+    whole = rows.select(method=method, metric=metric, task=task, region=FULL, seeds=ALL)
+    left_out = whole[whole["status"] == "missing"]
+    gap = expected - len(whole)
     if gap:
         what = "frames" if task else "avatars"
         reason = f"{gap} of {expected} {what} have no value: run the comparison to its end."
         return Aggregate("missing", None, reason)
     by_seed = [fmean(means.values()) for means in means_by_seed(mine).values()]
-    return Aggregate("ok", fmean(by_seed), spread=stdev(by_seed) if len(by_seed) > 1 else None)
+    said = f"Without {len(left_out)} of {len(whole)} frames, {_reason(left_out)}." if len(left_out) else ""
+    return Aggregate("ok", fmean(by_seed), said, stdev(by_seed) if len(by_seed) > 1 else None)
 
 
 def subject_means(rows: pd.DataFrame) -> dict[str, float]:

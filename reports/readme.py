@@ -2,12 +2,15 @@
 
 python -m headbench.reports.readme demo demo-output .
 python -m headbench.reports.readme suite suite-output .
+python -m headbench.reports.readme suite-2 suite-output .    # the second edition, until its subjects are measured
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
+from functools import partial
 from itertools import chain, product
 from pathlib import Path
 from typing import Any
@@ -36,10 +39,11 @@ from .table_report import Columns, table_of, table_text
 from .writers import to_markdown
 
 GALLERY = "reports/gallery"
-SUITE = f"{GALLERY}/suite"
+SUITE, SECOND = "suite", "suite-2"
+"""Stored results of the suite in `GALLERY`: those of the README, and those of the second edition as far as they are measured."""
 PICTURE = "contact_sheet.jpg"
 RESULTS = "results.md"
-PAGES = {"demo": "docs/explanation/results.md", "suite": "README.md"}
+PAGES = {"demo": "docs/explanation/results.md", SUITE: "README.md", SECOND: "docs/explanation/suite.md"}
 """The page of each block, in the repository."""
 OURS = "ours"
 SHOWN = ("psnr", "lpips")
@@ -56,16 +60,16 @@ def publish_demo(out: Path, root: Path) -> None:
     _write(root / PAGES["demo"], "demo", demo_block(target.root))
 
 
-def publish_suite(out: Path, root: Path) -> None:
+def publish_suite(out: Path, root: Path, name: str = SUITE) -> None:
     """Copy manifest and rows of a suite's run to the repository ``root``, and write its tables and block."""
-    target = root / SUITE
+    target = root / GALLERY / name
     for run in chain.from_iterable(suite_runs(out, base) for base in (RUN, SEEDS_RUN, LARGE_RUN)):
         place = target / run.relative_to(out)
         _copy(RunFolder(run), RunFolder(place))
         if avatars := read_extremes([run]):
             write_json(place / EXTREMES / RECORD_FILE, {"avatars": avatars})
     write_text(target / RESULTS, suite_results(target))
-    _write(root / PAGES["suite"], "suite", suite_block(target))
+    _write(root / PAGES[name], name, suite_block(root, name))
 
 
 def _copy(source: RunFolder, target: RunFolder) -> None:
@@ -152,8 +156,10 @@ def suite_options(folder: Path) -> tuple[str, ...]:
     return tuple(words)
 
 
-def suite_block(folder: Path) -> str:
-    """Return the block for the stored results of the suite: Markdown."""
+def suite_block(root: Path, name: str = SUITE) -> str:
+    """Return the block for stored results of the suite in the repository ``root``, with a link to all tables: Markdown."""
+    folder = root / GALLERY / name
+    results = os.path.relpath(folder / RESULTS, (root / PAGES[name]).parent)
     folders = suite_runs(folder)
     runs = RunSet.read(folders)
     options = " ".join(suite_options(folder))
@@ -169,7 +175,7 @@ def suite_block(folder: Path) -> str:
     columns = Columns((*SHOWN, *(name for name in of_avatars if name in measured)))
     return (
         f"{to_markdown(table_of(shown, columns=columns)).strip()}\n\n{conclusions(shown)}\n\n"
-        f"[SSIM, tables by region and by part of FREE, paired differences with tests]({SUITE}/{RESULTS}). "
+        f"[SSIM, tables by region and by part of FREE, paired differences with tests]({results}). "
         f"The captures are of edition {made.get('edition', 1)}, made with seed {made['seed']}, and have the options `headbench run suite {options}`. "
         f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{interrupted}."
     )
@@ -232,7 +238,7 @@ def _listed(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
-PUBLISH = {"demo": publish_demo, "suite": publish_suite}
+PUBLISH = {"demo": publish_demo, SUITE: publish_suite, SECOND: partial(publish_suite, name=SECOND)}
 
 if __name__ == "__main__":
     PUBLISH[sys.argv[1]](Path(sys.argv[2]), Path(sys.argv[3]))

@@ -335,7 +335,7 @@ def _task_summary(rows: Rows, task: str, protocol_id: str, keys: Collection[Fram
 
 def _cell(aggregate: Aggregate, digits: int, notes: list[str], mark: str) -> TableCell:
     """A cell; ``mark`` is the note for its value, "" for none."""
-    text = mark if aggregate.value is not None else aggregate.reason
+    text = f"{aggregate.reason} {mark}".strip() if aggregate.value is not None else aggregate.reason
     if text not in ("", *notes):
         notes.append(text)
     note = notes.index(text) if text else None

@@ -182,7 +182,7 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
 
     blocks = {
         "demo": readme.demo_block(ROOT / readme.GALLERY),
-        "suite": readme.suite_block(ROOT / readme.SUITE),
+        **{name: readme.suite_block(ROOT, name) for name in (readme.SUITE, readme.SECOND)},
     }
     for name, block in blocks.items():
         begin, end = readme.marks(name)
@@ -194,8 +194,9 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
 def test_all_tables_of_the_suite_are_generated():
     from headbench.reports import readme
 
-    results = ROOT / readme.SUITE / readme.RESULTS
-    assert results.read_text(encoding="utf-8") == readme.suite_results(ROOT / readme.SUITE)
+    for name in (readme.SUITE, readme.SECOND):
+        folder = ROOT / readme.GALLERY / name
+        assert (folder / readme.RESULTS).read_text(encoding="utf-8") == readme.suite_results(folder)
 
 
 def test_nothing_installs_headbench_by_its_name():

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..condition import Condition, label_of
 from ..contracts import CheckedMethod, Clip
-from ..errors import ChangedInputError, HeadbenchError, InputError, UnavailableError, is_damage
+from ..errors import ChangedInputError, HeadbenchError, InputError, LeftOutError, UnavailableError, is_damage
 from ..executors.outcome import outcome_path
 from ..executors.settings import Execution, check_executor
 from ..io.files import check_kind, check_output_folder
@@ -346,6 +346,8 @@ def warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
             continue
         try:
             value = compared_over_time(metric, spec.kind)(image, image)
+        except LeftOutError:
+            continue
         except UnavailableError as error:
             log.warning("%s will be missing: %s", spec.label, error)
         else:

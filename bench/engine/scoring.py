@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..contracts import ByteArray, Clip, FrameKey, Progress, RegionalClip, no_progress
-from ..errors import HeadbenchError, InputError, UnavailableError
+from ..errors import HeadbenchError, InputError, LeftOutError, UnavailableError
 from ..io.files import check_name
 from ..registry import resolve
+from ..rows import LEFT_OUT
 from ..specs import MetricSpec
 
 FULL = "full"
@@ -145,6 +146,8 @@ def _score_frame(
             if spec.kind == "regional" and masks:
                 values = metric.in_regions(image, truth, masks)
                 scores += [Score(spec.name, key, name, float(value)) for name, value in values.items()]
+        except LeftOutError as error:
+            scores.append(_missing(spec, key, f"{LEFT_OUT}{error}"))
         except UnavailableError as error:
             scores.append(_missing(spec, key, error.note))
     return scores

@@ -26,7 +26,6 @@ def program(monkeypatch):
     module = types.ModuleType("pyfvvdp")
     module.fvvdp = Predictor
     monkeypatch.setitem(sys.modules, "pyfvvdp", module)
-    monkeypatch.setattr(jod, "find_spec", lambda name: object())
     jod._program.cache_clear()
     yield calls
     jod._program.cache_clear()
@@ -55,7 +54,8 @@ def test_pictures_of_other_sizes_are_refused(program):
 
 
 def test_without_the_program_the_reason_names_its_licence(monkeypatch):
-    monkeypatch.setattr(jod, "find_spec", lambda name: None if name == "pyfvvdp" else object())
+    monkeypatch.setitem(sys.modules, "pyfvvdp", None)
+    monkeypatch.setattr(jod, "find_spec", lambda name: None)
     jod._program.cache_clear()
     with pytest.raises(UnavailableError, match="package pyfvvdp.*CC BY-NC 4.0.*pip install"):
         jod.Jod()(frames(2, 0), frames(2, 0))

@@ -15,9 +15,9 @@ def test_the_run_of_a_suite_is_published_without_folders(write_run, tmp_path, mo
     page.write_text("\n".join(readme.marks("suite")))
     write_run("run", {"ga": 30.0, "ours": 31.0})
     monkeypatch.setattr(readme, "suite_results", lambda folder: "tables")
-    monkeypatch.setattr(readme, "suite_block", lambda folder: "block")
+    monkeypatch.setattr(readme, "suite_block", lambda root, name: "block")
     readme.publish_suite(tmp_path, page.parent)
-    target = page.parent / readme.SUITE
+    target = page.parent / readme.GALLERY / readme.SUITE
     found = {path.relative_to(target).as_posix() for path in target.rglob("*.json")}
     protocols = {f"run/{PROTOCOLS}/hash-{task}.json" for task in ("novel_view", "self_reenactment")}
     assert found == {"run/run.json", *protocols}

@@ -5,8 +5,8 @@ import sys
 import numpy as np
 import pytest
 
+from headbench.bench import landmark_network as network
 from headbench.bench.errors import UnavailableError
-from headbench.datasets.tracking import network
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch):
