@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
@@ -238,7 +238,11 @@ def _listed(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
-PUBLISH = {"demo": publish_demo, SUITE: publish_suite, SECOND: partial(publish_suite, name=SECOND)}
+PUBLISH: dict[str, Callable[[Path, Path], None]] = {
+    "demo": publish_demo,
+    SUITE: publish_suite,
+    SECOND: partial(publish_suite, name=SECOND),
+}
 
 if __name__ == "__main__":
     PUBLISH[sys.argv[1]](Path(sys.argv[2]), Path(sys.argv[3]))

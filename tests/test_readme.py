@@ -177,12 +177,20 @@ def test_ci_runs_the_test_command_of_the_readme():
     assert "make test" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
 
 
+def stored_suites():
+    """The suite of the README, and the second edition as soon as it has rows."""
+    from headbench.reports import readme
+
+    folders = (ROOT / readme.GALLERY / name for name in (readme.SUITE, readme.SECOND))
+    return [folder.name for folder in folders if folder.name == readme.SUITE or folder.is_dir()]
+
+
 def test_tables_are_generated_from_the_stored_rows_never_typed():
     from headbench.reports import readme
 
     blocks = {
         "demo": readme.demo_block(ROOT / readme.GALLERY),
-        **{name: readme.suite_block(ROOT, name) for name in (readme.SUITE, readme.SECOND)},
+        **{name: readme.suite_block(ROOT, name) for name in stored_suites()},
     }
     for name, block in blocks.items():
         begin, end = readme.marks(name)
@@ -194,7 +202,7 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
 def test_all_tables_of_the_suite_are_generated():
     from headbench.reports import readme
 
-    for name in (readme.SUITE, readme.SECOND):
+    for name in stored_suites():
         folder = ROOT / readme.GALLERY / name
         assert (folder / readme.RESULTS).read_text(encoding="utf-8") == readme.suite_results(folder)
 
