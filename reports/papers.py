@@ -224,7 +224,10 @@ def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
     title = f"Printed in {printed.table} of the paper (not comparable): {printed.data}"
     absent = [TASK_TITLES[task] for task in TASKS if task in asked and task not in tasks]
     missing = [f"{task} is printed, but not measured here." for task in absent]
-    said = f"Printed values: {paper_named(name).citation}; {printed.conditions}; read in {printed.read} (grade {printed.grade})."
+    said = (
+        f"Printed values: {paper_named(name).citation}.",
+        f"Their conditions: {printed.conditions}. Read in: {printed.read} (grade {printed.grade}).",
+    )
     return replace(
         measured,
         groups=(*measured.groups, (title, rows)),

@@ -90,7 +90,8 @@ class Table:
 
     ``marking`` says what the ranks mean, and by which test (``tested``: whether there is one), ``part`` which part of
     the frames the values are of, "" for all, ``missing`` why a task has no columns, ``name`` the layout, ``cameras`` what
-    seen and unseen cameras are, or why they are not shown apart, ``printed`` where values of a paper are from.
+    seen and unseen cameras are, or why they are not shown apart, ``printed`` where values of a paper are from,
+    with their conditions in further sentences.
     """
 
     columns: tuple[Column, ...]
@@ -106,7 +107,7 @@ class Table:
     name: str = ""
     tested: bool = False
     cameras: str = ""
-    printed: str = ""
+    printed: tuple[str, ...] = ()
 
     @property
     def titled(self) -> bool:
@@ -144,7 +145,7 @@ class Table:
         seeds = spread if self.seeds > 1 else "one seed"
         parts.append(f"Mean over frames, then sequences, then subjects; {seeds}.")
         parts += [self.marking] if self.marking else []
-        parts += [self.printed] if self.printed else []
+        parts += self.printed
         if self.machine and self.has_speed:
             parts.append(f"Speed measured on {self.machine}.")
         return tuple(parts)
@@ -169,7 +170,7 @@ class Table:
             places = ["second underlined", *(["third in italics"] if 3 in ranks else [])]
             digits = [] if self.tested else ["by the digits shown"]
             parts.append(", ".join([best, *places, *digits]) + ".")
-        parts += [self.printed] if self.printed else []
+        parts += self.printed[:1]
         if self.machine and self.has_speed:
             parts.append(f"Speed on {self.machine}.")
         return " ".join(parts)
