@@ -118,9 +118,9 @@ class RunSettings:
     """YAML file with any settings of a run."""
     head: str | None = None
     """Head model for captures that bring none: FLAME pickle or npz."""
-    protocol: str | None = None
-    """Published protocol whose metrics and regions are measured, too, and whose tasks are: a name of `headbench list protocols`.
-    `headbench table --protocol NAME` prints its table."""
+    protocol: tuple[str, ...] = ()
+    """Published protocols whose metrics and regions are measured, too, and whose tasks are: names of `headbench list protocols`.
+    `headbench table --protocol NAME` prints the table of one."""
     seeds: str | None = None
     """Seeds of the training, separated by commas: an avatar is trained for each. Default: 0."""
     executor: ExecutorName | None = None
@@ -160,7 +160,7 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
             raise InputError(source, key, f"--{key} or the key {key} in --config", "neither")
     assigned = parse_assignments(settings.set)
     values = merge(values, assigned)
-    if settings.protocol is not None:
+    if settings.protocol:
         values = merge(values, needed(settings.protocol, values))
     if "reader" not in values and isinstance(values["data"], str):
         from .engine.captures import reader_of  # which takes long to import
@@ -182,7 +182,7 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
         own = [Path(config.out)] if (Path(config.out) / "run.json").is_file() else []
         known = [*own, *([Path(settings.estimates)] if settings.estimates else [])]
         return forecast(planned_jobs(config), known)
-    if settings.protocol is not None:
+    if settings.protocol:
         from .engine.captures import open_clips
 
         for clip in open_clips(config):

@@ -6,7 +6,7 @@ rows; it needs no rendering.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -131,32 +131,32 @@ def protocol_named(name: str) -> NamedProtocol:
     return named_protocols()[name]
 
 
-def needed(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a run that measures what a protocol selects: tasks, profile and region beside the usual ones.
+def needed(names: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a run that measures what protocols select: their tasks, profiles and regions beside the usual ones.
 
-    ``settings`` are those that are given; they decide. Raises `InputError` for one that leaves out what the protocol needs.
+    ``settings`` are those that are given; they decide. Raises `InputError` for one that leaves out what a protocol needs, and for
+    an unknown protocol.
     """
-    protocol = protocol_named(name)
-    wanted: dict[str, tuple[str, ...]] = {
-        "tasks": tuple(protocol.frames),
-        "metric_profiles": tuple(dict.fromkeys(("canonical", protocol.profile))),
-        "regions": () if protocol.region == "full" else tuple(dict.fromkeys(("face", protocol.region))),
-    }
+    wanted: dict[str, list[str]] = {"tasks": [], "metric_profiles": ["canonical"], "regions": []}
+    for name in names:
+        protocol = protocol_named(name)
+        wanted["tasks"] += protocol.frames
+        wanted["metric_profiles"].append(protocol.profile)
+        wanted["regions"] += [] if protocol.region == "full" else ["face", protocol.region]
     found: dict[str, Any] = {}
     for key, values in wanted.items():
         given = settings.get(key)
         if given is None:
-            found |= {key: values} if values else {}
-        elif lacking := set(values) - {*given} - {"canonical", "face"}:
-            raise InputError(
-                "settings", key, f"{', '.join(sorted(lacking))}, by protocol {name}", ", ".join(given)
-            )
+            found |= {key: tuple(dict.fromkeys(values))} if values else {}
+        elif lacking := {*values} - {*given} - {"canonical", "face"}:
+            expected = f"{', '.join(sorted(lacking))}, by protocol {' or '.join(names)}"
+            raise InputError("settings", key, expected, ", ".join(given))
     return found
 
 
-def check_capture(name: str, clip: Clip) -> None:
+def check_capture(names: Sequence[str], clip: Clip) -> None:
     """Raise `InputError` if a capture has no frames of a task of a protocol, or none of its cameras or sequences."""
-    for task, wanted in protocol_named(name).frames.items():
+    for name, (task, wanted) in ((n, each) for n in names for each in protocol_named(n).frames.items()):
         keys = clip.splits.get(cast(TaskName, task), ())
         trained = {key.camera for key in clip.splits["train"]}
         seen = {key.camera in trained for key in keys}

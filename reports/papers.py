@@ -218,6 +218,7 @@ def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
         machine=runs.machine,
         part=runs.part,
         keys=runs.keys,
+        averaged=runs.averaged,
         name=f"{name}-{printed.number}",
     ).mapped(lambda row: replace(row, method=names[row.method]))
     rows = tuple(TableRow(row.name, "", True, _cells(row, measured)) for row in printed.rows)

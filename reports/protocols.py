@@ -20,6 +20,7 @@ from ..bench.specs import CommandResult, MetricSpec
 from .aggregate import summarise
 from .cameras import unseen_cameras
 from .runs import RunSet
+from .tables import AVERAGED
 
 CANONICAL = "canonical"
 QUALITY = {"psnr": 2, "lpips": 4}
@@ -52,7 +53,13 @@ def under(runs: RunSet, name: str, protocol: NamedProtocol) -> RunSet:
     found = {task: frozenset(own) for task, own in keys.items()} if protocol.average == "sequences" else {}
     shown = " ".join([f"Protocol {name}: {protocol.title}.", *differences(runs, protocol)])
     present = tuple(spec for spec in metrics if spec.name in rows.metrics)
-    return replace(runs, rows=rows, tasks=tasks, metrics=present, keys=found, part=shown, protocol=name)
+    selected = replace(runs, rows=rows, tasks=tasks, metrics=present, keys=found, part=shown)
+    return replace(selected, protocol=name, averaged=_averaged(protocol))
+
+
+def _averaged(protocol: NamedProtocol) -> str:
+    batches = "" if protocol.pooled is None else f"batches of {protocol.pooled} "
+    return f"{batches}{AVERAGED if protocol.average == 'sequences' else 'frames, then subjects'}"
 
 
 def _frames(runs: RunSet, task: str, wanted: TaskFrames, name: str) -> list[FrameKey]:
@@ -180,7 +187,7 @@ def protocols_command(settings: ProtocolsSettings, progress: Progress) -> Comman
     for method in settings.methods:
         if method not in runs.methods:
             raise InputError("command line", "--methods", f"some of {', '.join(runs.methods)}", method)
-    runs = runs.only(settings.methods or runs.ranked)
+    runs = runs.only(settings.methods or runs.ranked or runs.methods)
     values: dict[str, dict[str, float]] = {}
     refused: dict[str, str] = {}
     for label, protocol in choices(runs).items():

@@ -22,6 +22,7 @@ from ..bench.rows import ALL, Rows
 from ..bench.specs import MetricSpec
 from .cameras import EXPLAINED, SPLIT_TASK, unseen_cameras
 from .coded import check_codecs, with_coded
+from .tables import AVERAGED
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,7 @@ class RunSet:
     the manifest by label; ``trivial`` has labels of trivial baselines. ``keys`` has the frames of each task
     in the protocol, including those without values. ``shown`` has, by label, the first run of the method and
     its name there, whose renders are shown. ``protocol`` is the name of the protocol by which rows were chosen, see
-    `protocols.under`, "" for none.
+    `protocols.under`, "" for none, ``averaged`` says over what its values are means.
     """
 
     runs: tuple[RunData, ...]
@@ -184,6 +185,7 @@ class RunSet:
     part: str = ""
     cameras: str = ""
     protocol: str = ""
+    averaged: str = AVERAGED
 
     @classmethod
     def read(cls, folders: Sequence[Path], part: FrameSelection = WHOLE) -> RunSet:

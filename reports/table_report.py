@@ -219,6 +219,7 @@ def table_of(
         missing=runs.missing if tasks == runs.tasks else (),
         cameras=runs.cameras if {SPLIT_TASK, SEEN_CAMERAS, UNSEEN_CAMERAS} & {*tasks} else "",
         keys=runs.keys,
+        averaged=runs.averaged,
         avatar_title=TITLES.get(layout, AVATAR_TITLE),
         name=layout,
         apart=apart,

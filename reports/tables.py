@@ -84,6 +84,9 @@ class TaskSummary:
     subjects: int
 
 
+AVERAGED = "frames, then sequences, then subjects"
+
+
 @dataclass(frozen=True)
 class Table:
     """A comparison, ready to be written in any format.
@@ -91,7 +94,7 @@ class Table:
     ``marking`` says what the ranks mean, and by which test (``tested``: whether there is one), ``part`` which part of
     the frames the values are of, "" for all, ``missing`` why a task has no columns, ``name`` the layout, ``cameras`` what
     seen and unseen cameras are, or why they are not shown apart, ``printed`` where values of a paper are from,
-    with their conditions in further sentences.
+    with their conditions in further sentences, ``averaged`` over what values are means.
     """
 
     columns: tuple[Column, ...]
@@ -108,6 +111,7 @@ class Table:
     tested: bool = False
     cameras: str = ""
     printed: tuple[str, ...] = ()
+    averaged: str = AVERAGED
 
     @property
     def titled(self) -> bool:
@@ -143,7 +147,7 @@ class Table:
             parts.append(f"Images of {self.image_size} pixels.")
         spread = f"mean of {self.seeds} seeds ± its standard deviation from seed to seed"
         seeds = spread if self.seeds > 1 else "one seed"
-        parts.append(f"Mean over frames, then sequences, then subjects; {seeds}.")
+        parts.append(f"Mean over {self.averaged}; {seeds}.")
         parts += [self.marking] if self.marking else []
         parts += self.printed
         if self.machine and self.has_speed:
@@ -215,6 +219,7 @@ def build_table(
     missing: Sequence[str] = (),
     cameras: str = "",
     keys: Mapping[str, Collection[FrameKey]] | None = None,
+    averaged: str = AVERAGED,
     avatar_title: str = AVATAR_TITLE,
     name: str = "",
     apart: Sequence[RowGroup] = (),
@@ -240,8 +245,8 @@ def build_table(
         Frames of each task, if more are scored than have rows.
     protocol_ids : Mapping[str, str]
         Readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` (if
-        the rows do not record the machine that measured speed), ``part``, ``cameras`` and the
-        sentences of ``missing``.
+        the rows do not record the machine that measured speed), ``part``, ``cameras``, ``averaged`` and
+        the sentences of ``missing``.
     avatar_title : str
         Heading of the columns that belong to no task.
     name : str
@@ -320,6 +325,7 @@ def build_table(
         part=part,
         missing=tuple(missing),
         cameras=cameras,
+        averaged=averaged,
         name=name,
         tested=any(best is not None and best.methods is not None for best in bests),
     )

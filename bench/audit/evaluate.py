@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from ..condition import PLAIN
 from ..contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
@@ -147,7 +146,7 @@ def _open(settings: EvaluateSettings, heads: Mapping[str, str]) -> tuple[RunConf
             used=("metrics",),
         )
     else:
-        asked: dict[str, Any] = {} if settings.protocol is None else needed(settings.protocol, {})
+        asked = needed(settings.protocol, {}) if settings.protocol else {}
         config = capture_configuration(
             str(settings.clip),
             settings.out,
@@ -159,8 +158,8 @@ def _open(settings: EvaluateSettings, heads: Mapping[str, str]) -> tuple[RunConf
             frames_per_task=settings.frames_per_task,
         )
         clips = open_clips(config)
-        for clip in clips if settings.protocol is not None else []:
-            check_capture(str(settings.protocol), clip)
+        for clip in clips:
+            check_capture(settings.protocol, clip)
     config = replace(
         config,
         out=settings.out,

@@ -134,8 +134,8 @@ class EvaluateSettings(ExecutionOptions):
     metrics: tuple[str, ...] = ()
     """By which metrics of frames; default: those of `headbench run`. Not with --like."""
 
-    protocol: str | None = None
-    """Published protocol, as for `headbench run`. Not with --like."""
+    protocol: tuple[str, ...] = ()
+    """Published protocols, as for `headbench run`. Not with --like."""
 
     reader: str = ""
     """Which dataset reader opens the capture; default: the one that finds it. Not with --like."""

@@ -43,18 +43,21 @@ def test_a_file_with_a_wrong_key_or_value_is_refused(tmp_path, change, message):
 
 
 def test_a_run_measures_what_a_protocol_selects():
-    assert needed("cro-2026", {}) == {
+    assert needed(["cro-2026"], {}) == {
         "tasks": ("novel_view", "self_reenactment"),
         "metric_profiles": ("canonical",),
         "regions": ("face", "foreground"),
     }
-    assert needed("gaussianavatars-2024", {"tasks": ["novel_view", "self_reenactment"]}) == {
+    assert needed(["gaussianavatars-2024"], {"tasks": ["novel_view", "self_reenactment"]}) == {
         "metric_profiles": ("canonical", "ga-training")
     }
+    both = needed(["cro-2026", "gaussianavatars-2024"], {})
+    assert both["metric_profiles"] == ("canonical", "ga-training")
+    assert both["regions"] == ("face", "foreground")
     with pytest.raises(InputError, match="regions: expected foreground, by protocol cro-2026, found hair"):
-        needed("cro-2026", {"regions": ["hair"]})
+        needed(["cro-2026"], {"regions": ["hair"]})
     with pytest.raises(InputError, match="--protocol: expected one of .*Did you mean 'suite'"):
-        needed("suit", {})
+        needed(["suit"], {})
 
 
 def capture(held_out, novel=("b",)):
@@ -94,5 +97,5 @@ def capture(held_out, novel=("b",)):
 )
 def test_what_a_capture_lacks_is_refused_by_name(name, clip, message):
     with pytest.raises(InputError, match=f"clip s, {message}"):
-        check_capture(name, clip)
-    check_capture(name, capture([("FREE", "a"), ("FREE", "b")]))
+        check_capture([name], clip)
+    check_capture([name], capture([("FREE", "a"), ("FREE", "b")]))

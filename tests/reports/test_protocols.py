@@ -124,8 +124,10 @@ def test_missing_sequences_and_tasks_are_refused(runs):
 
 
 def test_differences_from_the_published_conditions_are_said(runs):
-    text = under(runs, "suite", named_protocols()["suite"]).part
+    text = table_text([GALLERY], "md", protocol="suite")
     assert "Pixels: 144x208, there 275x401." in text
+    assert "Mean over frames, then sequences, then subjects" in text
+    assert "Mean over frames, then subjects" in table_text([GALLERY], "md", protocol="mogaface-2026")
 
 
 def test_every_choice_is_tabled_as_a_difference(runs):
