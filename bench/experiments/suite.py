@@ -37,7 +37,6 @@ from .suite_settings import (
     SEED,
     SEEDS_RUN,
     TRACKED,
-    TRACKED_METHODS,
     SuiteSettings,
 )
 
@@ -134,7 +133,7 @@ def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:
         method.spec.name: method.budget.iterations for method in resolved if not method.spec.trivial
     }
     if (count := iterations.get(EQUAL_TO)) is not None:
-        others = tuple(name for name in TRACKED_METHODS if iterations.get(name) not in (None, count))
+        others = (OURS,) if iterations.get(OURS) not in (None, count) else ()
         asked = settings.equal_iterations or others
         names = tuple(name for name in asked if name != NONE)
         found.append(Condition(EQUAL, names, {"budget": {"iterations": count}}))

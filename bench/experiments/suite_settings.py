@@ -20,7 +20,7 @@ TRACKED, LEVEL, AS_TRACKED, EQUAL = "tracked", "tracking-{:g}", "as-tracked", "e
 method that otherwise gets it converted; as many iterations as `EQUAL_TO` has."""
 EQUAL_TO = "ga"
 TRACKED_METHODS = ("ga", "gbs", "ours", "ours-plus")
-"""Methods that have these conditions, except the third, where none are named."""
+"""Methods that have the first two conditions where none are named."""
 
 RUN, LARGE_RUN, SEEDS_RUN = "run", "run-large", "run-seeds"
 """Folders of a suite's runs, each with a folder for each subject; those of the second have images of twice the size, those of the
@@ -61,8 +61,8 @@ class SuiteSettings(ExecutionOptions):
     conditions such as `tracking-3`."""
 
     equal_iterations: tuple[str, ...] = ()
-    """Methods trained a second time, with as many iterations as ga, as condition `equal-iterations`; or "none". Default: gbs, ours and
-    ours-plus, if they run and have other numbers of iterations."""
+    """Methods trained a second time, with as many iterations as ga, as condition `equal-iterations`; or "none". Default: ours, if it
+    runs and has another number of iterations."""
 
     subjects: int = 10
     """Number of the suite's subjects, from the first. Significant differences require 6 subjects for two
