@@ -47,6 +47,14 @@ def test_commands_that_pages_call_exist(page):
     assert [name for name in called if not {name, name.split()[0]} & offered] == []
 
 
+def test_the_readme_counts_what_is_stored():
+    from headbench.bench.named_protocol import named_protocols
+    from headbench.reports.papers import papers
+
+    said = f"Tables of {len(papers())} papers and {len(named_protocols())} evaluation protocols"
+    assert said in README
+
+
 def test_the_readme_is_short():
     assert README.count("\n") <= 150
 
