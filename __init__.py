@@ -53,7 +53,7 @@ if _TYPE_CHECKING:
     from .bench.engine.adaptation import AdaptedClip, MethodNeeds
     from .bench.engine.config import resolve_method
     from .bench.engine.stored import load_avatar
-    from .bench.errors import ChangedInputError, HeadbenchError, InputError, UnavailableError
+    from .bench.errors import ChangedInputError, HeadbenchError, InputError, LeftOutError, UnavailableError
     from .bench.options import DependentOptions
     from .bench.rows import ALL
     from .bench.specs import (
@@ -103,6 +103,7 @@ __all__ = [
     "HeadPose",
     "HeadbenchError",
     "InputError",
+    "LeftOutError",
     "ListedFrames",
     "Measurement",
     "Method",
@@ -156,7 +157,7 @@ _HOMES = {
     "bench.conformance.metrics": ("check_metric",),
     "bench.conformance.readers": ("check_clip", "check_reader"),
     "bench.options": ("DependentOptions",),
-    "bench.errors": ("ChangedInputError", "HeadbenchError", "InputError", "UnavailableError"),
+    "bench.errors": ("ChangedInputError", "HeadbenchError", "InputError", "LeftOutError", "UnavailableError"),
     "bench.engine.config": ("resolve_method",),
     "bench.engine.stored": ("load_avatar",),
     "bench.rows": ("ALL",),

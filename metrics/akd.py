@@ -9,14 +9,17 @@ import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray
 from ..bench.errors import HeadbenchError, LeftOutError, UnavailableError
-from ..bench.landmark_network import COUNT, LandmarkNetwork
 from ..bench.specs import MetricSpec, Need
 from .pairs import check_pair
+
+if TYPE_CHECKING:
+    from ..bench.landmark_network import LandmarkNetwork
 
 VARIABLE = "HEADBENCH_FACE_LANDMARKS"
 REMEDY = (
@@ -32,7 +35,7 @@ AKD = MetricSpec(
     higher_is_better=False,
     digits=2,
     implementation="headbench.metrics.akd:Akd",
-    summary=f"Mean distance of {COUNT} MediaPipe landmarks in pixels; frames in which no face is found are left out and counted.",
+    summary="Mean distance of 468 MediaPipe landmarks in pixels; frames in which no face is found are left out and counted.",
     needs="headbench.metrics.akd:needs",
 )
 
@@ -65,6 +68,8 @@ class Akd:
 
 
 def _network() -> LandmarkNetwork:
+    from ..bench.landmark_network import LandmarkNetwork
+
     path = os.environ.get(VARIABLE, "")
     if not path:
         raise UnavailableError("AKD needs a landmark network, whose file is not named.", REMEDY)

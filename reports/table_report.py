@@ -18,7 +18,8 @@ from ..bench.registry import unknown
 from ..bench.specs import MetricSpec
 from ..bench.streams import on_terminal
 from .cameras import SPLIT_TASK
-from .papers import as_printed, printed_tables
+from .papers import printed_tables
+from .printed import as_printed
 from .protocols import chosen
 from .runs import WHOLE, FrameSelection, RunSet
 from .tables import AVATAR_TITLE, TITLES, RowGroup, Table, build_table

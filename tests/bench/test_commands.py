@@ -283,6 +283,7 @@ def test_every_command_with_a_folder_to_write_locks_it():
         "export html",
         "export ply",
         "export sog",
+        "protocols",
         "report",
         "doctor stress",
         "table",

@@ -204,7 +204,7 @@ CODECS: dict[str, tuple[Callable[[bytes], Any], Callable[[Any], bytes]]] = {
     ".npz": (_npz, lambda t: _stream(lambda stream: np.savez_compressed(stream, **t))),
     ".npy": (lambda c: np.load(io.BytesIO(c)), lambda t: _stream(lambda stream: np.save(stream, t))),
     ".parquet": (
-        lambda c: pq.read_table(io.BytesIO(c)).to_pydict(),
+        lambda c: pq.read_table(io.BytesIO(c), use_threads=False, pre_buffer=False).to_pydict(),
         lambda t: _stream(lambda stream: pq.write_table(pa.table(t), stream)),
     ),
     ".safetensors": (load, _safetensors),

@@ -8,7 +8,8 @@ import yaml
 from headbench.bench.errors import InputError
 from headbench.bench.registry import discover
 from headbench.reports import papers as module
-from headbench.reports.papers import FOLDER, as_printed, counts, papers, printed_tables, read_paper
+from headbench.reports.papers import FOLDER, counts, papers, printed_tables, read_paper
+from headbench.reports.printed import as_printed
 from headbench.reports.runs import RunSet
 from headbench.reports.table_report import table_text
 
