@@ -160,10 +160,9 @@ class Paper:
 
     @property
     def citation(self) -> str:
-        """Title, venue and number."""
-        return ", ".join(
-            [self.title, self.venue, *([f"arXiv {self.arxiv}"] if self.arxiv is not None else [])]
-        )
+        """Title, venue where it is known, and number."""
+        venue = [] if self.venue == "arXiv" or self.venue.startswith("not stated") else [self.venue]
+        return ", ".join([self.title, *venue, *([f"arXiv {self.arxiv}"] if self.arxiv is not None else [])])
 
 
 def read_paper(path: Path) -> Paper:
