@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from .errors import InputError
-from .io.documents import parse_setting, shown
+from .io.documents import parse_setting, read_yaml, shown
 from .io.files import expand_home
 from .registry import unknown
 
@@ -89,6 +89,16 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
         return cls(**arguments)
     except ValueError as error:
         raise InputError(source, prefix.rstrip(".") or cls.__name__, "valid settings", str(error)) from error
+
+
+def build_folder(cls: type[T], folder: Path) -> dict[str, T]:
+    """Build ``cls`` from every YAML file of a folder, by name of the file. Raises `InputError` as `build` does."""
+    return {path.stem: build_file(cls, path) for path in sorted(folder.glob("*.yaml"))}
+
+
+def build_file(cls: type[T], path: Path) -> T:
+    """Build ``cls`` from a YAML file. Raises `InputError` as `build` does."""
+    return build(cls, read_yaml(path), str(path))
 
 
 def setting_paths(cls: Any, prefix: str = "") -> list[str]:
@@ -183,6 +193,10 @@ def _convert(hint: Any, value: Any, source: str, key: str) -> Any:
     if origin in (dict, Mapping) or hint is dict:
         if not isinstance(value, Mapping):
             raise InputError(source, key, "a group of settings", shown(value))
+        if arguments and dataclasses.is_dataclass(arguments[1]):
+            return {
+                name: _convert(arguments[1], each, source, f"{key}.{name}") for name, each in value.items()
+            }
         return dict(value)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         if isinstance(value, hint):

@@ -12,10 +12,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from .configuration import build
+from .configuration import build_file, build_folder
 from .contracts import Clip, TaskName
 from .errors import InputError
-from .io.documents import read_yaml
 from .registry import unknown
 
 FOLDER = Path(__file__).with_name("protocols")
@@ -78,7 +77,7 @@ class NamedProtocol:
 
     title: str
     source: str
-    tasks: dict[str, Any]
+    tasks: Mapping[str, TaskFrames]
     region: str = "full"
     profile: str = "canonical"
     average: Literal["sequences", "frames"] = "frames"
@@ -92,36 +91,25 @@ class NamedProtocol:
     head_model: str = ""
 
     def __post_init__(self) -> None:
-        """Read the tasks; refuse unknown ones, and batches of less than one frame."""
-        frames = {}
-        for task, value in self.tasks.items():
+        """Refuse unknown tasks, none, and batches of less than one frame."""
+        for task in self.tasks:
             if task not in ("novel_view", "self_reenactment"):
                 raise ValueError(f"tasks: novel_view or self_reenactment; found {task}")
-            given = (
-                value if isinstance(value, TaskFrames) else build(TaskFrames, value or {}, f"tasks.{task}")
-            )
-            frames[task] = given
-        if not frames:
+        if not self.tasks:
             raise ValueError("tasks: at least one; found none")
         if self.pooled is not None and self.pooled < 1:
             raise ValueError(f"pooled: at least 1, or null; found {self.pooled}")
-        object.__setattr__(self, "tasks", frames)
-
-    @property
-    def frames(self) -> Mapping[str, TaskFrames]:
-        """Scored frames by task."""
-        return self.tasks
 
 
 def read_protocol(path: Path) -> NamedProtocol:
     """Read the file of a protocol. Raises `InputError` for keys or values that it cannot have."""
-    return build(NamedProtocol, read_yaml(path), str(path))
+    return build_file(NamedProtocol, path)
 
 
 @cache
 def named_protocols() -> dict[str, NamedProtocol]:
     """All protocols by name."""
-    return {path.stem: read_protocol(path) for path in sorted(FOLDER.glob("*.yaml"))}
+    return build_folder(NamedProtocol, FOLDER)
 
 
 def protocol_named(name: str) -> NamedProtocol:
@@ -140,7 +128,7 @@ def needed(names: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
     wanted: dict[str, list[str]] = {"tasks": [], "metric_profiles": ["canonical"], "regions": []}
     for name in names:
         protocol = protocol_named(name)
-        wanted["tasks"] += protocol.frames
+        wanted["tasks"] += protocol.tasks
         wanted["metric_profiles"].append(protocol.profile)
         wanted["regions"] += [] if protocol.region == "full" else ["face", protocol.region]
     found: dict[str, Any] = {}
@@ -156,7 +144,7 @@ def needed(names: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
 
 def check_capture(names: Sequence[str], clip: Clip) -> None:
     """Raise `InputError` if a capture has no frames of a task of a protocol, or none of its cameras or sequences."""
-    for name, (task, wanted) in ((n, each) for n in names for each in protocol_named(n).frames.items()):
+    for name, (task, wanted) in ((n, each) for n in names for each in protocol_named(n).tasks.items()):
         keys = clip.splits.get(cast(TaskName, task), ())
         trained = {key.camera for key in clip.splits["train"]}
         seen = {key.camera in trained for key in keys}

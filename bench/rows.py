@@ -414,7 +414,7 @@ class Rows:
     def as_one_sequence(self) -> Rows:
         """The same rows, all frames of a subject and task in one sequence, so that every frame has the same weight.
 
-        Timesteps are numbered anew, sorted by sequence and timestep.
+        Timesteps are numbered from 0, sorted by sequence and timestep.
         """
         table = self._table
         own = (table["task"] != "") & (table["timestep"] >= 0)

@@ -48,11 +48,9 @@ class Jod:
         for image, target in zip(images, targets, strict=True):
             check_pair(image, target)
         program = _program()
-        # A still picture has no rate.
-        order, rate = ("FHWC", RATE) if len(images) > 1 else ("FHWC", 0)
-        found, _ = program.predict(
-            np.stack(images), np.stack(targets), dim_order=order, frames_per_second=rate
-        )
+        rate = RATE if len(images) > 1 else 0  # a still picture has none
+        stacks = np.stack(images), np.stack(targets)
+        found, _ = program.predict(*stacks, dim_order="FHWC", frames_per_second=rate)
         return float(found)
 
 

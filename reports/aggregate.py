@@ -30,7 +30,11 @@ def whole_images(rows: Rows, method: str, metric: str, task: str) -> pd.DataFram
 
     Frames that the metric left out are not among them, unless all are.
     """
-    found = rows.select(method=method, metric=metric, task=task, region=FULL, seeds=ALL)
+    return _judged(rows.select(method=method, metric=metric, task=task, region=FULL, seeds=ALL))
+
+
+def _judged(found: pd.DataFrame) -> pd.DataFrame:
+    """Rows without those of frames that their metric left out, unless all are."""
     missing = (found["status"] == "missing").to_numpy()
     if not missing.any():
         return found
@@ -40,7 +44,8 @@ def whole_images(rows: Rows, method: str, metric: str, task: str) -> pd.DataFram
 
 def summarise(rows: Rows, method: str, metric: str, task: str) -> Aggregate:
     """Aggregate `whole_images`; ``rows`` of all methods determine the frames (``task`` "": subjects)."""
-    mine = whole_images(rows, method, metric, task)
+    whole = rows.select(method=method, metric=metric, task=task, region=FULL, seeds=ALL)
+    mine = _judged(whole)
     if mine.empty:
         own = rows.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
         failed = own[own["status"] == "failed"]
@@ -56,7 +61,6 @@ def summarise(rows: Rows, method: str, metric: str, task: str) -> Aggregate:
                 reason = f"{len(without)} of {len(mine)} values {status}: {reason}"
             return Aggregate(status, None, reason)  # type: ignore[arg-type]
     expected = len(rows.frames(task, FULL) if task else rows.subjects) * len(rows.seeds(method))
-    whole = rows.select(method=method, metric=metric, task=task, region=FULL, seeds=ALL)
     left_out = whole[whole["status"] == "missing"]
     gap = expected - len(whole)
     if gap:

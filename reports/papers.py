@@ -9,9 +9,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..bench.configuration import build
+from ..bench.configuration import build_file, build_folder
 from ..bench.errors import InputError
-from ..bench.io.documents import read_yaml
 from ..bench.registry import unknown
 
 if TYPE_CHECKING:
@@ -167,13 +166,13 @@ class Paper:
 
 def read_paper(path: Path) -> Paper:
     """Read the file of a paper. Raises `InputError` for keys, values or tables that the schema does not have."""
-    return build(Paper, read_yaml(path), str(path))
+    return build_file(Paper, path)
 
 
 @cache
 def papers() -> dict[str, Paper]:
     """All papers by name."""
-    return {path.stem: read_paper(path) for path in sorted(FOLDER.glob("*.yaml"))}
+    return build_folder(Paper, FOLDER)
 
 
 def paper_named(name: str) -> Paper:

@@ -12,6 +12,7 @@ from ..bench.specs import MetricSpec
 from .papers import OF_AVATARS, OF_FRAMES, TASKS, PrintedRow, PrintedTable, paper_named
 from .runs import RunSet
 from .tables import Table, TableCell, TableRow, build_table
+from .writers import column_name
 
 
 def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
@@ -77,6 +78,6 @@ def _name(record: MethodRecord, label: str, printed: PrintedTable) -> str:
 
 
 def _cells(row: PrintedRow, table: Table) -> tuple[TableCell, ...]:
-    texts = [row.values.get(f"{c.task}/{c.metric}" if c.task else c.metric) for c in table.columns]
+    texts = [row.values.get(column_name(column)) for column in table.columns]
     none = TableCell("none", None, "")
     return tuple(none if text is None else TableCell("published", float(text), text) for text in texts)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import tyro
 
 from ..bench.contracts import FrameKey, Progress
+from ..bench.engine.config import CANONICAL
 from ..bench.engine.scoring import FULL
 from ..bench.errors import InputError
 from ..bench.io.files import check_writable, write_text
@@ -21,8 +21,8 @@ from .aggregate import summarise
 from .cameras import unseen_cameras
 from .runs import RunSet
 from .tables import AVERAGED
+from .writers import pipe_table
 
-CANONICAL = "canonical"
 QUALITY = {"psnr": 2, "lpips": 4}
 """Metrics whose change is tabled, and their decimals."""
 
@@ -33,12 +33,12 @@ def under(runs: RunSet, name: str, protocol: NamedProtocol) -> RunSet:
     Raises `InputError` for what the runs or their captures lack: a task, cameras, a sequence, a region, a metric profile.
     """
     source = runs.runs[0].folder.rows
-    tasks = tuple(task for task in protocol.frames if task in runs.tasks)
+    tasks = tuple(task for task in protocol.tasks if task in runs.tasks)
     if not tasks:
         raise InputError(
-            source, "tasks", f"{' or '.join(protocol.frames)}, by protocol {name}", ", ".join(runs.tasks)
+            source, "tasks", f"{' or '.join(protocol.tasks)}, by protocol {name}", ", ".join(runs.tasks)
         )
-    keys = {task: _frames(runs, task, protocol.frames[task], name) for task in tasks}
+    keys = {task: _frames(runs, task, protocol.tasks[task], name) for task in tasks}
     if protocol.region != FULL and protocol.region not in runs.rows.regions:
         expected = f"{protocol.region}, by protocol {name}"
         remedy = f"`headbench run --protocol {name}` measures it."
@@ -157,10 +157,10 @@ NAMED = "protocol "
 
 def choices(runs: RunSet) -> dict[str, NamedProtocol]:
     """The usual protocol, those that differ from it in one choice, and the named ones."""
-    tasks: dict[str, Any] = {
+    tasks: dict[str, TaskFrames] = {
         task: TaskFrames() for task in ("novel_view", "self_reenactment") if task in runs.tasks
     }
-    usual = NamedProtocol("the usual one", "", dict(tasks))
+    usual = NamedProtocol("the usual one", "", tasks)
     found = {USUAL: usual}
     regions = sorted(runs.rows.regions - {FULL})
     found |= {f"pixels: {region}": replace(usual, region=region) for region in regions}
@@ -241,7 +241,7 @@ def _text(
                     cells.append(f"{own[key] - base[key]:+.{QUALITY[metric]}f}")
             if set(cells) != {"–"}:
                 lines.append([label, *cells])
-        table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        table = pipe_table(lines)
         spans = [
             max(found) - min(found)
             for m in methods

@@ -40,9 +40,14 @@ def to_markdown(table: Table) -> str:
     widths = [max(3, *(len(line[i]) for line in lines)) for i in range(len(names))]
     body = [[line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])] for line in lines]
     rule = [":" + "-" * (widths[0] - 1), *("-" * (width - 1) + ":" for width in widths[1:])]
-    text = "\n".join(f"| {' | '.join(cells)} |" for cells in (body[0], rule, *body[1:]))
+    text = pipe_table([body[0], rule, *body[1:]])
     notes = [f"<sup>{i}</sup> {escape_markdown(note)}  " for i, note in enumerate(table.notes, 1)]
     return "\n\n".join([text, escape_markdown(table.caption), *(["\n".join(notes)] if notes else [])]) + "\n"
+
+
+def pipe_table(lines: Iterable[Sequence[str]]) -> str:
+    """Lines of cells, the second with the rules, as a pipe table."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def escape_markdown(text: str) -> str:

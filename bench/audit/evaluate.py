@@ -70,8 +70,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
     source = Path(settings.folder)
     stored = open_avatar(source, settings.method) if settings.avatar else None
     config, clips = _open(settings, {} if stored is None else stored.heads)
-    kinds = ("frame", "regional", "temporal", "sequence", *(["avatar"] if settings.avatar else []))
-    metrics = [metric for metric in resolve_metrics(config) if metric.kind in kinds]
+    metrics = [m for m in resolve_metrics(config) if m.per_frame or (settings.avatar and m.kind == "avatar")]
     if not any(metric.per_frame for metric in metrics):
         raise InputError("metrics", "", "at least one metric of frames", ", ".join(config.metrics))
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)

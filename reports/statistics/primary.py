@@ -6,6 +6,7 @@ from itertools import product
 
 from ...bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
 from ..runs import RunSet
+from ..writers import pipe_table
 from .command import equivalence_text
 from .comparisons import LEVEL, PairedComparison, as_one_family, compare
 
@@ -58,7 +59,7 @@ def primary_section(runs: RunSet) -> str:
         bounds = "-" if c.low is None or c.high is None else f"{c.low:+.{digits}f}, {c.high:+.{digits}f}"
         numbers = [f"{c.difference:+.{digits}f}", bounds, f"{c.p:.4f}", f"{c.p_holm:.4f}"]
         lines.append([head, *numbers, c.verdict, equivalence_text(c, spec.unit)])
-    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    table = pipe_table(lines)
     how = (
         f"Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in found)} endpoints that can be tested; "
         "equivalence by two one-sided sign-flip tests, which assume that subjects differ symmetrically about the mean, Holm over "

@@ -9,6 +9,7 @@ from typing import Any
 
 from ...bench.experiments.robustness import RECORD_FILE
 from ...bench.io.documents import read_json
+from ..writers import pipe_table
 
 FOLDER = "extremes"
 KEPT = ("subject", "method", "seed", "frames", "frames_broken", "measures", "missing", "no_truth")
@@ -61,7 +62,7 @@ def extremes_section(avatars: Sequence[Mapping[str, Any]]) -> str:
     if not rows:
         return ""
     lines = [["method", "measure", "subjects", "mean", "worst", "frames that break the limit"], ["---"] * 6]
-    text = "\n".join(f"| {' | '.join(line)} |" for line in [*lines, *rows])
+    text = pipe_table([*lines, *rows])
     how = (
         "Joint samples of expression and jaw along the principal components of training, in views between and beyond the training "
         "cameras, against the path-traced person in the same pose and view (`headbench run extremes`)."

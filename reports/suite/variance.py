@@ -10,6 +10,7 @@ from ...bench.protocol import TASK_TITLES
 from ...bench.rows import ALL
 from ..aggregate import means_by_seed, whole_images
 from ..runs import RunSet
+from ..writers import pipe_table
 
 METRIC = "psnr"
 
@@ -45,7 +46,7 @@ def variance_section(runs: RunSet, pair: tuple[str, str]) -> str:
                 counts = [str(subjects), str(len(by_seed))]
                 title = TASK_TITLES.get(task, task)
                 lines.append([name, title, *counts, shown, f"{between:.3f}", f"{within:.3f}"])
-    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    table = pipe_table(lines)
     how = (
         "Standard deviations: between subjects, of the means over seeds; within subjects, of trainings with different seeds, pooled. "
         "Both methods of a difference have the same seed."
