@@ -6,17 +6,16 @@ Papers compute it with three kinds of landmarks at least (98 by PIPNet, 478 by M
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..bench.contracts import ByteArray, FloatArray
-from ..bench.errors import HeadbenchError, LeftOutError, UnavailableError
+from ..bench.contracts import FloatArray
+from ..bench.errors import HeadbenchError, UnavailableError
 from ..bench.specs import MetricSpec, Need
-from .pairs import check_pair
+from .faces import DlibLandmarks, FaceMetric
 
 if TYPE_CHECKING:
     from ..bench.landmark_network import LandmarkNetwork
@@ -28,46 +27,32 @@ REMEDY = (
     "pip install ai-edge-litert."
 )
 
-AKD = MetricSpec(
-    name="akd-mediapipe",
-    label="AKD",
-    unit="px",
-    higher_is_better=False,
-    digits=2,
-    implementation="headbench.metrics.akd:Akd",
-    summary="Mean distance of 468 MediaPipe landmarks in pixels; frames in which no face is found are left out and counted.",
-    needs="headbench.metrics.akd:needs",
-)
+
+class _Akd(FaceMetric):
+    """Mean distance of landmarks, pixels."""
+
+    def score(self, found: FloatArray, truth: FloatArray) -> float:
+        """Mean over (N, 2) landmarks."""
+        return float(np.linalg.norm(found - truth, axis=1).mean())
 
 
-class Akd:
-    """Mean distance in pixels of landmarks found in an image and in its ground truth, (H, W, 3) 8-bit each.
+class AkdMediaPipe(_Akd):
+    """AKD of 468 landmarks by MediaPipe; the image is searched around the landmarks of the ground truth first, then everywhere."""
 
-    The image is searched around the landmarks of the ground truth first, then everywhere.
-
-    Raises `LeftOutError` if one of them shows no face to the network, and `UnavailableError` without the network.
-    """
-
-    def __init__(self) -> None:
-        self._local = threading.local()  # an interpreter serves one thread
-
-    def __call__(self, image: ByteArray, target: ByteArray) -> float:
-        """See the class."""
-        check_pair(image, target)
-        first = self._find(target, "ground truth")
-        second = self._find(image, "render", first)
-        return float(np.linalg.norm(first - second, axis=1).mean())
-
-    def _find(self, image: ByteArray, name: str, near: FloatArray | None = None) -> FloatArray:
-        if not hasattr(self._local, "network"):
-            self._local.network = _network()
-        found: FloatArray | None = self._local.network.find(image, near)
-        if found is None:
-            raise LeftOutError(f"no face is found in the {name}")
-        return found
+    def network(self) -> LandmarkNetwork:
+        """The network of the file that the variable names."""
+        return _mediapipe()
 
 
-def _network() -> LandmarkNetwork:
+class AkdDlib(_Akd):
+    """AKD of 68 landmarks by dlib, each image searched by itself."""
+
+    def network(self) -> DlibLandmarks:
+        """dlib's landmarks."""
+        return DlibLandmarks()
+
+
+def _mediapipe() -> LandmarkNetwork:
     from ..bench.landmark_network import LandmarkNetwork
 
     path = os.environ.get(VARIABLE, "")
@@ -76,11 +61,28 @@ def _network() -> LandmarkNetwork:
     return LandmarkNetwork(Path(path))
 
 
-def needs(config: object, device: str) -> Iterator[Need]:
+def mediapipe_needs(config: object, device: str) -> Iterator[Need]:
     """The file of the network, and what reads it."""
     try:
-        _network()
+        _mediapipe()
     except HeadbenchError:
         yield Need("landmark network, for AKD", "", REMEDY, required=False)
     else:
         yield Need("landmark network, for AKD", os.environ[VARIABLE], REMEDY, required=False)
+
+
+def _spec(name: str, landmarks: str, implementation: str, needs: str) -> MetricSpec:
+    return MetricSpec(
+        name=name,
+        label="AKD",
+        unit="px",
+        higher_is_better=False,
+        digits=2,
+        implementation=f"headbench.metrics.akd:{implementation}",
+        summary=f"Mean distance of {landmarks} landmarks in pixels; frames in which no face is found are left out and counted.",
+        needs=f"headbench.metrics.{needs}",
+    )
+
+
+AKD_MEDIAPIPE = _spec("akd-mediapipe", "468 MediaPipe", "AkdMediaPipe", "akd:mediapipe_needs")
+AKD_DLIB = _spec("akd-dlib", "68 dlib", "AkdDlib", "faces:dlib_needs")

@@ -28,7 +28,7 @@ class Network:
 @pytest.fixture
 def network(monkeypatch):
     found = Network()
-    monkeypatch.setattr(akd, "_network", lambda: found)
+    monkeypatch.setattr(akd, "_mediapipe", lambda: found)
     return found
 
 
@@ -37,7 +37,7 @@ def level(value):
 
 
 def test_the_distance_is_that_of_the_landmarks(network):
-    assert akd.Akd()(level(13), level(10)) == pytest.approx(3 * np.sqrt(2))
+    assert akd.AkdMediaPipe()(level(13), level(10)) == pytest.approx(3 * np.sqrt(2))
     assert network.near[0] is None
     np.testing.assert_array_equal(network.near[1], np.full((COUNT, 2), 10.0))
 
@@ -45,20 +45,20 @@ def test_the_distance_is_that_of_the_landmarks(network):
 @pytest.mark.parametrize(("image", "truth", "name"), [(0, 9, "render"), (9, 0, "ground truth")])
 def test_a_picture_without_a_face_is_left_out(network, image, truth, name):
     with pytest.raises(LeftOutError, match=f"no face is found in the {name}"):
-        akd.Akd()(level(image), level(truth))
+        akd.AkdMediaPipe()(level(image), level(truth))
 
 
 def test_without_the_file_the_remedy_says_where_it_is(monkeypatch):
     monkeypatch.delenv(akd.VARIABLE, raising=False)
     with pytest.raises(UnavailableError, match=r"face_landmark\.tflite of the package mediapipe 0\.10\.21"):
-        akd.Akd()(level(1), level(1))
-    (need,) = akd.needs(None, "cpu")
+        akd.AkdMediaPipe()(level(1), level(1))
+    (need,) = akd.mediapipe_needs(None, "cpu")
     assert (need.found, need.required) == ("", False)
 
 
 def test_frames_left_out_have_a_reason(network, monkeypatch):
-    monkeypatch.setattr("headbench.bench.engine.scoring.resolve", lambda name: akd.Akd)
-    scores = score_frames(KEYS, FRAMES, [akd.AKD])["akd-mediapipe"]
+    monkeypatch.setattr("headbench.bench.engine.scoring.resolve", lambda name: akd.AkdMediaPipe)
+    scores = score_frames(KEYS, FRAMES, [akd.AKD_MEDIAPIPE])["akd-mediapipe"]
     assert [score.status for score in scores] == ["missing", "ok", "ok", "ok"]  # the first truth is black
     assert scores[0].reason == f"{LEFT_OUT}no face is found in the ground truth"
 

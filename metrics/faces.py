@@ -1,0 +1,126 @@
+"""What a network finds in the face of a render and in that of its ground truth, and dlib's networks."""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..bench.contracts import ByteArray, FloatArray
+from ..bench.errors import LeftOutError, UnavailableError, install_extra
+from ..bench.specs import Need
+from .pairs import check_pair
+
+REMEDY = f"{install_extra('faces')} (Boost licence; networks CC0, but the 68 landmarks were trained on 300-W: no commercial use)."
+ENLARGED = 1
+"""How often dlib's detector doubles the image's size: it finds faces of 80 pixels and more, and these of 40."""
+
+
+class FaceNetwork(Protocol):
+    """What finds something in a picture of a face."""
+
+    def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:
+        """An array for an (H, W, 3) 8-bit image, or None where no face is found.
+
+        ``near`` is what was found in a similar image; a network may ignore it.
+        """
+        ...
+
+
+class FaceMetric(ABC):
+    """A number from what a network finds in an image and in its ground truth, (H, W, 3) 8-bit each.
+
+    Raises `LeftOutError` if one of them shows no face to the network, and `UnavailableError` without the network.
+    """
+
+    def __init__(self) -> None:
+        self._local = threading.local()  # a network serves one thread
+
+    def __call__(self, image: ByteArray, target: ByteArray) -> float:
+        """See the class."""
+        check_pair(image, target)
+        truth = self._find(target, "ground truth")
+        return self.score(self._find(image, "render", truth), truth)
+
+    @abstractmethod
+    def network(self) -> FaceNetwork:
+        """A new network. Raises `UnavailableError`."""
+
+    @abstractmethod
+    def score(self, found: FloatArray, truth: FloatArray) -> float:
+        """The number, of what is found in the image and in the ground truth."""
+
+    def _find(self, image: ByteArray, name: str, near: FloatArray | None = None) -> FloatArray:
+        if not hasattr(self._local, "network"):
+            self._local.network = self.network()
+        found: FloatArray | None = self._local.network.find(image, near)
+        if found is None:
+            raise LeftOutError(f"no face is found in the {name}")
+        return found
+
+
+class _Dlib:
+    """dlib's frontal face detector, with landmarks in the most certain face."""
+
+    def __init__(self, landmarks: str):
+        self._dlib, self._folder = _dlib()
+        self._detector = self._dlib.get_frontal_face_detector()
+        self._landmarks = self._dlib.shape_predictor(str(self._folder / landmarks))
+
+    def _shape(self, image: ByteArray) -> Any:
+        image = np.ascontiguousarray(image)
+        faces, scores, _ = self._detector.run(image, ENLARGED, 0.0)
+        return self._landmarks(image, faces[int(np.argmax(scores))]) if faces else None
+
+
+class DlibLandmarks(_Dlib):
+    """The 68 landmarks of the 300-W benchmark. Raises `UnavailableError` without dlib or its networks."""
+
+    def __init__(self) -> None:
+        super().__init__("shape_predictor_68_face_landmarks.dat")
+
+    def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:
+        """(68, 2) pixels, whole numbers, as dlib returns them."""
+        shape = self._shape(image)
+        return None if shape is None else np.array([(point.x, point.y) for point in shape.parts()], float)
+
+
+class DlibIdentity(_Dlib):
+    """dlib's descriptor of a face, by which its networks recognise people. Raises as `DlibLandmarks`."""
+
+    def __init__(self) -> None:
+        super().__init__("shape_predictor_5_face_landmarks.dat")
+        path = str(self._folder / "dlib_face_recognition_resnet_model_v1.dat")
+        self._network = self._dlib.face_recognition_model_v1(path)
+
+    def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:
+        """(128,) numbers."""
+        shape = self._shape(image)
+        if shape is None:
+            return None
+        return np.array(self._network.compute_face_descriptor(np.ascontiguousarray(image), shape))
+
+
+def _dlib() -> tuple[Any, Path]:
+    """The package, and the folder of its networks, whose package is not imported: its older versions import what is gone."""
+    found = find_spec("face_recognition_models")
+    try:
+        import dlib
+    except ImportError as error:
+        raise UnavailableError("The Python package dlib is not installed.", REMEDY) from error
+    if found is None or not found.submodule_search_locations:
+        raise UnavailableError("The Python package face_recognition_models is not installed.", REMEDY)
+    return dlib, Path(found.submodule_search_locations[0]) / "models"
+
+
+def dlib_needs(config: object, device: str) -> Iterator[Need]:
+    """The packages dlib and face_recognition_models."""
+    found = all(find_spec(name) is not None for name in ("dlib", "face_recognition_models"))
+    yield Need(
+        "dlib and its networks, for AKD and CSIM", "installed" if found else "", REMEDY, required=False
+    )
