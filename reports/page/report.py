@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.engine.config import RunOptions
 from ...bench.engine.scoring import FULL
 from ...bench.engine.store import RunFolder
 from ...bench.errors import InputError
@@ -25,7 +24,9 @@ from ...bench.specs import CommandResult, MetricSpec
 from ..aggregate import summarise
 from ..compact import compact
 from ..drawing import colour_map
+from ..papers import printed_tables
 from ..pareto.points import LATENCY, SIZE, SPEED, pareto_front
+from ..printed import as_printed
 from ..runs import FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import COMPARISON, layouts, table_of
@@ -103,7 +104,7 @@ def _size(page: str, files: Sequence[PictureFile]) -> int:
 def page_text(
     runs: RunSet,
     max_mb: float,
-    options: RunOptions,
+    settings: PageSettings,
     progress: Progress = no_progress,
     *,
     apart: bool = False,
@@ -112,6 +113,11 @@ def page_text(
 
     Raises `InputError` if ``max_mb`` does not suffice.
     """
+    printed = [
+        TitledTable(f"As {table.table} of {name}", as_printed(runs, name, table))
+        for name in settings.papers
+        for table in printed_tables(name, None)
+    ]
     metrics = [spec for spec in runs.metrics if spec.per_frame and COMPARISON in spec.tables]
     values = frame_values(runs, metrics)
     worst = worst_frames(values, runs, metrics[0]) if metrics else []
@@ -127,7 +133,8 @@ def page_text(
             TitledTable(TITLES.get(name, name), table_of(runs, name))
             for name in layouts(runs)
             if name != COMPARISON
-        ],
+        ]
+        + printed,
         "comparisons": comparisons,
         "cards": cards,
         "anchors": {card["label"]: card["anchor"] for card in cards},
@@ -149,7 +156,7 @@ def page_text(
     entry = 8 * (len(runs.methods) + 2)  # bytes of a frame's entry in the list, without its pictures
     room -= entry * len(data["frames"])
     # The pictures that open the page stand in it twice, so that they show before its script has run.
-    pictures = choose_pictures(runs, worst, int(room * OPENING_SHARE), options, progress)
+    pictures = choose_pictures(runs, worst, int(room * OPENING_SHARE), settings, progress)
     best = [row.method for row in compact(parts[0].table).rows if not row.trivial]
     first = opening(runs, best, metrics, values, pictures)
     data["opening"] = _opening(runs, first)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import tyro
 
@@ -31,6 +32,9 @@ class PageSettings(RunOptions):
 
     max_mb: float | None = None
     """Maximum size in megabytes (10^6 bytes). By default 10, with --split 500."""
+
+    papers: Annotated[tuple[str, ...], tyro.conf.arg(name="as")] = ()
+    """Papers in the form of whose tables the runs are shown, too, with the rows that they printed: `headbench list papers`."""
 
     def __post_init__(self) -> None:
         if not self.runs:

@@ -102,6 +102,21 @@ def test_parts_are_the_regions_and_sequences_of_the_run(page, write_run):
     assert numbers(found.tables[1])[first["method"]] == [str(c["value"]) for c in first["cells"]]
 
 
+def test_tables_in_the_form_of_a_paper_have_its_rows(page, write_run):
+    run = write_run("run", {"ours": 30.0, "ga": 31.25})
+    found = page([run], papers=("tensorial-2025",))
+    for number in ("3", "4"):
+        expected = json.loads(table_text([run], "json", paper="tensorial-2025", number=number))
+        wanted = {row["method"]: [cell["text"] for cell in row["cells"]] for row in expected["groups"][-1][1]}
+        tables = [
+            {row[0][1].strip(): [cell[1].partition("\n")[0] for cell in row[1:]] for row in table[2:]}
+            for table in found.tables
+        ]
+        assert any(wanted.items() <= table.items() for table in tables), number
+    with pytest.raises(InputError, match="tensorial-2025"):
+        page([run], papers=("tensorial-2024",))
+
+
 def test_the_front_joins_the_methods_that_none_beats(page, write_run):
     plots = page([write_run("run", {"a": 30.0, "b": 31.0, "mean-image": 12.0})]).data["plots"]
     assert [plot["x"] for plot in plots] == ["Size (MB)", "Frame time (ms)"] * 2
