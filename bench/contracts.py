@@ -302,6 +302,14 @@ class StagedAvatar(Avatar, Protocol):
 
 
 @runtime_checkable
+class DepthAvatar(Avatar, Protocol):
+    """An avatar that knows how far away is what it shows. Optional."""
+
+    def depth(self, camera: Camera, pose: HeadPose) -> FloatArray:
+        """(H, W) distance along the camera's axis, metres, of what each pixel shows; NaN where that is mostly background."""
+
+
+@runtime_checkable
 class SharingAvatar(Avatar, Protocol):
     """An avatar that needs assets which all avatars of its kind share, such as the head model. Optional."""
 
@@ -495,6 +503,9 @@ class TrueFrame(NamedTuple):
     rgb: ByteArray  #: (H, W, 3) 8-bit sRGB on the clip's background
     mask: ByteArray  #: (H, W) 8-bit foreground coverage
     face: BoolArray  #: (H, W) pixels in which the face is visible
+    depth: FloatArray | None = (
+        None  #: (H, W) distance of the head along the camera's axis, metres; infinity beside it
+    )
 
 
 class GroundTruth(Protocol):
@@ -505,7 +516,10 @@ class GroundTruth(Protocol):
         """Hex digest of everything that a picture depends on besides camera and pose."""
 
     def render(self, camera: Camera, pose: HeadPose) -> TrueFrame:
-        """Picture of the subject; the same for the same input."""
+        """Picture of the subject, without depth; the same for the same input."""
+
+    def depth(self, camera: Camera, pose: HeadPose) -> FloatArray:
+        """Depth of the head, as `TrueFrame.depth`."""
 
 
 def no_stage(name: str) -> None:

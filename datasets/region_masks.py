@@ -66,6 +66,10 @@ class HeadRegions:
             labels[_beyond(covered, labels & _BITS["hair"] != 0) & foreground] |= _BITS["hair"]
         return labels
 
+    def depth(self, camera: Camera, pose: HeadPose) -> FloatArray:
+        """(H, W) distance of the mesh along the camera's axis, metres; infinity beside it."""
+        return rasterize_mesh(self._subject.meshes([pose])[0], self._head.faces, camera).depth
+
     @cached_property
     def _subject(self) -> PosedSubject:
         return PosedSubject(self._head, self._shape, self._offset)

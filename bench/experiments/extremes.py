@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from scipy.special import ndtri
 
-from ..contracts import Avatar, Clip, FloatArray, FrameKey, HeadPose, Progress
+from ..contracts import Avatar, Clip, DepthAvatar, FloatArray, FrameKey, HeadPose, Progress
 from ..engine.steps import Job
 from ..errors import UnavailableError
 from ..io.files import digest
@@ -33,6 +33,7 @@ from .stability import (
     typical,
     write_frame,
 )
+from .surface import surface
 from .truth import TRUTH_LIMITS, TruthJudge, TruthPair, TruthPictures, without_truth
 from .viewpoints import Viewpoint, common_target, turntable
 
@@ -288,6 +289,9 @@ def _judged(
             entry["truth"] = own[0].relative_to(job.run).as_posix()
             compared.append(TruthPair.of(rendered, truth))
             checks = scores.appearance(compared[-1], extrapolated=view.extrapolated)
+            small = truths.view(view.camera)
+            depth = avatar.depth(small, frame.pose) if isinstance(avatar, DepthAvatar) else None
+            checks += surface(depth, truth, small)
             response = scores.response(compared[-1], compared[frame.view])
             flicker = scores.flicker(compared[-1], compared[-2 if follows else -1])
         against.append((checks, [*([response] if sample else []), *([flicker] if follows else [])]))

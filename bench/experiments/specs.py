@@ -94,10 +94,12 @@ AGAINST_TRUTH = (
     MetricSpec("lpips", "LPIPS", "", False, 4, ""),
     MetricSpec("iou", "Overlap of masks", "ratio", True, 3, ""),
     MetricSpec("colour", "Colour of the face", "CIEDE2000", False, 2, ""),
+    MetricSpec("depth", "Depth of the face", "mm", False, 1, ""),
+    MetricSpec("normals", "Normals of the face", "degrees", False, 1, ""),
     MetricSpec("response", "Response", "ratio", True, 2, "", kind="avatar"),
     MetricSpec("flicker", "Flicker", "levels", False, 3, "", kind="avatar"),
 )
-"""What `truth.TruthJudge` has of a frame, against limits that follow from the truth."""
+"""What `truth.TruthJudge` and `surface.surface` have of a frame, against limits that follow from the truth."""
 
 EXTREMES = ConditionSpec(
     name="extremes",

@@ -25,13 +25,13 @@ from ..io.images import quantise, read_png, write_png
 from ..io.provenance import SYNTHETIC
 from ..registry import get, resolve
 from .stability import LimitCheck
+from .surface import FACE, NO_FACE, absent_surface
 
 FOLDER = "truth"
-FACE = "face"
 POSE_FIELDS = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids")
 LEAST_CHANGE = 2.0
 """Change of the truth, root mean square in 8-bit levels, below which it says little of how an avatar changes."""
-NOT_FINITE, NO_FACE = "the frame is not finite", "no face in view"
+NOT_FINITE = "the frame is not finite"
 
 
 @dataclass(frozen=True)
@@ -90,24 +90,25 @@ class TruthPictures:
 
     def missing(self, frames: Iterable[tuple[Camera, HeadPose]]) -> int:
         """How many pictures of some frames are not in the folder."""
-        files = {self._files(self._view(camera), pose) for camera, pose in frames}
+        files = {self._files(self.view(camera), pose) for camera, pose in frames}
         return sum(not (picture.exists() and mask.exists()) for picture, mask in files)
 
     def at(self, camera: Camera, pose: HeadPose) -> tuple[TrueFrame, tuple[Path, Path]]:
         """The truth of a frame, rendered unless it is in the folder, and its files: picture, and mask and face."""
-        view = self._view(camera)
+        view = self.view(camera)
         files = picture, masks = self._files(view, pose)
         try:
             mask, face, _ = np.moveaxis(read_png(masks), 2, 0)
-            return TrueFrame(read_png(picture), mask, face > 0), files
+            truth = TrueFrame(read_png(picture), mask, face > 0)
         except InputError:  # not there, or damaged
             truth = self._source.render(view, pose)
-        layers = [truth.mask, 255 * truth.face.astype(np.uint8), np.zeros_like(truth.mask)]
-        write_png(picture, truth.rgb, SYNTHETIC)
-        write_png(masks, np.stack(layers, axis=2), SYNTHETIC)
-        return truth, files
+            layers = [truth.mask, 255 * truth.face.astype(np.uint8), np.zeros_like(truth.mask)]
+            write_png(picture, truth.rgb, SYNTHETIC)
+            write_png(masks, np.stack(layers, axis=2), SYNTHETIC)
+        return truth._replace(depth=self._source.depth(view, pose)), files
 
-    def _view(self, camera: Camera) -> Camera:
+    def view(self, camera: Camera) -> Camera:
+        """A camera at the size of the pictures."""
         return camera.resized(round(camera.width * self._height / camera.height), self._height)
 
     def _files(self, view: Camera, pose: HeadPose) -> tuple[Path, Path]:
@@ -239,6 +240,7 @@ def _absent(name: str, region: str, reason: str) -> LimitCheck:
 def without_truth(reason: str) -> tuple[list[LimitCheck], LimitCheck, LimitCheck]:
     """Appearance, response and flicker of a frame that there is no truth for."""
     appearance = [_absent(name, region, reason) for name, region in APPEARANCE]
+    appearance += absent_surface(reason)
     return appearance, _absent("response", FULL, reason), _absent("flicker", FULL, reason)
 
 

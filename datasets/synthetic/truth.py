@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...bench.contracts import Camera, Clip, HeadPose, TrueFrame
+from ...bench.contracts import Camera, Clip, FloatArray, HeadPose, TrueFrame
 from ...bench.engine.captures import synthesis_arguments
 from ...bench.errors import UnavailableError
 from ...bench.io.files import digest
@@ -78,6 +78,10 @@ class SyntheticTruth:
             self._posed = pose
         rgb, mask = self._renderer.render_view(camera, seed, self._background)
         return TrueFrame(rgb, mask, select(self._regions.labels(camera, pose, mask), "face"))
+
+    def depth(self, camera: Camera, pose: HeadPose) -> FloatArray:
+        """(H, W) distance of the head's mesh along the camera's axis, metres; infinity beside it. Hair, beard and glasses have none."""
+        return self._regions.depth(camera, pose)
 
     @cached_property
     def _plan(self) -> SubjectPlan:

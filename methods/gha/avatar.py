@@ -14,7 +14,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ...bench.configuration import build
-from ...bench.contracts import Camera, Frame, HeadAsset, HeadPose, no_stage
+from ...bench.contracts import Camera, FloatArray, Frame, HeadAsset, HeadPose, no_stage
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.documents import parse_json
@@ -30,7 +30,7 @@ from ..shared.avatar_files import (
     read_shared_head,
     read_subject,
 )
-from ..shared.rendering import Drawn, LastPose, PosedSplats, posed_splats, read_back
+from ..shared.rendering import Drawn, LastPose, PosedSplats, posed_splats, read_back, splat_depth
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from ..shared.threads import torch_on_one_thread
 from ..splats.cpu import instruction_sets
@@ -114,6 +114,13 @@ class GHAAvatar:
         if other.any():
             image = image + (1 - alpha)[..., None] * to_device(torch.from_numpy(other), image.device)
         return read_back(Drawn(image.clamp(0, 1), alpha.contiguous()))
+
+    @torch.no_grad()
+    def depth(self, camera: Camera, pose: HeadPose) -> FloatArray:
+        """See `splat_depth`: super-resolution does not move what is shown."""
+        splats = self._posed(pose)
+        world = splats.world._replace(quats=F.normalize(splats.world.quats, dim=1))
+        return splat_depth(world, splats.opacities, camera, str(world.means.device))
 
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:

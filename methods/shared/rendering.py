@@ -15,7 +15,7 @@ from ...bench.contracts import Camera, FloatArray, Frame, HeadPose, no_stage
 from ...bench.native.dispatch import is_cuda, on_host, to_device
 from ..avatars.compact.container import codec_of
 from ..ops.splats import WorldSplats
-from ..splats import rasterize
+from ..splats import Rendering, rasterize
 from ..splats.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from .avatar_files import HEAD_FILE
 from .subject_mesh import pose_key
@@ -81,7 +81,17 @@ def draw_splats(
     cutoffs: Cutoffs = USUAL,
 ) -> Drawn:
     """Rasterize and clip to [0, 1]: the last two stages of `StagedAvatar.draw`."""
-    rendering = rasterize(
+    rendering = _rasterized(world, opacities, colors, view, cutoffs)
+    end_stage("rasterize")
+    drawn = Drawn(rendering.image.clamp(0, 1), rendering.alpha.clamp(0, 1))
+    end_stage("post")
+    return _copied_ahead(drawn) if is_cuda(drawn.image.device) else drawn
+
+
+def _rasterized(
+    world: WorldSplats, opacities: Tensor, colors: Tensor, view: View, cutoffs: Cutoffs
+) -> Rendering:
+    return rasterize(
         *(world.means, world.quats, world.scales, opacities, colors),
         *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
         background=view.background,
@@ -89,10 +99,17 @@ def draw_splats(
         transmittance_min=cutoffs.transmittance_min,
         check_values=False,
     )
-    end_stage("rasterize")
-    drawn = Drawn(rendering.image.clamp(0, 1), rendering.alpha.clamp(0, 1))
-    end_stage("post")
-    return _copied_ahead(drawn) if is_cuda(drawn.image.device) else drawn
+
+
+def splat_depth(
+    world: WorldSplats, opacities: Tensor, camera: Camera, device: str, cutoffs: Cutoffs = USUAL
+) -> FloatArray:
+    """(H, W) mean depth of the centres of the splats that a pixel shows, weighted as their colours; NaN below an alpha of 0.5."""
+    view = view_of(camera, device, (0.0, 0.0, 0.0))
+    axis = view.world_to_camera[2]
+    along = (world.means @ axis[:3] + axis[3]).clamp(min=0)
+    drawn = _rasterized(world, opacities, along[:, None].expand(-1, 3).contiguous(), view, cutoffs)
+    return _numpy(torch.where(drawn.alpha < 0.5, torch.nan, drawn.image[..., 0] / drawn.alpha))
 
 
 def _copied_ahead(drawn: Drawn) -> Drawn:
@@ -237,6 +254,12 @@ class StoredSplatAvatar:
     def read_back(self, drawn: Drawn) -> Frame:
         """A drawn frame in host memory."""
         return read_back(drawn)
+
+    @torch.no_grad()
+    def depth(self, camera: Camera, pose: HeadPose) -> FloatArray:
+        """See `splat_depth` and `DepthAvatar`."""
+        placed = self._place(pose, no_stage)
+        return splat_depth(placed.world, placed.opacities, camera, self._device, self._cutoffs)
 
     @torch.no_grad()
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> PosedSplats:

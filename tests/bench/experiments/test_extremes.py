@@ -31,7 +31,7 @@ from headbench.reports.robustness.sheets import BROKEN, EXTRAPOLATED, SHEET_FILE
 
 VIEWS, SAMPLES, PATH_FRAMES = 6, 5, 4
 FRAMES = VIEWS + 2 * SAMPLES + PATH_FRAMES
-MEASURES = 5 + 6  # of stability in every frame, and of appearance against the truth
+MEASURES = 5 + 6 + 2  # of stability in every frame, and of appearance and surface against the truth
 
 
 def settings(folder, **changes):

@@ -50,6 +50,9 @@ class TrueAvatar:
     def __init__(self, job, change=lambda rgb, alpha: rgb, always=None):
         self._truths, self._change, self._always = TruthPictures.of(job), change, always
 
+    def depth(self, camera, pose):
+        return self._truths.at(camera, self._always or pose)[0].depth
+
     def render(self, camera, pose, background=(1.0, 1.0, 1.0)):
         truth, _ = self._truths.at(camera, self._always or pose)
         alpha = (truth.mask / 255.0).astype(np.float32)
@@ -117,6 +120,8 @@ def test_an_avatar_that_is_the_person_passes(job, tmp_path):
     assert values["psnr"] == values["psnr face"] == 100.0
     assert values["iou"] == pytest.approx(1.0)
     assert values["response"] == 1.0
+    assert values["depth face"] == 0.0
+    assert values["normals face"] == pytest.approx(0.0, abs=1e-5)
     assert values["colour"] == values["flicker"] == 0.0
     assert "psnr face" in table([record])
     truths = [path for path in files if path.parent == job.run / "truth"]
@@ -138,7 +143,11 @@ def test_pictures_are_rendered_once_and_again_if_damaged(tmp_path):
         face[2:5, 3] = True
         return TrueFrame(np.full((10, 8, 3), 40, np.uint8), np.full((10, 8), 130, np.uint8), face)
 
-    truths = TruthPictures(SimpleNamespace(fingerprint="a", render=render), tmp_path, 10)
+    truths = TruthPictures(
+        SimpleNamespace(fingerprint="a", render=render, depth=lambda camera, pose: np.ones((10, 8))),
+        tmp_path,
+        10,
+    )
     camera = Camera("c", 16, 20, np.diag([20.0, 20.0, 1.0]), np.eye(4))
     pose = SimpleNamespace(head_model="m", expression=np.zeros(3), jaw=np.zeros(3), eyelids=None)
     pose = SimpleNamespace(**vars(pose), rotation=None, neck=None, eyes=None, translation=None)

@@ -1,0 +1,67 @@
+"""Depth and normals of the face that an avatar shows, against those of the true head."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..contracts import Camera, FloatArray, TrueFrame
+from .stability import LimitCheck
+
+FACE = "face"
+MEASURED = ("depth", "normals")
+NO_DEPTH, NO_FACE = "the avatar gives no depth", "no face in view"
+
+
+def surface(depth: FloatArray | None, truth: TrueFrame, camera: Camera) -> list[LimitCheck]:
+    """Mean errors of depth (mm) and normals (degrees) over the pixels of the face that the avatar covers.
+
+    Both are limited by the error of a flat card in the face's place: at the median of the true depth, along the mean of the
+    true normals.
+
+    Parameters
+    ----------
+    depth : FloatArray | None
+        (H, W) metres along the camera's axis, NaN where nothing is shown; None for an avatar that gives none.
+    truth : TrueFrame
+        With its depth.
+    camera : Camera
+        That of the (H, W) pictures.
+    """
+    if depth is None:
+        return absent_surface(NO_DEPTH)
+    assert truth.depth is not None
+    true = np.where(truth.face & np.isfinite(truth.depth), truth.depth, np.nan).astype(np.float64)
+    depth = np.where(np.isfinite(depth), depth, np.nan).astype(np.float64)
+    seen = np.isfinite(true) & np.isfinite(depth)
+    if not seen.any():
+        return absent_surface(NO_FACE)
+    error = 1000 * np.abs(depth - true)[seen].mean()
+    flat = 1000 * np.abs(true[seen] - np.median(true[seen])).mean()
+    checks = [LimitCheck("depth", float(error), 0.0, float(flat), region=FACE)]
+    shown, right = normals(depth, camera), normals(true, camera)
+    both = np.isfinite(shown).all(axis=2) & np.isfinite(right).all(axis=2)
+    if not both.any():
+        return [*checks, LimitCheck("normals", None, 0.0, 0.0, NO_FACE, FACE)]
+    mean = right[both].mean(axis=0)
+    angle, limit = _angle(shown[both], right[both]), _angle(mean / np.linalg.norm(mean), right[both])
+    return [*checks, LimitCheck("normals", angle, 0.0, limit, region=FACE)]
+
+
+def absent_surface(reason: str) -> list[LimitCheck]:
+    """The measures of a frame that cannot be measured."""
+    return [LimitCheck(name, None, 0.0, 0.0, reason, FACE) for name in MEASURED]
+
+
+def normals(depth: FloatArray, camera: Camera) -> FloatArray:
+    """(H, W, 3) unit normals towards the camera of an (H, W) map of depth, by central differences; NaN beside what has none."""
+    rows, columns = np.indices(depth.shape) + 0.5
+    rays = np.stack([columns, rows, np.ones_like(rows)], axis=2) @ np.linalg.inv(camera.K).T
+    points = depth[..., None] * rays
+    down, right = np.gradient(points, axis=(0, 1))
+    found = np.cross(down, right)
+    return np.asarray(found / np.linalg.norm(found, axis=2, keepdims=True))
+
+
+def _angle(first: FloatArray, second: FloatArray) -> float:
+    """Mean angle between unit vectors, degrees."""
+    return float(np.degrees(np.arccos(np.clip((first * second).sum(axis=-1), -1.0, 1.0))).mean())
