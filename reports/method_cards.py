@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from ..bench.io.documents import read_json
 from ..bench.registry import discover
 from ..bench.specs import MethodSpec
 from .papers import COMPARABLE, papers
+
+MEASURED = Path(__file__).with_name("measured.json")
+"""Written with the tables of the suite (`readme`)."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,24 @@ def printed_figures(spec: MethodSpec) -> list[PrintedFigures]:
     return sorted(found, key=lambda figures: not figures.own)
 
 
+@dataclass(frozen=True)
+class MeasuredFigures:
+    """What headbench measured for a method in the suite. Values by "task/metric", as displayed."""
+
+    suite: str
+    data: str
+    values: dict[str, str]
+
+
+def measured_figures(name: str) -> MeasuredFigures | None:
+    """Those of the method of a name; None for one that is not in the suite."""
+    if not MEASURED.is_file():
+        return None
+    stored = read_json(MEASURED)
+    values = stored["methods"].get(name)
+    return None if values is None else MeasuredFigures(stored["suite"], stored["data"], values)
+
+
 def citations() -> list[dict[str, Any]]:
     """A card for every registered method, for ``headbench list methods --cite``: ``summary`` has its text."""
     cards = []
@@ -54,6 +77,8 @@ def citations() -> list[dict[str, Any]]:
         )
         lines.append(f"Code: {code}")
         lines += [f"Printed: {figure_text(figure)}" for figure in figures]
+        measured = measured_figures(name)
+        lines += [f"Measured: {measured_text(measured)}"] if measured else []
         lines += [spec.bibtex.strip()] if spec.bibtex else []
         text = "\n".join(lines).replace("\n", "\n  ")
         cards.append(
@@ -65,6 +90,7 @@ def citations() -> list[dict[str, Any]]:
                 "bibtex": spec.bibtex.strip(),
                 "native": spec.native,
                 "printed": [vars(figure) for figure in figures],
+                "measured": vars(measured) if measured else None,
             }
         )
     return cards
@@ -76,11 +102,15 @@ UNITS = {"fps": "FPS"}
 
 def figure_text(figures: PrintedFigures) -> str:
     """PSNR and speed of a printed row in words, with who printed them."""
-    shown = [
-        f"{label} {figures.values[key]} {UNITS.get(key, 'dB')}"
-        for key, label in SHOWN.items()
-        if key in figures.values
-    ]
     by = "claimed" if figures.own else "run by others"
-    said = ", ".join(shown) or "other metrics"
-    return f"{said} ({by}: {figures.paper}, {figures.table}, {figures.data}, grade {figures.grade})"
+    return f"{_shown(figures.values)} ({by}: {figures.paper}, {figures.table}, {figures.data}, grade {figures.grade})"
+
+
+def measured_text(figures: MeasuredFigures) -> str:
+    """PSNR and speed of the suite in words."""
+    return f"{_shown(figures.values)} (by headbench, {figures.suite}: {figures.data})"
+
+
+def _shown(values: dict[str, str]) -> str:
+    shown = [f"{label} {values[key]} {UNITS.get(key, 'dB')}" for key, label in SHOWN.items() if key in values]
+    return ", ".join(shown) or "other metrics"

@@ -26,8 +26,10 @@ from ..bench.experiments.suite_settings import EQUAL, LARGE_RUN, NONE, RUN, SEED
 from ..bench.io.files import write_bytes, write_json, write_text
 from ..bench.io.images import encode_image, read_png
 from ..bench.manifest import Manifest
+from ..bench.progress import counted
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
+from .aggregate import summarise
 from .runs import RunSet
 from .statistics.command import equivalence_text
 from .statistics.comparisons import PairedComparison, compare
@@ -43,6 +45,8 @@ SUITE, SECOND = "suite", "suite-2"
 """Stored results of the suite in `GALLERY`: those of the README, and those of the second edition as far as they are measured."""
 PICTURE = "contact_sheet.jpg"
 RESULTS = "results.md"
+MEASURED = "reports/measured.json"
+"""Figures of the suite for cards of methods (`method_cards`)."""
 PAGES = {"demo": "docs/explanation/results.md", SUITE: "README.md", SECOND: "docs/explanation/suite.md"}
 """The page of each block, in the repository."""
 OURS = "ours"
@@ -69,6 +73,7 @@ def publish_suite(out: Path, root: Path, name: str = SUITE) -> None:
         if avatars := read_extremes([run]):
             write_json(place / EXTREMES / RECORD_FILE, {"avatars": avatars})
     write_text(target / RESULTS, suite_results(target))
+    write_json(root / MEASURED, measured(target))
     _write(root / PAGES[name], name, suite_block(root, name))
 
 
@@ -135,6 +140,24 @@ def suite_results(folder: Path) -> str:
 def _made(manifest: Manifest) -> dict[str, Any]:
     """What the settings of the captures of a run were, for all subjects alike."""
     return dict(manifest.clips[0].steps[0]["parameters"]["synthetic"])
+
+
+def measured(folder: Path) -> dict[str, Any]:
+    """Means of the stored runs of the suite, as `method_cards.MeasuredFigures` has them; over all cameras, as papers print them."""
+    runs = RunSet.read(suite_runs(folder))
+    specs = {spec.name: spec for spec in runs.metrics}
+    keys = [(task, name) for task in runs.tasks for name in specs if specs[name].per_frame]
+    keys += [("", name) for name in ("storage", "storage_coded", "fps") if name in specs]
+    methods: dict[str, dict[str, str]] = {}
+    for label in runs.ranked:
+        for task, name in keys:
+            value = summarise(runs.rows, label, name, task).value
+            if value is not None:
+                key = f"{task}/{name}".lstrip("/")
+                methods.setdefault(label, {})[key] = f"{value:.{specs[name].digits}f}"
+    subjects = len(runs.rows.subjects)
+    data = [counted(subjects, "synthetic subject"), runs.image_size]
+    return {"suite": folder.name, "data": ", ".join(filter(None, data)), "methods": methods}
 
 
 def suite_options(folder: Path) -> tuple[str, ...]:

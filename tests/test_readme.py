@@ -206,6 +206,14 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
         assert page.split(begin)[1].split(end)[0].strip() == block.strip()
 
 
+def test_measured_figures_of_methods_are_those_of_the_stored_rows():
+    from headbench.reports import readme
+
+    stored = json.loads((ROOT / readme.MEASURED).read_text("utf-8"))
+    assert stored == readme.measured(ROOT / readme.GALLERY / stored["suite"])
+    assert {"ours", "ga"} <= stored["methods"].keys()
+
+
 @pytest.mark.slow
 def test_all_tables_of_the_suite_are_generated():
     from headbench.reports import readme

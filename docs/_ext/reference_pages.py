@@ -31,7 +31,7 @@ from headbench.bench.executors.settings import Execution
 from headbench.bench.registry import discover, resolve
 from headbench.bench.specs import COMMAND_GROUPS
 from headbench.datasets.lint.catalogue import GROUPS, RULES
-from headbench.reports.method_cards import printed_figures
+from headbench.reports.method_cards import measured_figures, printed_figures
 
 OBJECT_TYPES = {
     "lint": "lint code",
@@ -389,7 +389,7 @@ def method_pages() -> dict[str, str]:
 
 
 def card_parts(spec: Any) -> list[str]:
-    """Source, citation and printed figures of a method."""
+    """Source, citation, and printed and measured figures of a method."""
     if not spec.source:
         return []
     parts = ["## Source\n", escaped(spec.source), ""]
@@ -412,6 +412,14 @@ def card_parts(spec: Any) -> list[str]:
         ]
         parts += ["Not comparable with each other or with measurements here.\n"]
         parts += [table(("table", "by", "data", *(PRINTED[key] for key in keys)), rows), ""]
+    measured = measured_figures(spec.name)
+    if measured:
+        keys = [key for key in PRINTED if key in measured.values]
+        parts += [
+            "## Measured figures\n",
+            f"Measured by headbench in {measured.suite}: {escaped(measured.data)}.\n",
+        ]
+        parts += [table([PRINTED[key] for key in keys], [[measured.values[key] for key in keys]]), ""]
     return parts
 
 
@@ -420,7 +428,7 @@ PRINTED = {
     for task, title in (("novel_view", "novel view"), ("self_reenactment", "self-reenactment"))
     for metric in ("psnr", "ssim", "lpips")
 } | {"storage": "MB", "fps": "FPS"}
-"""Columns of the printed figures of a method."""
+"""Columns of the figures of a method."""
 
 
 def run_settings_page() -> str:

@@ -1,7 +1,16 @@
 """Citations of methods with printed figures."""
 
+import json
+
 from headbench.bench.registry import discover
-from headbench.reports.method_cards import citations, figure_text, printed_figures
+from headbench.reports import method_cards
+from headbench.reports.method_cards import (
+    citations,
+    figure_text,
+    measured_figures,
+    measured_text,
+    printed_figures,
+)
 
 
 def figures(name):
@@ -24,6 +33,18 @@ def test_a_figure_says_what_was_printed_and_by_whom():
     text = figure_text(first)
     assert text.startswith(
         "novel view 32.97 dB, self-reenactment 28.07 dB, speed 300 FPS (claimed: tensorial-2025"
+    )
+
+
+def test_measured_figures_say_on_what_they_were_measured(tmp_path, monkeypatch):
+    file = tmp_path / "measured.json"
+    monkeypatch.setattr(method_cards, "MEASURED", file)
+    assert measured_figures("ours") is None
+    stored = {"suite": "suite", "data": "two subjects", "methods": {"ours": {"novel_view/psnr": "30.10"}}}
+    file.write_text(json.dumps(stored))
+    assert measured_figures("ga") is None
+    assert (
+        measured_text(measured_figures("ours")) == "novel view 30.10 dB (by headbench, suite: two subjects)"
     )
 
 
