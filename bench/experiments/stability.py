@@ -109,8 +109,10 @@ class LimitCheck:
 
     @property
     def worst_first(self) -> float:
-        """Orders values: the nearest to a limit, or the farthest beyond it, first."""
+        """Orders values: the nearest to a limit, or the farthest beyond it, first; of errors without limits the largest."""
         value = math.nan if self.value is None else self.value
+        if self.lower == -math.inf and self.upper == math.inf:
+            return -value
         if self.upper == math.inf:
             return value
         return -value if self.lower <= 0.0 else -abs(math.log(value)) if value > 0.0 else -math.inf
