@@ -1,7 +1,9 @@
-"""JOD of FovVideoVDP: predicted quality of a sequence as a video, in just-objectionable differences.
+"""JOD: predicted quality of a sequence as a video, in just-objectionable differences, by two programs.
 
 R. Mantiuk et al., "FovVideoVDP: A visible difference predictor for wide field-of-view video", ACM Transactions on Graphics 40(4), 2021.
-The program is not a dependency, since its licence (CC BY-NC 4.0) excludes commercial use.
+R. Mantiuk et al., "ColorVideoVDP: A visual difference predictor for image, video and display distortions", ACM Transactions on Graphics
+43(4), 2024. The programs are not dependencies: the licence of the first (CC BY-NC 4.0) excludes commercial use, and the second needs
+torchvision.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
@@ -22,53 +25,78 @@ from .pairs import check_pair
 DISPLAY = "standard_4k"
 RATE = 24.3
 """Frames per second of the NeRSemble benchmark's videos of avatars; captures do not record theirs."""
-REMEDY = "If its licence (CC BY-NC 4.0: no commercial use) suits you, install it: pip install pyfvvdp==1.2.2."
-
-JOD = MetricSpec(
-    name="jod",
-    label="JOD",
-    unit="",
-    higher_is_better=True,
-    digits=2,
-    implementation="headbench.metrics.jod:Jod",
-    summary=f"FovVideoVDP 1.2 of each sequence and camera as a video of {RATE} frames a second on a 4K display, not foveated; 10 is equal.",
-    kind="sequence",
-    needs="headbench.metrics.jod:needs",
-)
 
 
 class Jod:
-    """JOD of a sequence of 8-bit frames against its ground truth, as the NeRSemble benchmark's first author computes it.
+    """JOD of a sequence of 8-bit frames against its ground truth by FovVideoVDP, as the NeRSemble benchmark's first author computes it.
 
     Raises `UnavailableError` without the package.
     """
+
+    package, program = "pyfvvdp", "fvvdp"
+    remedy = (
+        "If its licence (CC BY-NC 4.0: no commercial use) suits you, install it: pip install pyfvvdp==1.2.2."
+    )
 
     def __call__(self, images: Sequence[ByteArray], targets: Sequence[ByteArray]) -> float:
         """JOD, at most 10, of (H, W, 3) frames in the order of time; a single frame is a still picture."""
         for image, target in zip(images, targets, strict=True):
             check_pair(image, target)
-        program = _program()
+        program = _program(self.package, self.program, self.remedy)
         rate = RATE if len(images) > 1 else 0  # a still picture has none
         stacks = np.stack(images), np.stack(targets)
         found, _ = program.predict(*stacks, dim_order="FHWC", frames_per_second=rate)
         return float(found)
 
 
+class ColorJod(Jod):
+    """The same by ColorVideoVDP, which also sees changes of colour."""
+
+    package, program = "pycvvdp", "cvvdp"
+    remedy = "Install it with the torchvision that belongs to the installed PyTorch (MIT licence): pip install cvvdp==0.5.7."
+
+
 @cache
-def _program() -> Any:
+def _program(package: str, name: str, remedy: str) -> Any:
     before = list(sys.path)
     try:
-        import pyfvvdp
+        module = import_module(package)
     except ImportError as error:
-        raise UnavailableError(
-            f"JOD needs the Python package {error.name}; it is not installed.", REMEDY
-        ) from error
+        what = f"JOD needs the Python package {error.name}; it is not installed."
+        raise UnavailableError(what, remedy) from error
     finally:
-        sys.path[:] = before  # which it extends by its own folder
-    return pyfvvdp.fvvdp(display_name=DISPLAY, heatmap=None, quiet=True)
+        sys.path[:] = before  # which they extend by their own folders
+    return getattr(module, name)(display_name=DISPLAY, heatmap=None, quiet=True)
+
+
+def _needs(metric: type[Jod]) -> Iterator[Need]:
+    found = find_spec(metric.package) is not None
+    yield Need(f"{metric.package}, for JOD", "installed" if found else "", metric.remedy, required=False)
 
 
 def needs(config: Any, device: str) -> Iterator[Need]:
     """The package pyfvvdp."""
-    found = find_spec("pyfvvdp") is not None
-    yield Need("pyfvvdp, for JOD", "installed" if found else "", REMEDY, required=False)
+    return _needs(Jod)
+
+
+def color_needs(config: Any, device: str) -> Iterator[Need]:
+    """The package pycvvdp."""
+    return _needs(ColorJod)
+
+
+def _spec(name: str, label: str, by: str, implementation: str, needs: str) -> MetricSpec:
+    return MetricSpec(
+        name=name,
+        label=label,
+        unit="",
+        higher_is_better=True,
+        digits=2,
+        implementation=f"headbench.metrics.jod:{implementation}",
+        summary=f"{by} of each sequence and camera as a video of {RATE} frames a second on a 4K display; 10 is equal.",
+        kind="sequence",
+        needs=f"headbench.metrics.jod:{needs}",
+    )
+
+
+JOD = _spec("jod", "JOD", "FovVideoVDP 1.2, not foveated,", "Jod", "needs")
+JOD_COLOR = _spec("jod-color", "JOD (colour)", "ColorVideoVDP 0.5", "ColorJod", "color_needs")

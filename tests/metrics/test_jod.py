@@ -23,9 +23,10 @@ def program(monkeypatch):
             calls.append((test.shape, dim_order, frames_per_second))
             return np.float32(10 - np.abs(test.astype(float) - reference).mean()), {}
 
-    module = types.ModuleType("pyfvvdp")
-    module.fvvdp = Predictor
-    monkeypatch.setitem(sys.modules, "pyfvvdp", module)
+    for package, name in (("pyfvvdp", "fvvdp"), ("pycvvdp", "cvvdp")):
+        module = types.ModuleType(package)
+        setattr(module, name, Predictor)
+        monkeypatch.setitem(sys.modules, package, module)
     jod._program.cache_clear()
     yield calls
     jod._program.cache_clear()
@@ -35,8 +36,9 @@ def frames(count, level):
     return [np.full((40, 30, 3), level, np.uint8) for _ in range(count)]
 
 
-def test_a_sequence_is_a_video_on_the_display_of_the_benchmark(program):
-    assert jod.Jod()(frames(5, 103), frames(5, 100)) == pytest.approx(7.0)
+@pytest.mark.parametrize("metric", [jod.Jod, jod.ColorJod])
+def test_a_sequence_is_a_video_on_the_display_of_the_benchmark(program, metric):
+    assert metric()(frames(5, 103), frames(5, 100)) == pytest.approx(7.0)
     assert program == [
         {"display_name": "standard_4k", "heatmap": None, "quiet": True},
         ((5, 40, 30, 3), "FHWC", 24.3),
@@ -53,11 +55,18 @@ def test_pictures_of_other_sizes_are_refused(program):
         jod.Jod()([np.zeros((40, 30, 3), np.uint8)], [np.zeros((40, 31, 3), np.uint8)])
 
 
-def test_without_the_program_the_reason_names_its_licence(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyfvvdp", None)
+@pytest.mark.parametrize(
+    ("metric", "needs", "remedy"),
+    [
+        (jod.Jod, jod.needs, r"package pyfvvdp[\s\S]*CC BY-NC 4.0[\s\S]*pip install"),
+        (jod.ColorJod, jod.color_needs, r"package pycvvdp[\s\S]*torchvision[\s\S]*pip install"),
+    ],
+)
+def test_without_the_program_the_reason_says_how_to_install_it(monkeypatch, metric, needs, remedy):
+    monkeypatch.setitem(sys.modules, metric.package, None)
     monkeypatch.setattr(jod, "find_spec", lambda name: None)
     jod._program.cache_clear()
-    with pytest.raises(UnavailableError, match="package pyfvvdp.*CC BY-NC 4.0.*pip install"):
-        jod.Jod()(frames(2, 0), frames(2, 0))
-    (need,) = jod.needs(None, "cpu")
+    with pytest.raises(UnavailableError, match=remedy):
+        metric()(frames(2, 0), frames(2, 0))
+    (need,) = needs(None, "cpu")
     assert (need.found, need.required) == ("", False)
