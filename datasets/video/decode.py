@@ -1,0 +1,97 @@
+"""Frames of a video file: upright, at a constant rate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from ...bench.contracts import ByteArray
+from ...bench.errors import InputError
+
+LEAST_FRAMES = 10
+SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+
+
+class VideoInfo(NamedTuple):
+    """What a video has."""
+
+    width: int
+    """Of upright frames, pixels."""
+    height: int
+    rate: float
+    """Mean number of frames a second."""
+    frames: int
+    """As the file says, which may not be exact."""
+
+
+def is_video(path: Path) -> bool:
+    """Whether a path names a file with the suffix of a video."""
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def probe_video(path: Path) -> VideoInfo:
+    """Size and rate of a video. Raises `InputError` for a file that is none."""
+    _, first = next(_decoded(path))
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    rate, count = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    capture.release()
+    if not 1.0 <= rate <= 1000.0:
+        raise InputError(path, "frame rate", "1 to 1000 frames a second", f"{rate:g}")
+    return VideoInfo(first.shape[1], first.shape[0], float(rate), max(0, int(count)))
+
+
+def video_frames(path: Path, rate: float | None = None) -> Iterator[tuple[float, ByteArray]]:
+    """Frames with their times in seconds, turned upright as the file says.
+
+    Of a video whose rate varies, or that has more than ``rate`` frames a second, the first frame from each multiple of
+    1 / ``rate`` on is taken.
+
+    Parameters
+    ----------
+    rate : float | None
+        Most frames a second; None for all frames.
+
+    Yields
+    ------
+    tuple[float, ByteArray]
+        Time from the first frame, and the (H, W, 3) RGB frame.
+
+    Raises
+    ------
+    InputError
+        The file is no video, or frames have different sizes.
+    """
+    following = 0
+    size = None
+    for time, frame in _decoded(path):
+        size = size or frame.shape
+        if frame.shape != size:
+            expected = f"frames of {size[1]}x{size[0]} pixels, as the first"
+            raise InputError(path, f"frame at {time:.2f} s", expected, f"{frame.shape[1]}x{frame.shape[0]}")
+        # A hundredth of a frame, for times that are rounded in the file.
+        if rate is None or time * rate >= following - 0.01:
+            following = following + 1 if rate is None else int(np.floor(time * rate + 0.01)) + 1
+            yield time, frame
+
+
+def _decoded(path: Path) -> Iterator[tuple[float, ByteArray]]:
+    if not path.is_file():
+        raise InputError(path, "", "a video", "no such file")
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        first = None
+        while True:
+            seen, frame = capture.read()
+            if not seen:
+                break
+            now = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            first = now if first is None else first
+            yield max(0.0, now - first), np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
+        if first is None:
+            raise InputError(path, "", "a video that OpenCV can decode, such as H.264 in mp4", "no frame")
+    finally:
+        capture.release()

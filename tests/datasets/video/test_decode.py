@@ -1,0 +1,104 @@
+"""Videos as cameras and phones write them, made with PyAV."""
+
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.datasets.video.decode import is_video, probe_video, video_frames
+
+
+def picture(index, width=64, height=48):
+    """Dark, with a bright left upper quarter; the number is in the level of the rest."""
+    image = np.full((height, width, 3), 40 + 8 * index, np.uint8)
+    image[: height // 2, : width // 2] = (230, 60, 60)
+    return image
+
+
+def write(path, times, size=(64, 48), turned=False, sound=False, codec="libx264"):
+    """A video of frames at some times in milliseconds; ``turned``: with the flag of a phone that is held upright."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25, options={"crf": "8"})
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+        audio = container.add_stream("aac", rate=44100) if sound else None
+        if audio is not None:
+            silence = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
+            silence.sample_rate, silence.pts = 44100, 0
+            container.mux(audio.encode(silence))
+        for index, time in enumerate(times):
+            frame = av.VideoFrame.from_ndarray(picture(index, *size), "rgb24")
+            frame.pts, frame.time_base = time, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+        if audio is not None:
+            container.mux(audio.encode())
+    if turned:
+        data = bytearray(path.read_bytes())
+        place = data.rindex(b"tkhd") + 4 + 40 if data[data.rindex(b"tkhd") + 4] == 0 else None
+        # The display matrix of a quarter turn: (0, 1, 0, -1, 0, 0, 0, 0, 1), ISO 14496-12, 8.3.2.
+        matrix = [0, 0x10000, 0, -0x10000, 0, 0, 0, 0, 0x40000000]
+        data[place : place + 36] = b"".join(value.to_bytes(4, "big", signed=True) for value in matrix)
+        path.write_bytes(bytes(data))
+    return path
+
+
+def levels(frames):
+    return [int(np.rint((frame[-4, -4].mean() - 40) / 8)) for _, frame in frames]
+
+
+@pytest.mark.parametrize("sound", [False, True])
+def test_all_frames_come_in_order_with_their_times(tmp_path, sound):
+    path = write(tmp_path / "a.mp4", range(0, 400, 40), sound=sound)
+    frames = list(video_frames(path))
+    assert levels(frames) == [*range(10)]
+    assert [time for time, _ in frames] == pytest.approx(np.arange(10) * 0.04, abs=1e-3)
+    assert probe_video(path)[:2] == (64, 48)
+    assert probe_video(path).rate == pytest.approx(25, rel=0.02)
+
+
+def test_a_video_that_varies_its_rate_is_sampled_evenly(tmp_path):
+    times = [0, 40, 80, 90, 100, 110, 160, 200, 320, 400]
+    frames = list(video_frames(write(tmp_path / "a.mp4", times), rate=25))
+    assert levels(frames) == [0, 1, 2, 6, 7, 8, 9]
+    assert [time for time, _ in frames] == pytest.approx(
+        np.array([0, 40, 80, 160, 200, 320, 400]) / 1000, abs=2e-3
+    )
+
+
+def test_fewer_frames_a_second_are_taken_from_a_fast_video(tmp_path):
+    frames = list(video_frames(write(tmp_path / "a.mp4", range(0, 400, 20)), rate=25))
+    assert levels(frames) == [*range(0, 20, 2)]
+
+
+def test_a_turned_phone_gives_upright_frames(tmp_path):
+    path = write(tmp_path / "a.mp4", range(0, 400, 40), turned=True)
+    _, frame = next(iter(video_frames(path)))
+    assert frame.shape == (64, 48, 3)
+    bright = frame[..., 0].astype(float) > 150
+    assert bright[:32, 24:].mean() > 0.9  # the left upper quarter, turned clockwise
+    assert bright[32:].mean() < 0.1
+    assert probe_video(path)[:2] == (48, 64)
+
+
+def test_other_codecs_and_containers_are_read(tmp_path):
+    assert levels(video_frames(write(tmp_path / "a.mkv", range(0, 200, 40), codec="mpeg4"))) == [*range(5)]
+
+
+@pytest.mark.parametrize(
+    ("content", "found"), [(None, "no such file"), (b"", "no frame"), (b"text" * 99, "no frame")]
+)
+def test_what_is_no_video_is_refused(tmp_path, content, found):
+    path = tmp_path / "a.mp4"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=found):
+        list(video_frames(path))
+
+
+def test_videos_are_recognised_by_their_suffix(tmp_path):
+    (tmp_path / "a.MOV").write_bytes(b"")
+    (tmp_path / "b.png").write_bytes(b"")
+    assert [is_video(tmp_path / name) for name in ("a.MOV", "b.png", "c.mp4")] == [True, False, False]
