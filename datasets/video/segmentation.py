@@ -45,7 +45,7 @@ class SelfieSegmentation:
             )
             _, self._height, self._width, _ = map(int, self._input["shape"])
             if tuple(self._output["shape"]) != (1, self._height, self._width, 1):
-                raise ValueError(f"an output of shape {tuple(self._output['shape'])}")
+                raise ValueError(f"an output of shape {tuple(map(int, self._output['shape']))}")
         except (ValueError, RuntimeError) as error:
             raise InputError(path, "", "a network that segments a person", str(error)) from error
 
