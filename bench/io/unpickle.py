@@ -1,8 +1,9 @@
-"""Read the arrays in a FLAME pickle without executing anything in the file.
+"""Read the arrays in a pickle without executing anything in the file.
 
 A pickle is a program that may call whatever it can import. FLAME and its masks come as Python-2 pickles full of chumpy
-and scipy objects, so every name in the stream is looked up in a closed table of stand-ins. A stand-in keeps what it is
-given; arrays are made at the end, of raw bytes whose number has to be what their types and shapes say.
+and scipy objects, and trackers write files of ``torch.save``, so every name in the stream is looked up in a closed table
+of stand-ins. A stand-in keeps what it is given; arrays are made at the end, of raw bytes whose number has to be what their
+types and shapes say.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from ..errors import InputError
 from .files import read_bytes, reading
 
 EXPECTED = "a pickled dictionary of numpy, scipy.sparse and chumpy arrays"
+REMEDY = "The file was not read. Get the model from its official source."
 MAX_BYTES = 2**30
 """Of a file; the largest of FLAME has 0.1 GB."""
 MAX_DENSE_BYTES = 40_000_000
@@ -49,22 +51,45 @@ def read_pickle(path: str | PathLike[str]) -> dict[str, Any]:
         that NumPy, scipy.sparse and chumpy arrays do not need. Nothing in the file is executed.
     """
     path = Path(path)
-    stream = read_bytes(path, EXPECTED, MAX_BYTES)
-    with reading(path, EXPECTED):
-        content = _ClosedUnpickler(path, stream).load()
+    return plain_content(path, read_bytes(path, EXPECTED, MAX_BYTES), EXPECTED, REMEDY)
+
+
+def plain_content(path: Path, stream: bytes, expected: str, remedy: str, levels: int = 1) -> dict[str, Any]:
+    """The dictionary in the bytes of a pickle, as `read_pickle` returns it, and dictionaries inside it, ``levels`` in all.
+
+    Raises `InputError` as `read_pickle` does, with ``path``, ``expected`` (the kind of file) and ``remedy``.
+    """
+    with reading(path, expected):
+        content = _ClosedUnpickler(path, stream, expected, remedy).load()
+        return _Arrays(len(stream) + MAX_DENSE_BYTES).plain(content, levels)
+
+
+class _Arrays:
+    """Makes arrays of stand-ins, each once however many names it has, and of at most ``left`` bytes together."""
+
+    def __init__(self, left: int) -> None:
+        self._left = left
+        self._made: dict[int, Any] = {}
+
+    def plain(self, content: Any, levels: int) -> dict[str, Any]:
+        """A dictionary of the stream with arrays for stand-ins, also in dictionaries inside, ``levels`` deep."""
         if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
             raise ValueError(f"a {type(content).__name__.lstrip('_').lower()}, not a dictionary with names")
-        left = len(stream) + MAX_DENSE_BYTES
-        made: dict[int, Any] = {}  # a stand-in with many names is made an array once
         for value in content.values():
-            if id(value) not in made:
-                made[id(value)] = value.array() if isinstance(value, _StandIn) else value
-                left -= getattr(made[id(value)], "nbytes", 0)
-            if left < 0 or not isinstance(made[id(value)], _DATA):
-                raise ValueError(
-                    "arrays of more bytes than the file has" if left < 0 else "an entry of no data"
-                )
-        return {key: made[id(value)] for key, value in content.items()}
+            if id(value) not in self._made:
+                self._made[id(value)] = self._value(value, levels)
+        return {key: self._made[id(value)] for key, value in content.items()}
+
+    def _value(self, value: Any, levels: int) -> Any:
+        if isinstance(value, dict) and levels > 1 and all(isinstance(key, str) for key in value):
+            return self.plain(value, levels - 1)
+        made = value.array() if isinstance(value, _StandIn) else value
+        self._left -= getattr(made, "nbytes", 0)
+        if self._left < 0 or not isinstance(made, _DATA):
+            raise ValueError(
+                "arrays of more bytes than the file has" if self._left < 0 else "an entry of no data"
+            )
+        return made
 
 
 class _StandIn:
@@ -266,13 +291,13 @@ class _ClosedUnpickler(_PythonUnpickler):
 
     dispatch = _OPERATIONS
 
-    def __init__(self, path: Path, stream: bytes) -> None:
+    def __init__(self, path: Path, stream: bytes, expected: str, remedy: str) -> None:
         super().__init__(io.BytesIO(stream), encoding="latin1")
         self._path, self._names = path, _table()
+        self._expected, self._remedy = expected, remedy
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in self._names:
-            remedy = "The file was not read. Get the model from its official source."
             key = f"global {module}.{name}"
-            raise InputError(self._path, key, EXPECTED, "a name that could run code", remedy)
+            raise InputError(self._path, key, self._expected, "a name that could run code", self._remedy)
         return self._names[module, name]

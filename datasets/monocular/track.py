@@ -34,8 +34,10 @@ class VideoFrame:
         File and entry, for messages.
     sequence, number : str, int
         The video's name, and the frame's number in its file name.
-    image, mask : Path
+    image, mask : Path, Path | None
         Files; the mask is the image itself if that has straight alpha.
+    inside : Path | None
+        A second mask; the coverage is the product of the two.
     pose : HeadPose
         Pose in the world that ``camera`` maps from; its timestep is not set yet.
     """
@@ -44,9 +46,10 @@ class VideoFrame:
     sequence: str
     number: int
     image: Path
-    mask: Path
+    mask: Path | None
     camera: Camera
     pose: HeadPose
+    inside: Path | None = None
 
     @property
     def name(self) -> tuple[str, int]:
@@ -64,8 +67,8 @@ class Track:
         Sorted by `VideoFrame.name`, without duplicates.
     shape : FloatArray
         (S,) identity coefficients of the head model.
-    hard_masks : bool
-        Whether masks are thresholded at one half, as the layout's own loader does.
+    threshold : float | None
+        Masks become 1 above this coverage in [0, 1] and else 0, as in the layout's own loader; None leaves them.
     held_out : frozenset[tuple[str, int]] | None
         Names of the frames that the layout holds out; None if it does not define a split.
     files : frozenset[Path]
@@ -79,7 +82,7 @@ class Track:
     held_out: frozenset[tuple[str, int]] | None
     files: frozenset[Path]
     notes: Mapping[str, Any] = field(default_factory=dict)
-    hard_masks: bool = False
+    threshold: float | None = None
 
 
 def ordered(root: Path, frames: Sequence[VideoFrame]) -> list[VideoFrame]:

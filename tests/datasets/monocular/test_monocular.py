@@ -17,8 +17,9 @@ from headbench.bench.protocol import make_protocols
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.monocular.clip import CONVENTION, _last
 from headbench.datasets.monocular.mesh_fit import read_vertices
-from headbench.datasets.monocular.reader import CONVENTION, _last, find_videos, read_video
+from headbench.datasets.monocular.reader import find_videos, read_video
 from headbench.datasets.open import find_reader, open_clip
 
 from ...memory import memory_below
