@@ -9,8 +9,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..bench.errors import InputError
-from ..bench.io.files import read_bytes
 from .ga.layout import ALL_FRAMES_FILE, SPLIT_FILES
 from .nersemble.names import is_subject
 
@@ -42,7 +40,7 @@ class Foreign(NamedTuple):
 
 
 def describe(path: Path) -> Foreign:
-    """Recognise the format at an existing ``path`` by file names; only a tracker's file is opened."""
+    """Recognise the format at an existing ``path`` by file names; no file is opened."""
     return _folder(path) if path.is_dir() else _file(path)
 
 
@@ -145,9 +143,9 @@ def _tracked(path: Path, names: list[str]) -> Foreign | None:
             lambda name: name == "flame_params.json" or (path / name / "flame_params.json").is_file(),
         ),
         (
-            "Pixel3DMM's tracking (checkpoint/*.frame)",
-            TRACK,
-            lambda name: name == "checkpoint" and _is_pixel3dmm(path / name),
+            "the files of Metrical Tracker or Pixel3DMM (checkpoint/*.frame)",
+            f"Make a capture of them: headbench import tracking {_quoted(path)} --head FLAME2020/generic_model.pkl --out capture",
+            lambda name: name == "checkpoint" and any((path / name).glob("*.frame")),
         ),
         (
             "a capture of INSTA or its Metrical Tracker",
@@ -161,17 +159,6 @@ def _tracked(path: Path, names: list[str]) -> Foreign | None:
         ),
     )
     return next((Foreign(what, way) for what, way, fits in known if any(map(fits, names))), None)
-
-
-def _is_pixel3dmm(checkpoints: Path) -> bool:
-    """Whether the ``.frame`` files of a folder are Pixel3DMM's: Metrical Tracker's, of the same suffix, lack that key."""
-    first = min(checkpoints.glob("*.frame"), default=None)
-    if first is None:
-        return False
-    try:
-        return b"joint_transforms" in read_bytes(first, "a frame of a tracker", 2**26)
-    except InputError:
-        return False
 
 
 def _cameras_only(path: Path, names: list[str]) -> Foreign | None:

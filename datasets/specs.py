@@ -124,6 +124,16 @@ TRACKED = ConditionSpec(
     implementation="headbench.datasets.tracked_clip:with_tracking",
 )
 
+IMPORT_TRACKING = CommandSpec(
+    name="import tracking",
+    group="data",
+    summary="Make a capture of the files of another tracker and the video's frames.",
+    settings="headbench.datasets.tracker_files.settings:ImportTrackingSettings",
+    function="headbench.datasets.tracker_files.command:import_tracking",
+    writes="out",
+    kinds=("captures",),
+)
+
 INSPECT = CommandSpec(
     name="inspect",
     group="inspect",

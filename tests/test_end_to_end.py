@@ -23,9 +23,12 @@ from headbench.bench.engine.config import RunConfig, resolve_metrics
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.io.documents import read_json
 from headbench.bench.registry import SPEC_TYPES, discover
+from headbench.datasets.ga.reader import read_capture
 from headbench.metrics import speed
 
 from .datasets.flat_renderer import flat_pictures
+from .datasets.monocular.videos import Recording
+from .datasets.tracker_files.trackers import write_metrical
 from .fuzz.samples import SETTINGS
 
 SMALL = (f"--set=settings.{name}={json.dumps(SETTINGS[name])}" for name in ("gbs", "gha", "insta"))
@@ -337,6 +340,14 @@ CASES = {
             *("splats on", "imported/point_cloud.ply"),
         )
     ],
+    "import tracking": [
+        case(
+            "import tracking tracker --head tracker/head.npz --out from-tracker",
+            "(?s)held out.*overlay.png",
+            "from-tracker/overlay.png",
+            "from-tracker/import.json",
+        )
+    ],
     "export colmap": [
         case(
             f"export colmap {{capture}} --out {names} --names {names}",
@@ -383,10 +394,13 @@ CASES = {
 
 
 @pytest.fixture(scope="module")
-def elsewhere(tmp_path_factory):
-    """The directory that commands run in: neither that of the run nor one above it."""
+def elsewhere(run, tmp_path_factory):
+    """The directory that commands run in, neither that of the run nor one above it, with a tracker's files."""
     folder = tmp_path_factory.mktemp("elsewhere")
     (folder / "board").mkdir()
+    (union,) = (run.root / "capture").glob("UNION*")
+    clip = read_capture(union)
+    write_metrical(Recording(clip, next(iter(clip.cameras))), folder / "tracker")
     return folder
 
 

@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from ...bench.contracts import Camera, FloatArray, HeadPose, Progress
 from ...bench.errors import InputError
@@ -38,13 +37,11 @@ from ..head.arrays import HeadArrays
 from ..head.loaders import EYELIDS_REMEDY
 from ..head.model import HeadModel
 from .mesh_fit import MeshFit, check_distance, read_vertices
-from .track import Track, VideoFrame, coefficients, frame_number, ordered
+from .track import VIDEO, Track, VideoFrame, coefficients, frame_number, ordered, rotations_of_6d
 
 log = logging.getLogger(__name__)
 
 EXPRESSIONS, CANONICAL = "flame/exp", "canonical.obj"
-VIDEO = "video"
-"""Name of the one sequence."""
 CHECKED_MESHES = 50
 """Number of meshes of a video that are compared with complete parameters, enough to include a blink."""
 WORST_VERTEX = 1e-3
@@ -270,7 +267,7 @@ class _Meshes:
         if len(values) != 6 * count:
             expected = f"{6 * count} numbers (6D rotations) or {3 * count} (axis-angle)"
             raise InputError(path, "", expected, f"{len(values)}")
-        return rotations_of_6d(path, values.reshape(count, 6)).ravel()
+        return rotations_of_6d(path, "", values.reshape(count, 6)).ravel()
 
     def _numbers(self, path: Path) -> FloatArray:
         text = read_text(path, "text", MAX_TEXT)
@@ -279,15 +276,3 @@ class _Meshes:
         check_numbers(path, "", values, MAX_MAGNITUDE)
         self.files.add(path)
         return values
-
-
-def rotations_of_6d(path: Path, rows: FloatArray) -> FloatArray:
-    """(N, 3) axis-angle of (N, 6) rotations that are the first two rows of a matrix, made orthonormal in order."""
-    first, second = rows[:, :3], rows[:, 3:]
-    normal = np.cross(first, second)
-    if np.linalg.norm(normal, axis=1).min() < 1e-6:
-        raise InputError(path, "", "6D rotations: two vectors of different directions", "none")
-    first = first / np.linalg.norm(first, axis=1, keepdims=True)
-    third = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    matrices = np.stack([first, np.cross(third, first), third], axis=1)
-    return Rotation.from_matrix(matrices).as_rotvec()

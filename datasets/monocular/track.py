@@ -20,6 +20,8 @@ from ...bench.errors import InputError
 from ..head.arrays import HeadArrays
 from ..head.model import HeadModel
 
+VIDEO = "video"
+"""Name of the sequence where a layout names none."""
 SAME_INTRINSICS = 1e-3
 """Maximum difference of the intrinsics of one camera, pixels."""
 
@@ -165,3 +167,18 @@ def coefficients(file: Path, entry: str, values: FloatArray, size: int) -> Float
         raise InputError(file, entry, expected, f"{len(values)}", remedy)
     kept = values[:size]
     return np.pad(kept, (0, size - len(kept)))
+
+
+def rotations_of_6d(file: Path, entry: str, rows: FloatArray) -> FloatArray:
+    """(N, 3) axis-angle of (N, 6) rotations that are the first two rows of a matrix, made orthonormal in order.
+
+    Raises `InputError` for two vectors of one direction.
+    """
+    first, second = rows[:, :3], rows[:, 3:]
+    normal = np.cross(first, second)
+    if np.linalg.norm(normal, axis=1).min() < 1e-6:
+        raise InputError(file, entry, "6D rotations: two vectors of different directions", "none")
+    first = first / np.linalg.norm(first, axis=1, keepdims=True)
+    third = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    matrices = np.stack([first, np.cross(third, first), third], axis=1)
+    return Rotation.from_matrix(matrices).as_rotvec()

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from ...bench.contracts import ByteArray, Progress, no_progress
+from ...bench.contracts import Progress, no_progress
 from ...bench.io.files import write_json
 from ...bench.progress import counted
 from ...bench.protocol import evenly_with_ends
@@ -33,6 +31,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     from ..clip import check_apart
     from ..head.refit.rewrite import capture_plan, write_capture
     from ..images import write_image
+    from ..overlay import draw_overlay
     from ..tracking_errors import tracking_errors
     from .network import landmark_source
     from .track import check_cameras, track
@@ -52,7 +51,9 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
         clip, cameras, settings.landmarks, teacher, seed=settings.seed, progress=progress
     )
     tracked = track(clip, cameras, source, notes=notes, progress=progress)
-    write_image(out / PICTURE, draw_overlay(tracked, cameras))
+    timesteps = evenly_with_ends([residual.timestep for residual in tracked.report.residuals], ROWS)
+    overlay = draw_overlay(tracked.clip, timesteps, evenly_with_ends(cameras, COLUMNS))
+    write_image(out / PICTURE, overlay)
     union = write_capture(tracked.clip, out, progress)
     data: dict[str, Any] = {"capture": union.as_posix(), **notes, **tracked.report.to_json()}
     lines = _text(tracked)
@@ -62,28 +63,6 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
         lines += _table(errors)
     write_json(out / REPORT, data)
     return CommandResult("\n".join([*lines, f"Capture: {union}"]), data)
-
-
-def draw_overlay(tracked: Tracked, cameras: Sequence[str]) -> ByteArray:
-    """Images of a few timesteps and cameras, and beside each one the mesh over it."""
-    from ..head.subject import PosedSubject
-    from ..mesh_pictures import draw_mesh
-
-    clip = tracked.clip
-    timesteps = evenly_with_ends([residual.timestep for residual in tracked.report.residuals], ROWS)
-    subject, rows = PosedSubject.of(clip), []
-    shown = evenly_with_ends(cameras, COLUMNS)
-    height, width = clip.image(clip.frame_at[timesteps[0], shown[0]]).shape[:2]
-    for timestep, mesh in subject.each(clip, timesteps):
-        row = []
-        for name in shown:
-            camera = clip.cameras[name].resized(width, height)
-            image = clip.image(clip.frame_at[timestep, name])
-            if image.shape[:2] != (height, width):
-                continue
-            row += [image, draw_mesh(mesh, clip.head.faces, camera, background=image, opacity=0.6)]
-        rows.append(np.concatenate(row, axis=1))
-    return np.concatenate(rows)
 
 
 def _text(tracked: Tracked) -> list[str]:

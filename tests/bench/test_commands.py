@@ -304,6 +304,7 @@ def test_a_folder_of_another_kind_is_refused_untouched(capsys, tmp_path, mark):
     commands = [
         "export colmap x",
         "import ga x.ply",
+        "import tracking x --head x",
         "inspect x",
         "prepare refit x --target ga",
         "render x --capture x",
@@ -319,7 +320,7 @@ def test_a_folder_of_another_kind_is_refused_untouched(capsys, tmp_path, mark):
     continued = {"run.json": {"demo"}, "subject.npz": {"import ga x.ply", "export compact x"}}
     continued |= {
         "sparse/x": {"export colmap x"},
-        "900_A/transforms.json": {"synth", "prepare refit x --target ga"},
+        "900_A/transforms.json": {"synth", "prepare refit x --target ga", "import tracking x --head x"},
     }
     for command in commands:
         if command not in continued.get(mark, ()):

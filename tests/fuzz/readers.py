@@ -17,6 +17,7 @@ from headbench.bench.engine.config import resolve_method
 from headbench.bench.io.arrays import read_npy, read_npz
 from headbench.bench.io.documents import read_json, read_yaml
 from headbench.bench.io.images import read_pixels
+from headbench.bench.io.saved import read_saved
 from headbench.bench.io.unpickle import read_pickle
 from headbench.bench.registry import get
 from headbench.bench.rows import Rows
@@ -120,6 +121,7 @@ SMALL = (
     of_file("rows", "rows.parquet", Rows.read),
     of_file("torch", "a.pth", lambda path: read_weights(path, {"x": NUMBERS.shape})),
     of_file("torch, old", "old.pth", lambda path: read_weights(path, {"x": NUMBERS.shape})),
+    of_file("torch, arrays", "a.frame", read_saved),
     of_file("pickle", "a.pkl", read_pickle),
     of_file("pickle of Python 2", "python2.pkl", read_pickle),
     of_file("safetensors", "a.safetensors", read_safetensors),
@@ -141,6 +143,7 @@ MEAN = "--methods mean-image --preset smoke --set metrics=psnr --set frames_per_
 GATE = "compare run --baseline baseline.json"
 PLY = f"{GA}/point_cloud.ply"
 EXCLUSIONS = "reviewed/tongue.yaml"
+IMPORT = "import tracking tracker --head tracker/head.npz"
 FUNCTIONS = (
     Reader("capture", "capture", look_at(read_capture, "capture"), cases=25),
     Reader("head npz", "heads", on(load_head, "head.npz"), ("head.npz",)),
@@ -176,6 +179,7 @@ COMMANDS = tuple(
         ("recording", "recording", f"{PREPARE} --out out", ("**/*",), 3),
         ("videos", "videos", f"{PREPARE} --out out", ("recording/**/*",), 3),
         ("monocular run", "monocular", f"run --data imavatar --out out {MEAN}", ("imavatar/**/*",), 3),
+        ("tracker", "monocular", f"{IMPORT} --out out", ("tracker/**/*",), 6),
         ("run table", "run", "table run", RUN, 6),
         ("run table cost", "run", "table run --layout cost --format html", RUN, 3),
         ("run compare", "run", "compare run", RUN, 4),

@@ -38,6 +38,7 @@ from ..datasets.monocular.videos import Recording, write_imavatar, write_insta
 from ..datasets.nersemble.benchmark_folder import write_benchmark
 from ..datasets.nersemble.recordings import write_recording
 from ..datasets.tiny_capture import make_plan, rig, write_tiny_capture
+from ..datasets.tracker_files.trackers import write_flashavatar
 from ..methods.gha.small import SMALL as SMALL_GHA
 from ..methods.insta.small import SMALL as SMALL_INSTA
 from ..methods.official.repository import lip_numbers, make_interpreter, make_repository
@@ -120,6 +121,7 @@ def files(folder: Path, samples: Path) -> None:
     save_checkpoint(folder / CHECKPOINT, "run", state)
     torch.manual_seed(0)
     torch.save(SQUEEZE.build().state_dict(), folder / BACKBONE)
+    torch.save({"flame": {"exp": NUMBERS, "jaw": NUMBERS[:1]}, "frame_id": "00001"}, folder / "a.frame")
     values = {**configuration(METHODS), "data": "nowhere", "seeds": [0, 1], "regions": ["face"]}
     values["reader_settings"] = {"background": [0, 0, 0]}
     (folder / "config.yaml").write_text(yaml.safe_dump(values))
@@ -162,12 +164,13 @@ def videos(folder: Path, samples: Path) -> None:
 
 
 def monocular(folder: Path, samples: Path) -> None:
-    """The capture's frontal camera as tracked videos, in both layouts."""
+    """The capture's frontal camera as tracked videos, in both layouts and as a tracker's files."""
     clip = read_capture(samples / "capture" / "capture")
     clip = replace(clip, poses={t: replace(pose, neck=np.zeros(3)) for t, pose in clip.poses.items()})
     video = Recording(clip, next(iter(clip.cameras)))
     write_insta(video, folder / "insta", parameters=("exp",))
     write_imavatar(video, folder / "imavatar", ["a", "b"])
+    write_flashavatar(video, folder / "tracker")
 
 
 def run(folder: Path, samples: Path) -> None:

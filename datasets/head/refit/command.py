@@ -61,8 +61,8 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
     return CommandResult("\n".join(lines), data)
 
 
-def target_head(name: str) -> HeadArrays:
-    """The head model of ``--target``: a version of the procedural head, or a file."""
+def target_head(name: str, option: str = "--target") -> HeadArrays:
+    """The head model that an option names: a version of the procedural head, or a file."""
     from ..loaders import load_head
     from ..procedural.model import procedural_head
     from ..procedural.versions import VERSIONS
@@ -72,7 +72,7 @@ def target_head(name: str) -> HeadArrays:
         return procedural_head(name)
     if not Path(name).exists():
         expected = f"{', '.join(short)} or the file of a head model"
-        raise InputError("command line", "--target", expected, repr(name))
+        raise InputError("command line", option, expected, repr(name))
     return load_head(name)
 
 

@@ -1,0 +1,120 @@
+"""``headbench import tracking``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ...bench.contracts import Progress, no_progress
+from ...bench.errors import InputError
+from ...bench.io.files import write_json
+from ...bench.progress import counted
+from ...bench.protocol import evenly_with_ends
+from ...bench.specs import CommandResult
+from .settings import ImportTrackingSettings
+
+if TYPE_CHECKING:
+    from ..clip import CaptureClip
+    from .pictures import Pictures
+
+REPORT, PICTURE = "import.json", "overlay.png"
+SHOWN = 6
+"""Timesteps of the picture."""
+
+
+def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_progress) -> CommandResult:
+    """Write a capture of the files of another tracker and the images that it tracked.
+
+    Writes under ``settings.out`` ``overlay.png`` with the mesh over a few images, the capture (PNG images without separate masks
+    are linked, others are composited on white), and ``import.json``. Raises `InputError` for files that cannot be
+    read and for images that do not belong to them, before anything is written.
+    """
+    from ..clip import check_apart
+    from ..head.refit.command import target_head
+    from ..head.refit.rewrite import capture_plan, write_capture
+    from ..images import write_image
+    from ..monocular.clip import clip_of_track
+    from ..overlay import draw_overlay
+    from .formats import recognise
+    from .frames import FOLDER, frame_files, read_frames
+    from .pictures import find_pictures
+    from .video import left_out, video_track
+
+    root, out = Path(settings.source), Path(settings.out)
+    if not settings.format:
+        _check_unknown_to_readers(root)
+    form = recognise(root, settings.format)
+    files = frame_files(root)
+    if root.name == FOLDER:
+        root = root.resolve().parent
+    head = target_head(settings.head, "--head")
+    frames = read_frames(files, form.members, form.convert)
+    pictures = find_pictures(
+        root, form.layout, [*files], settings.images, settings.masks, settings.first_image
+    )
+    track = video_track(root, frames, pictures, head, resized=form.layout.resized)
+    clip = clip_of_track(
+        root,
+        track,
+        head,
+        subject=settings.subject or re.sub(r"[^\w.+-]|_", "-", root.resolve().name).lstrip(".-") or "subject",
+        held_out_frames=settings.held_out_frames,
+        use_cache=False,
+        progress=progress,
+    )
+    capture_plan(clip, root)  # Captures that cannot be written are detected before anything is.
+    check_apart(clip, out)
+    timesteps = evenly_with_ends(sorted(clip.poses), SHOWN)
+    write_image(out / PICTURE, draw_overlay(clip, timesteps, [*clip.cameras]))
+    union = write_capture(clip, out, progress)
+    lost = left_out(frames, head)
+    data: dict[str, Any] = {
+        "capture": union.as_posix(),
+        "format": form.name,
+        "frames": len(frames),
+        "held_out": clip.steps[0].parameters["held_out"],
+        "images": pictures.folder.as_posix(),
+        "first_image": pictures.first,
+        "masks": pictures.masks,
+        "left_out": dict(lost),
+    }
+    write_json(out / REPORT, data)
+    return CommandResult("\n".join(_text(form.summary, clip, pictures, lost, out, union)), data)
+
+
+def _check_unknown_to_readers(root: Path) -> None:
+    """Raise `InputError` if a reader of captures reads the folder as it is."""
+    from ...bench.engine.captures import finds, readers
+
+    for name, spec in readers().items():
+        if finds(spec, root):
+            expected = "files of a tracker that no reader of captures reads"
+            remedy = f"No import is needed: give the folder to `headbench lint` and `headbench run` (reader {name})."
+            raise InputError(root, "", expected, f"a capture that the reader {name} reads", remedy)
+
+
+def _text(
+    summary: str, clip: CaptureClip, pictures: Pictures, lost: Mapping[str, str], out: Path, union: Path
+) -> list[str]:
+    (camera,) = clip.cameras.values()
+    masks = pictures.masks or (
+        "none, so that the room behind the subject is part of every image; "
+        "make masks (alpha or mask beside the images, or --masks) and import again"
+    )
+    lines = [
+        f"Read: {summary}",
+        f"  frames    {len(clip.files)}, {camera.width}x{camera.height} pixels; held out: {clip.steps[0].parameters['held_out']}",
+        f"  images    {pictures.folder}, image {pictures.first} is frame 0",
+        f"  masks     {masks}",
+        *(f"  left out  {name.replace('_', ' ')}: {words}" for name, words in lost.items()),
+    ]
+    if pictures.unused:
+        lines.append(f"  not used  {counted(pictures.unused, 'image')} without a tracked frame")
+    return [
+        *lines,
+        f"Look at {out / PICTURE}: a mesh beside the head means other images or another --first-image.",
+        f"Then: headbench lint {union}",
+        f"Capture: {union}",
+    ]
