@@ -109,7 +109,7 @@ def clip_of_track(
         store=ImageStore(cache_mb),
     )
     inside = {names[key]: frame.inside for key, frame in zip(keys, track.frames) if frame.inside}
-    return _masked(clip, track.threshold, inside)
+    return _masked(clip, track.solid, inside)
 
 
 def _split(
@@ -168,7 +168,9 @@ def _parts(keys: Sequence[FrameKey], held_out: Sequence[bool]) -> dict[str, tupl
     }
 
 
-def _masked(clip: CaptureClip, threshold: float | None, inside: Mapping[FrameKey, Path]) -> CaptureClip:
+def _masked(
+    clip: CaptureClip, solid: tuple[float, float] | None, inside: Mapping[FrameKey, Path]
+) -> CaptureClip:
     """Composite images with a visible room behind the subject using their masks."""
     bare = frozenset(key for key, files in clip.files.items() if files.mask not in (None, files.image))
     if not bare:
@@ -178,16 +180,18 @@ def _masked(clip: CaptureClip, threshold: float | None, inside: Mapping[FrameKey
     def change(key: FrameKey, pixels: FramePixels) -> FramePixels:
         if key not in bare or pixels.coverage is None:
             return pixels
-        coverage = _thresholded(pixels.coverage, threshold)
+        coverage = _hardened(pixels.coverage, solid)
         if key in inside:
             second = read_mask(inside[key], (coverage.shape[1], coverage.shape[0]))
-            coverage = coverage * _thresholded(second.astype(np.float32) / 255, threshold)
+            coverage = coverage * _hardened(second.astype(np.float32) / 255, solid)
         return FramePixels(composite(pixels.image, coverage, colour), coverage)
 
-    parameters: dict[str, int] = {"frames": len(bare), "hard_masks": threshold is not None}
+    parameters: dict[str, int] = {"frames": len(bare), "hard_masks": solid is not None}
     parameters |= {"second_masks": len(inside)} if inside else {}
     return clip.derive_pixels("composite_by_mask", parameters, change)
 
 
-def _thresholded(coverage: FloatArray, threshold: float | None) -> FloatArray:
-    return coverage if threshold is None else (coverage > threshold).astype(np.float32)
+def _hardened(coverage: FloatArray, solid: tuple[float, float] | None) -> FloatArray:
+    if solid is None:
+        return coverage
+    return ((coverage > solid[0]) & (coverage <= solid[1])).astype(np.float32)

@@ -93,7 +93,7 @@ def read_imavatar(root: Path, head: HeadArrays, progress: Progress) -> Track:
     assert shape is not None, "found by their parameters"
     files = frozenset(folder / PARAMETERS for folder in folders)
     notes = {"layout": "imavatar", "shape_coefficients": int(np.count_nonzero(shape))}
-    return Track(ordered(root, frames), shape, None, files, notes, threshold=0.5)
+    return Track(ordered(root, frames), shape, None, files, notes, solid=(0.5, 1.0))
 
 
 def _frame(

@@ -69,8 +69,9 @@ class Track:
         Sorted by `VideoFrame.name`, without duplicates.
     shape : FloatArray
         (S,) identity coefficients of the head model.
-    threshold : float | None
-        Masks become 1 above this coverage in [0, 1] and else 0, as in the layout's own loader; None leaves them.
+    solid : tuple[float, float] | None
+        Masks become 1 above the first and up to the second coverage in [0, 1] and else 0, as in the layout's own loader; None
+        leaves them.
     held_out : frozenset[tuple[str, int]] | None
         Names of the frames that the layout holds out; None if it does not define a split.
     files : frozenset[Path]
@@ -84,7 +85,7 @@ class Track:
     held_out: frozenset[tuple[str, int]] | None
     files: frozenset[Path]
     notes: Mapping[str, Any] = field(default_factory=dict)
-    threshold: float | None = None
+    solid: tuple[float, float] | None = None
 
 
 def ordered(root: Path, frames: Sequence[VideoFrame]) -> list[VideoFrame]:

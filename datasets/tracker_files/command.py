@@ -27,8 +27,8 @@ SHOWN = 6
 def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_progress) -> CommandResult:
     """Write a capture of the files of another tracker and the images that it tracked.
 
-    Writes under ``settings.out`` ``overlay.png`` with the mesh over a few images, the capture (PNG images without separate masks
-    are linked, others are composited on white), and ``import.json``. Raises `InputError` for files that cannot be
+    Writes under ``settings.out`` ``overlay.png`` with the mesh over a few images, the capture (PNG images without separate
+    masks are linked, others are composited on white), and ``import.json``. Raises `InputError` for files that cannot be
     read and for images that do not belong to them, before anything is written.
     """
     from ..clip import check_apart
@@ -103,9 +103,10 @@ def _text(
         "none, so that the room behind the subject is part of every image; "
         "make masks (alpha or mask beside the images, or --masks) and import again"
     )
+    held_out = clip.steps[0].parameters["held_out"]
     lines = [
         f"Read: {summary}",
-        f"  frames    {len(clip.files)}, {camera.width}x{camera.height} pixels; held out: {clip.steps[0].parameters['held_out']}",
+        f"  frames    {len(clip.files)}, {camera.width}x{camera.height} pixels; held out: {held_out}",
         f"  images    {pictures.folder}, image {pictures.first} is frame 0",
         f"  masks     {masks}",
         *(f"  left out  {name.replace('_', ' ')}: {words}" for name, words in lost.items()),

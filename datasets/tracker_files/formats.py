@@ -58,7 +58,7 @@ FORMATS = {
             mark=pixel3dmm.MARK,
             members=pixel3dmm.MEMBERS,
             convert=pixel3dmm.pixel3dmm_frame,
-            layout=Layout(images={"cropped": 0}, labels="seg_og", resized=True),
+            layout=Layout(images={"cropped": 0}, labels="seg_og", subject=(1, 18), resized=True),
         ),
     )
 }
@@ -69,10 +69,8 @@ def recognise(root: Path, name: str = "") -> TrackerFormat:
 
     Raises `InputError` for an unknown name, a folder without such files, and files of no known tracker.
     """
-    if name:
-        if name not in FORMATS:
-            raise InputError("command line", "--format", ", ".join(FORMATS), repr(name))
-        return FORMATS[name]
+    if name and name not in FORMATS:
+        raise InputError("command line", "--format", ", ".join(FORMATS), repr(name))
     known = "; ".join(one.summary for one in FORMATS.values())
     first = next(iter(frame_files(root).values()), None)
     if first is None:
@@ -80,6 +78,8 @@ def recognise(root: Path, name: str = "") -> TrackerFormat:
         found = f"no {FOLDER}/*{SUFFIX}" if root.is_dir() else "no such folder"
         remedy = "Exports of VHAP need no import: `headbench lint` and `headbench run` read them."
         raise InputError(root, "", expected, found, remedy)
+    if name:
+        return FORMATS[name]
     names = read_members(first)
     fitting = [one for one in FORMATS.values() if one.mark in names]
     if len(fitting) != 1:

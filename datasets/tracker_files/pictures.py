@@ -28,7 +28,9 @@ class Layout:
     masks : tuple[str, ...]
         Folders of masks beside that of the images.
     labels : str
-        Folder of label images beside that of the images, where only label 0 is background; "" for none.
+        Folder of label images beside that of the images; "" for none.
+    subject : tuple[int, int]
+        First and last label of the subject.
     resized : bool
         Whether images may be larger than the ones tracked, with the same ratio of width to height.
     """
@@ -36,6 +38,7 @@ class Layout:
     images: Mapping[str, int | None]
     masks: tuple[str, ...] = ()
     labels: str = ""
+    subject: tuple[int, int] = (1, 255)
     resized: bool = False
 
 
@@ -52,15 +55,15 @@ class Picture(NamedTuple):
 class Pictures:
     """Files by frame number.
 
-    ``masks`` describes the masks, "" if there are none; ``labels`` says whether they are label images. ``unused`` is the number
-    of images without a tracked frame.
+    ``masks`` describes the masks, "" if there are none; ``solid`` is `Track.solid`. ``unused`` is the number of images without
+    a tracked frame.
     """
 
     frames: Mapping[int, Picture]
     folder: Path
     first: int
     masks: str = ""
-    labels: bool = False
+    solid: tuple[float, float] | None = None
     unused: int = 0
 
 
@@ -120,7 +123,7 @@ def find_pictures(
         folder=folder,
         first=first,
         masks="" if plain else sources.described() or "alpha channels of the images",
-        labels=sources.labels,
+        solid=((layout.subject[0] - 0.5) / 255, (layout.subject[1] + 0.5) / 255) if sources.labels else None,
         unused=len(found) - len(pictures),
     )
 

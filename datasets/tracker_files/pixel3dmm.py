@@ -4,7 +4,8 @@ FLAME is posed with its root at rest, then moved by ``R`` and ``t`` about the or
 by a camera with OpenGL's axes, ``R_base_0`` and ``t_base_0``. The focal length ``fl`` is in widths of the square tracked
 image, and the principal point is (1 + pp) (size / 2 + 1/2). This is how the program draws the mesh. Its landmarks are
 projected with an offset of one pixel of the tracked image (256 pixels by default) in x, so a residual of that size is its
-own. Rotations are the first two rows of matrices. ``joint_transforms`` follow from the other parameters and are not read.
+own. Rotations are the first two rows of matrices. In its masks, labels of parts are 1 to 18, background is 0, and what lies
+outside the parsed box is 20. ``joint_transforms`` follow from the other parameters and are not read.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ class ImportTrackingSettings:
     def notes() -> str:
         """More text for the help."""
         return (
-            "Exports of VHAP (videos of one camera or several) need no import: the reader ga reads them, and every command takes "
-            "their folder. The files of INSTA's generate.sh are read by the reader monocular. SMIRK, DECA and EMOCA estimate "
-            "expressions in crops without a camera, from which no capture can be made."
+            "Exports of VHAP (videos of one camera or several) need no import: the reader ga reads them, and every command "
+            "takes their folder. The files of INSTA's generate.sh are read by the reader monocular. SMIRK, DECA and EMOCA "
+            "estimate expressions in crops without a camera, from which no capture can be made."
         )

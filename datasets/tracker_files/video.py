@@ -72,7 +72,7 @@ def video_track(
         shape=coefficients(first.file, "flame.shape", first.shape, identities),
         held_out=None,
         files=frozenset(frame.file for frame in frames),
-        threshold=0.0 if pictures.labels else None,
+        solid=pictures.solid,
     )
 
 

@@ -368,6 +368,8 @@ def test_faults_of_pixel3dmm_are_named(copied, tmp_path):
 
 def test_formats_are_chosen_and_recognised(copied, tmp_path):
     source = copied("metrical")
+    with pytest.raises(InputError, match="no checkpoint/"):
+        imported(source / "input", tmp_path / "out", format="metrical", head=str(source / HEAD_FILE))
     with pytest.raises(InputError, match=", ".join(FORMATS)):
         imported(source, tmp_path / "out", format="vhap")
     with pytest.raises(InputError, match="an array of that name"):

@@ -147,7 +147,8 @@ def write_pixel3dmm(recording: Recording, folder: Path, *, tracked: int) -> Path
         }
         save(folder / f"track/checkpoint/{number:05d}.frame", content)
         rgba = recording.rgba(key)
-        for name, pixels in (("cropped", rgba[..., :3]), ("seg_og", 3 * (rgba[..., 3] > 127))):
+        labels = np.where(rgba[..., 3] > 127, 18, 20 * (upper(*rgba.shape[:2]) > 0))
+        for name, pixels in (("cropped", rgba[..., :3]), ("seg_og", labels)):
             path = folder / name / f"{number:05d}.png"
             path.parent.mkdir(exist_ok=True)
             cv2.imwrite(str(path), pixels.astype(np.uint8))
