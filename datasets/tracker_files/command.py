@@ -17,7 +17,7 @@ from .settings import ImportTrackingSettings
 
 if TYPE_CHECKING:
     from ..clip import CaptureClip
-    from .pictures import Pictures
+    from .pictures import VideoPictures
 
 REPORT, PICTURE = "import.json", "overlay.png"
 SHOWN = 6
@@ -96,7 +96,7 @@ def _check_unknown_to_readers(root: Path) -> None:
 
 
 def _text(
-    summary: str, clip: CaptureClip, pictures: Pictures, lost: Mapping[str, str], out: Path, union: Path
+    summary: str, clip: CaptureClip, pictures: VideoPictures, lost: Mapping[str, str], out: Path, union: Path
 ) -> list[str]:
     (camera,) = clip.cameras.values()
     masks = pictures.masks or (

@@ -52,7 +52,7 @@ class Picture(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Pictures:
+class VideoPictures:
     """Files by frame number.
 
     ``masks`` describes the masks, "" if there are none; ``solid`` is `Track.solid`. ``unused`` is the number of images without
@@ -74,7 +74,7 @@ def find_pictures(
     images: str = "",
     masks: str = "",
     first: int | None = None,
-) -> Pictures:
+) -> VideoPictures:
     """Find the image and the mask of every frame.
 
     Parameters
@@ -118,7 +118,7 @@ def find_pictures(
     plain = [picture.image for picture in pictures.values() if picture.mask is None]
     if 0 < len(plain) < len(pictures):
         raise InputError(plain[0], "", "an alpha channel, as other images have", "colours alone")
-    return Pictures(
+    return VideoPictures(
         frames=pictures,
         folder=folder,
         first=first,

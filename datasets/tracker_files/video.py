@@ -14,14 +14,19 @@ from ..head.arrays import HeadArrays
 from ..head.loaders import EYELIDS_REMEDY
 from ..monocular.track import VIDEO, Track, VideoFrame, coefficients, ordered
 from .frames import TrackedFrame
-from .pictures import Picture, Pictures
+from .pictures import Picture, VideoPictures
 
 CLOSED = 0.05
 """Eyelid coefficient above which an eye counts as partly closed; 1 closes it."""
 
 
 def video_track(
-    root: Path, frames: Sequence[TrackedFrame], pictures: Pictures, head: HeadArrays, *, resized: bool = False
+    root: Path,
+    frames: Sequence[TrackedFrame],
+    pictures: VideoPictures,
+    head: HeadArrays,
+    *,
+    resized: bool = False,
 ) -> Track:
     """Join frames, images and head model.
 
