@@ -50,7 +50,7 @@ FORMATS = {
             mark="opencv.K",
             members=metrical.MEMBERS,
             convert=metrical.metrical_frame,
-            layout=Layout(images={"input": 0, "imgs": 1, "images": None}, masks=("alpha", "mask")),
+            layout=Layout(images={"imgs": 1, "input": 0, "images": None}, masks=("alpha", "mask")),
         ),
         TrackerFormat(
             name="pixel3dmm",

@@ -26,8 +26,8 @@ class ImportTrackingSettings:
     """metrical (Metrical Tracker, FlashAvatar) or pixel3dmm; default: recognised by the files."""
 
     images: str = ""
-    """Folder of the images that were tracked, cropped and resized as the tracker read them, named by numbers; default: input,
-    imgs or images (metrical), cropped (pixel3dmm), in the tracker's folder or beside it."""
+    """Folder of the images that were tracked, cropped and resized as the tracker read them, named by numbers; default: imgs,
+    input or images (metrical), cropped (pixel3dmm), in the tracker's folder or beside it."""
 
     first_image: int | None = None
     """Number in the name of the image of frame 0; default: 0 in input and cropped, 1 in imgs as in FlashAvatar, else the

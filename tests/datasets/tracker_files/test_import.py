@@ -199,7 +199,7 @@ def test_folders_and_numbers_are_given(copied, tmp_path):
         source / "checkpoint", tmp_path / "a", images=str(pictures), head=str(source / HEAD_FILE)
     )
     assert first.data["first_image"] == 1
-    (pictures / "imgs").rename(pictures / "frames")
+    (pictures / "imgs").rename(pictures / "frames")  # a name that says nothing about numbers
     masks = {"images": str(pictures / "frames"), "masks": str(pictures / "alpha")}
     second = imported(source, tmp_path / "b", **masks, first_image=1)
     assert second.data["masks"] == "alpha"
@@ -209,6 +209,14 @@ def test_folders_and_numbers_are_given(copied, tmp_path):
     third = imported(source, tmp_path / "c", **masks)
     assert third.data["first_image"] == 0  # the lowest number
     assert "1 image without a tracked frame" in third.text
+
+
+def test_flashavatars_images_come_before_the_trackers(written, copied, tmp_path):
+    source = copied("flashavatar")
+    shutil.copytree(written["metrical"] / "input", source / "input", dirs_exist_ok=True)
+    data = imported(source, tmp_path / "out").data
+    assert data["images"].endswith("/imgs")
+    assert data["masks"] == "alpha times parsing"
 
 
 def test_coefficients_fit_the_bases_of_the_head(recordings, copied, tmp_path):
