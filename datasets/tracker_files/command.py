@@ -47,7 +47,7 @@ def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_pr
         _check_unknown_to_readers(root)
     form = recognise(root, settings.format)
     files = frame_files(root)
-    if root.name == FOLDER:
+    if root.resolve().name == FOLDER:
         root = root.resolve().parent
     head = target_head(settings.head, "--head")
     frames = read_frames(files, form.members, form.convert)

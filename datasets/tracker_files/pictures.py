@@ -142,7 +142,7 @@ class _Masks:
 
 
 def _image_folder(root: Path, layout: Layout, given: str) -> Path:
-    places = [Path(given)] if given else [root, root.parent]
+    places = [Path(given)] if given else [root, root.resolve().parent]
     folders = [place / name for place in places for name in layout.images]
     for folder in [*places, *folders] if given else folders:
         if _numbered(folder):

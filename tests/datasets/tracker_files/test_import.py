@@ -211,6 +211,12 @@ def test_folders_and_numbers_are_given(copied, tmp_path):
     assert "1 image without a tracked frame" in third.text
 
 
+def test_the_folder_is_the_current_one(written, tmp_path, monkeypatch):
+    monkeypatch.chdir(written["pixel3dmm"] / "checkpoint")
+    settings = ImportTrackingSettings(".", "../head.npz", str(tmp_path / "out"))
+    assert import_tracking(settings).data["images"].endswith("/cropped")
+
+
 def test_flashavatars_images_come_before_the_trackers(written, copied, tmp_path):
     source = copied("flashavatar")
     shutil.copytree(written["metrical"] / "input", source / "input", dirs_exist_ok=True)
