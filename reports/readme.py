@@ -18,6 +18,7 @@ from typing import Any
 import cv2
 
 from ..bench.audit.bundle import without_paths
+from ..bench.engine.config import CODED
 from ..bench.engine.scoring import FULL
 from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
@@ -125,7 +126,8 @@ def _minutes(run_folder: Path) -> list[tuple[str, float | None]]:
     This is not the run's duration, which after a restart is that of its last part.
     """
     rows = Rows.read(RunFolder(run_folder).rows)
-    trained = rows.select(method=ALL, condition=ALL, metric="training_time", task="", region=FULL, seeds=ALL)
+    times = rows.select(method=ALL, condition=ALL, metric="training_time", task="", region=FULL, seeds=ALL)
+    trained = times[times["condition"] != CODED]  # which is derived from a trained avatar
     ended = trained["status"] == "ok"
     return [
         (str(m), float(v) if ok else None) for m, v, ok in zip(trained["method"], trained["value"], ended)
@@ -156,8 +158,9 @@ def measured(folder: Path) -> dict[str, Any]:
                 key = f"{task}/{name}".lstrip("/")
                 methods.setdefault(label, {})[key] = f"{value:.{specs[name].digits}f}"
     subjects = len(runs.rows.subjects)
-    data = [counted(subjects, "synthetic subject"), runs.image_size]
-    return {"suite": folder.name, "data": ", ".join(filter(None, data)), "methods": methods}
+    sizes = {found.resolution for run in runs.runs for found in run.manifest.protocols.values()}
+    data = f"{counted(subjects, 'synthetic subject')}, {' and '.join(sorted(sizes))}"
+    return {"suite": folder.name, "data": data, "methods": methods}
 
 
 def suite_options(folder: Path) -> tuple[str, ...]:
