@@ -214,6 +214,21 @@ class CaptureClip:
             raise InputError("clip", "frame key", f"a frame of subject {self.subject}", str(key)) from None
 
 
+def without_images(head: HeadArrays, poses: Mapping[int, HeadPose]) -> dict[str, Any]:
+    """Fields of a clip of poses alone: no cameras, no images, no static offset, a white background."""
+    return {
+        "head": head,
+        "static_offset": np.zeros(head.template.shape),
+        "poses": poses,
+        "cameras": {},
+        "excluded": {},
+        "background": np.ones(3),
+        "steps": (),
+        "source_fingerprint": "",
+        "store": ImageStore(),
+    }
+
+
 def check_apart(clip: CaptureClip, out: Path) -> None:
     """Raise `InputError` if images of a capture are in the output folder."""
     images = [files.image for files in clip.files.values() if files.image is not None]

@@ -152,6 +152,14 @@ STEPS = CommandSpec(
     writes="out",
 )
 
+DRIVE = CommandSpec(
+    name="drive",
+    group="inspect",
+    summary="Drive a stored avatar with any signal: coefficients, blendshapes, FLAME parameters, a capture.",
+    settings="headbench.datasets.drive.settings:DriveSettings",
+    function="headbench.datasets.drive.command:drive_avatar",
+)
+
 EXPORT_COLMAP = CommandSpec(
     name="export colmap",
     group="export",

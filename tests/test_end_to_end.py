@@ -275,6 +275,16 @@ CASES = {
             "frames in novel_view",
         ),
     ],
+    "drive": [
+        case(
+            f"drive {cell('ga')} --signal {{capture}} --capture {{capture}} --sequence FREE --out driven",
+            "(?s)identity spill.*lips.*latency",
+            "driven/drive.json",
+        ),
+        case(
+            f"drive {cell('insta')} --signal {{capture}} --size 64 --out driven.mp4", "jitter", "driven.mp4"
+        ),
+    ],
     "frames": [
         case("frames {demo} --out frames", "frames.csv and MAP.csv", "frames/frames.csv", "frames/MAP.csv"),
         case("frames {capture} --out listed --frames-per-task 2", "frames.csv", "listed/MAP.csv"),

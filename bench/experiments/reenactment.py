@@ -146,7 +146,7 @@ def drive(
 def _pairs(job: Job, source: str | None, camera: str | None, frames: int | None) -> list[Driven]:
     """The avatar of a cell with everyone who drives it."""
     clip = job.form.clip
-    view = _camera(clip, camera)
+    view = view_camera(clip, camera)
     pairs = []
     for other in _sources(job, source):
         if other.clip.subject != job.clip.subject:
@@ -234,7 +234,8 @@ def _sources(job: Job, source: str | None) -> Sequence[Job]:
     return make_jobs(config, [(job.method, PLAIN)], clips, {}, folder)
 
 
-def _camera(clip: Clip, wanted: str | None) -> Camera:
+def view_camera(clip: Clip, wanted: str | None) -> Camera:
+    """The camera of a name; None: the first that is held out, else the first. Raises `InputError` for an unknown name."""
     if wanted is None:
         keys = clip.splits.get("novel_view") or clip.splits["train"]
         return clip.cameras[min(key.camera for key in keys)]

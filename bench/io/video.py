@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 
@@ -86,33 +86,60 @@ def _check_whole(path: Path, written: Path, count: int) -> None:
         raise InputError(path, "", f"a video of {count} frames after writing it", f"{found} frames")
 
 
-def webm_writer() -> Any:
-    """The module that writes WebM. Raises `UnavailableError` if it is not installed."""
+def browser_encoder(path: Path = Path("video.webm")) -> Any:
+    """The module that writes videos for browsers. Raises `UnavailableError` if it or the encoder for a name is missing."""
     try:
-        return importlib.import_module("av")
+        av = importlib.import_module("av")
     except ImportError:
         raise UnavailableError(
             "Videos for browsers are written by PyAV, which is not installed.", install_extra("video")
         ) from None
+    encoder = ENCODINGS[path.suffix.lower()].encoder
+    if encoder not in av.codecs_available:
+        raise UnavailableError(f"This PyAV has no encoder {encoder}.", "Name a video in .webm.")
+    return av
 
 
-def write_webm(path: Path, frames: Iterable[ByteArray], fps: float, kind: str) -> None:
-    """Write (H, W, 3) RGB frames of one size as WebM: VP9 of constant quality, without subsampling of colours.
+class _Encoding(NamedTuple):
+    """How a container for browsers is written by PyAV."""
+
+    container: str
+    encoder: str
+    options: dict[str, str]
+    pixels: str
+    multiple: int
+    """Width and height have to be multiples of this."""
+
+
+ENCODINGS = {
+    ".webm": _Encoding("webm", "libvpx-vp9", {"crf": "16", "b": "0"}, "yuv444p", 1),
+    ".mp4": _Encoding("mp4", "libx264", {"crf": "16"}, "yuv420p", 2),
+}
+"""Videos for browsers by the ending of their names: VP9 without subsampling of colours, and H.264, which has it."""
+
+
+def write_browser_video(path: Path, frames: Iterable[ByteArray], fps: float, kind: str) -> None:
+    """Write (H, W, 3) RGB frames of one size as a video of constant quality, see `ENCODINGS`; an ending out of these.
 
     ``kind`` marks it in the tag COMMENT, see `provenance`.
 
-    On the demo's renders 44 dB at 2 kB a frame. Raises `UnavailableError` without PyAV, `InputError` for no frames.
+    WebM has 44 dB at 2 kB a frame on the demo's renders. Raises `UnavailableError` without PyAV or its encoder, `InputError`
+    for no frames and for an odd width or height of an mp4.
     """
-    av = webm_writer()
+    av, encoding = browser_encoder(path), ENCODINGS[path.suffix.lower()]
     stream: Any = None
-    with atomic_path(path) as temporary, av.open(str(temporary), "w", format="webm") as container:
+    with atomic_path(path) as temporary, av.open(str(temporary), "w", format=encoding.container) as container:
         container.metadata["comment"] = note(kind)
         for frame in frames:
             if stream is None:
+                height, width = frame.shape[:2]
+                if width % encoding.multiple or height % encoding.multiple:
+                    expected = "even width and height, as the codec asks"
+                    raise InputError(path, "size", expected, f"{width}x{height}", "Name a file in .webm.")
                 rate = Fraction(fps).limit_denominator(1001)
-                stream = container.add_stream("libvpx-vp9", rate=rate, options={"crf": "16", "b": "0"})
-                stream.height, stream.width = frame.shape[:2]
-                stream.pix_fmt = "yuv444p"
+                stream = container.add_stream(encoding.encoder, rate=rate, options=dict(encoding.options))
+                stream.height, stream.width = height, width
+                stream.pix_fmt = encoding.pixels
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "rgb24")))
         if stream is None:
             raise InputError(path, "", "at least one frame", "none")

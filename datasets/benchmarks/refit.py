@@ -5,20 +5,18 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from ...bench.benchmarks import Row, findings
-from ...bench.contracts import FloatArray, FrameKey, HeadAsset, HeadPose, Progress
+from ...bench.contracts import FloatArray, FrameKey, HeadPose, Progress
 from ...bench.specs import CommandResult
-from ..clip import CaptureClip, FrameFiles
+from ..clip import CaptureClip, FrameFiles, without_images
 from ..head.arrays import HeadArrays
 from ..head.procedural.model import procedural_head
 from ..head.refit.refit import refit
 from ..head.refit.settings import RefitSettings
-from ..images import ImageStore
 from .head import FLAME_SIZES, sized_head
 
 TIMESTEPS, QUICK_TIMESTEPS = 192, 64
@@ -115,18 +113,3 @@ def performance(head: HeadArrays, timesteps: int, *, seed: int = 0, strength: fl
         files={key: FrameFiles(Path("none"), None) for key in keys},
         **without_images(head, poses),
     )
-
-
-def without_images(head: HeadAsset, poses: dict[int, HeadPose]) -> dict[str, Any]:
-    """What is the same of every clip of poses alone."""
-    return {
-        "head": head,
-        "static_offset": np.zeros(head.template.shape),
-        "poses": poses,
-        "cameras": {},
-        "excluded": {},
-        "background": np.ones(3),
-        "steps": (),
-        "source_fingerprint": "",
-        "store": ImageStore(),
-    }

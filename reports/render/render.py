@@ -21,7 +21,7 @@ from ...bench.experiments.viewpoints import turntable
 from ...bench.io.files import grouped_writes
 from ...bench.io.images import quantise, read_png, write_png
 from ...bench.io.provenance import COMPOSITE, RENDER
-from ...bench.io.video import webm_writer, write_webm
+from ...bench.io.video import browser_encoder, write_browser_video
 from ...bench.specs import CommandResult
 from .settings import RenderSettings
 
@@ -46,7 +46,7 @@ def render_avatar(settings: RenderSettings, progress: Progress = no_progress) ->
     timesteps that the capture lacks.
     """
     if settings.video:
-        webm_writer()
+        browser_encoder()
     stored = open_avatar(Path(settings.avatar), settings.method)
     clip = _clip(settings)
     needs = MethodNeeds.of(stored.method.spec)
@@ -139,7 +139,7 @@ def _videos(shots: Sequence[Shot], settings: RenderSettings) -> list[Path]:
         parts.setdefault(shot.video, []).append(shot)
     for video, members in parts.items():
         kind = COMPOSITE if settings.beside else RENDER
-        write_webm(video, (_pictured(shot, settings.beside) for shot in members), settings.fps, kind)
+        write_browser_video(video, (_pictured(shot, settings.beside) for shot in members), settings.fps, kind)
     return list(parts)
 
 

@@ -19,7 +19,7 @@ from ...bench.errors import HeadbenchError
 from ...bench.experiments.viewpoints import turntable
 from ...bench.io.images import write_png
 from ...bench.io.provenance import COMPOSITE
-from ...bench.io.video import write_webm
+from ...bench.io.video import write_browser_video
 from ...bench.registry import resolve
 from .drawing import draw, rotations, splats_of
 from .panel import ControlPanel
@@ -282,7 +282,7 @@ class Session:
         try:
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / f"{name}.webm"
-                write_webm(path, images(), float(self._panel.fps), COMPOSITE)
+                write_browser_video(path, images(), float(self._panel.fps), COMPOSITE)
                 self._client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
         finally:
             bar.remove()

@@ -274,7 +274,7 @@ def test_a_folder_that_is_written_is_locked(offer, capsys, tmp_path):
 
 def test_every_command_with_a_folder_to_write_locks_it():
     """All but those that lock for themselves: they check first, or lock what they find to be written."""
-    own = {"demo", "evaluate", "prepare nersemble", "run", "synth"}
+    own = {"demo", "drive", "evaluate", "prepare nersemble", "run", "synth"}
     own |= {f"run {what}" for what in ("curve", "extremes", "reenact", "sweep")}
     files = {
         "doctor bench",

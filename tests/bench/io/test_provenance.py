@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_png, write_png
 from headbench.bench.io.provenance import COMPOSITE, RENDER, SYNTHETIC, mark_png, note
-from headbench.bench.io.video import write_webm
+from headbench.bench.io.video import write_browser_video
 from headbench.methods.avatars.formats import STANDARD
 from headbench.methods.shared.ply import read_ply, write_ply
 from headbench.reports.drawing import SheetSection, Tile, TileRow, write_sheet
@@ -64,13 +65,21 @@ def test_sheets_are_composites(tmp_path, pixels):
     assert source_of(tmp_path / "sheet.png")[1] == TERMS + COMPOSITE
 
 
-def test_videos_carry_a_tag(tmp_path):
+@pytest.mark.parametrize("name", ["a.webm", "a.mp4"])
+def test_videos_carry_a_tag(tmp_path, name):
     av = pytest.importorskip("av")
     frames = np.zeros((3, 16, 16, 3), np.uint8)
-    write_webm(tmp_path / "a.webm", frames, 25.0, RENDER)
-    with av.open(str(tmp_path / "a.webm")) as container:
+    write_browser_video(tmp_path / name, frames, 25.0, RENDER)
+    with av.open(str(tmp_path / name)) as container:
         tags = {name.lower(): text for name, text in container.metadata.items()}
     assert tags["comment"] == note(RENDER)
+
+
+def test_an_odd_size_is_refused_for_h264(tmp_path):
+    pytest.importorskip("av")
+    with pytest.raises(InputError, match="17x16"):
+        write_browser_video(tmp_path / "a.mp4", np.zeros((3, 16, 17, 3), np.uint8), 25.0, RENDER)
+    assert not (tmp_path / "a.mp4").exists()
 
 
 def test_a_ply_says_it_behind_its_properties(tmp_path):

@@ -1,0 +1,203 @@
+"""The 52 blendshapes of ARKit and MediaPipe, and what they do to a head model with a jaw and eyes that turn.
+
+FLAME has no such shapes. They are performed by a head that has them, the embedded one or one with expressions of ARKit's
+names such as ICT-FaceKit's, whose vertices are then transferred to the avatar's head.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+
+from ...bench.contracts import FloatArray
+from ...bench.errors import InputError
+from ..head.arrays import HeadArrays
+from ..head.procedural.expressions import SEMANTIC_NAMES
+from ..head.procedural.model import procedural_head
+from ..head.procedural.versions import VERSIONS, semantic_to_coefficients
+from .signal import POSE_PARTS, Signal, SignalRequest, make_poses
+from .table import SignalTable
+
+JAW_OPEN = 0.44
+"""Radians of the jaw at jawOpen 1: the hinge that explains the shape of that name of ICT-FaceKit."""
+JAW_SIDE = 0.10
+"""Radians of the jaw about the upward axis at jawLeft 1."""
+LOOK = 0.5
+"""Radians of an eye at eyeLookUpLeft 1 and its like."""
+RANGE = 2.0
+"""Largest magnitude of a blendshape; trackers give 0 to 1, with calibration somewhat beyond."""
+
+JOINTS: Mapping[str, Mapping[str, float]] = {
+    "jawOpen": {"jaw.0": JAW_OPEN},
+    "mouthClose": {"jaw.0": -JAW_OPEN},
+    "jawLeft": {"jaw.1": JAW_SIDE},
+    "jawRight": {"jaw.1": -JAW_SIDE},
+    "eyeLookUpLeft": {"eyes.0": -LOOK},
+    "eyeLookDownLeft": {"eyes.0": LOOK},
+    "eyeLookInLeft": {"eyes.1": -LOOK},
+    "eyeLookOutLeft": {"eyes.1": LOOK},
+    "eyeLookUpRight": {"eyes.3": -LOOK},
+    "eyeLookDownRight": {"eyes.3": LOOK},
+    "eyeLookInRight": {"eyes.4": LOOK},
+    "eyeLookOutRight": {"eyes.4": -LOOK},
+}
+"""Blendshapes that turn joints, by component of the pose. mouthClose keeps the lips together while the jaw opens; the jaw is
+opened less instead, to no less than 0."""
+
+SHAPES: Mapping[str, Mapping[str, float]] = {
+    "eyeBlink*": {"blink_*": 1},
+    "eyeSquint*": {"squint_*": 1},
+    "eyeWide*": {"eye_wide_*": 1},
+    "browDown*": {"brow_down_*": 1},
+    "browOuterUp*": {"brow_outer_up_*": 1},
+    "cheekSquint*": {"cheek_raise_*": 1},
+    "noseSneer*": {"nose_sneer_*": 1},
+    "mouthSmile*": {"smile_*": 1},
+    "mouthFrown*": {"mouth_frown": 0.5},
+    "mouthDimple*": {"dimple_*": 1},
+    "mouthStretch*": {"mouth_stretch_*": 1},
+    "mouthPress*": {"lip_press": 0.5},
+    "mouthLowerDown*": {"lower_lip_down_*": 1},
+    "mouthUpperUp*": {"upper_lip_up_*": 1},
+    "mouth*": {"mouth_*": 1},
+    "jawForward": {"jaw_forward": 1},
+    "mouthFunnel": {"funnel": 1},
+    "mouthPucker": {"pucker": 1},
+    "mouthRollLower": {"lip_roll": 0.5},
+    "mouthRollUpper": {"lip_roll": 0.5},
+    "mouthShrugLower": {"chin_raise": 1},
+    "browInnerUp": {"brow_inner_up": 1},
+    "cheekPuff": {"cheek_puff": 1},
+}
+"""Shapes of the embedded head; ``*`` is Left and left, Right and right."""
+
+NOT_DRIVEN = ("mouthShrugUpper", "tongueOut")
+"""Blendshapes for which the embedded head has no shape."""
+
+SIDES = ("Left", "Right")
+_EMBEDDED = {
+    name.replace("*", side): {shape.replace("*", side.lower()): weight for shape, weight in shapes.items()}
+    for name, shapes in SHAPES.items()
+    for side in (SIDES if "*" in name else ("",))
+}
+ARKIT = tuple(sorted({*JOINTS, *_EMBEDDED, *NOT_DRIVEN}))
+"""The 52 names."""
+
+_NEUTRAL = "_neutral"
+_OTHERS = re.compile(
+    r"(head|(left|right)eye)(yaw|pitch|roll)|time.*|frame.*|blendshapecount|_neutral", re.IGNORECASE
+)
+"""Other columns of the exports of MediaPipe and of Live Link Face."""
+
+
+def arkit_name(name: str) -> str:
+    """ARKit's name of a column, whose first letter may be a capital; "" for others."""
+    lower = name[:1].lower() + name[1:]
+    return lower if lower in ARKIT else ""
+
+
+def is_blendshapes(table: SignalTable) -> bool:
+    """Whether a table has columns of ARKit's names."""
+    return any(map(arkit_name, table.columns))
+
+
+def read_blendshapes(request: SignalRequest) -> Signal:
+    """Blendshapes of each frame. Raises `InputError` for an unknown column, and for values beyond `RANGE`."""
+    table = request.columns
+    known = {name: arkit_name(name) for name in table.columns}
+    unused = {}
+    for name in table.columns:
+        if not known[name]:
+            if not _OTHERS.fullmatch(name):
+                expected = "ARKit's names of blendshapes, and times"
+                raise InputError(
+                    table.path, "columns", expected, repr(name), "Use a map of columns: --map FILE.yaml."
+                )
+            unused[name] = "no blendshape"
+    channels = {arkit: table.values(name)[:, 0] for name, arkit in known.items() if arkit}
+    for name, values in channels.items():
+        if np.abs(values).max() > RANGE:
+            expected = f"values of blendshapes, from {-RANGE:g} to {RANGE:g}"
+            raise InputError(table.path, name, expected, f"{values[np.abs(values).argmax()]:g}")
+    signal = perform(request, channels)
+    return Signal(signal.form, signal.head, signal.poses, {**unused, **signal.unused})
+
+
+def perform(request: SignalRequest, channels: Mapping[str, FloatArray]) -> Signal:
+    """Poses of the head that performs the blendshapes: the one given, else the embedded one.
+
+    Parameters
+    ----------
+    channels : Mapping[str, FloatArray]
+        (T,) values by ARKit's name.
+    """
+    if request.signal_head:
+        head = request.head()
+    elif request.target.version in VERSIONS:
+        head = request.target
+    else:
+        head = procedural_head()
+    parts = blendshape_parts(head)
+    length = len(next(iter(channels.values())))
+    sizes = {**POSE_PARTS, "expression": head.expression_basis.shape[2], "eyelids": 2}
+    columns = {name: np.zeros((length, size)) for name, size in sizes.items()}
+    unused = {}
+    for name, values in channels.items():
+        if name not in parts:
+            unused[name] = f"{head.version} has no such shape"
+        for part, direction in parts.get(name, {}).items():
+            columns[part] += values[:, None] * direction
+    columns["jaw"][:, 0] = np.maximum(columns["jaw"][:, 0], 0.0)
+    return Signal("blendshapes", head, make_poses(request.path, head, columns), unused)
+
+
+def blendshape_parts(head: HeadArrays) -> dict[str, dict[str, FloatArray]]:
+    """What each blendshape adds to the parts of a pose at 1, by its name: expression (E,), jaw (3,), eyes (6,), eyelids (2,).
+
+    Raises `InputError` for a head without shapes of ARKit's names other than the embedded one.
+    """
+    found: dict[str, dict[str, FloatArray]] = {name: _joint(weights) for name, weights in JOINTS.items()}
+    if head.version in VERSIONS:
+        matrix, lids = semantic_to_coefficients(head.version)
+        for name, shapes in _EMBEDDED.items():
+            rows = [SEMANTIC_NAMES.index(shape) for shape in shapes]
+            weights = np.array([*shapes.values()])
+            found[name] = {"expression": weights @ matrix[rows]}
+            if lids is not None:
+                found[name]["eyelids"] = weights @ lids[rows]
+        return found
+    columns = _named_columns(head)
+    if not columns:
+        expected = "the embedded head, or one with expressions of ARKit's names such as ICT-FaceKit's"
+        raise InputError("command line", "--signal-head", expected, head.version)
+    for name, direction in columns.items():
+        if name == "jawOpen":  # the joint's place is taken by the shape
+            found.pop(name)
+        found.setdefault(name, {})["expression"] = direction
+    if "jawLeft" in columns:
+        del found["jawLeft"]["jaw"], found["jawRight"]["jaw"]
+    return found
+
+
+def _joint(weights: Mapping[str, float]) -> dict[str, FloatArray]:
+    """Directions of parts of a pose from weights of components such as ``jaw.0``."""
+    parts: dict[str, FloatArray] = {}
+    for name, weight in weights.items():
+        part, index = name.split(".")
+        parts.setdefault(part, np.zeros(POSE_PARTS[part]))[int(index)] += weight
+    return parts
+
+
+def _named_columns(head: HeadArrays) -> dict[str, FloatArray]:
+    """(E,) directions by ARKit's name of the head's named expressions; ``_L`` and ``_R`` stand for Left and Right."""
+    found: dict[str, FloatArray] = {}
+    for name, column in zip(head.expression_names, np.eye(len(head.expression_names))):
+        stem = re.sub("_([LR])$", "", name)
+        side = {"_L": "Left", "_R": "Right"}.get(name[len(stem) :], "")
+        for arkit in (stem + side, stem):  # browInnerUp is one shape with ARKit, a pair with others
+            if arkit_name(arkit):
+                found[arkit_name(arkit)] = found.get(arkit_name(arkit), 0.0) + column
+                break
+    return found

@@ -1,0 +1,157 @@
+"""Transfer of a signal to the head model of an avatar, relative to the signal's neutral face, and smoothing over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation
+
+from ...bench.contracts import FloatArray, FrameKey, HeadPose, Progress, no_progress
+from ...bench.errors import InputError
+from ...bench.experiments.reenactment import RigidMean, retarget
+from ..clip import CaptureClip, FrameFiles, without_images
+from ..head.arrays import HeadArrays
+from ..head.refit.refit import refit
+from ..head.refit.settings import RefitSettings
+from .signal import NO_EYELIDS, Signal
+
+SMOOTHED = ("expression", "jaw", "eyes", "eyelids", "neck", "rotation", "translation")
+ORDER = 2
+"""Order of the polynomials of the Savitzky-Golay filter."""
+AT_REST = RigidMean(np.eye(3), np.eye(3), np.zeros(3))
+
+
+class Transferred(NamedTuple):
+    """A signal on the head model of an avatar."""
+
+    read: Sequence[HeadPose]
+    """Poses of the avatar's head model, before a neutral face is subtracted."""
+    poses: Sequence[HeadPose]
+    """Poses relative to the neutral face."""
+    residual_mm: float | None
+    """Mean distance of the facial vertices after a refit between head models, millimetres; None if none was needed."""
+    unused: dict[str, str]
+    """Channels lost on the way."""
+
+
+def transfer(
+    signal: Signal, target: HeadArrays, neutral: int | None, progress: Progress = no_progress
+) -> Transferred:
+    """Bring a signal to a head model by `refit`, on the vertices of the signal's mean head, so that no identity is transferred.
+
+    Parameters
+    ----------
+    neutral : int | None
+        Frame of the signal with the neutral face; None takes the neutral face of the signal's head model.
+
+    Raises
+    ------
+    InputError
+        The signal lacks the frame, or the head models are incompatible, see `refit`.
+    """
+    poses = list(signal.poses)
+    if neutral is not None and neutral >= len(poses):
+        expected = f"a frame of the signal, from 0 to {len(poses) - 1}"
+        raise InputError("command line", "--neutral", expected, str(neutral))
+    if same_basis(signal.head, target):
+        lost = target.eyelid_basis is None and any(
+            pose.eyelids is not None and np.any(pose.eyelids) for pose in poses
+        )
+        read = [replace(p, eyelids=_lids(p, target)) for p in poses]
+        origin = None if neutral is None else read[neutral]
+        return Transferred(read, relative(read, origin), None, {"eyelids": NO_EYELIDS} if lost else {})
+    moving = {t: replace(pose, timestep=t) for t, pose in enumerate([*poses, resting(signal.head)])}
+    keys = {FrameKey("signal", "signal", t, "none"): FrameFiles(None, None) for t in moving}
+    clip = CaptureClip(
+        subject="signal",
+        shape=np.zeros(signal.head.shape_basis.shape[2]),
+        splits={"train": tuple(keys), "novel_view": (), "self_reenactment": ()},
+        files=keys,
+        **without_images(signal.head, moving),
+    )
+    refitted = refit(clip, target, RefitSettings(neck="keep"), progress=progress)
+    found = [refitted.clip.poses[t] for t in sorted(moving)]
+    read, rest = found[:-1], found[-1]
+    residual = float(np.mean([frame.mean_mm for frame in refitted.report.frames[:-1]]))
+    return Transferred(read, relative(read, rest if neutral is None else read[neutral]), residual, {})
+
+
+def same_basis(one: HeadArrays, other: HeadArrays) -> bool:
+    """Whether coefficients of two head models mean the same."""
+    return one.version == other.version and one.expression_basis.shape[2] == other.expression_basis.shape[2]
+
+
+def resting(head: HeadArrays, subject: str = "") -> HeadPose:
+    """The neutral face of a head model, its head at the origin."""
+    expression, none = np.zeros(head.expression_basis.shape[2]), np.zeros(3)
+    lids = None if head.eyelid_basis is None else np.zeros(head.eyelid_basis.shape[2])
+    return HeadPose(head.version, expression, none, none, none, np.zeros(6), none, lids, subject)
+
+
+def relative(poses: Sequence[HeadPose], neutral: HeadPose | None) -> list[HeadPose]:
+    """Poses as seen from a neutral face: differences of coefficients, turns of jaw and eyes from the neutral ones."""
+    if neutral is None:
+        return list(poses)
+    return [
+        replace(
+            pose,
+            expression=pose.expression - neutral.expression,
+            jaw=_turn(neutral.jaw, pose.jaw),
+            eyes=_turn(neutral.eyes, pose.eyes),
+            eyelids=None
+            if pose.eyelids is None or neutral.eyelids is None
+            else pose.eyelids - neutral.eyelids,
+        )
+        for pose in poses
+    ]
+
+
+def head_motion(poses: Sequence[HeadPose], still: bool) -> list[HeadPose]:
+    """Poses whose head moves around the origin, relative to its mean over time; not at all if ``still``."""
+    if still:
+        return [replace(p, rotation=np.zeros(3), neck=np.zeros(3), translation=np.zeros(3)) for p in poses]
+    mean = RigidMean.of(poses)
+    return [retarget(pose, mean, AT_REST, pose.subject) for pose in poses]
+
+
+def smoothed(poses: Sequence[HeadPose], seconds: float, fps: float) -> list[HeadPose]:
+    """Poses filtered over time by least-squares polynomials of `ORDER` in a moving window.
+
+    Savitzky and Golay, "Smoothing and differentiation of data by simplified least squares procedures", Anal. Chem. 36, 1964,
+    by `scipy.signal.savgol_filter`. The window has the odd number of frames nearest to ``seconds``.
+
+    Raises `InputError` for a window that is too short to smooth, or longer than the signal.
+    """
+    if not seconds:
+        return list(poses)
+    window = 2 * round((seconds * fps - 1) / 2) + 1
+    if not ORDER + 2 <= window <= len(poses):
+        expected = f"a window of {ORDER + 3} to {len(poses)} frames, {(ORDER + 3) / fps:g} s or more"
+        raise InputError(
+            "command line", "--smooth", expected, f"{seconds:g} s, {window} frames at {fps:g} a second"
+        )
+    columns = {}
+    for name in SMOOTHED:
+        values = [getattr(pose, name) for pose in poses]
+        if values[0] is not None:
+            columns[name] = savgol_filter(np.array(values, np.float64), window, ORDER, axis=0)
+    return [
+        replace(p, **{name: values[row] for name, values in columns.items()}) for row, p in enumerate(poses)
+    ]
+
+
+def _turn(neutral: FloatArray, angles: FloatArray) -> FloatArray:
+    """Axis-angle vectors, (3 n,), of the rotations from ``neutral`` to ``angles``."""
+    origin, turned = (Rotation.from_rotvec(np.reshape(part, (-1, 3))) for part in (neutral, angles))
+    return np.asarray((origin.inv() * turned).as_rotvec()).reshape(-1)
+
+
+def _lids(pose: HeadPose, target: HeadArrays) -> FloatArray | None:
+    """Eyelids of a pose as the target has them."""
+    if target.eyelid_basis is None:
+        return None
+    return np.zeros(target.eyelid_basis.shape[2]) if pose.eyelids is None else pose.eyelids
