@@ -17,7 +17,7 @@ from ..head.arrays import HeadArrays
 from ..head.procedural.expressions import SEMANTIC_NAMES
 from ..head.procedural.model import procedural_head
 from ..head.procedural.versions import VERSIONS, semantic_to_coefficients
-from .signal import POSE_PARTS, Signal, SignalRequest, make_poses
+from .signal import POSE_PARTS, DrivingSignal, SignalRequest, make_poses
 from .table import SignalTable
 
 JAW_OPEN = 0.44
@@ -103,7 +103,7 @@ def is_blendshapes(table: SignalTable) -> bool:
     return any(map(arkit_name, table.columns))
 
 
-def read_blendshapes(request: SignalRequest) -> Signal:
+def read_blendshapes(request: SignalRequest) -> DrivingSignal:
     """Blendshapes of each frame. Raises `InputError` for an unknown column, and for values beyond `RANGE`."""
     table = request.columns
     known = {name: arkit_name(name) for name in table.columns}
@@ -122,10 +122,10 @@ def read_blendshapes(request: SignalRequest) -> Signal:
             expected = f"values of blendshapes, from {-RANGE:g} to {RANGE:g}"
             raise InputError(table.path, name, expected, f"{values[np.abs(values).argmax()]:g}")
     signal = perform(request, channels)
-    return Signal(signal.form, signal.head, signal.poses, {**unused, **signal.unused})
+    return DrivingSignal(signal.form, signal.head, signal.poses, {**unused, **signal.unused})
 
 
-def perform(request: SignalRequest, channels: Mapping[str, FloatArray]) -> Signal:
+def perform(request: SignalRequest, channels: Mapping[str, FloatArray]) -> DrivingSignal:
     """Poses of the head that performs the blendshapes: the one given, else the embedded one.
 
     Parameters
@@ -150,7 +150,7 @@ def perform(request: SignalRequest, channels: Mapping[str, FloatArray]) -> Signa
         for part, direction in parts.get(name, {}).items():
             columns[part] += values[:, None] * direction
     columns["jaw"][:, 0] = np.maximum(columns["jaw"][:, 0], 0.0)
-    return Signal("blendshapes", head, make_poses(request.path, head, columns), unused)
+    return DrivingSignal("blendshapes", head, make_poses(request.path, head, columns), unused)
 
 
 def blendshape_parts(head: HeadArrays) -> dict[str, dict[str, FloatArray]]:

@@ -12,7 +12,7 @@ import numpy as np
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from .names import IDENTITY, NAMES
-from .signal import NO_EYELIDS, Signal, SignalRequest, make_poses
+from .signal import NO_EYELIDS, DrivingSignal, SignalRequest, make_poses
 from .table import SignalTable
 
 USUAL_HEAD = "flame2020"
@@ -24,7 +24,7 @@ def is_coefficients(table: SignalTable) -> bool:
     return any(name in table.columns for name in NAMES["expression"])
 
 
-def read_coefficients(request: SignalRequest) -> Signal:
+def read_coefficients(request: SignalRequest) -> DrivingSignal:
     """Coefficients of each frame. Identity stays behind."""
     table = request.columns
     head = request.head(USUAL_HEAD)
@@ -42,7 +42,7 @@ def read_coefficients(request: SignalRequest) -> Signal:
     }
     if "eyelids" in parts and head.eyelid_basis is None:
         unused[found["eyelids"]] = NO_EYELIDS
-    return Signal("coefficients", head, make_poses(table.path, head, parts), unused)
+    return DrivingSignal("coefficients", head, make_poses(table.path, head, parts), unused)
 
 
 def _parts(

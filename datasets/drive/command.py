@@ -21,7 +21,7 @@ from .formats import read_signal
 from .measure import DrivenMeasures
 from .output import REST, Renderer, canonical, write_driven_capture, write_movie
 from .settings import DriveSettings
-from .signal import Signal, SignalRequest
+from .signal import DrivingSignal, SignalRequest
 from .stage import SEQUENCE, Stage, make_stage
 from .transfer import Transferred, head_motion, resting, smoothed, transfer
 
@@ -88,7 +88,7 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
 
 
 def measured(
-    settings: DriveSettings, stage: Stage, signal: Signal, found: Transferred, motion: tuple[Any, Any]
+    settings: DriveSettings, stage: Stage, signal: DrivingSignal, found: Transferred, motion: tuple[Any, Any]
 ) -> dict[str, Any]:
     """Measures of the driven poses as plain values, and the channels of the signal that drive nothing.
 

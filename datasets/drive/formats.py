@@ -11,7 +11,7 @@ from ...bench.registry import unknown
 from .blendshapes import is_blendshapes, read_blendshapes
 from .coefficients import is_coefficients, read_coefficients
 from .mapping import read_mapped
-from .signal import Signal, SignalRequest
+from .signal import DrivingSignal, SignalRequest
 from .table import SignalTable, read_table
 from .tracked import is_flame_parameters, read_capture_signal, read_flame_parameters
 
@@ -26,14 +26,14 @@ class SignalFormat:
         Name for ``--form``, and what it is.
     fits : Callable[[SignalTable], bool]
         Whether a table without a map is of this format.
-    read : Callable[[SignalRequest], Signal]
+    read : Callable[[SignalRequest], DrivingSignal]
         Reader; its errors are `InputError`.
     """
 
     name: str
     summary: str
     fits: Callable[[SignalTable], bool]
-    read: Callable[[SignalRequest], Signal]
+    read: Callable[[SignalRequest], DrivingSignal]
 
 
 FORMATS = (
@@ -55,7 +55,7 @@ FORMATS = (
 """In the order in which they are tried. A folder that a reader of captures finds is a capture, a table with a map is mapped."""
 
 
-def read_signal(request: SignalRequest, name: str = "") -> Signal:
+def read_signal(request: SignalRequest, name: str = "") -> DrivingSignal:
     """Read a signal in the named format, or in the one that recognises it.
 
     Raises

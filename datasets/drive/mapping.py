@@ -14,12 +14,12 @@ from ...bench.io.documents import checked, read_yaml
 from ...bench.registry import unknown
 from ..head.arrays import HeadArrays
 from .blendshapes import ARKIT, perform
-from .signal import POSE_PARTS, Signal, SignalRequest, make_poses
+from .signal import POSE_PARTS, DrivingSignal, SignalRequest, make_poses
 
 _COMPONENT = re.compile(r"([a-z]+)\.(\d+)")
 
 
-def read_mapped(request: SignalRequest) -> Signal:
+def read_mapped(request: SignalRequest) -> DrivingSignal:
     """Poses of a table by the map file of the request, ``{column: {coefficient: weight}}``.
 
     Raises `InputError` for a map with a column that the table lacks, with an unknown coefficient, or with ARKit's names beside
@@ -49,9 +49,9 @@ def read_mapped(request: SignalRequest) -> Signal:
             sums[name] += weight * values[column][:, 0]
     if blendshapes:
         signal = perform(request, sums)
-        return Signal("mapped", signal.head, signal.poses, {**unused, **signal.unused})
+        return DrivingSignal("mapped", signal.head, signal.poses, {**unused, **signal.unused})
     head = request.head()
-    return Signal("mapped", head, make_poses(table.path, head, _parts(source, head, sums)), unused)
+    return DrivingSignal("mapped", head, make_poses(table.path, head, _parts(source, head, sums)), unused)
 
 
 def _parts(source: Path, head: HeadArrays, sums: Mapping[str, FloatArray]) -> dict[str, FloatArray]:

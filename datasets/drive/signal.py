@@ -25,7 +25,7 @@ AVATAR = "avatar"
 
 
 @dataclass(frozen=True, eq=False)
-class Signal:
+class DrivingSignal:
     """A driving signal.
 
     Attributes

@@ -7,7 +7,7 @@ from pathlib import Path
 from ...bench.errors import InputError
 from ..ga.layout import Declaration
 from ..ga.tracking import POSE_SIZES, find_head, read_animation, read_tracking
-from .signal import AVATAR, Signal, SignalRequest
+from .signal import AVATAR, DrivingSignal, SignalRequest
 from .table import SignalTable, in_order
 
 USUAL_HEAD = "flame2023"
@@ -23,7 +23,7 @@ def is_flame_parameters(table: SignalTable) -> bool:
     )
 
 
-def read_flame_parameters(request: SignalRequest) -> Signal:
+def read_flame_parameters(request: SignalRequest) -> DrivingSignal:
     """Poses of a folder with a parameter file for each frame, or of one file. Identity stays behind.
 
     The head model is the one given, else that which a declaration of headbench beside the folder names, else the avatar's if
@@ -41,10 +41,10 @@ def read_flame_parameters(request: SignalRequest) -> Signal:
     unused = {**IDENTITY_UNUSED, **{k: v for k, v in tracking.notes.items() if k == "eyelids"}}
     if tracking.notes.get("dynamic_offset_ignored_m"):
         unused["dynamic_offset"] = "offsets of vertices"
-    return Signal("flame_param", tracking.head, poses, unused)
+    return DrivingSignal("flame_param", tracking.head, poses, unused)
 
 
-def read_capture_signal(request: SignalRequest) -> Signal:
+def read_capture_signal(request: SignalRequest) -> DrivingSignal:
     """Poses of a capture of any layout, of all its sequences or one of them, in the order of time.
 
     Raises `InputError` for an unknown sequence.
@@ -57,4 +57,4 @@ def read_capture_signal(request: SignalRequest) -> Signal:
     if request.sequence and request.sequence not in names:
         raise InputError("command line", "--sequence", f"one of {', '.join(names)}", request.sequence)
     timesteps = [t for t in sorted(clip.poses) if request.sequence in ("", sequences.get(t))]
-    return Signal("capture", clip.head, [clip.poses[t] for t in timesteps], IDENTITY_UNUSED)
+    return DrivingSignal("capture", clip.head, [clip.poses[t] for t in timesteps], IDENTITY_UNUSED)

@@ -17,7 +17,7 @@ from ..clip import CaptureClip, FrameFiles, without_images
 from ..head.arrays import HeadArrays
 from ..head.refit.refit import refit
 from ..head.refit.settings import RefitSettings
-from .signal import NO_EYELIDS, Signal
+from .signal import NO_EYELIDS, DrivingSignal
 
 SMOOTHED = ("expression", "jaw", "eyes", "eyelids", "neck", "rotation", "translation")
 ORDER = 2
@@ -39,7 +39,7 @@ class Transferred(NamedTuple):
 
 
 def transfer(
-    signal: Signal, target: HeadArrays, neutral: int | None, progress: Progress = no_progress
+    signal: DrivingSignal, target: HeadArrays, neutral: int | None, progress: Progress = no_progress
 ) -> Transferred:
     """Bring a signal to a head model by `refit`, on the vertices of the signal's mean head, so that no identity is transferred.
 
