@@ -52,6 +52,10 @@ class RigidMean:
         return cls(_mean_rotation(rotations), _mean_rotation(necks), translations.mean(axis=0))
 
 
+AT_ORIGIN = RigidMean(np.eye(3), np.eye(3), np.zeros(3))
+"""Mean of a head that moves around the origin."""
+
+
 def retarget(pose: HeadPose, source: RigidMean, target: RigidMean, subject: str) -> HeadPose:
     """Retarget a pose of the source to the target.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from functools import cache
 
 import numpy as np
 
@@ -138,7 +139,7 @@ def perform(request: SignalRequest, channels: Mapping[str, FloatArray]) -> Drivi
     elif request.target.version in VERSIONS:
         head = request.target
     else:
-        head = procedural_head()
+        head = _embedded_head()
     parts = blendshape_parts(head)
     length = len(next(iter(channels.values())))
     sizes = {**POSE_PARTS, "expression": head.expression_basis.shape[2], "eyelids": 2}
@@ -160,14 +161,7 @@ def blendshape_parts(head: HeadArrays) -> dict[str, dict[str, FloatArray]]:
     """
     found: dict[str, dict[str, FloatArray]] = {name: _joint(weights) for name, weights in JOINTS.items()}
     if head.version in VERSIONS:
-        matrix, lids = semantic_to_coefficients(head.version)
-        for name, shapes in _EMBEDDED.items():
-            rows = [SEMANTIC_NAMES.index(shape) for shape in shapes]
-            weights = np.array([*shapes.values()])
-            found[name] = {"expression": weights @ matrix[rows]}
-            if lids is not None:
-                found[name]["eyelids"] = weights @ lids[rows]
-        return found
+        return found | _embedded_parts(head.version)
     columns = _named_columns(head)
     if not columns:
         expected = "the embedded head, or one with expressions of ARKit's names such as ICT-FaceKit's"
@@ -178,6 +172,25 @@ def blendshape_parts(head: HeadArrays) -> dict[str, dict[str, FloatArray]]:
         found.setdefault(name, {})["expression"] = direction
     if "jawLeft" in columns:
         del found["jawLeft"]["jaw"], found["jawRight"]["jaw"]
+    return found
+
+
+@cache
+def _embedded_head() -> HeadArrays:
+    return procedural_head()
+
+
+@cache
+def _embedded_parts(version: str) -> dict[str, dict[str, FloatArray]]:
+    """Parts of the shapes of a version of the embedded head."""
+    matrix, lids = semantic_to_coefficients(version)
+    found = {}
+    for name, shapes in _EMBEDDED.items():
+        rows = [SEMANTIC_NAMES.index(shape) for shape in shapes]
+        weights = np.array([*shapes.values()])
+        found[name] = {"expression": weights @ matrix[rows]}
+        if lids is not None:
+            found[name]["eyelids"] = weights @ lids[rows]
     return found
 
 

@@ -74,7 +74,12 @@ def read_signal(request: SignalRequest, name: str = "") -> DrivingSignal:
         return formats["capture"].read(request)
     if request.sequence:
         raise InputError("command line", "--sequence", "a signal that is a capture", str(path))
-    request = replace(request, table=read_table(path))
+    return read_rows(replace(request, table=read_table(path)), name)
+
+
+def read_rows(request: SignalRequest, name: str = "") -> DrivingSignal:
+    """Read the signal of a request with a table, as `read_signal` does."""
+    formats = {form.name: form for form in FORMATS}
     if request.map or name == "mapped":
         if not request.map or name not in ("", "mapped"):
             expected = "--form mapped" if request.map else "the map of --form mapped"
@@ -85,6 +90,6 @@ def read_signal(request: SignalRequest, name: str = "") -> DrivingSignal:
         expected = "; ".join(f"{form.name}: {form.summary}" for form in FORMATS)
         found = ", ".join([*request.columns.columns][:12])
         raise InputError(
-            path, "columns", expected, found, "Name other columns in a map file: --map FILE.yaml."
+            request.path, "columns", expected, found, "Name other columns in a map file: --map FILE.yaml."
         )
     return (formats[name] if name else fitting[0]).read(request)

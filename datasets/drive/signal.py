@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -82,12 +83,18 @@ class SignalRequest:
         Raises `InputError` if it is not given and has to be.
         """
         if self.signal_head and self.signal_head != AVATAR:
-            return target_head(self.signal_head)
+            return _loaded(self.signal_head)
         if self.signal_head == AVATAR or usual in ("", self.target.version):
             return self.target
         expected = f"the head model of the signal, as the avatar's is {self.target.version}"
         remedy = f"Signals of this format usually are of {usual}. Name its file, or `{AVATAR}` if they are of the avatar's."
         raise InputError("command line", "--signal-head", expected, "none", remedy)
+
+
+@lru_cache(maxsize=2)
+def _loaded(name: str) -> HeadArrays:
+    """A head model, which the frames of a live signal share."""
+    return target_head(name)
 
 
 def make_poses(path: Path, head: HeadArrays, parts: Mapping[str, FloatArray]) -> list[HeadPose]:

@@ -11,14 +11,13 @@ from ...bench.contracts import FloatArray, FrameKey, HeadPose, Progress
 from ...bench.engine.stored import HEAD_FILE, SUBJECT_FILE, StoredAvatar
 from ...bench.errors import InputError
 from ...bench.experiments.extremes import training_poses
-from ...bench.experiments.reenactment import RigidMean, retarget, view_camera
+from ...bench.experiments.reenactment import AT_ORIGIN, RigidMean, retarget, view_camera
 from ...bench.io.arrays import MAX_MAGNITUDE, Member, read_arrays
 from ..clip import CaptureClip, FrameFiles, without_images
 from ..head.arrays import HeadArrays, read_head
 from ..head.subject import PosedSubject
 from ..mesh_pictures import portrait_camera
 from .settings import DriveSettings
-from .transfer import AT_REST
 
 SEQUENCE = "drive"
 """Name of the driven sequence in captures."""
@@ -46,7 +45,7 @@ class Stage:
 
     def placed(self, poses: Sequence[HeadPose]) -> list[HeadPose]:
         """Poses that move around the origin, moved to where the head rests."""
-        return [retarget(pose, AT_REST, self.rest, self.clip.subject) for pose in poses]
+        return [retarget(pose, AT_ORIGIN, self.rest, self.clip.subject) for pose in poses]
 
     def driven(self, poses: Mapping[int, HeadPose], sequences: Mapping[int, str]) -> CaptureClip:
         """The clip with other poses, all of them to be rendered; ``sequences`` names that of each timestep."""
@@ -83,7 +82,7 @@ def make_stage(settings: DriveSettings, stored: StoredAvatar, progress: Progress
     camera = portrait_camera(neutral, settings.size, settings.size)
     fields = without_images(head, {}) | {"static_offset": offset, "cameras": {camera.id: camera}}
     subject = str(stored.record["subject"])
-    return Stage(CaptureClip(subject=subject, shape=shape, splits={}, files={}, **fields), AT_REST)
+    return Stage(CaptureClip(subject=subject, shape=shape, splits={}, files={}, **fields), AT_ORIGIN)
 
 
 def _identity(stored: StoredAvatar, head: HeadArrays) -> tuple[FloatArray, FloatArray]:

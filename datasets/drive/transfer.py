@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,17 +12,20 @@ from scipy.spatial.transform import Rotation
 
 from ...bench.contracts import FloatArray, FrameKey, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.experiments.reenactment import RigidMean, retarget
+from ...bench.experiments.reenactment import AT_ORIGIN, RigidMean, retarget
 from ..clip import CaptureClip, FrameFiles, without_images
 from ..head.arrays import HeadArrays
-from ..head.refit.refit import refit
+from ..head.refit.identity import match
+from ..head.refit.refit import BlockFitter, refit
 from ..head.refit.settings import RefitSettings
+from ..head.subject import PosedSubject
+from ..head.teeth import with_teeth_where_possible
 from .signal import NO_EYELIDS, DrivingSignal
 
 SMOOTHED = ("expression", "jaw", "eyes", "eyelids", "neck", "rotation", "translation")
+KEEP_NECK = RefitSettings(neck="keep")
 ORDER = 2
 """Order of the polynomials of the Savitzky-Golay filter."""
-AT_REST = RigidMean(np.eye(3), np.eye(3), np.zeros(3))
 
 
 class Transferred(NamedTuple):
@@ -64,20 +67,62 @@ def transfer(
         read = [replace(p, eyelids=_lids(p, target)) for p in poses]
         origin = None if neutral is None else read[neutral]
         return Transferred(read, relative(read, origin), None, {"eyelids": NO_EYELIDS} if lost else {})
-    moving = {t: replace(pose, timestep=t) for t, pose in enumerate([*poses, resting(signal.head)])}
-    keys = {FrameKey("signal", "signal", t, "none"): FrameFiles(None, None) for t in moving}
-    clip = CaptureClip(
-        subject="signal",
-        shape=np.zeros(signal.head.shape_basis.shape[2]),
-        splits={"train": tuple(keys), "novel_view": (), "self_reenactment": ()},
-        files=keys,
-        **without_images(signal.head, moving),
-    )
-    refitted = refit(clip, target, RefitSettings(neck="keep"), progress=progress)
+    source = with_teeth_of(target, signal.head)
+    moving = {t: replace(pose, timestep=t) for t, pose in enumerate([*poses, resting(source)])}
+    refitted = refit(poses_alone(source, moving), target, KEEP_NECK, progress=progress)
     found = [refitted.clip.poses[t] for t in sorted(moving)]
     read, rest = found[:-1], found[-1]
     residual = float(np.mean([frame.mean_mm for frame in refitted.report.frames[:-1]]))
     return Transferred(read, relative(read, rest if neutral is None else read[neutral]), residual, {})
+
+
+class FrameTransfer:
+    """`transfer` of one frame at a time, for signals whose end is not known.
+
+    Parameters
+    ----------
+    source, target : HeadArrays
+        Head models of the signal and of the avatar.
+    """
+
+    def __init__(self, source: HeadArrays, target: HeadArrays):
+        self._target, self._fitter = target, None
+        if not same_basis(source, target):
+            source = with_teeth_of(target, source)
+            clip = poses_alone(source, {0: resting(source)})
+            matching = match(source, PosedSubject.of(clip).neutral, target, KEEP_NECK)
+            self._fitter = BlockFitter(clip, target, matching, np.zeros(target.template.shape), KEEP_NECK)
+            self._rest = self._fitted(self._fitter, resting(source))
+
+    def __call__(self, pose: HeadPose) -> HeadPose:
+        """The pose on the target, relative to the neutral face of the source."""
+        if self._fitter is None:
+            return replace(pose, eyelids=_lids(pose, self._target))
+        return relative([self._fitted(self._fitter, pose)], self._rest)[0]
+
+    @staticmethod
+    def _fitted(fitter: BlockFitter, pose: HeadPose) -> HeadPose:
+        return fitter.pose(pose, None, fitter.fit([pose]), 0)
+
+
+def poses_alone(head: HeadArrays, poses: Mapping[int, HeadPose]) -> CaptureClip:
+    """A clip of the mean head in poses, without images."""
+    keys = {FrameKey("signal", "signal", t, "none"): FrameFiles(None, None) for t in poses}
+    return CaptureClip(
+        subject="signal",
+        shape=np.zeros(head.shape_basis.shape[2]),
+        splits={"train": tuple(keys), "novel_view": (), "self_reenactment": ()},
+        files=keys,
+        **without_images(head, poses),
+    )
+
+
+def with_teeth_of(target: HeadArrays, source: HeadArrays) -> HeadArrays:
+    """The source with teeth, if it differs from the target's mesh by them alone: then vertices of one index are one point."""
+    teeth = len(target.regions.get("teeth", ()))
+    if teeth and "teeth" not in source.regions and len(source.template) + teeth == len(target.template):
+        return with_teeth_where_possible(source)
+    return source
 
 
 def same_basis(one: HeadArrays, other: HeadArrays) -> bool:
@@ -115,7 +160,7 @@ def head_motion(poses: Sequence[HeadPose], still: bool) -> list[HeadPose]:
     if still:
         return [replace(p, rotation=np.zeros(3), neck=np.zeros(3), translation=np.zeros(3)) for p in poses]
     mean = RigidMean.of(poses)
-    return [retarget(pose, mean, AT_REST, pose.subject) for pose in poses]
+    return [retarget(pose, mean, AT_ORIGIN, pose.subject) for pose in poses]
 
 
 def smoothed(poses: Sequence[HeadPose], seconds: float, fps: float) -> list[HeadPose]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadPose, SplatAvatar
 from ...bench.io.images import quantise
-from .scene import Scene, ShownAvatar
+from .scene import LIVE, Scene, ShownAvatar
 from .state import FreeView, State
 
 LABEL_PX = 22
@@ -98,7 +98,7 @@ def arrangement(count: int, width: int, height: int) -> tuple[int, int]:
 
 def pose_of(shown: ShownAvatar, state: State, key: FrameKey | None) -> HeadPose:
     """The pose of an avatar."""
-    return state.sliders.added(shown.pose(key))
+    return state.sliders.added(shown.live_pose() if state.recording == LIVE else shown.pose(key))
 
 
 def moved(scene: Scene, shown: ShownAvatar, camera: Camera, key: FrameKey | None) -> Camera:

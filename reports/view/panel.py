@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...bench.contracts import FloatArray
-from .scene import NEUTRAL, Scene
+from .scene import LIVE, NEUTRAL, Scene
 from .state import Sliders, State
 
 JAW, NECK, EYES = ("open", "sideways", "roll"), ("nod", "turn", "tilt"), ("up and down", "sideways")
@@ -58,9 +58,8 @@ class ControlPanel:
         )
         self._background = self._add(gui.add_rgb("Background", initial_value=(255, 255, 255)))
         with gui.add_folder("Recording"):
-            self._recording = gui.add_dropdown(
-                "Sequence", (NEUTRAL, *scene.recordings), initial_value=NEUTRAL
-            )
+            names = (*([LIVE] if scene.live else []), NEUTRAL, *scene.recordings)
+            self._recording = gui.add_dropdown("Sequence", names, initial_value=names[0])
             self._timestep = self._add(gui.add_slider("Frame", min=0, max=1, step=1, initial_value=0))
             self._playing = self._add(gui.add_checkbox("Play", initial_value=False))
             self._fps = gui.add_slider("Frames per second", min=1, max=MOST_FPS, step=1, initial_value=25)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -20,19 +21,29 @@ from ...bench.engine.store import RunFolder
 from ...bench.engine.stored import avatar_folder, open_avatar
 from ...bench.errors import HeadbenchError, InputError
 from ...bench.experiments.extremes import head_center, training_poses
-from ...bench.experiments.reenactment import RigidMean, check_heads, retarget
+from ...bench.experiments.reenactment import AT_ORIGIN, RigidMean, check_heads, retarget
 from ...bench.expressions import Expression, expressions_of
 from .settings import ViewSettings
 
 log = logging.getLogger(__name__)
 NEUTRAL = "neutral"
 """Name of the neutral pose, without a recording."""
+LIVE = "live signal"
+"""Name of the live signal among recordings."""
 MOST_SHOWN = 12
 """Avatars at once; more would be drawn too small to see."""
 
 
 Recording = dict[int, dict[str, FrameKey]]
 """The frames of one sequence of a subject: keys by timestep and camera."""
+
+
+class LiveSource(Protocol):
+    """Where live poses come from, see `live.LivePoses`."""
+
+    def pose(self, version: str) -> HeadPose | None: ...
+    def listen(self, listener: Callable[[], None]) -> None: ...
+    def forget(self, listener: Callable[[], None]) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +56,8 @@ class ShownAvatar:
         Unique name.
     sources : Mapping[str, AdaptedClip]
         Clips of other subjects, adapted to its method, by subject.
+    live : LiveSource | None
+        Poses of the live signal, if there is one.
     """
 
     label: str
@@ -52,6 +65,7 @@ class ShownAvatar:
     clip: Clip
     form: AdaptedClip
     sources: Mapping[str, AdaptedClip]
+    live: LiveSource | None = None
 
     @property
     def version(self) -> str:
@@ -80,6 +94,13 @@ class ShownAvatar:
         source = self.sources[key.subject]
         poses = source.clip.poses[source.key(key).timestep]
         return retarget(poses, self._means[key.subject], self._means[""], self.clip.subject)
+
+    def live_pose(self) -> HeadPose:
+        """The latest pose of the live signal, where the head is on average; neutral before the first."""
+        pose = None if self.live is None else self.live.pose(self.version)
+        if pose is None:
+            return self.neutral
+        return retarget(pose, AT_ORIGIN, self._means[""], self.clip.subject)
 
     def camera(self, view: Camera, key: FrameKey | None) -> Camera:
         """A camera of the world of `clip` as the method sees the world at a timestep.
@@ -123,6 +144,11 @@ class Scene:
     def first(self) -> ShownAvatar:
         """The avatar in whose world the viewer's camera is."""
         return self.shown[0]
+
+    @property
+    def live(self) -> LiveSource | None:
+        """The live signal, which is the same for all avatars."""
+        return self.first.live
 
     def expressions(self, count: int) -> dict[str, list[Expression]]:
         """The strongest expressions of each head model, by its version; ranges are those of the training of the first avatar."""

@@ -18,6 +18,7 @@ from typing import Any
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError, UnavailableError, install_extra
 from ...bench.specs import CommandResult
+from .live import with_live_signal
 from .scene import Scene, open_scene
 from .session import Session
 from .settings import ViewSettings
@@ -30,8 +31,8 @@ def view_avatars(settings: ViewSettings, progress: Progress = no_progress) -> Co
     viser()
     check_port(settings.host, settings.port)
     with tempfile.TemporaryDirectory(prefix="headbench-view-") as kept:
-        scene = open_scene(settings, Path(kept))
-        with serving(scene, settings) as server:
+        opened = open_scene(settings, Path(kept))
+        with with_live_signal(opened, settings) as scene, serving(scene, settings) as server:
             address = server.address
             names = ", ".join(shown.label for shown in scene.shown)
             log.warning("%s: %s (Ctrl-C ends it)", address, names)

@@ -7,6 +7,10 @@ from dataclasses import dataclass
 import tyro
 
 from ...bench.engine.config import RunOptions
+from ...bench.options import DependentOptions
+
+STANDARD_INPUT = "-"
+"""Value of ``--live`` for standard input."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,13 @@ class ViewSettings(RunOptions):
 
     source: str | None = None
     """Capture of another subject, with the same head model, whose sequences drive the avatars too."""
+
+    live: str = ""
+    """Live signal that drives all avatars: lines of JSON, each a frame as `headbench drive` reads them, on standard input (-) or on
+    a port of this machine (a number), at which only programs of this machine can connect."""
+
+    signal_head: str = ""
+    """With --live: head model of the signal, as of `headbench drive`."""
 
     expressions: int = 10
     """Number of sliders for expressions of each head model: the named ones, else the single coefficients, that move it farthest."""
@@ -50,7 +61,12 @@ class ViewSettings(RunOptions):
     seconds: float | None = None
     """Stop after this time; by default when interrupted."""
 
+    dependent = (DependentOptions(("signal_head",), "live"),)
+
     def __post_init__(self) -> None:
+        is_port = self.live.isascii() and self.live.isdigit() and 0 < int(self.live) < 65536
+        if self.live not in ("", STANDARD_INPUT) and not is_port:
+            raise ValueError(f"live is {self.live!r}; - or a port from 1 to 65535")
         if not self.avatars:
             raise ValueError("avatars: at least one folder")
         if not 0 <= self.port < 65536:

@@ -1,0 +1,53 @@
+"""Signals whose frames arrive one by one, as lines of JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ...bench.contracts import HeadAsset, HeadPose
+from ...bench.errors import InputError
+from ...bench.experiments.reenactment import AT_ORIGIN, RigidMean, retarget
+from ..head.arrays import HeadArrays
+from .formats import read_rows
+from .signal import SignalRequest
+from .table import SignalTable, parse_line
+from .transfer import FrameTransfer
+
+
+class LiveDriver:
+    """Takes lines with a frame each to poses of an avatar's head model: coefficients or blendshapes, as `read_signal` has them.
+
+    Parameters
+    ----------
+    target : HeadAsset
+        Head model of the avatar.
+    signal_head : str
+        See `settings.DriveSettings`.
+    """
+
+    def __init__(self, target: HeadAsset, signal_head: str = ""):
+        if not isinstance(target, HeadArrays):
+            raise InputError(
+                "avatar", "head", "a head model of headbench's own arrays", type(target).__name__
+            )
+        self._target, self._signal_head = target, signal_head
+        self._transfer: dict[str, FrameTransfer] = {}
+        self._first: RigidMean | None = None
+
+    def __call__(self, line: str) -> HeadPose:
+        """The pose of a line; the head moves around the origin, relative to the first line.
+
+        Raises `InputError` for a line that is no frame of a known format.
+        """
+        path = Path("live signal")
+        frame = parse_line(line, path, "line")
+        table = SignalTable(path, {name: [value] for name, value in frame.items()}, ["line"])
+        if not frame:
+            raise InputError(path, "line", "values of a frame", "an empty object")
+        signal = read_rows(SignalRequest(path, self._target, table, self._signal_head))
+        version = signal.head.version
+        if version not in self._transfer:
+            self._transfer[version] = FrameTransfer(signal.head, self._target)
+        pose = self._transfer[version](signal.poses[0])
+        self._first = self._first or RigidMean.of([pose])
+        return retarget(pose, self._first, AT_ORIGIN, pose.subject)
