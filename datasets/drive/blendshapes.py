@@ -136,7 +136,7 @@ def perform(request: SignalRequest, channels: Mapping[str, FloatArray]) -> Drivi
     """
     if request.signal_head:
         head = request.head()
-    elif request.target.version in VERSIONS:
+    elif is_embedded(request.target):
         head = request.target
     else:
         head = _embedded_head()
@@ -154,13 +154,21 @@ def perform(request: SignalRequest, channels: Mapping[str, FloatArray]) -> Drivi
     return DrivingSignal("blendshapes", head, make_poses(request.path, head, columns), unused)
 
 
+def is_embedded(head: HeadArrays) -> bool:
+    """Whether a head has the expressions of the embedded one; files of that version may have fewer."""
+    if head.version not in VERSIONS:
+        return False
+    (expression,) = {len(parts["expression"]) for parts in _embedded_parts(head.version).values()}
+    return head.expression_basis.shape[2] == expression
+
+
 def blendshape_parts(head: HeadArrays) -> dict[str, dict[str, FloatArray]]:
     """What each blendshape adds to the parts of a pose at 1, by its name: expression (E,), jaw (3,), eyes (6,), eyelids (2,).
 
     Raises `InputError` for a head without shapes of ARKit's names other than the embedded one.
     """
     found: dict[str, dict[str, FloatArray]] = {name: _joint(weights) for name, weights in JOINTS.items()}
-    if head.version in VERSIONS:
+    if is_embedded(head):
         return found | _embedded_parts(head.version)
     columns = _named_columns(head)
     if not columns:

@@ -12,7 +12,8 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadPose, SplatAvatar
 from ...bench.io.images import quantise
-from .scene import LIVE, Scene, ShownAvatar
+from .live_source import LIVE
+from .scene import Scene, ShownAvatar
 from .state import FreeView, State
 
 LABEL_PX = 22

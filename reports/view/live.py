@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import BinaryIO
 
 from ...bench.contracts import HeadPose
-from ...bench.errors import HeadbenchError, InputError
+from ...bench.errors import HeadbenchError, InputError, text_of
 from ...bench.io.documents import parse_json
 from ...bench.registry import resolve
 from .scene import Scene
@@ -80,10 +80,11 @@ class LivePoses:
                 return
             try:
                 self._poses = {version: driver(line) for version, driver in self._drivers.items()}
-            except HeadbenchError as error:
-                if str(error) != self._said:  # a signal of the wrong kind would repeat it with each line
-                    self._said = str(error)
-                    log.warning("%s", error)
+            except Exception as error:  # the next line may be a good one
+                if text_of(error) != self._said:  # a signal of the wrong kind would repeat it with each line
+                    self._said = text_of(error)
+                    known = isinstance(error, HeadbenchError)
+                    log.warning("%s", error if known else f"live signal: {self._said}", exc_info=not known)
                 continue
             for listener in tuple(self._listeners):
                 listener()

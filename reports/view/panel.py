@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ...bench.contracts import FloatArray
-from .scene import LIVE, NEUTRAL, Scene
+from .live_source import LIVE
+from .scene import NEUTRAL, Scene
 from .state import Sliders, State
 
 JAW, NECK, EYES = ("open", "sideways", "roll"), ("nod", "turn", "tilt"), ("up and down", "sideways")
@@ -58,7 +59,7 @@ class ControlPanel:
         )
         self._background = self._add(gui.add_rgb("Background", initial_value=(255, 255, 255)))
         with gui.add_folder("Recording"):
-            names = (*([LIVE] if scene.live else []), NEUTRAL, *scene.recordings)
+            names = (*([LIVE] if scene.first.live else []), NEUTRAL, *scene.recordings)
             self._recording = gui.add_dropdown("Sequence", names, initial_value=names[0])
             self._timestep = self._add(gui.add_slider("Frame", min=0, max=1, step=1, initial_value=0))
             self._playing = self._add(gui.add_checkbox("Play", initial_value=False))

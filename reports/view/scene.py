@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -23,27 +22,18 @@ from ...bench.errors import HeadbenchError, InputError
 from ...bench.experiments.extremes import head_center, training_poses
 from ...bench.experiments.reenactment import AT_ORIGIN, RigidMean, check_heads, retarget
 from ...bench.expressions import Expression, expressions_of
+from .live_source import LiveSource
 from .settings import ViewSettings
 
 log = logging.getLogger(__name__)
 NEUTRAL = "neutral"
 """Name of the neutral pose, without a recording."""
-LIVE = "live signal"
-"""Name of the live signal among recordings."""
 MOST_SHOWN = 12
 """Avatars at once; more would be drawn too small to see."""
 
 
 Recording = dict[int, dict[str, FrameKey]]
 """The frames of one sequence of a subject: keys by timestep and camera."""
-
-
-class LiveSource(Protocol):
-    """Where live poses come from, see `live.LivePoses`."""
-
-    def pose(self, version: str) -> HeadPose | None: ...
-    def listen(self, listener: Callable[[], None]) -> None: ...
-    def forget(self, listener: Callable[[], None]) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +46,6 @@ class ShownAvatar:
         Unique name.
     sources : Mapping[str, AdaptedClip]
         Clips of other subjects, adapted to its method, by subject.
-    live : LiveSource | None
-        Poses of the live signal, if there is one.
     """
 
     label: str
@@ -65,7 +53,7 @@ class ShownAvatar:
     clip: Clip
     form: AdaptedClip
     sources: Mapping[str, AdaptedClip]
-    live: LiveSource | None = None
+    live: LiveSource | None = None  # poses of the live signal, if there is one
 
     @property
     def version(self) -> str:
@@ -97,10 +85,8 @@ class ShownAvatar:
 
     def live_pose(self) -> HeadPose:
         """The latest pose of the live signal, where the head is on average; neutral before the first."""
-        pose = None if self.live is None else self.live.pose(self.version)
-        if pose is None:
-            return self.neutral
-        return retarget(pose, AT_ORIGIN, self._means[""], self.clip.subject)
+        pose = self.live.pose(self.version) if self.live else None
+        return self.neutral if pose is None else retarget(pose, AT_ORIGIN, self._means[""], self.clip.subject)
 
     def camera(self, view: Camera, key: FrameKey | None) -> Camera:
         """A camera of the world of `clip` as the method sees the world at a timestep.
@@ -144,11 +130,6 @@ class Scene:
     def first(self) -> ShownAvatar:
         """The avatar in whose world the viewer's camera is."""
         return self.shown[0]
-
-    @property
-    def live(self) -> LiveSource | None:
-        """The live signal, which is the same for all avatars."""
-        return self.first.live
 
     def expressions(self, count: int) -> dict[str, list[Expression]]:
         """The strongest expressions of each head model, by its version; ranges are those of the training of the first avatar."""

@@ -78,8 +78,8 @@ class Session:
         self._panel.screenshot.on_click(lambda _: self._do(self._screenshot))
         self._panel.turntable.on_click(lambda _: self._do(self._turntable))
         self._panel.sequence.on_click(lambda _: self._do(self._sequence))
-        if scene.live is not None:
-            scene.live.listen(self._changed.set)
+        if scene.first.live is not None:
+            scene.first.live.listen(self._changed.set)
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._changed.set()
         self._thread.start()
@@ -87,8 +87,8 @@ class Session:
     def close(self) -> None:
         """Stop drawing; called when the browser has gone."""
         self._closed = True
-        if self._scene.live is not None:
-            self._scene.live.forget(self._changed.set)
+        if self._scene.first.live is not None:
+            self._scene.first.live.forget(self._changed.set)
         self._changed.set()
         self._thread.join(timeout=10.0)
 

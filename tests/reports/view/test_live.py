@@ -105,20 +105,20 @@ def test_avatars_show_the_poses_of_lines(scene, method):
 
     from headbench.datasets.drive.live import LiveDriver
     from headbench.reports.view.drawing import pose_of
-    from headbench.reports.view.scene import LIVE
+    from headbench.reports.view.live_source import LIVE
     from headbench.reports.view.state import State
 
     shown = next(one for one in scene.shown if one.label == method)
-    made = LivePoses({shown.version: LiveDriver(shown.form.clip.head)})
+    made = LivePoses({shown.version: LiveDriver(shown.form.clip.head, "avatar")})
     try:
         avatar, state = replace(shown, live=made), State(recording=LIVE)
         neutral = pose_of(avatar, state, None)
         assert not neutral.jaw.any()
-        made.put(json.dumps({"jawOpen": 0.5, "mouthSmileLeft": 1.0}))
+        made.put(json.dumps({"expression": [0.5, -0.25], "jaw": [0.2, 0, 0]}))
         assert eventually(lambda: made.pose(shown.version) is not None)
         pose = pose_of(avatar, state, None)
-        assert pose.jaw[0] == pytest.approx(0.22, abs=1e-6)
-        assert np.abs(pose.expression).max() > 0.1
+        assert pose.jaw == pytest.approx([0.2, 0, 0])
+        assert pose.expression[:3] == pytest.approx([0.5, -0.25, 0])
         camera = next(iter(shown.form.clip.cameras.values()))
         assert np.isfinite(avatar.avatar.render(camera, pose).rgb).all()
     finally:
