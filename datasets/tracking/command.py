@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,30 +34,46 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     from ..images import write_image
     from ..overlay import draw_overlay
     from ..tracking_errors import tracking_errors
+    from ..video.command import opened_video
+    from ..video.decode import is_video
     from .network import landmark_source
-    from .track import check_cameras, track
+    from .track import LandmarkSource, check_cameras, track
 
     out = Path(settings.out)
-    clip = settings.open(settings.capture, progress)
-    teacher = settings.open(settings.embedding, progress) if settings.embedding else None
-    exact = settings.open(settings.against, progress) if settings.against else None
-    capture_plan(clip, settings.capture)  # Captures that cannot be rewritten are detected before the fit.
-    check_apart(clip, out)
-    check_cameras(clip, cameras := [*settings.cameras] or [*clip.cameras])
-    notes = {
-        "landmarks": Path(settings.landmarks).name or "vertices of the tracked mesh",
-        "seed": settings.seed,
+    with ExitStack() as stack:
+        if is_video(Path(settings.capture)):
+            video = stack.enter_context(opened_video(settings, out, progress))
+            clip = video.clip
+        else:
+            video, clip = None, settings.open(settings.capture, progress)
+            check_apart(clip, out)
+            teacher = settings.open(settings.embedding, progress) if settings.embedding else None
+        exact = settings.open(settings.against, progress) if settings.against else None
+        capture_plan(clip, settings.capture)  # Captures that cannot be rewritten are detected before the fit.
+        check_cameras(clip, cameras := [*settings.cameras] or [*clip.cameras])
+        notes = {
+            "landmarks": Path(settings.landmarks).name or "vertices of the tracked mesh",
+            "seed": settings.seed,
+        }
+        source: LandmarkSource
+        if video is not None:
+            source = video.landmarks
+        else:
+            source = landmark_source(
+                clip, cameras, settings.landmarks, teacher, seed=settings.seed, progress=progress
+            )
+        tracked = track(clip, cameras, source, notes=notes, progress=progress)
+        timesteps = evenly_with_ends([residual.timestep for residual in tracked.report.residuals], ROWS)
+        overlay = draw_overlay(tracked.clip, timesteps, evenly_with_ends(cameras, COLUMNS))
+        write_image(out / PICTURE, overlay)
+        union = write_capture(tracked.clip, out, progress)
+    data: dict[str, Any] = {
+        "capture": union.as_posix(),
+        **notes,
+        **(video.data if video else {}),
+        **tracked.report.to_json(),
     }
-    source = landmark_source(
-        clip, cameras, settings.landmarks, teacher, seed=settings.seed, progress=progress
-    )
-    tracked = track(clip, cameras, source, notes=notes, progress=progress)
-    timesteps = evenly_with_ends([residual.timestep for residual in tracked.report.residuals], ROWS)
-    overlay = draw_overlay(tracked.clip, timesteps, evenly_with_ends(cameras, COLUMNS))
-    write_image(out / PICTURE, overlay)
-    union = write_capture(tracked.clip, out, progress)
-    data: dict[str, Any] = {"capture": union.as_posix(), **notes, **tracked.report.to_json()}
-    lines = _text(tracked)
+    lines = [*(video.lines if video else []), *_text(tracked)]
     if exact is not None:
         errors = tracking_errors(tracked.clip, exact)
         data["errors_mm"] = {name: error._asdict() for name, error in errors.items()}

@@ -107,6 +107,7 @@ class Fitter:
     """C cameras."""
     landmarks: ImageLandmarks
     """Landmarks of T timesteps."""
+    landmark_weight: float = LANDMARK_WEIGHT
 
     def _prior(self, keep_shape: bool) -> HeadPrior:
         """Weak prior of all parameters."""
@@ -172,7 +173,7 @@ class Fitter:
             if leave_out:
                 near = np.sqrt(square) / sigma < MISTAKEN_MM / LANDMARK_MM
                 found &= ((found & near).sum(axis=1) > found.sum(axis=1) / 2)[:, None]
-            robust = found * LANDMARK_WEIGHT / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
+            robust = found * self.landmark_weight / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
             distance[row] = np.sqrt((found * square).sum() / max(found.sum(), 1))
             weighted = robust[..., None, None] * projected.derivative
             curvature = np.einsum("cpki,cpkj->pij", weighted, projected.derivative)

@@ -140,6 +140,12 @@ def _rest(head: HeadAsset, embedding: Embedding) -> tuple[FloatArray, FloatArray
     return mixed[0], mixed[1]
 
 
+def check_teacher(teacher: CaptureClip, head: HeadAsset) -> None:
+    """Raise `InputError` if a clip from which landmarks are learnt has another head model."""
+    if teacher.head.version != head.version:
+        raise InputError("embedding", "head_model", head.version, teacher.head.version)
+
+
 def landmark_source(
     clip: CaptureClip,
     cameras: Sequence[str],
@@ -158,7 +164,6 @@ def landmark_source(
         raise InputError("settings of the tracker", other, f"a value beside {given}", "none")
     if teacher is None:
         return partial(known_rig_landmarks, clip, cameras, seed=seed)
-    if teacher.head.version != clip.head.version:
-        raise InputError("embedding", "head_model", clip.head.version, teacher.head.version)
+    check_teacher(teacher, clip.head)
     network = LandmarkNetwork(Path(landmarks))
     return NetworkLandmarks(network, learn_embedding(network, teacher, progress), clip, cameras)

@@ -8,14 +8,16 @@ from typing import Annotated
 import tyro
 
 from ..options import CaptureOptions
+from ..video.settings import VideoOptions
 
 
 @dataclass(frozen=True)
-class TrackSettings(CaptureOptions):
+class TrackSettings(VideoOptions, CaptureOptions):
     """Settings of ``headbench track``."""
 
     capture: Annotated[str, tyro.conf.Positional]
-    """Capture, in a layout that a reader knows; images, cameras and head model are used."""
+    """Capture in a layout that a reader knows, whose images, cameras and head model are used; or the file of a video of one
+    person, with --head, --landmarks, --embedding, and --segmentation or --masks."""
 
     out: str
     """Folder for the tracked capture, track.json and overlay.png."""
@@ -36,3 +38,6 @@ class TrackSettings(CaptureOptions):
 
     seed: int = 0
     """Seed of the error of landmarks that are not a network's."""
+
+    def __post_init__(self) -> None:
+        self.check_video()

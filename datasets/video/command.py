@@ -1,0 +1,100 @@
+"""The part of ``headbench track`` that is for video files."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ...bench.contracts import Progress
+from ...bench.errors import InputError
+from ...bench.landmark_network import LandmarkNetwork
+from ..clip import CaptureClip
+from ..head.refit.command import target_head
+from ..tracking.focal import FocalLength, estimate_focal
+from ..tracking.network import NetworkLandmarks, check_teacher, learn_embedding
+from .clip import VideoClip, open_video
+
+if TYPE_CHECKING:
+    from ..tracking.settings import TrackSettings
+
+FRAMES = ".frames"
+"""Folder of the frames of a video while it is tracked."""
+NEEDED = ("head", "landmarks", "embedding")
+
+
+class OpenedVideo(NamedTuple):
+    """A video to be tracked: its clip, its landmarks, and what is said of it, as data and in lines."""
+
+    clip: CaptureClip
+    landmarks: NetworkLandmarks
+    data: dict[str, Any]
+    lines: list[str]
+
+
+@contextmanager
+def opened_video(settings: TrackSettings, out: Path, progress: Progress) -> Iterator[OpenedVideo]:
+    """The clip of a video with its focal length.
+
+    Its frames are in ``out`` while the context lasts. Raises `InputError` for options that are missing, and as `open_video`.
+    """
+    path = Path(settings.capture)
+    for name in NEEDED:
+        if not getattr(settings, name):
+            raise InputError("command line", f"--{name}", "a value, for the file of a video", "none")
+    named = settings.head or ""
+    head = target_head(named, "--head")
+    network = LandmarkNetwork(Path(settings.landmarks))
+    own = replace(settings, head=named if Path(named).exists() else None)  # a name of a head is for no reader
+    teacher = own.open(settings.embedding, progress)
+    check_teacher(teacher, head)
+    folder = out / FRAMES
+    shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed
+    folder.mkdir(parents=True)
+    try:
+        video = open_video(path, settings, head, network, folder, progress)
+        embedding = learn_embedding(network, teacher, progress)
+        clip, focal = video.clip, None
+        landmarks = NetworkLandmarks(network, embedding, clip, [*clip.cameras])
+        if settings.focal is None:
+            (camera,) = clip.cameras.values()
+            side = max(video.info.width, video.info.height) * video.scale
+            focal = estimate_focal(clip.head, camera, landmarks(sorted(clip.poses)), side)
+            clip = video.with_focal(focal.pixels / video.scale)
+            landmarks = NetworkLandmarks(network, embedding, clip, [*clip.cameras])
+        data, lines = _data(video, settings.focal, focal), _lines(video, settings.focal, focal)
+        yield OpenedVideo(clip, landmarks, data, lines)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _data(video: VideoClip, given: float | None, focal: FocalLength | None) -> dict[str, Any]:
+    return {
+        "video": {
+            **video.info._asdict(),
+            "crop": [*video.crop],
+            "scale": video.scale,
+            "without_face": [*video.without_face],
+            "focal_pixels": given if focal is None else focal.pixels / video.scale,
+            "focal_estimated": focal is not None,
+            "focal_clear": focal is None or focal.clear,
+        }
+    }
+
+
+def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> list[str]:
+    (camera,) = video.clip.cameras.values()
+    lines = [
+        f"{len(video.clip.files)} frames of {camera.width}x{camera.height} pixels around the head",
+        f"  video      {video.info.width}x{video.info.height} pixels, {video.info.rate:.3g} frames a second",
+    ]
+    if video.without_face:
+        shown = ", ".join(map(str, video.without_face[:8])) + (" ..." if len(video.without_face) > 8 else "")
+        lines.append(f"  left out   {len(video.without_face)} frames without a face: {shown}")
+    if focal is None:
+        return [*lines, f"  focal      {given:g} pixels, as given"]
+    unsure = "" if focal.clear else "; the landmarks hardly determine it: give --focal if you know it"
+    return [*lines, f"  focal      {focal.pixels / video.scale:.0f} pixels of the video, estimated{unsure}"]

@@ -1,0 +1,48 @@
+"""Options of tracking a video file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+MASKLESS = "none"
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoOptions:
+    """What `headbench track` needs to know of a video file; without effect on captures."""
+
+    segmentation: str = ""
+    """Video: MediaPipe's selfie_segmentation.tflite, which finds the person in each frame; needs ai-edge-litert."""
+
+    masks: str = ""
+    """Video: folder of masks instead, named 00000.png and so on in the order of the frames, of the video's size; or "none" to keep the
+    room behind the person, which then counts in every metric."""
+
+    focal: float | None = None
+    """Video: focal length in pixels of its upright frames; default: estimated from the landmarks, which is inexact."""
+
+    rate: float = 25.0
+    """Video: most frames a second that are used."""
+
+    longest: int | None = None
+    """Video: most frames that are used, from its beginning; default: all."""
+
+    size: int = 512
+    """Video: longest side of the frames after a crop around the head, pixels; smaller frames are not enlarged."""
+
+    subject: str = ""
+    """Video: name of the subject; default: that of the file."""
+
+    held_out_frames: int | None = None
+    """Video: number of last frames held out for self-reenactment; default: 350, or a quarter of fewer than 700."""
+
+    def check_video(self) -> None:
+        """Raise `ValueError` for a value out of range."""
+        if self.focal is not None and not self.focal > 0:
+            raise ValueError(f"focal is {self.focal}; more than 0")
+        if not 1 <= self.rate <= 240:
+            raise ValueError(f"rate is {self.rate}; from 1 to 240")
+        if not 64 <= self.size <= 4096:
+            raise ValueError(f"size is {self.size}; from 64 to 4096")
+        if self.longest is not None and self.longest < 1:
+            raise ValueError(f"longest is {self.longest}; at least 1")

@@ -1,0 +1,215 @@
+"""``headbench track`` on a video file, with a network that knows the landmarks of every picture."""
+
+import hashlib
+import json
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import Camera
+from headbench.bench.errors import InputError
+from headbench.bench.landmark_network import COUNT
+from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.ga.writer import CaptureWriter
+from headbench.datasets.head.procedural.model import procedural_head
+from headbench.datasets.images import write_image
+from headbench.datasets.mesh_pictures import draw_mesh, rasterize_mesh
+from headbench.datasets.tracking.command import track_capture
+from headbench.datasets.tracking.focal import estimate_focal
+from headbench.datasets.tracking.landmarks import ImageLandmarks, spread_vertices
+from headbench.datasets.tracking.settings import TrackSettings
+from headbench.datasets.video import clip as video_clip
+from headbench.datasets.video import command
+from headbench.datasets.video.decode import video_frames
+from headbench.datasets.video.faces import Crop, Faces, crop_around
+
+from ..tiny_capture import look_at, make_plan, posed_vertices
+
+HEIGHT, WIDTH, COUNTED = 160, 120, 12
+FACELESS = 5
+
+
+def digest(image):
+    return hashlib.sha1(np.ascontiguousarray(image).tobytes()).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    """A video of one camera, a capture of another subject, and the landmarks of all their pictures by their bytes."""
+    root = tmp_path_factory.mktemp("filmed")
+    head = procedural_head("2023")
+    camera = look_at("0", np.array([0.0, 0.1, 1.0]), WIDTH, HEIGHT, WIDTH / 2, HEIGHT / 2)
+    offset = np.zeros(head.template.shape, np.float32)
+    lengths = {"FREE": 3, "EMO-1-shout+laugh": COUNTED}
+    person, other = (
+        make_plan(
+            head=head,
+            cameras=[camera],
+            lengths=lengths,
+            static_offset=offset,
+            seed=seed,
+            novel_view_cameras=(),
+        )
+        for seed in (0, 1)
+    )
+    places = 150 * np.asarray(head.template)
+    colors = 0.5 + 0.4 * np.sin(places @ np.array([[1, 0.3, 0.5], [0.2, 1, 0.6], [0.4, 0.5, 1]]))
+    marks = np.asarray(head.regions["face"])[
+        spread_vertices(np.asarray(head.template)[head.regions["face"]], 200)
+    ]
+    marks = np.resize(marks, COUNT)
+    known = {}
+
+    def picture(plan, pose):
+        mesh = posed_vertices(plan, pose)
+        image = draw_mesh(mesh, head.faces, camera, colors, shading=0.0, background=(0.4, 0.5, 0.4))
+        seen = (mesh[marks] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]) @ camera.K.T
+        mask = np.where(rasterize_mesh(mesh, head.faces, camera).face >= 0, 255, 0).astype(np.uint8)
+        return image, mask, seen[:, :2] / seen[:, 2:]
+
+    writer = CaptureWriter(root / "other", other)
+    for sequence in other.sequences:
+        for timestep, pose in enumerate(sequence.poses):
+            image, mask, found = picture(other, pose)
+            writer.write_frame(sequence.name, timestep, camera.id, image, mask)
+            known[digest(image)] = found
+    writer.write_metadata()
+    poses = person.sequences[1].poses
+    with av.open(str(root / "me.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=Fraction(25), options={"crf": "4"})
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv444p"
+        for pose in poses:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(person, pose)[0], "rgb24")))
+        container.mux(stream.encode())
+    (root / "masks").mkdir()
+    for number, ((_, frame), pose) in enumerate(zip(video_frames(root / "me.mp4"), poses, strict=True)):
+        _, mask, found = picture(person, pose)
+        shown = np.where(mask[..., None] > 0, frame, 255).astype(np.uint8)
+        known[digest(frame)] = known[digest(shown)] = None if number == FACELESS else found
+        write_image(root / "masks" / f"{number:05d}.png", mask)
+    np.savez(root / "landmarks.npz")  # in place of the network's file
+    return root, writer.union, known, camera, person
+
+
+@pytest.fixture
+def settings(filmed, monkeypatch, tmp_path):
+    """Settings of the video, and a network that knows the landmarks."""
+    root, other, known, camera, _ = filmed
+
+    class Network:
+        def __init__(self, path):
+            pass
+
+        def find(self, image, near=None):
+            return known[digest(image)]
+
+    monkeypatch.setattr(command, "LandmarkNetwork", Network)
+    monkeypatch.setattr(video_clip, "crop_around", lambda faces, width, height: Crop(0, 0, width, height))
+    given = {
+        "head": "2023",
+        "landmarks": "network.tflite",
+        "embedding": str(other),
+        "focal": float(camera.K[0, 0]),
+    }
+
+    def make(**changes):
+        out = tmp_path / "out"
+        return TrackSettings(str(root / "me.mp4"), str(out), **(given | {"masks": "none"} | changes))
+
+    return make
+
+
+def test_a_video_becomes_a_capture_of_its_frames(settings, filmed):
+    found = track_capture(settings())
+    clip = read_capture(found.data["capture"])
+    numbers = [number for number in range(COUNTED) if number != FACELESS]
+    assert len(clip.files) == len(numbers)
+    assert found.data["video"]["without_face"] == [FACELESS]
+    assert f"without a face: {FACELESS}" in found.text
+    assert clip.splits["self_reenactment"]
+    assert found.data["landmarks_px"] < 2.0
+    out = Path(settings().out)
+    assert not (out / command.FRAMES).exists()
+    assert json.loads((out / "track.json").read_text())["video"]["focal_estimated"] is False
+
+
+def test_masks_remove_the_room(settings, filmed):
+    clip = read_capture(track_capture(settings(masks=str(filmed[0] / "masks"))).data["capture"])
+    key = min(clip.files)
+    mask = clip.mask(key)
+    assert (clip.image(key)[mask == 0] == 255).all()
+    assert 0.2 < (mask > 0).mean() < 0.8
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"masks": ""}, "masks of a video: expected one of --segmentation"),
+        ({"segmentation": "a.tflite"}, "masks of a video.*found both"),
+        ({"landmarks": ""}, "--landmarks: expected a value"),
+        ({"embedding": ""}, "--embedding: expected a value"),
+        ({"head": None}, "--head: expected a value"),
+        ({"head": "2020"}, "head_model"),
+        ({"masks": "nowhere"}, "nowhere"),
+        ({"longest": 1}, "frames for training"),
+    ],
+)
+def test_what_is_missing_is_said(settings, changes, message):
+    with pytest.raises(InputError, match=message):
+        track_capture(settings(**changes))
+
+
+def test_a_video_without_faces_is_refused(settings, monkeypatch):
+    monkeypatch.setattr(command.LandmarkNetwork, "find", lambda self, image, near=None: None)
+    with pytest.raises(InputError, match=r"a face in at least 50% of the frames, found one in 0 of 12"):
+        track_capture(settings())
+
+
+@pytest.mark.parametrize("changes", [{"focal": -1.0}, {"rate": 0.5}, {"size": 8}, {"longest": 0}])
+def test_settings_out_of_range_are_refused(changes):
+    with pytest.raises(ValueError, match=next(iter(changes))):
+        TrackSettings("me.mp4", "out", **changes)
+
+
+def test_a_crop_holds_every_face_and_moves_the_camera():
+    pixels = np.full((3, COUNT, 2), np.nan)
+    rng = np.random.default_rng(0)
+    for row, middle in ((0, (200, 150)), (2, (230, 160))):
+        pixels[row] = middle + 30 * rng.uniform(-1, 1, (COUNT, 2))
+    crop = crop_around(Faces(pixels), 640, 300)
+    low, high = np.nanmin(pixels, axis=(0, 1)), np.nanmax(pixels, axis=(0, 1))
+    assert crop.left <= low[0] - 40
+    assert crop.top <= low[1] - 50
+    assert crop.left + crop.width >= high[0] + 40
+    assert crop.top + crop.height <= 300
+    image = np.arange(640 * 300).reshape(300, 640)
+    assert crop.of(image)[0, 0] == image[crop.top, crop.left]
+
+
+@pytest.mark.parametrize("ratio", [1.2, 2.6])
+def test_the_focal_length_of_exact_landmarks_is_found(filmed, ratio):
+    plan = filmed[-1]
+    focal = ratio * HEIGHT
+    K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1.0]])
+    distance = focal * 0.3 / HEIGHT  # at which the head fills the picture
+    motion = look_at("0", np.array([0.0, 0.05, distance]), WIDTH, HEIGHT, 0.0, 0.0).world_to_camera
+    vertices = np.asarray(plan.head.regions["face"])
+    vertices = vertices[spread_vertices(np.asarray(plan.head.template)[vertices], 80)]
+    pixels = []
+    for pose, yaw in zip(plan.sequences[1].poses, np.linspace(-0.5, 0.5, 6)):
+        pose = replace(pose, rotation=np.array([0.0, yaw, 0.0]))
+        seen = (posed_vertices(plan, pose)[vertices] @ motion[:3, :3].T + motion[:3, 3]) @ K.T
+        pixels.append(seen[:, :2] / seen[:, 2:])
+    corners = np.repeat(vertices[:, None], 3, axis=1)
+    weights = np.tile([1.0, 0.0, 0.0], (len(vertices), 1))
+    found = estimate_focal(
+        plan.head,
+        Camera("0", WIDTH, HEIGHT, K * [[2, 1, 1], [1, 2, 1], [1, 1, 1]], motion),
+        ImageLandmarks(corners, weights, np.stack(pixels)[:, None]),
+        HEIGHT,
+    )
+    assert found.pixels == pytest.approx(focal, rel=0.15)
