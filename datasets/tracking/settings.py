@@ -17,7 +17,7 @@ class TrackSettings(VideoOptions, CaptureOptions):
 
     capture: Annotated[str, tyro.conf.Positional]
     """Capture in a layout that a reader knows, whose images, cameras and head model are used; or the file of a video of one
-    person, with --head, --landmarks, --embedding, and --segmentation or --masks."""
+    person, with --head, --landmarks, and --segmentation or --masks."""
 
     out: str
     """Folder for the tracked capture, track.json and overlay.png."""
@@ -31,7 +31,7 @@ class TrackSettings(VideoOptions, CaptureOptions):
 
     embedding: str = ""
     """Capture of another subject with exact tracking in the same head model, from which the places of the network's landmarks
-    on the mesh are learnt; only with --landmarks."""
+    on the mesh are learnt; default: drawings of the head model. Only with --landmarks."""
 
     against: str = ""
     """Capture with the exact tracking, to print errors in millimetres by region."""

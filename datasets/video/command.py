@@ -15,7 +15,7 @@ from ...bench.landmark_network import LandmarkNetwork
 from ..clip import CaptureClip
 from ..head.refit.command import target_head
 from ..tracking.focal import FocalLength, estimate_focal
-from ..tracking.network import NetworkLandmarks, check_teacher, learn_embedding
+from ..tracking.network import NetworkLandmarks, head_embedding
 from .clip import VideoClip, open_video
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 FRAMES = ".frames"
 """Folder of the frames of a video while it is tracked."""
-NEEDED = ("head", "landmarks", "embedding")
+NEEDED = ("head", "landmarks")
 
 
 class OpenedVideo(NamedTuple):
@@ -49,14 +49,13 @@ def opened_video(settings: TrackSettings, out: Path, progress: Progress) -> Iter
     head = target_head(named, "--head")
     network = LandmarkNetwork(Path(settings.landmarks))
     own = replace(settings, head=named if Path(named).exists() else None)  # a name of a head is for no reader
-    teacher = own.open(settings.embedding, progress)
-    check_teacher(teacher, head)
+    teacher = own.open(settings.embedding, progress) if settings.embedding else None
+    embedding = head_embedding(network, head, teacher, progress)
     folder = out / FRAMES
     shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed
     folder.mkdir(parents=True)
     try:
         video = open_video(path, settings, head, network, folder, progress)
-        embedding = learn_embedding(network, teacher, progress)
         clip, focal = video.clip, None
         landmarks = NetworkLandmarks(network, embedding, clip, [*clip.cameras])
         if settings.focal is None:

@@ -38,10 +38,10 @@ def test_report_and_picture(finished):
     assert (height, width) == (3 * 160, 2 * 3 * 120)
 
 
-def test_a_network_needs_an_embedding(patterned_capture, tmp_path):
-    settings = TrackSettings(str(patterned_capture.union), str(tmp_path / "out"), landmarks="network.tflite")
-    with pytest.raises(InputError, match="embedding: expected a value beside landmarks"):
-        track_capture(settings)
+def test_an_embedding_needs_a_network(patterned_capture, tmp_path):
+    capture = str(patterned_capture.union)
+    with pytest.raises(InputError, match="landmarks: expected a value beside embedding"):
+        track_capture(TrackSettings(capture, str(tmp_path / "out"), embedding=capture))
 
 
 def test_a_missing_network_is_refused(patterned_capture, tmp_path):

@@ -151,7 +151,6 @@ def test_masks_remove_the_room(settings, filmed):
         ({"masks": ""}, "masks of a video: expected one of --segmentation"),
         ({"segmentation": "a.tflite"}, "masks of a video.*found both"),
         ({"landmarks": ""}, "--landmarks: expected a value"),
-        ({"embedding": ""}, "--embedding: expected a value"),
         ({"head": None}, "--head: expected a value"),
         ({"head": "2020"}, "head_model"),
         ({"masks": "nowhere"}, "nowhere"),
