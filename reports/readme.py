@@ -18,6 +18,7 @@ from typing import Any
 import cv2
 
 from ..bench.audit.bundle import without_paths
+from ..bench.contracts import no_progress
 from ..bench.engine.config import CODED
 from ..bench.engine.scoring import FULL
 from ..bench.engine.store import RunFolder
@@ -31,6 +32,7 @@ from ..bench.progress import counted
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from .aggregate import summarise
+from .protocols import ProtocolsSettings, protocols_command
 from .runs import RunSet
 from .statistics.command import equivalence_text
 from .statistics.comparisons import PairedComparison, compare
@@ -42,15 +44,23 @@ from .table_report import Columns, table_of, table_text
 from .writers import to_markdown
 
 GALLERY = "reports/gallery"
+PROTOCOLS = "protocols"
 SUITE, SECOND = "suite", "suite-2"
 """Stored results of the suite in `GALLERY`: those of the README, and those of the second edition as far as they are measured."""
 PICTURE = "contact_sheet.jpg"
 RESULTS = "results.md"
 MEASURED = "reports/measured.json"
 """Figures of the suite for cards of methods (`method_cards`)."""
-PAGES = {"demo": "docs/explanation/results.md", SUITE: "README.md", SECOND: "docs/explanation/suite.md"}
+PAGES = {
+    "demo": "docs/explanation/results.md",
+    SUITE: "README.md",
+    SECOND: "docs/explanation/suite.md",
+    PROTOCOLS: "docs/explanation/protocols.md",
+}
 """The page of each block, in the repository."""
 OURS = "ours"
+COMPARED = (OURS, "ga")
+"""Methods of the table of protocols."""
 SHOWN = ("psnr", "lpips")
 """Metrics of frames in the README, whose table would not fit a page with all; those of the suite's tables are in `RESULTS`."""
 
@@ -75,6 +85,7 @@ def publish_suite(out: Path, root: Path, name: str = SUITE) -> None:
             write_json(place / EXTREMES / RECORD_FILE, {"avatars": avatars})
     write_text(target / RESULTS, suite_results(target))
     write_json(root / MEASURED, measured(target))
+    _write(root / PAGES[PROTOCOLS], PROTOCOLS, protocols_block(target))
     _write(root / PAGES[name], name, suite_block(root, name))
 
 
@@ -161,6 +172,14 @@ def measured(folder: Path) -> dict[str, Any]:
     sizes = {found.resolution for run in runs.runs for found in run.manifest.protocols.values()}
     data = f"{counted(subjects, 'synthetic subject')}, {' and '.join(sorted(sizes))}"
     return {"suite": folder.name, "data": data, "methods": methods}
+
+
+def protocols_block(folder: Path) -> str:
+    """What the choices of an evaluation are worth on stored runs of the suite, for two methods: Markdown."""
+    runs = tuple(map(str, suite_runs(folder)))
+    subjects = counted(len(RunSet.read(suite_runs(folder)).rows.subjects), "subject")
+    found = protocols_command(ProtocolsSettings(runs, COMPARED), no_progress)
+    return f"`{'` and `'.join(COMPARED)}`, {subjects} of {folder.name}:\n\n{found.text}"
 
 
 def suite_options(folder: Path) -> tuple[str, ...]:

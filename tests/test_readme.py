@@ -199,6 +199,7 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
     blocks = {
         "demo": readme.demo_block(ROOT / readme.GALLERY),
         **{name: readme.suite_block(ROOT, name) for name in stored_suites()},
+        readme.PROTOCOLS: readme.protocols_block(ROOT / readme.GALLERY / stored_suites()[-1]),
     }
     for name, block in blocks.items():
         begin, end = readme.marks(name)

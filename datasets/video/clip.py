@@ -25,8 +25,8 @@ from .segmentation import SelfieSegmentation
 from .settings import MASKLESS, VideoOptions
 
 IMAGES, MASKS = "images", "masks"
-USUAL_FOCAL = 1.5
-"""Focal length relative to the longer side of a frame with which tracking of one camera begins: a phone's, or a webcam's."""
+USUAL_FOCAL = 1.0
+"""Focal length relative to the longer side of a frame where it is not known: about that of phones' main cameras and of webcams."""
 DISTANCE = 1.0  # of the head before it is tracked, metres
 
 

@@ -16,7 +16,7 @@ from ..clip import CaptureClip
 from ..head.refit.command import target_head
 from ..tracking.focal import FocalLength, estimate_focal
 from ..tracking.network import NetworkLandmarks, head_embedding
-from .clip import VideoClip, open_video
+from .clip import USUAL_FOCAL, VideoClip, open_video
 
 if TYPE_CHECKING:
     from ..tracking.settings import TrackSettings
@@ -62,8 +62,9 @@ def opened_video(settings: TrackSettings, out: Path, progress: Progress) -> Iter
             (camera,) = clip.cameras.values()
             side = max(video.info.width, video.info.height) * video.scale
             focal = estimate_focal(clip.head, camera, landmarks(sorted(clip.poses)), side)
-            clip = video.with_focal(focal.pixels / video.scale)
-            landmarks = NetworkLandmarks(network, embedding, clip, [*clip.cameras])
+            if focal.clear:
+                clip = video.with_focal(focal.pixels / video.scale)
+                landmarks = NetworkLandmarks(network, embedding, clip, [*clip.cameras])
         data, lines = _data(video, settings.focal, focal), _lines(video, settings.focal, focal)
         yield OpenedVideo(clip, landmarks, data, lines)
     finally:
@@ -77,23 +78,30 @@ def _data(video: VideoClip, given: float | None, focal: FocalLength | None) -> d
             "crop": [*video.crop],
             "scale": video.scale,
             "without_face": [*video.without_face],
-            "focal_pixels": given if focal is None else focal.pixels / video.scale,
-            "focal_estimated": focal is not None,
-            "focal_clear": focal is None or focal.clear,
+            "focal": dict(zip(("pixels", "source"), _focal(video, given, focal))),
         }
     }
 
 
+def _focal(video: VideoClip, given: float | None, focal: FocalLength | None) -> tuple[float, str]:
+    """Focal length in pixels of the video, and where it is from."""
+    if focal is None:
+        return given or 0.0, "given"
+    if focal.clear:
+        return focal.pixels / video.scale, "estimated from landmarks"
+    usual = USUAL_FOCAL * max(video.info.width, video.info.height)
+    return usual, "assumed, since the landmarks do not determine it; give --focal if you know it"
+
+
 def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> list[str]:
     (camera,) = video.clip.cameras.values()
+    pixels, source = _focal(video, given, focal)
     lines = [
         f"{len(video.clip.files)} frames of {camera.width}x{camera.height} pixels around the head",
         f"  video      {video.info.width}x{video.info.height} pixels, {video.info.rate:.3g} frames a second",
+        f"  focal      {pixels:.0f} pixels of the video, {source}",
     ]
     if video.without_face:
         shown = ", ".join(map(str, video.without_face[:8])) + (" ..." if len(video.without_face) > 8 else "")
         lines.append(f"  left out   {len(video.without_face)} frames without a face: {shown}")
-    if focal is None:
-        return [*lines, f"  focal      {given:g} pixels, as given"]
-    unsure = "" if focal.clear else "; the landmarks hardly determine it: give --focal if you know it"
-    return [*lines, f"  focal      {focal.pixels / video.scale:.0f} pixels of the video, estimated{unsure}"]
+    return lines

@@ -19,7 +19,7 @@ from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.images import write_image
 from headbench.datasets.mesh_pictures import draw_mesh, rasterize_mesh
 from headbench.datasets.tracking.command import track_capture
-from headbench.datasets.tracking.focal import estimate_focal
+from headbench.datasets.tracking.focal import FocalLength, estimate_focal
 from headbench.datasets.tracking.landmarks import ImageLandmarks, spread_vertices
 from headbench.datasets.tracking.settings import TrackSettings
 from headbench.datasets.video import clip as video_clip
@@ -134,7 +134,7 @@ def test_a_video_becomes_a_capture_of_its_frames(settings, filmed):
     assert found.data["landmarks_px"] < 2.0
     out = Path(settings().out)
     assert not (out / command.FRAMES).exists()
-    assert json.loads((out / "track.json").read_text())["video"]["focal_estimated"] is False
+    assert json.loads((out / "track.json").read_text())["video"]["focal"]["source"] == "given"
 
 
 def test_masks_remove_the_room(settings, filmed):
@@ -162,8 +162,12 @@ def test_what_is_missing_is_said(settings, changes, message):
         track_capture(settings(**changes))
 
 
-def test_a_video_without_faces_is_refused(settings, monkeypatch):
-    monkeypatch.setattr(command.LandmarkNetwork, "find", lambda self, image, near=None: None)
+def test_a_video_without_faces_is_refused(settings, filmed, monkeypatch):
+    root, _, known, *_ = filmed
+    frames = {digest(frame): None for _, frame in video_frames(root / "me.mp4")}
+    monkeypatch.setattr(
+        command.LandmarkNetwork, "find", lambda self, image, near=None: (known | frames)[digest(image)]
+    )
     with pytest.raises(InputError, match=r"a face in at least 50% of the frames, found one in 0 of 12"):
         track_capture(settings())
 
@@ -187,6 +191,18 @@ def test_a_crop_holds_every_face_and_moves_the_camera():
     assert crop.top + crop.height <= 300
     image = np.arange(640 * 300).reshape(300, 640)
     assert crop.of(image)[0, 0] == image[crop.top, crop.left]
+
+
+@pytest.mark.parametrize(("clear", "source"), [(True, "estimated"), (False, "assumed")])
+def test_a_focal_length_that_is_not_clear_is_assumed(settings, monkeypatch, clear, source):
+    found = FocalLength(300.0, np.array([2.0, 1.0, 2.0] if clear else [1.0, 1.0, 1.0]), np.ones(3))
+    monkeypatch.setattr(command, "estimate_focal", lambda *given: found)
+    result = track_capture(settings(focal=None))
+    pixels = 300.0 if clear else video_clip.USUAL_FOCAL * HEIGHT
+    assert result.data["video"]["focal"]["pixels"] == pixels
+    assert f"{pixels:.0f} pixels of the video, {source}" in result.text
+    (camera,) = read_capture(result.data["capture"]).cameras.values()
+    assert camera.K[0, 0] == pytest.approx(pixels, rel=1e-5)
 
 
 @pytest.mark.parametrize("ratio", [1.2, 2.6])
