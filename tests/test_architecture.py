@@ -197,7 +197,11 @@ READ_IN_ONE_PLACE = {
         "bench/io/video.py",  # the package that brings ffmpeg
         "methods/official/gha/method.py",  # names of packages that the authors' code needs
     },
-    r"\bcv2\.VideoCapture\(": {"bench/io/video.py", "datasets/nersemble/sequence.py"},
+    r"\bcv2\.VideoCapture\(": {
+        "bench/io/video.py",
+        "datasets/nersemble/sequence.py",
+        "datasets/video/decode.py",
+    },
     r"\bsafe_open\(|\bload_file\(": {"methods/shared/tensor_files.py"},
     r"\btorch\.load\(": {
         "methods/official/gbs/method.py",  # a program for the authors' interpreter, run there

@@ -207,7 +207,7 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
         assert page.split(begin)[1].split(end)[0].strip() == block.strip()
 
 
-def test_measured_figures_of_methods_are_those_of_the_stored_rows():
+def test_measured_figures_are_those_of_the_stored_rows():
     from headbench.reports import readme
 
     stored = json.loads((ROOT / readme.MEASURED).read_text("utf-8"))

@@ -12,7 +12,8 @@ import numpy as np
 from ...bench.contracts import ByteArray
 from ...bench.errors import InputError
 
-LEAST_FRAMES = 10
+MOST_SIDE = 8192
+"""Longest side of a frame, pixels."""
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 
@@ -83,6 +84,9 @@ def _decoded(path: Path) -> Iterator[tuple[float, ByteArray]]:
         raise InputError(path, "", "a video", "no such file")
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
+        sides = [int(capture.get(name)) for name in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+        if max(sides) > MOST_SIDE:
+            raise InputError(path, "size", f"at most {MOST_SIDE} pixels a side", "x".join(map(str, sides)))
         first = None
         while True:
             seen, frame = capture.read()

@@ -18,7 +18,7 @@ ABOVE, BELOW, BESIDE = 1.0, 0.6, 0.8
 """Room around the landmarks in a crop, relative to their height or width: hair, neck, and turns of the head."""
 
 
-class Faces(NamedTuple):
+class FoundFaces(NamedTuple):
     """Landmarks of T frames."""
 
     pixels: FloatArray
@@ -45,7 +45,7 @@ class Crop(NamedTuple):
 
 def find_faces(
     path: Path, frames: Iterable[ByteArray], network: LandmarkNetwork, progress: Progress = no_progress
-) -> Faces:
+) -> FoundFaces:
     """Landmarks of all frames; each is searched around those of the frame before, then everywhere.
 
     Raises `InputError` where too few frames show a face.
@@ -55,7 +55,7 @@ def find_faces(
         near = network.find(frame, near)
         found.append(np.full((COUNT, 2), np.nan) if near is None else near)
         progress(number + 1, number + 1, "landmarks")
-    faces = Faces(np.stack(found) if found else np.zeros((0, COUNT, 2)))
+    faces = FoundFaces(np.stack(found) if found else np.zeros((0, COUNT, 2)))
     seen = int(faces.found.sum())
     if seen < max(1, LEAST_SEEN * len(found)):
         expected = f"a face in at least {LEAST_SEEN:.0%} of the frames"
@@ -64,7 +64,7 @@ def find_faces(
     return faces
 
 
-def crop_around(faces: Faces, width: int, height: int) -> Crop:
+def crop_around(faces: FoundFaces, width: int, height: int) -> Crop:
     """The box that holds the head in all frames with a face, inside the picture."""
     seen = faces.pixels[faces.found]
     low, high = seen.min(axis=1), seen.max(axis=1)  # (T, 2)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
+from headbench.datasets.video import decode
 from headbench.datasets.video.decode import is_video, probe_video, video_frames
 
 
@@ -96,6 +97,12 @@ def test_what_is_no_video_is_refused(tmp_path, content, found):
         path.write_bytes(content)
     with pytest.raises(InputError, match=found):
         list(video_frames(path))
+
+
+def test_frames_beyond_the_largest_size_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(decode, "MOST_SIDE", 63)
+    with pytest.raises(InputError, match="at most 63 pixels a side, found 64x48"):
+        probe_video(write(tmp_path / "a.mp4", range(0, 200, 40)))
 
 
 def test_videos_are_recognised_by_their_suffix(tmp_path):

@@ -25,7 +25,7 @@ from headbench.datasets.tracking.settings import TrackSettings
 from headbench.datasets.video import clip as video_clip
 from headbench.datasets.video import command
 from headbench.datasets.video.decode import video_frames
-from headbench.datasets.video.faces import Crop, Faces, crop_around
+from headbench.datasets.video.faces import Crop, FoundFaces, crop_around
 
 from ..tiny_capture import look_at, make_plan, posed_vertices
 
@@ -183,7 +183,7 @@ def test_a_crop_holds_every_face_and_moves_the_camera():
     rng = np.random.default_rng(0)
     for row, middle in ((0, (200, 150)), (2, (230, 160))):
         pixels[row] = middle + 30 * rng.uniform(-1, 1, (COUNT, 2))
-    crop = crop_around(Faces(pixels), 640, 300)
+    crop = crop_around(FoundFaces(pixels), 640, 300)
     low, high = np.nanmin(pixels, axis=(0, 1)), np.nanmax(pixels, axis=(0, 1))
     assert crop.left <= low[0] - 40
     assert crop.top <= low[1] - 50
