@@ -17,8 +17,8 @@ from typing import Any
 from ...bench.errors import InputError
 from ...bench.io.documents import checked, parse_json
 from ...bench.io.files import read_bytes
+from ...bench.process import environment
 from .config import INSTAOfficialConfig, OfficialConfig
-from .process import environment
 
 SHORTEST_COMMIT = 7
 PROBE_S = 300.0

@@ -32,6 +32,7 @@ from ...bench.errors import InputError, UnavailableError
 from ...bench.io.documents import read_json
 from ...bench.io.files import check_output_folder, digest_file, write_json
 from ...bench.io.images import probe_image
+from ...bench.process import ProgramEnd, described, run_program
 from ...datasets.images import write_image
 from ..shared.avatar_files import (
     HEAD_FILE,
@@ -48,7 +49,6 @@ from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import threads
 from .checkout import Checkout, Environment, Repository, inspect_checkout, inspect_interpreter
 from .config import OfficialConfig
-from .process import ProgramEnd, described, run_program
 
 TRAINING, RENDERING = "training", "rendering"
 """Temporary folders inside the avatar's, for training and for rendering."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from ....bench.contracts import Clip, FloatArray, FrameKey, HeadAsset, Progress
 from ....bench.errors import InputError
+from ....bench.process import ProgramEnd
 from ....datasets.ga.writer import save_npz
 from ....datasets.head.teeth import RING_LENGTH
 from ....datasets.steps.clusters import cluster_expressions
@@ -36,7 +37,6 @@ from ..ga.method import (
     copy_file,
 )
 from ..method import Listed, Patch, Workplace
-from ..process import ProgramEnd
 from ..spec import TGA_OFFICIAL
 
 JAW_FILE, CLUSTER_FILE = "sorted_jaw_poses.npz", "train_cluster_16.npz"

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from headbench.methods.official.process import ProgramError
+from headbench.bench.process import ProgramError
 
 from ..toy_clip import toy_clip
 from .repository import lip_numbers, make_repository

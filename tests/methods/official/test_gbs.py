@@ -14,6 +14,7 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.images import read_pixels
+from headbench.bench.process import ProgramError
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.images import write_image
 from headbench.methods.official.checkout import Checkout
@@ -21,7 +22,6 @@ from headbench.methods.official.config import GBSOfficialConfig
 from headbench.methods.official.gbs.export import GRIDS
 from headbench.methods.official.gbs.method import SHRINK, GBSOfficial
 from headbench.methods.official.method import Listed, Workplace, check_export
-from headbench.methods.official.process import ProgramError
 from headbench.methods.official.spec import GBS_OFFICIAL
 from headbench.methods.shared.schedule import ShuffledEpochs
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from headbench.bench.io.files import write_bytes
+from headbench.bench.process import run_program
 from headbench.datasets.head.teeth import lip_rings, with_teeth
 from headbench.methods.official.ga.export import MARK_STEP, mark
 from headbench.methods.official.ga.head_files import TEMPLATE_FILE, OfficialHead, OfficialTracking, pickled
-from headbench.methods.official.process import run_program
 
 from ...datasets.head.toy import toy_head
 

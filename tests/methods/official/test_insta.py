@@ -10,6 +10,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
+from headbench.bench.process import ProgramError
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
 from headbench.datasets.monocular.mesh_fit import read_vertices
 from headbench.methods.official import checkout, needs
@@ -18,7 +19,6 @@ from headbench.methods.official.insta import export
 from headbench.methods.official.insta.export import HAIR, MOUTH, SKIN, VideoMesh
 from headbench.methods.official.insta.method import INSTAOfficial
 from headbench.methods.official.method import TRAINING_LOG, Listed, check_export
-from headbench.methods.official.process import ProgramError
 from headbench.methods.shared.avatar_files import Subject
 
 from .insta_repository import make_insta_repository

@@ -16,6 +16,7 @@ from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest_file, grouped_writes
 from headbench.bench.io.images import read_png
+from headbench.bench.process import ProgramError
 from headbench.methods.official.ga.windows import inside
 from headbench.methods.official.method import (
     RENDERING,
@@ -25,7 +26,6 @@ from headbench.methods.official.method import (
     Workplace,
     check_export,
 )
-from headbench.methods.official.process import ProgramError
 
 from .conftest import brightness
 from .repository import StandIn, fit, lip_numbers, make_repository, renders, settings, views

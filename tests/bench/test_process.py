@@ -8,7 +8,7 @@ import time
 import psutil
 import pytest
 
-from headbench.methods.official.process import LONGEST_LOG, ProgramError, run_program
+from headbench.bench.process import LONGEST_LOG, ProgramError, run_program
 
 LEAVES = """
 import subprocess, sys

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from ...bench.errors import HeadbenchError, shortened
-from ...bench.io.files import flush_renames
-from ...bench.orphans import orphans_ended
+from .errors import HeadbenchError, shortened
+from .io.files import flush_renames
+from .orphans import orphans_ended
 
 KEPT = (
     *("PATH", "HOME", "USER", "LANG", "LC_ALL", "TMPDIR", "XDG_CACHE_HOME", "XDG_RUNTIME_DIR"),
