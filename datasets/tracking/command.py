@@ -36,9 +36,12 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     from ..tracking_errors import tracking_errors
     from ..video.command import opened_video
     from ..video.decode import is_video
+    from .external import track_with_program
     from .network import landmark_source
     from .track import LandmarkSource, check_cameras, track
 
+    if settings.program != "light":
+        return track_with_program(settings, progress)
     out = Path(settings.out)
     with ExitStack() as stack:
         if is_video(Path(settings.capture)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -36,8 +36,19 @@ class TrackSettings(VideoOptions, CaptureOptions):
     against: str = ""
     """Capture with the exact tracking, to print errors in millimetres by region."""
 
+    program: Annotated[Literal["light", "vhap", "pixel3dmm"], tyro.conf.arg(name="with")] = "light"
+    """Tracker: the one of headbench, or VHAP or Pixel3DMM in an installation of yours, for the file of a video; they need an NVIDIA GPU."""
+
+    checkout: str = ""
+    """With vhap or pixel3dmm: folder of its repository."""
+
+    python: str = "python3"
+    """With vhap or pixel3dmm: interpreter of its environment."""
+
     seed: int = 0
     """Seed of the error of landmarks that are not a network's."""
 
     def __post_init__(self) -> None:
         self.check_video()
+        if (self.program == "light") != (not self.checkout):
+            raise ValueError("--with vhap or pixel3dmm and --checkout need each other")

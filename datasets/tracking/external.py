@@ -1,0 +1,61 @@
+"""``headbench track --with``: another tracker in the user's installation, and its result as a capture."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ...bench.contracts import Progress
+from ...bench.errors import InputError
+from ...bench.specs import CommandResult
+from ..head.refit.rewrite import link_or_copy
+from ..tracker_files.command import import_tracking
+from ..tracker_files.settings import ImportTrackingSettings
+from ..video.decode import is_video, probe_video
+from .programs import LOG, Work, check_program, export_of, run_steps
+
+CAPTURE = "capture"
+"""Folder of the capture, beside that of the program."""
+
+if TYPE_CHECKING:
+    from .settings import TrackSettings
+
+
+def track_with_program(settings: TrackSettings, progress: Progress) -> CommandResult:
+    """Run another tracker on the file of a video and make a capture of what it wrote.
+
+    Its files are in a folder of its name in ``settings.out``, the capture beside it. Started again, it continues after the last
+    step that was finished. Raises `InputError` before anything runs, and `ProgramError` for a program that fails.
+    """
+    source, name = Path(settings.capture), settings.program
+    if not is_video(source):
+        raise InputError(source, "", f"the file of a video, for --with {name}", "something else")
+    probe_video(source)
+    if not settings.head:
+        raise InputError("command line", "--head", "the FLAME model that the tracker uses", "none")
+    checkout = Path(settings.checkout).absolute()
+    program = check_program(name, checkout, settings.python)
+    subject = settings.subject or re.sub(r"[^A-Za-z0-9-]", "-", source.stem).strip("-") or "subject"
+    folder = Path(settings.out).absolute() / name
+    folder.mkdir(parents=True, exist_ok=True)
+    work = Work(folder, folder / f"{subject}.mp4")
+    link_or_copy(source.resolve(), work.video)
+    run_steps(name, program, checkout, settings.python, work, progress)
+    said = f"{name} has finished; its output is in {folder / LOG}."
+    if name == "vhap":
+        capture = export_of(work)
+        text = f"{said}\nThen: headbench lint {capture} --head {settings.head}\nCapture: {capture}"
+        return CommandResult(text, {"capture": capture.as_posix()})
+    (tracked,) = sorted(folder.glob(f"tracking/{subject}_nV1*"))[:1]
+    given = ImportTrackingSettings(
+        source=str(tracked),
+        head=settings.head,
+        out=str(folder.parent / CAPTURE),
+        format=name,
+        images=str(folder / "preprocessed" / subject / "cropped"),
+        subject=subject,
+        held_out_frames=settings.held_out_frames,
+    )
+    found = import_tracking(given, progress)
+    return CommandResult(f"{said}\n{found.text}", found.data)

@@ -1,0 +1,250 @@
+"""Trackers of other authors, run in the user's own installation on the file of a video."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...bench.contracts import Progress
+from ...bench.errors import InputError
+from ...bench.io.documents import read_json
+from ...bench.io.files import digest, write_json
+from ...bench.process import described, environment, run_program
+
+IMPORTING_S = 300.0
+"""Time limit for an interpreter to import the modules of a program, seconds."""
+STEPS, LOG = "steps.json", "program.log"
+
+
+@dataclass(frozen=True)
+class Work:
+    """Where a program works.
+
+    Attributes
+    ----------
+    folder : Path
+        For everything that the program writes; absolute.
+    video : Path
+        The file of the video in it, named by the subject.
+    """
+
+    folder: Path
+    video: Path
+
+    @property
+    def name(self) -> str:
+        """Name of the video, by which the programs name their folders."""
+        return self.video.stem
+
+
+@dataclass(frozen=True)
+class Step:
+    """One of a program's commands.
+
+    Attributes
+    ----------
+    name : str
+        For messages.
+    arguments : Callable
+        Arguments of the interpreter, in the checkout's folder: a script, and what it is given.
+    made : str
+        Pattern of files in the working folder of which one exists afterwards; programs may fail with exit code 0. It contains
+        ``{name}`` for the name of the video.
+    """
+
+    name: str
+    arguments: Callable[[Work], list[str]]
+    made: str
+
+
+@dataclass(frozen=True)
+class TrackingProgram:
+    """A tracker.
+
+    Attributes
+    ----------
+    url, commit : str
+        Its repository, and the commit that the commands are of.
+    steps : tuple[Step, ...]
+        In order.
+    variables : Callable
+        Environment variables in addition to those of `run_program`, of checkout and work.
+    modules : tuple[str, ...]
+        Modules that its interpreter must be able to import.
+    files : tuple[str, ...]
+        Files of the checkout that it distributes separately, such as weights, with the remedy if one is missing.
+    remedy : str
+        How to get them.
+    """
+
+    url: str
+    commit: str
+    steps: tuple[Step, ...]
+    variables: Callable[[Path, Work], Mapping[str, str]]
+    modules: tuple[str, ...]
+    files: tuple[str, ...]
+    remedy: str
+
+
+def _nothing(checkout: Path, work: Work) -> Mapping[str, str]:
+    return {}
+
+
+def _paths_of_pixel3dmm(checkout: Path, work: Work) -> Mapping[str, str]:
+    return {
+        "PIXEL3DMM_CODE_BASE": str(checkout),
+        "PIXEL3DMM_PREPROCESSED_DATA": str(work.folder / "preprocessed"),
+        "PIXEL3DMM_TRACKING_OUTPUT": str(work.folder / "tracking"),
+    }
+
+
+def _predict(kind: str) -> Step:
+    return Step(
+        f"prediction of {kind}",
+        lambda work: [
+            "scripts/network_inference.py",
+            f"model.prediction_type={kind}",
+            f"video_name={work.name}",
+        ],
+        f"preprocessed/{{name}}/p3dmm/{kind}/*.png",
+    )
+
+
+VHAP = TrackingProgram(
+    url="https://github.com/ShenhanQian/VHAP",
+    commit="4b64ab7dc62232110fcdb47d6b5c55e832bc452d",
+    steps=(
+        Step(
+            "frames and matting",
+            lambda work: [
+                *("vhap/preprocess_video.py", "--input", str(work.video)),
+                *("--matting_method", "robust_video_matting"),
+            ],
+            "{name}/alpha_maps/*",
+        ),
+        Step(
+            "tracking",
+            lambda work: [
+                *("vhap/track.py", "--data.root_folder", str(work.folder), "--data.sequence", work.name),
+                *("--exp.output_folder", str(work.folder / "output")),
+            ],
+            "output/**/tracked_flame_params*.npz",
+        ),
+        Step(
+            "export",
+            lambda work: [
+                *("vhap/export_as_nerf_dataset.py", "--src_folder", str(work.folder / "output")),
+                *("--tgt_folder", str(export_of(work)), "--background-color", "white"),
+            ],
+            "export/*/transforms*.json",
+        ),
+    ),
+    variables=_nothing,
+    modules=("torch", "nvdiffrast", "vhap"),
+    files=("asset/flame/flame2023.pkl", "asset/flame/FLAME_masks.pkl"),
+    remedy="Put FLAME 2023 and its masks there, as the page of VHAP says.",
+)
+
+PIXEL3DMM = TrackingProgram(
+    url="https://github.com/SimonGiebenhain/pixel3dmm",
+    commit="98b5d79f18bc478282494be02f984dc93f5c9fe9",
+    steps=(
+        Step(
+            "preprocessing",
+            lambda work: ["scripts/run_preprocessing.py", "--video_or_images_path", str(work.video)],
+            "preprocessed/{name}/seg_og/*",
+        ),
+        _predict("normals"),
+        _predict("uv_map"),
+        Step(
+            "tracking",
+            lambda work: ["scripts/track.py", f"video_name={work.name}"],
+            "tracking/{name}_nV1*/checkpoint/*.frame",
+        ),
+    ),
+    variables=_paths_of_pixel3dmm,
+    modules=("torch", "nvdiffrast", "pixel3dmm"),
+    files=("pretrained_weights/uv.ckpt", "pretrained_weights/normals.ckpt"),
+    remedy="Run ./install_preprocessing_pipeline.sh in the checkout, which downloads them.",
+)
+
+PROGRAMS: Mapping[str, TrackingProgram] = {"vhap": VHAP, "pixel3dmm": PIXEL3DMM}
+
+
+def export_of(work: Work) -> Path:
+    """Folder of VHAP's export, named as its page names it."""
+    return work.folder / "export" / f"{work.name}_whiteBg_staticOffset_maskBelowLine"
+
+
+def check_program(name: str, checkout: Path, python: str) -> TrackingProgram:
+    """The program of a name, whose checkout and interpreter are complete.
+
+    Raises `InputError` for a script, a file or a module that is missing.
+    """
+    program = PROGRAMS[name]
+    scripts = [step.arguments(Work(Path("/"), Path("/video.mp4")))[0] for step in program.steps]
+    for script in scripts:
+        if not (checkout / script).is_file():
+            remedy = f"git clone --recursive {program.url}; the commands are of commit {program.commit[:10]}."
+            raise InputError(checkout, script, f"the checkout of {name}", "no such file", remedy)
+    for file in program.files:
+        if not (checkout / file).exists():
+            raise InputError(checkout, file, f"a file that {name} needs", "no such file", program.remedy)
+    if shutil.which(python) is None:
+        raise InputError("command line", "--python", f"the interpreter of the environment of {name}", python)
+    found = subprocess.run(
+        [python, "-c", f"import {', '.join(program.modules)}"],
+        cwd=checkout,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=IMPORTING_S,
+        check=False,
+    )
+    if found.returncode:
+        said = found.stderr.strip().splitlines()[-1:] or [described(found.returncode)]
+        remedy = f"Give the interpreter of the environment that the page of {name} makes."
+        raise InputError(python, "", f"the modules {', '.join(program.modules)}", said[0], remedy)
+    return program
+
+
+def run_steps(
+    name: str, program: TrackingProgram, checkout: Path, python: str, work: Work, progress: Progress
+) -> None:
+    """Run the steps of a program that have not been finished for this video and checkout.
+
+    Finished steps are kept in ``steps.json`` of the working folder, all output in ``program.log``.
+
+    Raises `ProgramError` with the last lines of a step that fails or does not write what it should.
+    """
+    record = work.folder / STEPS
+    finished: dict[str, str] = read_json(record) if record.exists() else {}
+    interpreter = Path(shutil.which(python) or python).absolute()
+    # Scripts call "python" through the shell.
+    path = os.pathsep.join([str(interpreter.parent), os.environ.get("PATH", "")])
+    variables = {"PATH": path, **program.variables(checkout, work)}
+    same = True  # a step is repeated if one before it was
+    for number, step in enumerate(program.steps):
+        command = [str(interpreter), *step.arguments(work)]
+        state = digest(command, str(checkout), work.video.stat().st_size)
+        pattern = step.made.format(name=work.name)
+        same = same and finished.get(step.name) == state and any(work.folder.glob(pattern))
+        if same:
+            continue
+        note = f"{name}, {step.name}"
+
+        def shown(line: str, number: int = number, note: str = note) -> None:
+            progress(number, len(program.steps), f"{note}: {line[:60]}" if line else note)
+
+        shown("")
+        ended = run_program(command, checkout, work.folder / LOG, shown, variables=variables)
+        if ended.code:
+            raise ended.error(f"{name}: {step.name} {described(ended.code)}")
+        if not any(work.folder.glob(pattern)):
+            raise ended.error(f"{name}: {step.name} wrote no {pattern} in {work.folder}")
+        finished[step.name] = state
+        write_json(record, finished)
