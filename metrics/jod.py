@@ -61,8 +61,8 @@ def _program(package: str, name: str, remedy: str) -> Any:
     before = list(sys.path)
     try:
         module = import_module(package)
-    except ImportError as error:
-        what = f"JOD needs the Python package {error.name}; it is not installed."
+    except Exception as error:  # a torchvision that does not belong to PyTorch raises others than ImportError
+        what = f"JOD needs the Python package {package}, which cannot be imported: {error}."
         raise UnavailableError(what, remedy) from error
     finally:
         sys.path[:] = before  # which they extend by their own folders

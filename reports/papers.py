@@ -188,7 +188,8 @@ def printed_tables(name: str, number: str | None) -> tuple[PrintedTable, ...]:
     found = [table for table in tables if number is None or table.number == number]
     if not found:
         offered = ", ".join(dict.fromkeys(table.table for table in tables)) or "none of them read in full"
-        raise InputError("command line", "--table", f"a table of {name}: {offered}", str(number))
+        option, given = ("--as", name) if number is None else ("--table", number)
+        raise InputError("command line", option, f"a table of {name}: {offered}", given)
     return tuple(found)
 
 

@@ -12,12 +12,13 @@ from .stability import LimitCheck
 FACE = "face"
 MEASURED = ("depth", "normals")
 NO_DEPTH, NO_FACE = "the avatar gives no depth", "no face in view"
+NOT_SHOWN = "the avatar shows nothing where the face is"
 
 
 def surface(depth: FloatArray | None, truth: TrueFrame, camera: Camera) -> list[LimitCheck]:
     """Mean errors of depth (mm) and normals (degrees) over the pixels of the face that the avatar covers.
 
-    They have no limits: translucent splats show a mean depth behind the skin, which no picture tells.
+    Pixels of the face that the avatar does not show do not count; their number is in the overlap of masks. There are no limits: translucent splats show a mean depth behind the skin, which images do not determine.
 
     Parameters
     ----------
@@ -35,7 +36,7 @@ def surface(depth: FloatArray | None, truth: TrueFrame, camera: Camera) -> list[
     depth = np.where(np.isfinite(depth), depth, np.nan).astype(np.float64)
     seen = np.isfinite(true) & np.isfinite(depth)
     if not seen.any():
-        return absent_surface(NO_FACE)
+        return absent_surface(NOT_SHOWN if np.isfinite(true).any() else NO_FACE)
     error = 1000 * np.abs(depth - true)[seen].mean()
     checks = [_measured("depth", float(error))]
     shown, right = normals(depth, camera), normals(true, camera)

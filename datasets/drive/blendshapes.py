@@ -117,7 +117,14 @@ def read_blendshapes(request: SignalRequest) -> DrivingSignal:
                     table.path, "columns", expected, repr(name), "Use a map of columns: --map FILE.yaml."
                 )
             unused[name] = "no blendshape"
-    channels = {arkit: table.values(name)[:, 0] for name, arkit in known.items() if arkit}
+    channels: dict[str, FloatArray] = {}
+    for name, arkit in known.items():
+        if arkit:
+            if arkit in channels:
+                raise InputError(table.path, "columns", f"one column for {arkit}", "two")
+            channels[arkit] = table.single(name)
+    if not channels:
+        raise InputError(table.path, "columns", "a column with ARKit's name of a blendshape", "none")
     for name, values in channels.items():
         if np.abs(values).max() > RANGE:
             expected = f"values of blendshapes, from {-RANGE:g} to {RANGE:g}"

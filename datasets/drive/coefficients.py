@@ -34,7 +34,8 @@ def read_coefficients(request: SignalRequest) -> DrivingSignal:
         raise InputError(table.path, "", expected, ", ".join(sorted(table.columns)))
     values = {part: table.values(name) for part, name in found.items() if name}
     parts = _parts(table, values, found)
-    used = {name for name in found.values() if name}
+    taken = {part: name for part, name in found.items() if name and _drives(part, parts, values)}
+    used = {*taken.values()}
     unused = {
         name: "identity" if name in IDENTITY else "no coefficient of the pose"
         for name in table.columns
@@ -62,3 +63,12 @@ def _parts(
     if len(sides) == 2:
         parts.setdefault("eyes", np.concatenate(sides, axis=1))
     return parts
+
+
+def _drives(part: str, parts: Mapping[str, FloatArray], values: Mapping[str, FloatArray]) -> bool:
+    """Whether an array of the signal is in the parts of the poses: ``pose`` and single eyes may be superseded or incomplete."""
+    if part == "pose":
+        return "rotation" not in values or ("jaw" not in values and values[part].shape[1] == 6)
+    if part in ("left_eye", "right_eye"):
+        return "eyes" not in values and "eyes" in parts
+    return True

@@ -13,17 +13,19 @@ import numpy as np
 from ...bench.contracts import Progress, no_progress
 from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
 from ...bench.engine.stored import open_avatar
+from ...bench.errors import InputError
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_json
 from ...bench.io.lock import locked
 from ...bench.io.video import ENCODINGS, browser_encoder
 from ...bench.specs import CommandResult
+from ..video.decode import SUFFIXES
 from .formats import read_signal
 from .measure import DrivenMeasures
 from .output import REST, Renderer, canonical, write_driven_capture, write_movie
 from .settings import DriveSettings
 from .signal import DrivingSignal, SignalRequest
 from .stage import SEQUENCE, Stage, make_stage
-from .transfer import Transferred, head_motion, resting, smoothed, transfer
+from .transfer import Transferred, head_motion, resting, smoothed, transfer, window_length
 
 RESULT_FILE = "drive.json"
 
@@ -39,12 +41,21 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
         if is_video:
             browser_encoder(out)
             check_writable(out, "--out")
+        elif out.suffix.lower() in SUFFIXES:
+            raise InputError(
+                "command line", "--out", f"a folder, or a file in {', '.join(ENCODINGS)}", out.name
+            )
         else:
             check_output_folder(out)
             check_kind(out, "captures")
             stack.enter_context(locked(out))
         stored = open_avatar(Path(settings.avatar), settings.method)
         stage = make_stage(settings, stored, progress)
+        sizes = {(camera.width, camera.height) for camera in stage.clip.cameras.values()}
+        if is_video and any(side % 2 for size in sizes for side in size):
+            remedy = "Write a folder, or leave out --capture."
+            shown = " and ".join(f"{width}x{height}" for width, height in sizes)
+            raise InputError("command line", "--capture", "a camera of even size, for a video", shown, remedy)
         start = time.perf_counter()
         request = SignalRequest(
             Path(settings.signal),
@@ -56,6 +67,7 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
             progress=progress,
         )
         signal = read_signal(request, settings.form)
+        window_length(len(signal.poses), settings.smooth, settings.fps)
         found = transfer(signal, stage.head, settings.neutral, progress)
         moving = head_motion(found.poses, settings.still_head)
         driven = smoothed(moving, settings.smooth, settings.fps)

@@ -31,6 +31,10 @@ class LiveDriver:
                 "avatar", "head", "a head model of headbench's own arrays", type(target).__name__
             )
         self._target, self._signal_head = target, signal_head
+        if signal_head:
+            SignalRequest(
+                Path("live signal"), target, signal_head=signal_head
+            ).head()  # Raises for a file that cannot be read.
         self._transfer: dict[str, FrameTransfer] = {}
         self._first: RigidMean | None = None
 

@@ -28,16 +28,13 @@ def read_mapped(request: SignalRequest) -> DrivingSignal:
     table, source = request.columns, Path(request.map)
     content = {str(name): entry for name, entry in read_yaml(source).items()}
     weights = checked(content, dict[str, dict[str, float]], source)
-    if not weights:
-        raise InputError(source, "", "{column: {coefficient: weight}}", "an empty map")
-    for column in weights:
+    for column, entry in weights.items() or (("", {}),):
+        if not entry:
+            raise InputError(source, column, "{column: {coefficient: weight}}", "an empty map")
         if column not in table.columns:
             raise unknown(str(source), "columns", column, [*table.columns])
     unused = dict.fromkeys((name for name in table.columns if name not in weights), "not in the map")
-    values = {column: table.values(column) for column in weights}
-    for column, found in values.items():
-        if found.shape[1] != 1:
-            raise InputError(table.path, column, "one number a frame", str(found.shape[1]))
+    values = {column: table.single(column) for column in weights}
     targets = {name for entry in weights.values() for name in entry}
     blendshapes = targets & {*ARKIT}
     if blendshapes and blendshapes != targets:
@@ -46,7 +43,7 @@ def read_mapped(request: SignalRequest) -> DrivingSignal:
     sums: dict[str, FloatArray] = {name: np.zeros(len(table)) for name in sorted(targets)}
     for column, entry in weights.items():
         for name, weight in entry.items():
-            sums[name] += weight * values[column][:, 0]
+            sums[name] += weight * values[column]
     if blendshapes:
         signal = perform(request, sums)
         return DrivingSignal("mapped", signal.head, signal.poses, {**unused, **signal.unused})

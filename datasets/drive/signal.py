@@ -49,7 +49,7 @@ class DrivingSignal:
 
 @dataclass(frozen=True, eq=False)
 class SignalRequest:
-    """What is asked of a reader of signals; see `settings.DriveSettings` for the fields of the same name.
+    """Input of a reader of signals; see `settings.DriveSettings` for the fields of the same name.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class SignalRequest:
 @lru_cache(maxsize=2)
 def _loaded(name: str) -> HeadArrays:
     """A head model, which the frames of a live signal share."""
-    return target_head(name)
+    return target_head(name, "--signal-head")
 
 
 def make_poses(path: Path, head: HeadArrays, parts: Mapping[str, FloatArray]) -> list[HeadPose]:

@@ -70,6 +70,13 @@ class SignalTable:
         check_numbers(self.path, name, values, MAX_MAGNITUDE)
         return values
 
+    def single(self, name: str) -> FloatArray:
+        """(T,) values of a column with one number a frame. Raises `InputError` for more, and as `values`."""
+        found = self.values(name)
+        if found.shape[1] != 1:
+            raise InputError(self.path, name, "one number a frame", str(found.shape[1]))
+        return found[:, 0]
+
     def _row(self, name: str, place: str, value: Any) -> FloatArray | list[float]:
         if isinstance(value, np.ndarray):
             if value.dtype.kind not in "fiu":
@@ -82,8 +89,10 @@ class SignalTable:
             items = inner if isinstance(inner, list) else [inner]
             if any(isinstance(item, (bool, list, dict, type(None))) for item in items):
                 raise ValueError
+            if not items:
+                raise ValueError
             return [float(item) for item in items]
-        except ValueError:
+        except (ValueError, OverflowError):
             expected = "a number" if isinstance(value, str) else "a number or a list of numbers"
             raise InputError(self.path, f"{name}, {place}", expected, shown(value)) from None
 
@@ -108,8 +117,13 @@ def read_table(path: Path) -> SignalTable:
 
 def parse_line(text: str, path: Path, place: str) -> dict[str, Any]:
     """Columns of one line of JSON; MediaPipe's lists of categories become one column each."""
+    return _expanded(parse_json(text, path, place))
+
+
+def _expanded(frame: Mapping[str, Any]) -> dict[str, Any]:
+    """Columns of a frame, with one for each of MediaPipe's categories."""
     line: dict[str, Any] = {}
-    for name, value in parse_json(text, path, place).items():
+    for name, value in frame.items():
         categories = _categories(value)
         line |= {name: value} if categories is None else categories
     return line
@@ -164,7 +178,8 @@ def _json(path: Path) -> SignalTable:
         for number, frame in enumerate(frames):
             if not isinstance(frame, dict):
                 raise InputError(path, f"{_FRAMES}[{number}]", "an object", shown(frame))
-        return _joined(path, [f"{_FRAMES}[{number}]" for number in range(len(frames))], frames)
+        places = [f"{_FRAMES}[{number}]" for number in range(len(frames))]
+        return _joined(path, places, [_expanded(frame) for frame in frames])
     columns = {name: value for name, value in document.items() if isinstance(value, list)}
     return _columns(path, columns)
 
@@ -176,7 +191,11 @@ def _npz(path: Path) -> SignalTable:
 def _columns(path: Path, columns: Mapping[str, Any]) -> SignalTable:
     """A table of whole columns: a row of an array, or a number, for each frame. Vectors of coefficients alone are one frame."""
     moving = {name: values for name, values in columns.items() if name not in IDENTITY and len(values)}
-    rows = {name: values for name, values in moving.items() if np.ndim(values[0])}
+    rows = {
+        name: values
+        for name, values in moving.items()
+        if isinstance(values[0], list) or (isinstance(values[0], np.ndarray) and values[0].ndim)
+    }
     if not rows and any(name in moving for name in NAMES["expression"]):
         return SignalTable(path, {name: [values] for name, values in moving.items()}, ["frame 0"])
     length = max(map(len, (rows or moving).values()), default=0)

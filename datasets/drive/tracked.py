@@ -18,9 +18,8 @@ IDENTITY_UNUSED = {"shape": "identity", "static_offset": "identity"}
 
 def is_flame_parameters(table: SignalTable) -> bool:
     """Whether a table has the arrays of VHAP's parameter files."""
-    return {*POSE_SIZES, "expr"} <= {*table.columns} and (
-        table.path.is_dir() or table.path.suffix.lower() == ".npz"
-    )
+    files = [*table.path.glob("*.npz")] if table.path.is_dir() else [table.path]
+    return {*POSE_SIZES, "expr"} <= {*table.columns} and any(file.suffix.lower() == ".npz" for file in files)
 
 
 def read_flame_parameters(request: SignalRequest) -> DrivingSignal:
@@ -45,16 +44,27 @@ def read_flame_parameters(request: SignalRequest) -> DrivingSignal:
 
 
 def read_capture_signal(request: SignalRequest) -> DrivingSignal:
-    """Poses of a capture of any layout, of all its sequences or one of them, in the order of time.
+    """Poses of one sequence of a capture of any layout, without excluded frames, in the order of time.
 
-    Raises `InputError` for an unknown sequence.
+    Raises `InputError` for an unknown sequence, and for none where the capture has several.
     """
     head = request.signal_head if request.signal_head != AVATAR else ""
-    options = {"head": head} if head and Path(head).exists() else {}
+    if head and not Path(head).exists():
+        expected = "the file of a head model, for a signal that is a capture"
+        raise InputError("command line", "--signal-head", expected, head)
+    options = {"head": head} if head else {}
     clip = request.options.open(str(request.path), request.progress, **options)
     sequences = {key.timestep: key.sequence for key in sorted(clip.files)}
     names = sorted({*sequences.values()})
     if request.sequence and request.sequence not in names:
         raise InputError("command line", "--sequence", f"one of {', '.join(names)}", request.sequence)
-    timesteps = [t for t in sorted(clip.poses) if request.sequence in ("", sequences.get(t))]
+    if len(names) > 1 and not request.sequence:
+        remedy = "Sequences are cuts, over which nothing can be smoothed."
+        raise InputError("command line", "--sequence", f"one of {', '.join(names)}", "none", remedy)
+    left_out = {key.timestep for key in clip.excluded}
+    timesteps = [
+        t for t in sorted(clip.poses) if t not in left_out and request.sequence in ("", sequences.get(t))
+    ]
+    if not timesteps:
+        raise InputError(request.path, request.sequence, "frames that are not excluded", "none")
     return DrivingSignal("capture", clip.head, [clip.poses[t] for t in timesteps], IDENTITY_UNUSED)

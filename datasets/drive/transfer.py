@@ -163,22 +163,32 @@ def head_motion(poses: Sequence[HeadPose], still: bool) -> list[HeadPose]:
     return [retarget(pose, mean, AT_ORIGIN, pose.subject) for pose in poses]
 
 
+def window_length(frames: int, seconds: float, fps: float) -> int:
+    """Odd number of frames of a window of ``seconds``; 0 for no window.
+
+    Raises `InputError` for a window that is too short to smooth, or longer than the signal.
+    """
+    if not seconds:
+        return 0
+    window = 2 * round((seconds * fps - 1) / 2) + 1
+    if not ORDER + 2 <= window <= frames:
+        expected = f"a window of {ORDER + 3} to {frames} frames, {(ORDER + 3) / fps:g} s or more"
+        found = f"{seconds:g} s, {window} frames at {fps:g} a second"
+        raise InputError("command line", "--smooth", expected, found)
+    return window
+
+
 def smoothed(poses: Sequence[HeadPose], seconds: float, fps: float) -> list[HeadPose]:
     """Poses filtered over time by least-squares polynomials of `ORDER` in a moving window.
 
     Savitzky and Golay, "Smoothing and differentiation of data by simplified least squares procedures", Anal. Chem. 36, 1964,
     by `scipy.signal.savgol_filter`. The window has the odd number of frames nearest to ``seconds``.
 
-    Raises `InputError` for a window that is too short to smooth, or longer than the signal.
+    Raises `InputError` as `window_length`.
     """
     if not seconds:
         return list(poses)
-    window = 2 * round((seconds * fps - 1) / 2) + 1
-    if not ORDER + 2 <= window <= len(poses):
-        expected = f"a window of {ORDER + 3} to {len(poses)} frames, {(ORDER + 3) / fps:g} s or more"
-        raise InputError(
-            "command line", "--smooth", expected, f"{seconds:g} s, {window} frames at {fps:g} a second"
-        )
+    window = window_length(len(poses), seconds, fps)
     columns = {}
     for name in SMOOTHED:
         values = [getattr(pose, name) for pose in poses]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
@@ -31,6 +32,19 @@ HELD_OUT_SUFFIX = "-held-out"
 SHORT, SHORT_SHARE = 2 * CONVENTION, 4
 """A video with fewer frames than the first number holds out the second fraction, since 350 would be most of
 it."""
+
+
+def subject_of(path: Path) -> str:
+    """A name of a subject from that of a file or folder."""
+    return re.sub(r"[^\w.+-]|_", "-", path.stem if path.is_file() else path.name).lstrip(".-") or "subject"
+
+
+def check_subject(name: str, option: str) -> None:
+    """Raise `InputError` for a name that folders of captures cannot have."""
+    check_name(name, "command line", option)
+    if "_" in name:
+        expected = "a name without underscores, which separate the parts of the names of folders"
+        raise InputError("command line", option, expected, repr(name))
 
 
 def clip_of_track(

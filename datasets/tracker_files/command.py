@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,7 +34,7 @@ def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_pr
     from ..head.refit.command import target_head
     from ..head.refit.rewrite import capture_plan, write_capture
     from ..images import write_image
-    from ..monocular.clip import clip_of_track
+    from ..monocular.clip import clip_of_track, subject_of
     from ..overlay import draw_overlay
     from .formats import recognise
     from .frames import FOLDER, frame_files, read_frames
@@ -59,7 +58,7 @@ def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_pr
         root,
         track,
         head,
-        subject=settings.subject or re.sub(r"[^\w.+-]|_", "-", root.resolve().name).lstrip(".-") or "subject",
+        subject=settings.subject or subject_of(root.resolve()),
         held_out_frames=settings.held_out_frames,
         use_cache=False,
         progress=progress,

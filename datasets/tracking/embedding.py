@@ -20,6 +20,7 @@ LEARNING_FRAMES = 120
 """Images of a capture from which an embedding is learnt."""
 MOST_SPREAD = 0.004
 """Landmarks that slide on the mesh by more than this, median, are left out, metres."""
+FEWEST_LANDMARKS = 10
 FACING = 0.5
 """Least cosine between the normal of a landmark and the direction to the camera."""
 _FEWEST = 0.15  # part of the images in which a landmark has to hit the mesh
@@ -90,11 +91,15 @@ def learn_embedding(
         places[-1][hit] = np.einsum("lk,lki->li", weights, template[corners])[hit]
     seen = np.stack(places)
     enough = np.flatnonzero(np.isfinite(seen[..., 0]).sum(axis=0) > _FEWEST * len(seen))
-    if len(enough) < 10:
-        expected = "pictures in which the network finds faces"
-        raise InputError(f"head model {head.version}", "landmarks", expected, f"{len(enough)} landmarks")
-    middle = np.nanmedian(seen[:, enough], axis=0)
-    spread = np.nanmedian(np.linalg.norm(seen[:, enough] - middle, axis=2), axis=0)
-    kept = spread < MOST_SPREAD
+    kept = np.zeros(0, bool)
+    if len(enough):
+        middle = np.nanmedian(seen[:, enough], axis=0)
+        spread = np.nanmedian(np.linalg.norm(seen[:, enough] - middle, axis=2), axis=0)
+        kept = spread < MOST_SPREAD
+    if kept.sum() < FEWEST_LANDMARKS:
+        expected = (
+            f"pictures in which the network finds faces, with {FEWEST_LANDMARKS} landmarks at fixed places"
+        )
+        raise InputError(f"head model {head.version}", "landmarks", expected, f"{kept.sum()} landmarks")
     on_mesh = closest_points(middle[kept], template, np.asarray(head.faces))
     return Embedding(enough[kept], np.asarray(head.faces)[on_mesh.face], on_mesh.weights)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
+from ...bench.io.files import check_output_folder
 from ...bench.specs import CommandResult
+from ..head.refit.command import target_head
 from ..head.refit.rewrite import link_or_copy
+from ..monocular.clip import check_subject, subject_of
 from ..tracker_files.command import import_tracking
 from ..tracker_files.settings import ImportTrackingSettings
 from ..video.decode import is_video, probe_video
@@ -34,14 +36,21 @@ def track_with_program(settings: TrackSettings, progress: Progress) -> CommandRe
     probe_video(source)
     if not settings.head:
         raise InputError("command line", "--head", "the FLAME model that the tracker uses", "none")
+    target_head(settings.head, "--head")
+    subject = settings.subject or subject_of(source)
+    check_subject(subject, "--subject")
+    if "." in subject:
+        raise InputError(
+            "command line", "--subject", "a name without dots, which the programs cut off", subject
+        )
+    check_output_folder(Path(settings.out))
     checkout = Path(settings.checkout).absolute()
-    program = check_program(name, checkout, settings.python)
-    subject = settings.subject or re.sub(r"[^A-Za-z0-9-]", "-", source.stem).strip("-") or "subject"
+    program, interpreter = check_program(name, checkout, settings.python)
     folder = Path(settings.out).absolute() / name
     folder.mkdir(parents=True, exist_ok=True)
     work = Work(folder, folder / f"{subject}.mp4")
     link_or_copy(source.resolve(), work.video)
-    run_steps(name, program, checkout, settings.python, work, progress)
+    run_steps(name, program, checkout, interpreter, work, progress)
     said = f"{name} has finished; its output is in {folder / LOG}."
     if name == "vhap":
         capture = export_of(work)
@@ -50,7 +59,7 @@ def track_with_program(settings: TrackSettings, progress: Progress) -> CommandRe
     (tracked,) = sorted(folder.glob(f"tracking/{subject}_nV1*"))[:1]
     given = ImportTrackingSettings(
         source=str(tracked),
-        head=settings.head,
+        head=settings.head or "",
         out=str(folder.parent / CAPTURE),
         format=name,
         images=str(folder / "preprocessed" / subject / "cropped"),

@@ -18,7 +18,7 @@ FRAMES = 16
 WEIGHT = 1.0
 """Weight of a landmark beside the prior. That of tracking leaves residuals to the prior, which hide the perspective."""
 CLEAR = 1.02
-"""Ratio of the residuals at half and at twice the focal length to the least one from which it counts as determined."""
+"""Ratio of the residuals at both ends of `TRIED` to the least one from which the focal length counts as determined."""
 
 
 class FocalLength(NamedTuple):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from pathlib import Path
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
-from ...bench.io.files import digest, write_json
+from ...bench.io.files import digest, digest_file, write_json
 from ...bench.process import described, environment, run_program
 
 IMPORTING_S = 300.0
@@ -144,7 +145,7 @@ VHAP = TrackingProgram(
         ),
     ),
     variables=_nothing,
-    modules=("torch", "nvdiffrast", "vhap"),
+    modules=("torch", "nvdiffrast", "tyro"),
     files=("asset/flame/flame2023.pkl", "asset/flame/FLAME_masks.pkl"),
     remedy="Put FLAME 2023 and its masks there, as the page of VHAP says.",
 )
@@ -180,8 +181,8 @@ def export_of(work: Work) -> Path:
     return work.folder / "export" / f"{work.name}_whiteBg_staticOffset_maskBelowLine"
 
 
-def check_program(name: str, checkout: Path, python: str) -> TrackingProgram:
-    """The program of a name, whose checkout and interpreter are complete.
+def check_program(name: str, checkout: Path, python: str) -> tuple[TrackingProgram, Path]:
+    """The program of a name, whose checkout and interpreter are complete, and the interpreter's path.
 
     Raises `InputError` for a script, a file or a module that is missing.
     """
@@ -194,26 +195,34 @@ def check_program(name: str, checkout: Path, python: str) -> TrackingProgram:
     for file in program.files:
         if not (checkout / file).exists():
             raise InputError(checkout, file, f"a file that {name} needs", "no such file", program.remedy)
-    if shutil.which(python) is None:
+    interpreter = shutil.which(python)
+    if interpreter is None:
         raise InputError("command line", "--python", f"the interpreter of the environment of {name}", python)
-    found = subprocess.run(
-        [python, "-c", f"import {', '.join(program.modules)}"],
-        cwd=checkout,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=IMPORTING_S,
-        check=False,
-    )
+    path = Path(interpreter).absolute()
+    command = [str(path), "-c", f"import {', '.join(program.modules)}"]
+    remedy = f"Give the interpreter of the environment that the page of {name} makes."
+    expected = f"the modules {', '.join(program.modules)}"
+    with tempfile.TemporaryDirectory() as elsewhere:  # where the checkout itself is not found
+        try:
+            found = subprocess.run(
+                command,
+                cwd=elsewhere,
+                env=environment(),
+                capture_output=True,
+                text=True,
+                timeout=IMPORTING_S,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise InputError(path, "", expected, f"none within {IMPORTING_S:g} s", remedy) from None
     if found.returncode:
         said = found.stderr.strip().splitlines()[-1:] or [described(found.returncode)]
-        remedy = f"Give the interpreter of the environment that the page of {name} makes."
-        raise InputError(python, "", f"the modules {', '.join(program.modules)}", said[0], remedy)
-    return program
+        raise InputError(path, "", expected, said[0], remedy)
+    return program, path
 
 
 def run_steps(
-    name: str, program: TrackingProgram, checkout: Path, python: str, work: Work, progress: Progress
+    name: str, program: TrackingProgram, checkout: Path, interpreter: Path, work: Work, progress: Progress
 ) -> None:
     """Run the steps of a program that have not been finished for this video and checkout.
 
@@ -223,18 +232,20 @@ def run_steps(
     """
     record = work.folder / STEPS
     finished: dict[str, str] = read_json(record) if record.exists() else {}
-    interpreter = Path(shutil.which(python) or python).absolute()
     # Scripts call "python" through the shell.
     path = os.pathsep.join([str(interpreter.parent), os.environ.get("PATH", "")])
     variables = {"PATH": path, **program.variables(checkout, work)}
+    video = digest_file(work.video)
     same = True  # a step is repeated if one before it was
     for number, step in enumerate(program.steps):
         command = [str(interpreter), *step.arguments(work)]
-        state = digest(command, str(checkout), work.video.stat().st_size)
+        state = digest(command, str(checkout), video)
         pattern = step.made.format(name=work.name)
         same = same and finished.get(step.name) == state and any(work.folder.glob(pattern))
         if same:
             continue
+        for old in [*work.folder.glob(pattern)]:  # which would hide that the step writes nothing
+            shutil.rmtree(old) if old.is_dir() else old.unlink()
         note = f"{name}, {step.name}"
 
         def shown(line: str, number: int = number, note: str = note) -> None:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from ...bench.options import DependentOptions
 from ..options import CaptureOptions
 from ..video.settings import VideoOptions
 
@@ -47,6 +48,14 @@ class TrackSettings(VideoOptions, CaptureOptions):
 
     seed: int = 0
     """Seed of the error of landmarks that are not a network's."""
+
+    dependent = (
+        DependentOptions(("landmarks", "embedding", "cameras", "against", "seed"), "program", ("light",)),
+        DependentOptions(
+            ("segmentation", "masks", "focal", "rate", "longest", "size"), "program", ("light",)
+        ),
+        DependentOptions(("python",), "checkout"),
+    )
 
     def __post_init__(self) -> None:
         self.check_video()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -13,13 +12,14 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.io.images import probe_image
 from ...bench.landmark_network import LandmarkNetwork
 from ..clip import CaptureClip
 from ..head.arrays import HeadArrays
 from ..images import read_mask, write_image
-from ..monocular.clip import clip_of_track
+from ..monocular.clip import check_subject, clip_of_track, subject_of
 from ..monocular.track import VIDEO, Track, VideoFrame
-from .decode import VideoInfo, probe_video, video_frames
+from .decode import TimedFrame, VideoInfo, probe_video, video_frames
 from .faces import Crop, crop_around, find_faces
 from .segmentation import SelfieSegmentation
 from .settings import MASKLESS, VideoOptions
@@ -61,11 +61,15 @@ def open_video(
     """Read a video, write its frames and masks under ``out``, and return them as a clip in a neutral pose.
 
     Raises `InputError` for a file that is no video, masks that do not fit, too few frames with a face, and where it is not said
-    how to mask; then nothing is written.
+    how to mask, before anything is written.
     """
-    mask_of = _masks(options)
+    subject = options.subject or subject_of(path)
+    check_subject(subject, "--subject")
     info = probe_video(path)
-    faces = find_faces(path, _frames(path, options), network, progress)
+    numbers: list[int] = []
+    mask_of = _masks(options)
+    faces = find_faces(path, _images(path, options, numbers), network, progress)
+    check_masks(options, [n for n, found in zip(numbers, faces.found) if found], info)
     crop = crop_around(faces, info.width, info.height)
     scale = min(1.0, options.size / max(crop.width, crop.height))
     width, height = max(1, round(crop.width * scale)), max(1, round(crop.height * scale))
@@ -75,8 +79,8 @@ def open_video(
     K = np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]])
     camera = Camera("0", width, height, K, np.eye(4))
     frames = []
-    for number, frame in enumerate(_frames(path, options)):
-        if not faces.found[number]:
+    for row, (number, _, frame) in enumerate(_frames(path, options)):
+        if not faces.found[row]:
             continue
         image = out / IMAGES / f"{number:05d}.png"
         write_image(image, _resized(crop.of(frame), width, height))
@@ -87,9 +91,8 @@ def open_video(
             write_image(mask, _resized(crop.of(mask_of(number, frame)), width, height))
         pose = _neutral(head)
         frames.append(VideoFrame((path, f"frame {number}"), VIDEO, number, image, mask, camera, pose))
-        progress(number + 1, len(faces.pixels), "frames")
+        progress(row + 1, len(faces.pixels), "frames")
     identities = np.zeros(head.shape_basis.shape[2], np.float32)
-    subject = options.subject or re.sub(r"[^\w.+-]|_", "-", path.stem).lstrip(".-") or "subject"
     clip = clip_of_track(
         out,
         Track(frames, identities, None, frozenset()),
@@ -99,12 +102,31 @@ def open_video(
         use_cache=False,
         progress=progress,
     )
-    lost = tuple(np.flatnonzero(~faces.found).tolist())
+    lost = tuple(number for number, found in zip(numbers, faces.found) if not found)
     return VideoClip(clip, info, crop, scale, lost)
 
 
-def _frames(path: Path, options: VideoOptions) -> Iterator[ByteArray]:
-    return (frame for _, frame in islice(video_frames(path, options.rate), options.longest))
+def _frames(path: Path, options: VideoOptions) -> Iterator[TimedFrame]:
+    return islice(video_frames(path, options.rate), options.longest)
+
+
+def _images(path: Path, options: VideoOptions, numbers: list[int]) -> Iterator[ByteArray]:
+    """Images of the frames; appends their numbers."""
+    for frame in _frames(path, options):
+        numbers.append(frame.number)
+        yield frame.image
+
+
+def check_masks(options: VideoOptions, numbers: Sequence[int], info: VideoInfo) -> None:
+    """Raise `InputError` unless the folder of masks has a mask of the video's size for every frame that is used."""
+    if options.masks in ("", MASKLESS):
+        return
+    for number in numbers:
+        mask = Path(options.masks) / f"{number:05d}.png"
+        found = probe_image(mask)
+        if (found.width, found.height) != (info.width, info.height):
+            expected = f"{info.width}x{info.height} pixels, the size of the video"
+            raise InputError(mask, "", expected, f"{found.width}x{found.height}")
 
 
 def _masks(options: VideoOptions) -> Callable[[int, ByteArray], ByteArray] | None:

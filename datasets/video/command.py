@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
+from ...bench.io.files import check_output_folder
 from ...bench.landmark_network import LandmarkNetwork
 from ..clip import CaptureClip
 from ..head.refit.command import target_head
@@ -51,10 +52,9 @@ def opened_video(settings: TrackSettings, out: Path, progress: Progress) -> Iter
     own = replace(settings, head=named if Path(named).exists() else None)  # a name of a head is for no reader
     teacher = own.open(settings.embedding, progress) if settings.embedding else None
     embedding = head_embedding(network, head, teacher, progress)
+    check_output_folder(out)
     folder = out / FRAMES
-    shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed
-    folder.mkdir(parents=True)
-    try:
+    with _emptied(folder):
         video = open_video(path, settings, head, network, folder, progress)
         clip, focal = video.clip, None
         landmarks = NetworkLandmarks(network, embedding, clip, [*clip.cameras])
@@ -67,6 +67,15 @@ def opened_video(settings: TrackSettings, out: Path, progress: Progress) -> Iter
                 landmarks = NetworkLandmarks(network, embedding, clip, [*clip.cameras])
         data, lines = _data(video, settings.focal, focal), _lines(video, settings.focal, focal)
         yield OpenedVideo(clip, landmarks, data, lines)
+
+
+@contextmanager
+def _emptied(folder: Path) -> Iterator[None]:
+    """A new folder, without what a killed run left; removed when the block ends."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    try:
+        yield
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

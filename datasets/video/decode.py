@@ -12,13 +12,15 @@ import numpy as np
 from ...bench.contracts import ByteArray
 from ...bench.errors import InputError
 
+LEAST_SHARE = 0.9
+"""Part of the stated number of frames that has to be decoded."""
 MOST_SIDE = 8192
 """Longest side of a frame, pixels."""
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 
 class VideoInfo(NamedTuple):
-    """What a video has."""
+    """Properties of a video file."""
 
     width: int
     """Of upright frames, pixels."""
@@ -45,8 +47,19 @@ def probe_video(path: Path) -> VideoInfo:
     return VideoInfo(first.shape[1], first.shape[0], float(rate), max(0, int(count)))
 
 
-def video_frames(path: Path, rate: float | None = None) -> Iterator[tuple[float, ByteArray]]:
-    """Frames with their times in seconds, turned upright as the file says.
+class TimedFrame(NamedTuple):
+    """A frame of a video."""
+
+    number: int
+    """From 0, of all frames in the file."""
+    time: float
+    """From the first frame, seconds."""
+    image: ByteArray
+    """(H, W, 3) RGB, upright."""
+
+
+def video_frames(path: Path, rate: float | None = None) -> Iterator[TimedFrame]:
+    """Frames with their numbers and times, turned upright as the file says.
 
     Of a video whose rate varies, or that has more than ``rate`` frames a second, the first frame from each multiple of
     1 / ``rate`` on is taken.
@@ -56,19 +69,14 @@ def video_frames(path: Path, rate: float | None = None) -> Iterator[tuple[float,
     rate : float | None
         Most frames a second; None for all frames.
 
-    Yields
-    ------
-    tuple[float, ByteArray]
-        Time from the first frame, and the (H, W, 3) RGB frame.
-
     Raises
     ------
     InputError
-        The file is no video, or frames have different sizes.
+        The file is no video, frames have different sizes, or many frames cannot be decoded.
     """
     following = 0
     size = None
-    for time, frame in _decoded(path):
+    for number, (time, frame) in enumerate(_decoded(path)):
         size = size or frame.shape
         if frame.shape != size:
             expected = f"frames of {size[1]}x{size[0]} pixels, as the first"
@@ -76,7 +84,7 @@ def video_frames(path: Path, rate: float | None = None) -> Iterator[tuple[float,
         # A hundredth of a frame, for times that are rounded in the file.
         if rate is None or time * rate >= following - 0.01:
             following = following + 1 if rate is None else int(np.floor(time * rate + 0.01)) + 1
-            yield time, frame
+            yield TimedFrame(number, time, frame)
 
 
 def _decoded(path: Path) -> Iterator[tuple[float, ByteArray]]:
@@ -87,15 +95,20 @@ def _decoded(path: Path) -> Iterator[tuple[float, ByteArray]]:
         sides = [int(capture.get(name)) for name in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
         if max(sides) > MOST_SIDE:
             raise InputError(path, "size", f"at most {MOST_SIDE} pixels a side", "x".join(map(str, sides)))
-        first = None
+        first, count = None, 0
         while True:
             seen, frame = capture.read()
             if not seen:
                 break
+            count += 1
             now = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             first = now if first is None else first
             yield max(0.0, now - first), np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
         if first is None:
             raise InputError(path, "", "a video that OpenCV can decode, such as H.264 in mp4", "no frame")
+        stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))  # of some formats an estimate
+        if count < LEAST_SHARE * stated:
+            remedy = "The file is damaged. Convert it again, for example with ffmpeg."
+            raise InputError(path, "", f"{stated} frames, as the file states", f"{count}", remedy)
     finally:
         capture.release()

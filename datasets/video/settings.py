@@ -15,17 +15,17 @@ class VideoOptions:
     """Video: MediaPipe's selfie_segmentation.tflite, which finds the person in each frame; needs ai-edge-litert."""
 
     masks: str = ""
-    """Video: folder of masks instead, named 00000.png and so on in the order of the frames, of the video's size; or "none" to keep the
-    room behind the person, which then counts in every metric."""
+    """Video: folder of masks instead, of the video's size, named by the number of the frame in the file (00000.png is the first frame, also
+    where --rate takes fewer); or "none" to keep the room behind the person, which then counts in every metric."""
 
     focal: float | None = None
     """Video: focal length in pixels of its upright frames; default: estimated from the landmarks, which is inexact."""
 
     rate: float = 25.0
-    """Video: most frames a second that are used."""
+    """Video: maximum frame rate; of a faster one frames are left out."""
 
     longest: int | None = None
-    """Video: most frames that are used, from its beginning; default: all."""
+    """Video: maximum number of frames that are used, from its beginning; default: all."""
 
     size: int = 512
     """Video: longest side of the frames after a crop around the head, pixels; smaller frames are not enlarged."""

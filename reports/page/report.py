@@ -113,11 +113,7 @@ def page_text(
 
     Raises `InputError` if ``max_mb`` does not suffice.
     """
-    printed = [
-        TitledTable(f"As {table.table} of {name}", as_printed(runs, name, table))
-        for name in settings.papers
-        for table in printed_tables(name, None)
-    ]
+    printed = [shown for name in settings.papers for shown in _printed(runs, name)]
     metrics = [spec for spec in runs.metrics if spec.per_frame and COMPARISON in spec.tables]
     values = frame_values(runs, metrics)
     worst = worst_frames(values, runs, metrics[0]) if metrics else []
@@ -174,6 +170,19 @@ def page_text(
         found = f"{size / MEGABYTE:.2f} needed"
         raise InputError("command line", "--max-mb", "room for tables and record", found)
     return page, pictures, files
+
+
+def _printed(runs: RunSet, name: str) -> list[TitledTable]:
+    """The runs in the form of the tables of a paper whose tasks they have. Raises `InputError` if there is none."""
+    found, refused = [], None
+    for table in printed_tables(name, None):
+        try:
+            found.append(TitledTable(f"As {table.table} of {name}", as_printed(runs, name, table)))
+        except InputError as error:  # the runs lack the task of the table
+            refused = error
+    if refused is not None and not found:
+        raise refused
+    return found
 
 
 def _places(frame: ShownFrame, pictures: Pictures, images: list[str], reasons: list[str]) -> list[int]:

@@ -24,6 +24,8 @@ DRIVER = "headbench.datasets.drive.live:LiveDriver"
 """Takes lines to poses of a head model. By name, since this package imports no reader."""
 LOOPBACK = "127.0.0.1"
 LONGEST_LINE = 2**20
+SILENCE_S = 60.0
+"""Seconds without a line after which a connection is closed."""
 """Bytes; a frame of blendshapes has 2,000."""
 
 
@@ -61,11 +63,11 @@ class LivePoses:
         self._listeners.add(listener)
 
     def forget(self, listener: Callable[[], None]) -> None:
-        """Call ``listener`` no more."""
+        """Remove a listener."""
         self._listeners.discard(listener)
 
     def close(self) -> None:
-        """End."""
+        """Stop the thread."""
         with self._arrived:
             self._closed = True
             self._arrived.notify()
@@ -126,25 +128,30 @@ def local_port(live: LivePoses, port: int) -> Iterator[int]:
     except OSError as error:
         expected = "a port of this machine that is free"
         raise InputError("command line", "--live", expected, f"{port}: {error}", "Choose another.") from None
-    thread = threading.Thread(target=_serve, args=(server, live), daemon=True)
+    connected: list[socket.socket] = []
+    thread = threading.Thread(target=_serve, args=(server, live, connected), daemon=True)
     thread.start()
     try:
         yield server.getsockname()[1]
     finally:
-        with suppress(OSError):
-            server.shutdown(socket.SHUT_RDWR)
+        for end in (server, *connected):
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
         server.close()
         thread.join(timeout=10.0)
 
 
-def _serve(server: socket.socket, live: LivePoses) -> None:
+def _serve(server: socket.socket, live: LivePoses, connected: list[socket.socket]) -> None:
     while True:
         try:
             connection, _ = server.accept()
         except OSError:  # closed
             return
+        connection.settimeout(SILENCE_S)  # a program that sends nothing gives way to another
+        connected[:] = [connection]
         with connection, connection.makefile("rb") as stream:
             _read(stream, live)
+        connected.clear()
 
 
 def _read(stream: BinaryIO, live: LivePoses) -> None:

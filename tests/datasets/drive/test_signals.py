@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from headbench.bench.errors import InputError
 from headbench.datasets.drive.blendshapes import ARKIT, JAW_OPEN
 from headbench.datasets.drive.formats import read_signal
 from headbench.datasets.drive.signal import SignalRequest
@@ -143,7 +144,9 @@ def test_another_subjects_capture_drives_without_its_identity(pristine_capture):
     plan = pristine_capture.writer.plan
     target = replace(plan.head, version="target")
     signal, found = driven(pristine_capture.union, target, sequence="FREE")
-    poses = plan.sequence("FREE").poses
+    sequence = plan.sequence("FREE")
+    poses = [pose for number, pose in enumerate(sequence.poses) if number not in sequence.excluded]
+    assert len(poses) < len(sequence.poses)
     assert (signal.form, len(found)) == ("capture", len(poses))
     for mesh, pose in zip(found, poses):
         wanted = skinned(plan.head, pose.expression, jaw=pose.jaw, eyes=pose.eyes)
@@ -303,3 +306,93 @@ def test_parameters_of_headbenchs_own_writer_are_read(tmp_path):
     save_npz(tmp_path / "p" / "00000.npz", pose_to_parameters(pose) | {"shape": np.zeros(6)})
     again = read_signal(SignalRequest(tmp_path / "p", SOURCE, signal_head="avatar"))
     np.testing.assert_allclose(again.poses[0].expression, pose.expression, rtol=1e-6)
+
+
+# ------------------------------------------------------------------ what is refused, and what is said
+
+
+def _npy_folder(path):
+    path.mkdir()
+    names = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
+    for name in names:
+        np.save(path / f"{name}.npy", np.zeros((FRAMES, 3)))
+    return path
+
+
+WRITTEN = {
+    "huge.jsonl": '{"jawOpen": 1' + "0" * 400 + "}",
+    "empty.jsonl": '{"jawOpen": []}',
+    "two.jsonl": '{"jawOpen": [0.1, 0.9]}',
+    "time.csv": "time\n0\n1\n",
+    "twice.csv": "jawOpen,JawOpen\n0.5,0.1\n",
+    "nested.json": '{"exp": [[[1], [1, 2]], [[1], [1, 2]]]}',
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "message"),
+    [
+        ("huge.jsonl", "", "a number or a list of numbers"),
+        ("empty.jsonl", "", "a number or a list of numbers"),
+        ("two.jsonl", "", "jawOpen: expected one number a frame, found 2"),
+        ("time.csv", "blendshapes", "a column with ARKit's name"),
+        ("twice.csv", "", "one column for jawOpen, found two"),
+        ("nested.json", "", "a number or a list of numbers"),
+    ],
+)
+def test_values_that_are_no_numbers_are_refused(tmp_path, name, form, message):
+    (tmp_path / name).write_text(WRITTEN[name])
+    with pytest.raises(InputError, match=message):
+        driven(tmp_path / name, form=form, signal_head="avatar")
+
+
+def test_a_folder_of_arrays_is_no_folder_of_flame_parameters(tmp_path):
+    with pytest.raises(InputError):
+        driven(_npy_folder(tmp_path / "arrays"), form="flame_param")
+
+
+@pytest.mark.parametrize("text", ["{}", "jaw: {}"])
+def test_an_empty_map_is_refused(tmp_path, text):
+    (tmp_path / "a.csv").write_text("jaw\n0.1\n")
+    (tmp_path / "map.yaml").write_text(text)
+    with pytest.raises(InputError, match="an empty map"):
+        driven(tmp_path / "a.csv", map=str(tmp_path / "map.yaml"))
+
+
+def test_a_head_model_that_does_not_exist_is_refused(tmp_path, pristine_capture):
+    for path, options in ((pristine_capture.union, {"sequence": "FREE"}), (write_json(tmp_path), {})):
+        with pytest.raises(InputError, match="--signal-head"):
+            driven(path, signal_head=str(tmp_path / "typo.pkl"), **options)
+
+
+def write_json(folder):
+    path = folder / "a.json"
+    path.write_text(json.dumps({"frames": [{"exp": [0.0] * 6}]}))
+    return path
+
+
+def test_a_capture_of_several_sequences_needs_one(pristine_capture):
+    with pytest.raises(InputError, match="--sequence: expected one of"):
+        driven(pristine_capture.union)
+
+
+def test_eyes_and_poses_that_drive_nothing_are_listed(tmp_path):
+    frame = {
+        "exp": [0.0] * 6,
+        "rotation": [0.0] * 3,
+        "jaw": [0.0] * 3,
+        "pose": [0.1] * 6,
+        "eye_l_pose": [0.1] * 3,
+    }
+    (tmp_path / "a.json").write_text(json.dumps({"frames": [frame]}))
+    signal, _ = driven(tmp_path / "a.json", signal_head="avatar")
+    assert {"pose", "eye_l_pose"} <= signal.unused.keys()
+
+
+def test_lists_of_categories_are_read_in_frames_too(tmp_path):
+    categories = [[{"categoryName": "jawOpen", "score": 0.5}]]
+    (tmp_path / "a.json").write_text(json.dumps({"frames": [{"faceBlendshapes": categories}]}))
+    (tmp_path / "b.jsonl").write_text(json.dumps({"jawOpen": 0.5}))
+    first, second = (driven(tmp_path / name)[0].poses[0].jaw for name in ("a.json", "b.jsonl"))
+    np.testing.assert_array_equal(first, second)
+    assert first[0] > 0

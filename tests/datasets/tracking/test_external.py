@@ -92,7 +92,7 @@ def settings(made, tmp_path):
     def make(name, behaviour=(), **changes):
         checkout = tmp_path / name
         program = PROGRAMS[name]
-        for file in (*program.files, *(f"{module}.py" for module in program.modules)):
+        for file in (*program.files, *(f"installed/{module}.py" for module in program.modules)):
             (checkout / file).parent.mkdir(parents=True, exist_ok=True)
             (checkout / file).touch()
         for script, body in SCRIPTS[name].items():
@@ -100,7 +100,11 @@ def settings(made, tmp_path):
             (checkout / script).write_text(SCRIPT + body)
         (checkout / "behaviour.json").write_text(json.dumps(dict(behaviour)))
         shutil.copytree(made, checkout / "made", dirs_exist_ok=True)
-        given = {"head": str(made / "track" / HEAD_FILE), "checkout": str(checkout), "python": sys.executable}
+        python = tmp_path / "environment" / "python"
+        python.parent.mkdir(exist_ok=True)
+        python.write_text(f'#!/bin/sh\nPYTHONPATH="{checkout / "installed"}" exec "{sys.executable}" "$@"\n')
+        python.chmod(0o755)
+        given = {"head": str(made / "track" / HEAD_FILE), "checkout": str(checkout), "python": str(python)}
         return TrackSettings(str(video), str(tmp_path / "out"), program=name, **(given | changes))
 
     return make
@@ -164,16 +168,16 @@ def test_a_kill_ends_the_program_and_finished_steps_stay(settings, tmp_path):
         "--checkout",
         given.checkout,
         "--python",
-        sys.executable,
+        given.python,
         "--out",
         given.out,
     ]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=(tmp_path / "errors").open("w"))
     asleep = Path(given.checkout) / "asleep"
     until = time.monotonic() + 120
     while not asleep.exists() and time.monotonic() < until and process.poll() is None:
         time.sleep(0.1)
-    assert asleep.exists()
+    assert asleep.exists(), (tmp_path / "errors").read_text()
     process.terminate()
     process.wait(timeout=60)
     running = [
@@ -196,7 +200,10 @@ def test_a_kill_ends_the_program_and_finished_steps_stay(settings, tmp_path):
             "pretrained_weights/uv.ckpt",
             r"uv\.ckpt: expected a file that pixel3dmm needs.*install_preprocessing",
         ),
-        ("pixel3dmm.py", r"expected the modules torch, nvdiffrast, pixel3dmm, found ModuleNotFoundError"),
+        (
+            "installed/pixel3dmm.py",
+            r"expected the modules torch, nvdiffrast, pixel3dmm, found ModuleNotFoundError",
+        ),
     ],
 )
 def test_what_an_installation_lacks_is_said_before_it_runs(settings, missing, message):

@@ -86,7 +86,7 @@ def filmed(tmp_path_factory):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(person, pose)[0], "rgb24")))
         container.mux(stream.encode())
     (root / "masks").mkdir()
-    for number, ((_, frame), pose) in enumerate(zip(video_frames(root / "me.mp4"), poses, strict=True)):
+    for (number, _, frame), pose in zip(video_frames(root / "me.mp4"), poses, strict=True):
         _, mask, found = picture(person, pose)
         shown = np.where(mask[..., None] > 0, frame, 255).astype(np.uint8)
         known[digest(frame)] = known[digest(shown)] = None if number == FACELESS else found
@@ -164,7 +164,7 @@ def test_what_is_missing_is_said(settings, changes, message):
 
 def test_a_video_without_faces_is_refused(settings, filmed, monkeypatch):
     root, _, known, *_ = filmed
-    frames = {digest(frame): None for _, frame in video_frames(root / "me.mp4")}
+    frames = {digest(frame.image): None for frame in video_frames(root / "me.mp4")}
     monkeypatch.setattr(
         command.LandmarkNetwork, "find", lambda self, image, near=None: (known | frames)[digest(image)]
     )
