@@ -11,8 +11,10 @@ from headbench.reports.statistics.comparisons import PairedComparison
 
 def test_the_run_of_a_suite_is_published_without_folders(write_run, tmp_path, monkeypatch):
     page = tmp_path / "public" / "README.md"
-    page.parent.mkdir()
-    page.write_text("\n".join(readme.marks("suite")))
+    for name in (readme.SUITE, readme.PROTOCOLS):
+        written = page.parent / readme.PAGES[name]
+        written.parent.mkdir(parents=True, exist_ok=True)
+        written.write_text("\n".join(readme.marks(name)))
     write_run("run", {"ga": 30.0, "ours": 31.0})
     monkeypatch.setattr(readme, "suite_results", lambda folder: "tables")
     monkeypatch.setattr(readme, "suite_block", lambda root, name: "block")

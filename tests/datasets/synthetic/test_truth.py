@@ -8,6 +8,7 @@ import pytest
 from headbench.bench.contracts import StepRecord
 from headbench.bench.errors import UnavailableError
 from headbench.bench.registry import get, resolve
+from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.open import open_clip
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.datasets.synthetic.performance import EXPRESSION_CONTROLS
@@ -39,7 +40,7 @@ def test_at_a_frame_of_the_capture_it_has_its_bytes(still):
     truth = resolve(get("datasets", "synthetic").truth)(still)
     key = still.splits["novel_view"][1]
     seed = truth._plan.render_seed(key.sequence, key.timestep, key.camera)
-    picture, mask, face = truth.render(still.cameras[key.camera], still.poses[key.timestep], seed)
+    picture, mask, face, _ = truth.render(still.cameras[key.camera], still.poses[key.timestep], seed)
     assert np.array_equal(picture, still.image(key))
     assert np.array_equal(mask, still.mask(key))
     assert np.array_equal(face, still.region_masks(key, ["face"])["face"])
@@ -51,7 +52,7 @@ def test_expressions_of_the_capture_look_as_there(moving):
     keys = [key for key in moving.splits["train"] if key.camera != FRONTAL]
     far = max(keys[1:], key=lambda key: -decibels(moving.image(key), moving.image(keys[0])))
     for key in (keys[0], far):
-        picture, mask, _ = truth.render(moving.cameras[key.camera], moving.poses[key.timestep])
+        picture, mask, *_ = truth.render(moving.cameras[key.camera], moving.poses[key.timestep])
         assert decibels(picture, moving.image(key)) > 37
         assert np.abs(mask.astype(int) - moving.mask(key)).mean() < 1.0
     assert decibels(moving.image(keys[0]), moving.image(far)) < 30
@@ -59,7 +60,7 @@ def test_expressions_of_the_capture_look_as_there(moving):
 
 def test_what_it_stands_on_is_the_clips(still):
     red = replace(still, background=np.array([1.0, 0.0, 0.0]))
-    picture, mask, _ = SyntheticTruth(red).render(still.cameras[FRONTAL], still.poses[0])
+    picture, mask, *_ = SyntheticTruth(red).render(still.cameras[FRONTAL], still.poses[0])
     assert (picture[mask == 0] == [255, 0, 0]).all()
     assert SyntheticTruth(red).fingerprint != SyntheticTruth(still).fingerprint
 
@@ -105,3 +106,18 @@ def test_a_clip_without_a_truth_says_why(still, changes, reason):
         clip = without(still, **changes)
     with pytest.raises(UnavailableError, match=reason):
         SyntheticTruth(clip)
+
+
+def test_depth_is_that_of_the_posed_mesh(still):
+    truth = SyntheticTruth(still)
+    camera, pose = still.cameras[FRONTAL], still.poses[0]
+    depth = truth.depth(camera, pose)
+    assert depth.shape == (camera.height, camera.width)
+    (mesh,) = PosedSubject.of(still).meshes([pose])
+    along = mesh @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+    face = truth.render(camera, pose).face
+    seen = depth[face & np.isfinite(depth)]
+    assert seen.size
+    assert along.min() - 1e-3 <= seen.min()
+    assert seen.max() <= along.max()
+    assert np.median(seen) < np.median(along)  # the front of the head
