@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 
 from .contracts import ByteArray, FloatArray
-from .errors import InputError, UnavailableError
+from .errors import InputError
+from .tflite import open_network
 
 CORNERS = (33, 263)
 """Landmarks of the outer corners of the eyes, between which the crop is level."""
@@ -44,25 +45,16 @@ class LandmarkNetwork:
     """
 
     def __init__(self, path: Path):
-        if not path.exists():
-            remedy = "It is in the wheel of mediapipe 0.10.21, as mediapipe/modules/face_landmark/face_landmark.tflite."
-            raise InputError(path, "", "the file of a landmark network", "no such file", remedy)
+        remedy = "It is in the wheel of mediapipe 0.10.21, as mediapipe/modules/face_landmark/face_landmark.tflite."
+        expected = f"a network that finds {COUNT} landmarks"
+        self._network: Any = open_network(path, expected, remedy)
         try:
-            from ai_edge_litert.interpreter import Interpreter
-        except ImportError as error:
-            what = "Landmarks by a network need the package ai-edge-litert; it is not installed."
-            raise UnavailableError(what, "pip install ai-edge-litert") from error
-        try:
-            self._network: Any = Interpreter(model_path=str(path), num_threads=1)
-            self._network.allocate_tensors()
             (self._input,) = self._network.get_input_details()
             outputs = self._network.get_output_details()
             self._landmarks = next(one for one in outputs if np.prod(one["shape"]) == 3 * COUNT)
             self._score = next(one for one in outputs if np.prod(one["shape"]) == 1)
-        except (ValueError, RuntimeError, StopIteration) as error:
-            raise InputError(
-                path, "", f"a network that finds {COUNT} landmarks", str(error) or "other outputs"
-            ) from error
+        except (ValueError, StopIteration) as error:
+            raise InputError(path, "", expected, str(error) or "other outputs") from error
         self._side = int(self._input["shape"][1])
 
     def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:

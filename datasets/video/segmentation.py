@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 
 from ...bench.contracts import ByteArray, FloatArray
-from ...bench.errors import InputError, UnavailableError, install_extra
+from ...bench.errors import InputError
+from ...bench.tflite import open_network
 
 
 class SelfieSegmentation:
@@ -28,26 +29,17 @@ class SelfieSegmentation:
     """
 
     def __init__(self, path: Path):
-        if not path.exists():
-            remedy = "It is in the wheel of mediapipe 0.10.21, as mediapipe/modules/selfie_segmentation/selfie_segmentation.tflite."
-            raise InputError(path, "", "the file of a segmentation network", "no such file", remedy)
-        try:
-            from ai_edge_litert.interpreter import Interpreter
-        except ImportError as error:
-            what = "Segmentation by a network needs the package ai-edge-litert; it is not installed."
-            raise UnavailableError(what, install_extra("track")) from error
-        try:
-            self._network: Any = Interpreter(model_path=str(path), num_threads=1)
-            self._network.allocate_tensors()
-            (self._input,), (self._output,) = (
-                self._network.get_input_details(),
-                self._network.get_output_details(),
-            )
-            _, self._height, self._width, _ = map(int, self._input["shape"])
-            if tuple(self._output["shape"]) != (1, self._height, self._width, 1):
-                raise ValueError(f"an output of shape {tuple(map(int, self._output['shape']))}")
-        except (ValueError, RuntimeError) as error:
-            raise InputError(path, "", "a network that segments a person", str(error)) from error
+        remedy = "It is in the wheel of mediapipe 0.10.21, as mediapipe/modules/selfie_segmentation/selfie_segmentation.tflite."
+        expected = "a network that segments a person"
+        self._network: Any = open_network(path, expected, remedy)
+        (self._input,), (self._output,) = (
+            self._network.get_input_details(),
+            self._network.get_output_details(),
+        )
+        _, self._height, self._width, _ = map(int, self._input["shape"])
+        shape = tuple(map(int, self._output["shape"]))
+        if shape != (1, self._height, self._width, 1):
+            raise InputError(path, "", expected, f"an output of shape {shape}")
 
     def mask(self, image: ByteArray) -> ByteArray:
         """(H, W) 8-bit coverage of the person in an (H, W, 3) image."""
