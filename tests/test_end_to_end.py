@@ -282,7 +282,9 @@ CASES = {
             "driven/drive.json",
         ),
         case(
-            f"drive {cell('insta')} --signal {{capture}} --size 64 --out driven.mp4", "jitter", "driven.mp4"
+            f"drive {cell('insta')} --signal {{capture}} --sequence FREE --size 64 --out driven.mp4",
+            "jitter",
+            "driven.mp4",
         ),
     ],
     "frames": [

@@ -39,7 +39,7 @@ class DriveSettings(CaptureOptions):
     eyelids.0, neck.0, rotation.0, translation.0, named expressions of the head, or ARKit's names."""
 
     sequence: str = ""
-    """Of a signal that is a capture, only this sequence."""
+    """Of a signal that is a capture: the sequence that drives; required if it has several."""
 
     capture: str = ""
     """Capture of the avatar, whose camera and mean head pose are used; default: a camera in front of the head."""
