@@ -18,6 +18,7 @@ from ...bench.io.files import check_kind, check_output_folder, check_writable, w
 from ...bench.io.lock import locked
 from ...bench.io.video import ENCODINGS, browser_encoder
 from ...bench.specs import CommandResult
+from ..head.subject import resting
 from ..video.decode import SUFFIXES
 from .formats import read_signal
 from .measure import DrivenMeasures
@@ -25,7 +26,7 @@ from .output import REST, Renderer, canonical, write_driven_capture, write_movie
 from .settings import DriveSettings
 from .signal import DrivingSignal, SignalRequest
 from .stage import SEQUENCE, Stage, make_stage
-from .transfer import Transferred, head_motion, resting, smoothed, transfer, window_length
+from .transfer import Transferred, head_motion, smoothed, transfer, window_length
 
 RESULT_FILE = "drive.json"
 

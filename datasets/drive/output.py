@@ -18,7 +18,7 @@ from ...bench.io.video import write_browser_video
 from ..clip import CaptureClip
 from ..ga.writer import CANONICAL_JAW, CapturePlan, CaptureWriter, SequencePlan
 from ..head.arrays import HeadArrays
-from .transfer import resting
+from ..head.subject import resting
 
 REST = "REST"
 """Training sequence of a driven capture, which has to have one: one frame, see `canonical`."""

@@ -18,7 +18,7 @@ from ..head.arrays import HeadArrays
 from ..head.refit.identity import match
 from ..head.refit.refit import BlockFitter, refit
 from ..head.refit.settings import RefitSettings
-from ..head.subject import PosedSubject
+from ..head.subject import PosedSubject, resting
 from ..head.teeth import with_teeth_where_possible
 from .signal import NO_EYELIDS, DrivingSignal
 
@@ -128,13 +128,6 @@ def with_teeth_of(target: HeadArrays, source: HeadArrays) -> HeadArrays:
 def same_basis(one: HeadArrays, other: HeadArrays) -> bool:
     """Whether coefficients of two head models mean the same."""
     return one.version == other.version and one.expression_basis.shape[2] == other.expression_basis.shape[2]
-
-
-def resting(head: HeadArrays, subject: str = "") -> HeadPose:
-    """The neutral face of a head model, its head at the origin."""
-    expression, none = np.zeros(head.expression_basis.shape[2]), np.zeros(3)
-    lids = None if head.eyelid_basis is None else np.zeros(head.eyelid_basis.shape[2])
-    return HeadPose(head.version, expression, none, none, none, np.zeros(6), none, lids, subject)
 
 
 def relative(poses: Sequence[HeadPose], neutral: HeadPose | None) -> list[HeadPose]:

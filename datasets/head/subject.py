@@ -103,3 +103,10 @@ def pose_in_head_frame(pose: HeadPose) -> HeadPose:
     """The pose without rigid motion."""
     rest = np.zeros(3)
     return replace(pose, rotation=rest, neck=rest, translation=rest)
+
+
+def resting(head: HeadAsset, subject: str = "") -> HeadPose:
+    """The neutral face of a head model, its head at the origin."""
+    expression, none = np.zeros(head.expression_basis.shape[2]), np.zeros(3)
+    lids = None if head.eyelid_basis is None else np.zeros(head.eyelid_basis.shape[2])
+    return HeadPose(head.version, expression, none, none, none, np.zeros(6), none, lids, subject)

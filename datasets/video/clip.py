@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +17,7 @@ from ...bench.io.images import probe_image
 from ...bench.landmark_network import LandmarkNetwork
 from ..clip import CaptureClip
 from ..head.arrays import HeadArrays
+from ..head.subject import resting
 from ..images import read_mask, write_image
 from ..monocular.clip import check_subject, clip_of_track, subject_of
 from ..monocular.track import VIDEO, Track, VideoFrame
@@ -160,13 +162,6 @@ def _resized(image: ByteArray, width: int, height: int) -> ByteArray:
 
 def _neutral(head: HeadArrays) -> HeadPose:
     """At rest in front of the camera, upright and facing it."""
-    return HeadPose(
-        head_model=head.version,
-        expression=np.zeros(head.expression_basis.shape[2]),
-        rotation=np.array([np.pi, 0.0, 0.0]),
-        neck=np.zeros(3),
-        jaw=np.zeros(3),
-        eyes=np.zeros(6),
-        translation=np.array([0.0, 0.0, DISTANCE]),
-        eyelids=None if head.eyelid_basis is None else np.zeros(head.eyelid_basis.shape[2]),
+    return replace(
+        resting(head), rotation=np.array([np.pi, 0.0, 0.0]), translation=np.array([0.0, 0.0, DISTANCE])
     )
