@@ -1,4 +1,4 @@
-"""Pictures of a head model's mean, painted by its regions, from which landmarks are learnt where no capture is at hand."""
+"""Pictures of a head model's mean, painted by its regions, from which landmarks are learnt where no capture is given."""
 
 from __future__ import annotations
 

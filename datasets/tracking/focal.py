@@ -40,7 +40,7 @@ class FocalLength(NamedTuple):
 def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, side: float) -> FocalLength:
     """The focal length at which the head model fits landmarks of one camera best.
 
-    Shape, poses and expressions are fitted anew for each tried length; between them the minimum of a parabola in its logarithm is
+    Shape, poses and expressions are fitted for each tried length; between them the minimum of a parabola in its logarithm is
     taken. Landmarks have systematic errors of some millimetres, and a near face with a short lens looks like a longer face, so that
     the estimate may be wrong by a quarter.
 

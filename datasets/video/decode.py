@@ -37,7 +37,7 @@ def is_video(path: Path) -> bool:
 
 
 def probe_video(path: Path) -> VideoInfo:
-    """Size and rate of a video. Raises `InputError` for a file that is none."""
+    """Size and rate of a video. Raises `InputError` for another file."""
     _, first = next(_decoded(path))
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     rate, count = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
@@ -67,7 +67,7 @@ def video_frames(path: Path, rate: float | None = None) -> Iterator[TimedFrame]:
     Parameters
     ----------
     rate : float | None
-        Most frames a second; None for all frames.
+        Maximum number of frames a second; None for all frames.
 
     Raises
     ------
