@@ -18,7 +18,7 @@ from ...datasets.head.rotations import axis_angle_to_matrix, matrix_to_quaternio
 from ..ops.harmonics import coefficient_count, harmonic_colors
 from ..ops.splats import WorldSplats, apply_matrices, left_products
 from ..shared.subject_mesh import SubjectMesh
-from .points import SurfacePoints
+from ..shared.surface_points import SurfacePoints
 
 LARGEST_SCALE = 0.1
 """Maximum size of a splat, metres: training removes larger neutral splats, and expressions are clamped to it."""

@@ -15,9 +15,10 @@ from ..shared.capacity import CapacityPlan, CapacityPlanner
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.schedule import ShuffledEpochs
+from ..shared.surface_points import SurfacePoints
 from .avatar import GBSAvatar
 from .config import GBSConfig
-from .points import SurfacePoints, padded_offset, with_mouth
+from .mouth import padded_offset, with_mouth
 from .spec import GBS as SPEC
 from .storage import AVATAR_FILE, write_avatar
 from .training import GBSTraining

@@ -16,9 +16,9 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.files import write_bytes
 from ..ops.harmonics import coefficient_count
+from ..shared.surface_points import SurfacePoints, full_barycentric
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .blendshapes import Entries, difference_widths
-from .points import SurfacePoints, full_barycentric
 
 AVATAR_FILE = "avatar.safetensors"
 EXPRESSIONS = "expressions"

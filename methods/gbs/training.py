@@ -20,6 +20,7 @@ from ..shared.optimisation import logit, rows_of_tables
 from ..shared.schedule import Sampler, Timeline, torch_generator
 from ..shared.splat_training import Initial, SplatTrainer
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, pose_key
+from ..shared.surface_points import SurfacePoints, poisson_disk, spacing
 from .blendshapes import (
     PARTS,
     Entries,
@@ -31,7 +32,7 @@ from .blendshapes import (
     entries_of,
 )
 from .config import GBSConfig
-from .points import SurfacePoints, mouth_cylinder, poisson_disk, rows_of_teeth, spacing
+from .mouth import mouth_cylinder, rows_of_teeth
 
 DIFFERENCES = "differences"
 RATE = 1e-6

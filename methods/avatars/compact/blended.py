@@ -11,10 +11,10 @@ from torch import Tensor
 from ....bench.contracts import FloatArray, HeadAsset, IntArray
 from ....bench.errors import InputError
 from ...gbs.blendshapes import Entries, difference_widths
-from ...gbs.points import SurfacePoints, full_barycentric
 from ...gbs.storage import Stored
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import SubjectMesh
+from ...shared.surface_points import SurfacePoints, full_barycentric
 from ...shared.tensor_files import check_sizes
 from .container import Arrays, Content, coded, narrow, read_content
 from .encoding import (

@@ -14,8 +14,8 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ....datasets.head.refit.identity import closest_points
-from ...gbs.points import poisson_disk
 from ...ops.harmonics import sh_basis
+from ...shared.surface_points import poisson_disk
 
 FAR = 0.015
 """Distance from the nearest vertex, metres, from which a point gets that vertex instead of the nearest triangle. No

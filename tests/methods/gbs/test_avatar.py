@@ -7,8 +7,8 @@ from safetensors.torch import load_file, save_file
 
 from headbench.bench.errors import InputError
 from headbench.methods.gbs.blendshapes import Entries, difference_widths
-from headbench.methods.gbs.points import SurfacePoints, full_barycentric
 from headbench.methods.gbs.storage import AVATAR_FILE, EXPRESSIONS, MEMBERS, read_avatar, write_avatar
+from headbench.methods.shared.surface_points import SurfacePoints, full_barycentric
 
 FACES, EXPRESSION_SIZE = 40, 60
 PUBLISHED_BYTES = 4 * 3128  # what the authors' viewer reads for each splat

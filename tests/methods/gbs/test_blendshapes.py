@@ -26,7 +26,7 @@ from headbench.methods.gbs.blendshapes import (
     initial_rotations,
     nearest_rotation,
 )
-from headbench.methods.gbs.points import SurfacePoints, full_barycentric
+from headbench.methods.shared.surface_points import SurfacePoints, full_barycentric
 
 from ...datasets.head.toy import toy_head
 from ..toy_clip import toy_pose

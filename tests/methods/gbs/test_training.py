@@ -11,7 +11,7 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.methods.gbs.blendshapes import PointMotions, apply_pose, difference_widths
 from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
 from headbench.methods.gbs.method import GBS
-from headbench.methods.gbs.points import mouth_cylinder, padded_offset, with_mouth
+from headbench.methods.gbs.mouth import mouth_cylinder, padded_offset, with_mouth
 from headbench.methods.gbs.training import DIFFERENCES, GBSTraining, sample_count
 from headbench.methods.shared.avatar_files import Subject
 from headbench.methods.shared.schedule import Timeline
