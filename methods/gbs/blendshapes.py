@@ -18,7 +18,7 @@ from ...datasets.head.rotations import axis_angle_to_matrix, matrix_to_quaternio
 from ..ops.harmonics import coefficient_count, harmonic_colors
 from ..ops.splats import WorldSplats, apply_matrices, left_products
 from ..shared.subject_mesh import SubjectMesh
-from ..shared.surface_points import SurfacePoints
+from ..shared.surface_points import MeshPoints, SurfacePoints
 
 LARGEST_SCALE = 0.1
 """Maximum size of a splat, metres: training removes larger neutral splats, and expressions are clamped to it."""
@@ -192,8 +192,8 @@ class Rig:
 
     Attributes
     ----------
-    corners, barycentric : Tensor
-        (3 P,) int64 vertices and (3, P, 1) weights of the points' corners, all first corners first.
+    at_points : MeshPoints
+        Interpolates values of the vertices at the points.
     turns, turned : Tensor
         (4 F, K) `initial_rotations` of the triangles with points, and (P,) int64 index of each
         point's triangle in them.
@@ -211,17 +211,15 @@ class Rig:
         self.mesh = SubjectMesh(head, shape, static_offset, device)
         model = self.mesh.model
         self.expressions = min(expressions, model.expression_size)
-        like = model.template
-        self._triangles = torch.from_numpy(points.triangles).to(device)
-        self.corners = self.mesh.faces[self._triangles].t().reshape(-1)
-        self.barycentric = torch.from_numpy(points.barycentric).to(like).t()[:, :, None]
+        self.at_points = MeshPoints(points, self.mesh.faces, model.template)
         self._weights = self.at_points(model.skinning_weights)
         self.rest = self.at_points(self.mesh.canonical)
         self._basis = torch.cat([model.expression_matrix[: self.expressions], model.pose_matrix])
         basis = model.expression_matrix[: self.expressions].t().unflatten(0, (-1, 3))
-        used = torch.unique(self._triangles)
+        triangles = self.at_points.triangles
+        used = torch.unique(triangles)
         turns = initial_rotations(self.mesh.canonical, basis, self.mesh.faces[used])
-        self.turned = torch.searchsorted(used, self._triangles)
+        self.turned = torch.searchsorted(used, triangles)
         self.turns = turns.flatten(0, 1)
 
     def arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
@@ -253,11 +251,6 @@ class Rig:
         rotation, product = quaternion_to_matrix(quaternion).flatten(1), left_products(quaternion).flatten(1)
         turn = (self.turns @ coefficients).view(-1, 4)[self.turned]
         return torch.cat([linear, offset, rotation, product, turn, shift], dim=1)
-
-    def at_points(self, values: Tensor) -> Tensor:
-        """(P, C) of (V, C) vertex values."""
-        corners = values.index_select(0, self.corners).view(3, -1, values.shape[1])
-        return (corners * self.barycentric).sum(0)
 
 
 POLAR_STEPS = 8

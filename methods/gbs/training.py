@@ -15,10 +15,11 @@ from ...datasets.head.geometry import triangle_areas
 from ..ops.harmonics import initial_coefficients
 from ..ops.photometric import photometric_loss
 from ..shared.avatar_files import Subject
+from ..shared.image_training import Initial
 from ..shared.loop import recomposited
 from ..shared.optimisation import logit, rows_of_tables
 from ..shared.schedule import Sampler, Timeline, torch_generator
-from ..shared.splat_training import Initial, SplatTrainer
+from ..shared.splat_training import SplatTrainer
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, pose_key
 from ..shared.surface_points import SurfacePoints, poisson_disk, spacing
 from .blendshapes import (

@@ -147,6 +147,55 @@ class Weighted:
         return int(self._draws(block)[position])
 
 
+class GroupedBatches:
+    """Batches of images, each image once per epoch, in a new random order each epoch. Batches are numbered from 1.
+
+    As a `Sampler` it gives the images of the batches one after another; every batch occupies ``size`` numbers.
+
+    Parameters
+    ----------
+    groups : Sequence[int]
+        (n,) group of each image, such as its timestep.
+    size : int
+        Images of a batch; the last one of an epoch may have fewer.
+    together : int
+        Number of images of a group that follow each other, if it has so many.
+    """
+
+    def __init__(self, groups: Sequence[int], size: int, together: int, seed: int):
+        self._groups, self._size, self._together, self._seed = np.asarray(groups), size, together, seed
+        self._epoch = -(-len(groups) // size)
+        self._order = lru_cache(maxsize=2)(self._batches)
+
+    def batch(self, iteration: int) -> tuple[int, ...]:
+        """The images of a batch."""
+        epoch, position = divmod(iteration - 1, self._epoch)
+        return self._order(epoch)[position]
+
+    def positions(self, iteration: int) -> list[tuple[int, int]]:
+        """Number, as for the sampler, and index of each image of a batch."""
+        batch, end = self.batch(iteration), iteration * self._size
+        numbers = [*range(end - self._size + 1, end - self._size + len(batch)), end]
+        return list(zip(numbers, batch))
+
+    def __call__(self, iteration: int) -> int:
+        batch, member = divmod(iteration - 1, self._size)
+        images = self.batch(batch + 1)
+        return images[min(member, len(images) - 1)]
+
+    def _batches(self, epoch: int) -> list[tuple[int, ...]]:
+        random = numpy_generator(self._seed, "batches", epoch)
+        order = random.permutation(len(self._groups))
+        chunks = []
+        for group in np.unique(self._groups):
+            images = order[self._groups[order] == group]
+            chunks += [images[at : at + self._together] for at in range(0, len(images), self._together)]
+        chunks = [chunks[at] for at in random.permutation(len(chunks))]
+        # Incomplete ones come last, so that they do not displace those after them.
+        images = np.concatenate(sorted(chunks, key=len, reverse=True))
+        return [tuple(map(int, images[at : at + self._size])) for at in range(0, len(images), self._size)]
+
+
 def balanced_weights(timestep_of_image: IntArray, class_of_timestep: dict[int, int]) -> np.ndarray:
     """Weight of each image: 1 / (number of timesteps in its class).
 

@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from ...bench.contracts import Camera, Clip, FrameKey
+from ...bench.contracts import Camera, Clip
 from ..ops.mesh import TriangleFrames
 from ..ops.photometric import photometric_loss
 from ..ops.splats import WorldSplats
 from ..splats import rasterize
 from ..splats.request import Rendering
 from .config import DensifiedTraining, SplatTraining
-from .loop import Fit, TrainingImages, TrainingSummary, train
+from .image_training import ImageTrainer, Initial
 from .losses import position_penalty, scale_penalty
 from .optimisation import Densifier, Optimiser
-from .rendering import View, scene_center, scene_extent, view_of
+from .rendering import View, scene_center, scene_extent
 from .schedule import DensifySchedule, Sampler, Timeline, log_linear
 
-Initial = Mapping[str, tuple[Tensor, float]]
-"""Initial tensors with their learning rates, by name."""
 
-
-class SplatTrainer:
-    """A `Trainable` except for its loss: images, cameras, optimiser, density and learning rates.
+class SplatTrainer(ImageTrainer):
+    """A `Trainable` except for its loss: images, optimiser, density and learning rates of splats.
 
     A derived class calls `_start` at the end of its initialiser and `_render` in its ``loss``.
     """
@@ -35,12 +30,8 @@ class SplatTrainer:
     def __init__(
         self, clip: Clip, settings: DensifiedTraining, sampler: Sampler, device: str, *, masks: bool = False
     ):
-        self._settings, self._sampler = settings, sampler
-        self.keys: Sequence[FrameKey] = clip.splits["train"]
-        self._images = TrainingImages(clip, self.keys, sampler, device, masks=masks)
-        self.cameras = {key.camera: clip.cameras[key.camera] for key in self.keys}
-        self._views = {name: view_of(camera, device) for name, camera in self.cameras.items()}
-        self._background = torch.tensor(np.asarray(clip.background), dtype=torch.float32, device=device)
+        super().__init__(clip, settings, sampler, device, masks=masks)
+        self._settings = settings
 
     def _start(
         self,
@@ -63,10 +54,7 @@ class SplatTrainer:
         """
         initial = {**splats, **shared}
         self.splat_names, self.extent = tuple(splats), extent
-        self.optimiser = Optimiser(
-            {name: nn.Parameter(value) for name, (value, _) in initial.items()},
-            {name: rate for name, (_, rate) in initial.items()},
-        )
+        self._optimise(initial)
         self._rates = {name: rate for name, (_, rate) in initial.items() if name != "means"}
         self._densifier = Densifier(
             self._settings, self.optimiser, self.splat_names, binding, face_count, extent, seed, **density
@@ -79,13 +67,9 @@ class SplatTrainer:
 
     def begin(self, timeline: Timeline) -> None:
         """Fit schedules to the length of the run."""
-        self._timeline = timeline
+        super().begin(timeline)
         white = bool((self._background == 1).all())
         self._schedule = DensifySchedule.of(self._settings, timeline, white=white)
-
-    def loss(self, iteration: int, index: int) -> Tensor:
-        """Loss of one image."""
-        raise NotImplementedError
 
     def after_backward(self, iteration: int) -> None:
         """Apply densification and resets of this iteration, and the learning rates."""
@@ -107,28 +91,16 @@ class SplatTrainer:
 
     def state(self) -> dict[str, Any]:
         """Parameters, moments, binding and densification statistics."""
-        return {"optimiser": self.optimiser.state(), "densifier": self._densifier.state()}
+        return {**super().state(), "densifier": self._densifier.state()}
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Restore what `state` returned."""
-        self.optimiser.load_state(state["optimiser"])
+        super().load_state(state)
         self._densifier.load_state(state["densifier"])
 
     def note(self) -> str:
         """Number of splats."""
         return f"{len(self.binding)} splats"
-
-    def run(self, fit: Fit) -> TrainingSummary:
-        """Train to the end of the budget; see `train`."""
-        length, seconds = self._settings.schedule_length, self._settings.checkpoint_every_s
-        try:
-            return train(self, self._sampler, fit, published_length=length, checkpoint_every_s=seconds)
-        finally:
-            self.close()
-
-    def close(self) -> None:
-        """Stop background work."""
-        self._images.close()
 
     def _position_progress(self, iteration: int) -> float:
         """Progress of the positions' learning rate towards the final one, which it keeps above 1."""

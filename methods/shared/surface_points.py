@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from ...bench.contracts import FloatArray, IntArray
 from ...datasets.head.geometry import triangle_areas
@@ -33,6 +35,32 @@ class SurfacePoints(NamedTuple):
     def positions(self, vertices: FloatArray, faces: IntArray) -> FloatArray:
         """(P, 3) positions on a mesh of (V, 3) vertices."""
         return (self.barycentric[:, :, None] * vertices[faces[self.triangles]]).sum(1)
+
+
+class MeshPoints:
+    """Values of the vertices of a mesh, interpolated at points on it.
+
+    Parameters
+    ----------
+    points, faces, like : SurfacePoints, Tensor, Tensor
+        The points, the (F, 3) int64 triangles of the mesh, and a tensor of the type of the values.
+
+    Attributes
+    ----------
+    triangles : Tensor
+        (P,) int64 triangle of each point.
+    """
+
+    def __init__(self, points: SurfacePoints, faces: Tensor, like: Tensor):
+        self.triangles = torch.from_numpy(points.triangles).to(like.device)
+        # All first corners first: separate corners are added faster than rows of three.
+        self._corners = faces[self.triangles].t().reshape(-1)
+        self._weights = torch.from_numpy(points.barycentric).to(like).t()[:, :, None]
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """(P, C) of (V, C) values of the vertices."""
+        corners = values.index_select(0, self._corners).view(3, -1, values.shape[1])
+        return (corners * self._weights).sum(0)
 
 
 def poisson_disk(

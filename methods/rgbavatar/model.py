@@ -1,0 +1,184 @@
+"""The model of RGBAvatar: splats on a mesh, blendshapes of them, the network of their weights, and its file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from safetensors.torch import save
+from torch import Tensor
+from torch.nn.functional import linear
+
+from ...bench.contracts import HeadAsset
+from ...bench.errors import InputError
+from ...bench.io.arrays import Member
+from ...bench.io.files import write_bytes
+from ...datasets.head.rotations import axis_angle_to_matrix
+from ..ops.harmonics import C0
+from ..ops.mesh import TriangleFrames
+from ..ops.splats import WorldSplats, to_world
+from ..shared.schedule import torch_generator
+from ..shared.subject_mesh import SubjectMesh
+from ..shared.surface_points import MeshPoints, SurfacePoints, full_barycentric
+from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
+from .config import INPUTS
+
+AVATAR_FILE = "avatar.safetensors"
+INPUTS_KEY = "inputs"
+"""Key of the file's metadata: the network's inputs."""
+SHAPES = {"means": "mean_shapes", "quats": "quat_shapes", "colors": "color_shapes"}
+"""Attributes that blendshapes change, and the names of their blendshapes."""
+WEIGHTS, BIASES = (tuple(f"network_{part}_{layer}" for layer in range(3)) for part in ("weight", "bias"))
+_SPLATS: dict[str, tuple[int | str, ...]] = {
+    "means": ("N", 3),
+    "quats": ("N", 4),
+    "colors": ("N", 3),
+    "log_scales": ("N", 3),
+    "opacities": ("N",),
+    "barycentric": ("N", 2),
+    "mean_shapes": ("K", "N", 3),
+    "quat_shapes": ("K", "N", 4),
+    "color_shapes": ("K", "N", 3),
+    **dict(zip(WEIGHTS, (("hidden", "inputs"), ("hidden 2", "hidden"), ("K", "hidden 2")))),
+    **dict(zip(BIASES, (("hidden",), ("hidden 2",), ("K",)))),
+}
+MEMBERS = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in _SPLATS.items()} | {
+    "triangles": Member("i", ("N",), dtype="i4")
+}
+"""Tensors of an avatar of N splats and K blendshapes. Positions are in metres along the axes of the triangle, quaternions wxyz,
+colours harmonics of degree 0, scales logarithms of metres, opacities logits; triangle and the last two barycentric coordinates of the
+surface point; weights and biases of the network."""
+ROTATIONS = ("neck", "jaw", "eyes")
+"""Inputs that are rotations."""
+
+
+def tracked_inputs(arguments: Mapping[str, Tensor], names: Sequence[str]) -> Tensor:
+    """(T, I) inputs of the network: coefficients as they are, each rotation as the first two rows of its matrix.
+
+    Eyelids are left out for a head model without them.
+    """
+    columns = []
+    for name in names:
+        values = arguments.get(name)
+        if values is not None and name in ROTATIONS:
+            values = axis_angle_to_matrix(values.unflatten(1, (-1, 3)))[:, :, :2].flatten(1)
+        columns += [] if values is None else [values]
+    return torch.cat(columns, dim=1)
+
+
+def input_count(head: HeadAsset, names: Sequence[str]) -> int:
+    """Number of the network's inputs for a head model."""
+    lids = 0 if head.eyelid_basis is None else 2
+    sizes = {"expression": head.expression_basis.shape[2], "neck": 6, "jaw": 6, "eyes": 12, "eyelids": lids}
+    return sum({**sizes, "translation": 3}[name] for name in names)
+
+
+def initial_network(inputs: int, hidden: int, outputs: int, seed: int) -> dict[str, Tensor]:
+    """Weights and biases by name, uniform in the inverse root of the layer's inputs, as `torch.nn.Linear` has them."""
+    generator = torch_generator(seed, "network")
+    sizes = (inputs, *(len(WEIGHTS) - 1) * (hidden,), outputs)
+    tensors = {}
+    for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
+        for name, shape in ((WEIGHTS[layer], (fan_out, fan_in)), (BIASES[layer], (fan_out,))):
+            tensors[name] = (2 * torch.rand(shape, generator=generator) - 1) * fan_in**-0.5
+    return tensors
+
+
+def blend_weights(network: Mapping[str, Tensor], inputs: Tensor) -> Tensor:
+    """(T, K) weights of the blendshapes for (T, I) inputs; three layers with ReLU between them."""
+    values = inputs
+    for layer, (weight, bias) in enumerate(zip(WEIGHTS, BIASES)):
+        values = linear(values.relu() if layer else values, network[weight], network[bias])
+    return values
+
+
+def blended(splats: Mapping[str, Tensor], weights: Tensor) -> list[dict[str, Tensor]]:
+    """Splats of each of T poses: the neutral ones plus the blendshapes times the (T, K) weights."""
+    posed: list[dict[str, Tensor]] = [dict(splats) for _ in range(len(weights))]
+    for name, shapes_name in SHAPES.items():
+        shapes = splats[shapes_name]
+        changes = (weights @ shapes.flatten(1)).view(-1, *shapes.shape[1:])
+        for splat, change in zip(posed, changes):
+            splat[name] = splat[name] + change
+    return posed
+
+
+class PosedSurface(NamedTuple):
+    """Surface of a pose: the triangles' axes, of size 1 and without position, and the (N, 3) points of the splats."""
+
+    axes: TriangleFrames
+    points: Tensor
+
+
+class Surface:
+    """The surface points that splats are bound to, on the mesh of a subject."""
+
+    def __init__(self, mesh: SubjectMesh, points: SurfacePoints):
+        self.mesh, self._at_points = mesh, MeshPoints(points, mesh.faces, mesh.canonical)
+
+    @torch.no_grad()
+    def posed(self, arguments: Mapping[str, Tensor]) -> PosedSurface:
+        """The surface for the arguments of one timestep."""
+        vertices = self.mesh.posed(arguments)
+        frames = self.mesh.frames(vertices)
+        axes = frames._replace(center=torch.zeros_like(frames.center), size=torch.ones_like(frames.size))
+        return PosedSurface(axes, self._at_points(vertices))
+
+    def place(self, surface: PosedSurface, splats: Mapping[str, Tensor]) -> WorldSplats:
+        """Splats in the world: turned with their triangle, moved with their surface point, of unchanged size."""
+        means, log_scales, quats = (splats[name] for name in ("means", "log_scales", "quats"))
+        world = to_world(surface.axes, self._at_points.triangles, means, log_scales, quats)
+        return world._replace(means=world.means + surface.points)
+
+
+def seen_colors(values: Tensor) -> Tensor:
+    """(N, 3) colours of harmonics of degree 0, from every direction."""
+    return (0.5 + C0 * values).relu()
+
+
+class Stored(NamedTuple):
+    """Content of an avatar's file.
+
+    Attributes
+    ----------
+    tensors : dict[str, Tensor]
+        By the names of `MEMBERS`, without triangles and barycentric coordinates.
+    points : SurfacePoints
+        Surface point of each splat.
+    inputs : tuple[str, ...]
+        Tracked parameters that the network takes.
+    """
+
+    tensors: dict[str, Tensor]
+    points: SurfacePoints
+    inputs: tuple[str, ...]
+
+
+def write_avatar(path: Path, stored: Stored) -> None:
+    """Write an avatar as safetensors, exact: 68 bytes for each splat and 40 for each of its blendshapes."""
+    tensors = {name: value.detach().to("cpu", torch.float32) for name, value in stored.tensors.items()}
+    tensors["triangles"] = torch.from_numpy(stored.points.triangles.astype(np.int32))
+    tensors["barycentric"] = torch.from_numpy(stored.points.barycentric[:, 1:].astype(np.float32))
+    contiguous = {name: value.contiguous() for name, value in tensors.items()}
+    write_bytes(path, save(contiguous, {INPUTS_KEY: ",".join(stored.inputs)}))
+
+
+def read_avatar(path: Path, head: HeadAsset, device: str) -> Stored:
+    """Read and check what `write_avatar` wrote. Raises `InputError` where a tensor is missing or does not fit."""
+    tensors, metadata = read_safetensors(path)
+    inputs = tuple(metadata.get(INPUTS_KEY, "").split(","))
+    if not set(inputs) <= set(INPUTS) or len(set(inputs)) != len(inputs):
+        expected = f"names among {', '.join(INPUTS)}, each once"
+        raise InputError(path, INPUTS_KEY, expected, repr(metadata.get(INPUTS_KEY))[:80])
+    sizes = check_tensors(path, tensors, MEMBERS, {"inputs": input_count(head, inputs)})
+    triangles = tensors.pop("triangles").numpy().astype(np.int64)
+    if not sizes["N"] or not (0 <= triangles.min() and triangles.max() < len(head.faces)):
+        expected = f"at least one, each from 0 to {len(head.faces) - 1}"
+        raise InputError(path, "triangles", expected, f"{sizes['N']}, or others")
+    check_sizes(path, tensors["log_scales"])
+    points = SurfacePoints(triangles, full_barycentric(tensors.pop("barycentric").numpy()))
+    return Stored({name: tensors[name].to(device) for name in MEMBERS if name in tensors}, points, inputs)

@@ -1,0 +1,59 @@
+"""Spec of RGBAvatar. Light: the implementation is not imported."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...bench.specs import MethodSpec
+
+NERSEMBLE: dict[str, Any] = {
+    "schedule_length": 30_000,
+    "samples": 83_000,
+    "inputs": ("expression",),
+    "ssim_weight": 0.2,
+    "join": 2_000,
+    "position_lr": 1.6e-4,
+    "position_lr_final": 1.6e-6,
+    "position_settles": 30_000,
+    "opacity_lr": 0.025,
+    "scale_lr": 0.005,
+    "rotation_lr": 0.001,
+    "color_lr": 0.0025,
+}
+"""Values of the authors' program for several cameras (``config/nersemble.yaml``)."""
+SHORT: dict[str, Any] = {
+    "inputs": ("expression",),
+    "ssim_weight": 0.2,
+    "batch": 4,
+    "together": 4,
+    "color_every": 10,
+    "final_rate": 0.1,
+}
+"""Settings of runs much shorter than published (docs/explanation/methods/rgbavatar.md, "Presets")."""
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "smoke": {"budget": {"iterations": 60}, **SHORT, "samples": 3_000},
+    "demo": {"budget": {"iterations": 500}, **SHORT, "samples": 20_000},
+    "fast": {"budget": {"iterations": 1_000}, **SHORT, "samples": 40_000},
+    "nersemble": {"budget": {"iterations": 30_000}, **NERSEMBLE},
+    "gpu": {"budget": {"iterations": 5_000}},
+    "paper": {"budget": {"iterations": 5_000}},
+}
+
+RGBAVATAR = MethodSpec(
+    name="rgbavatar",
+    version="1",
+    summary="RGBAvatar: splats on the mesh with a few learnt blendshapes, weighted by a network of the tracked parameters.",
+    implementation="headbench.methods.rgbavatar.method:RGBAvatar",
+    config="headbench.methods.rgbavatar.config:RGBAvatarConfig",
+    needs="headbench.methods.shared.needs:splats",
+    presets=PRESETS,
+    source="RGBAvatar: Reduced Gaussian Blendshapes for Online Modeling of Head Avatars, CVPR 2025, arXiv 2503.12886",
+    bibtex=r"""@inproceedings{li2025rgbavatar,
+  title     = {{RGBAvatar}: Reduced {Gaussian} Blendshapes for Online Modeling of Head Avatars},
+  author    = {Li, Linzhou and Li, Yumeng and Weng, Yanlin and Zheng, Youyi and Zhou, Kun},
+  booktitle = {Proceedings of the IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
+  year      = {2025},
+  eprint    = {2503.12886},
+}""",
+)

@@ -1,0 +1,215 @@
+"""Training of RGBAvatar: batches of images, colours taken from them at the start, blendshapes that join later."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...bench.contracts import Clip
+from ..ops.harmonics import C0
+from ..ops.photometric import photometric_loss
+from ..ops.splats import WorldSplats
+from ..shared.avatar_files import clip_mesh
+from ..shared.image_training import ImageTrainer, Initial
+from ..shared.loop import recomposited
+from ..shared.optimisation import logit
+from ..shared.rendering import View
+from ..shared.schedule import GroupedBatches, log_linear, numpy_generator
+from ..shared.subject_mesh import BoundedCache
+from ..shared.surface_points import poisson_disk
+from ..splats import rasterize
+from .config import RGBAvatarConfig
+from .model import (
+    BIASES,
+    SHAPES,
+    WEIGHTS,
+    PosedSurface,
+    Stored,
+    Surface,
+    blend_weights,
+    blended,
+    initial_network,
+    seen_colors,
+    tracked_inputs,
+)
+
+PUBLISHED_SAMPLES = 60_000
+"""Number of splats for which the published size at the start is given: texels of 256 x 256 that show FLAME, rounded."""
+
+
+class RGBAvatarTraining(ImageTrainer):
+    """A `Trainable`: neutral splats, their blendshapes, and the network of the weights.
+
+    Attributes
+    ----------
+    colored : Tensor
+        (N,) bool, splats that images have given a colour.
+    """
+
+    def __init__(self, clip: Clip, config: RGBAvatarConfig, device: str, seed: int):
+        keys = clip.splits["train"]
+        batches = GroupedBatches([key.timestep for key in keys], config.batch, config.together, seed)
+        masks = config.random_background and clip.mask(keys[0]) is not None
+        super().__init__(clip, config, batches, device, masks=masks)
+        self._config, self._batches, self._seed, self._masks = config, batches, seed, masks
+        mesh = clip_mesh(clip, device)
+        faces, vertices = np.asarray(clip.head.faces), mesh.canonical.cpu().numpy().astype(np.float64)
+        self.points = poisson_disk(vertices, faces, np.arange(len(faces)), config.samples, seed)
+        self._surface = Surface(mesh, self.points)
+        timesteps = sorted({key.timestep for key in keys})
+        self._row = {timestep: row for row, timestep in enumerate(timesteps)}
+        self._arguments = mesh.arguments([clip.poses[timestep] for timestep in timesteps])
+        self._inputs = tracked_inputs(self._arguments, config.inputs)
+        entry = 4 * (17 * len(faces) + 3 * len(self.points.triangles))
+        self._surfaces = BoundedCache(self._posed, config.mesh_cache_mb * 2**20 // entry)
+        initial = self._initial(device)
+        self._rates = {name: rate for name, (_, rate) in initial.items()}
+        self._optimise(initial)
+        self.colored = torch.zeros(len(self.points.triangles), dtype=torch.bool, device=device)
+
+    def loss(self, iteration: int, index: int) -> Tensor:
+        """Mean loss of the images of a batch; ``index`` is that of one of them."""
+        self._seen: list[tuple[WorldSplats, Tensor, View, Tensor]] = []
+        batch = self._batches.batch(iteration)
+        rows = sorted({self._row[self.keys[image].timestep] for image in batch})
+        splats = dict(zip(rows, self._splats(iteration, rows)))
+        placed = {
+            row: (self._surface.place(self._surfaces(row), splats[row]), seen_colors(splats[row]["colors"]))
+            for row in rows
+        }
+        opacities = self.optimiser["opacities"].sigmoid()
+        total = opacities.new_zeros(())
+        for position, image in self._batches.positions(iteration):
+            key = self.keys[image]
+            view, (world, colors) = self._views[key.camera], placed[self._row[key.timestep]]
+            pixels = self._images.get(position, image)
+            truth, background = self._on_background(pixels, iteration, image)
+            camera = view.camera
+            rendering = rasterize(
+                *(*world, opacities, colors, view.world_to_camera, view.K, camera.width, camera.height),
+                background=background,
+                check_values=False,
+            )
+            total = total + photometric_loss(rendering.image, truth, self._config.ssim_weight)
+            self._seen.append((world, opacities, view, pixels))
+        return total / len(batch)
+
+    def after_backward(self, iteration: int) -> None:
+        """Give colours to splats that are seen for the first time; set the learning rates."""
+        config = self._config
+        due = config.color_weight > 0 and (iteration - 1) % config.color_every == 0
+        if due and not bool(self.colored.all()):
+            self._take_colors()
+        progress = iteration / max(self._timeline.at(config.position_settles), 1)
+        positions = log_linear(config.position_lr, config.position_lr_final, progress) / config.position_lr
+        late = max(0.0, 2 * self._timeline.fraction(iteration) - 1)
+        others = log_linear(1.0, config.final_rate, late)
+        for name, rate in self._rates.items():
+            self.optimiser.set_learning_rate(name, rate * (positions if name == "means" else others))
+
+    def state(self) -> dict[str, Any]:
+        """Parameters, moments, and which splats have a colour."""
+        return {**super().state(), "colored": self.colored}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Restore what `state` returned."""
+        super().load_state(state)
+        self.colored = state["colored"]
+
+    def note(self) -> str:
+        """Number of splats."""
+        return f"{len(self.colored)} splats"
+
+    def result(self) -> Stored:
+        """The trained avatar, without splats that no image has given a colour: nothing was learnt about them."""
+        kept = self.colored if self._config.color_weight else torch.ones_like(self.colored)
+        if not bool(kept.any()):
+            kept = torch.ones_like(kept)
+        tensors = {name: self.optimiser[name].detach() for name in self._rates}
+        for name, value in tensors.items():
+            if name in SHAPES.values():
+                tensors[name] = value[:, kept]
+            elif name not in (*WEIGHTS, *BIASES):
+                tensors[name] = value[kept]
+        rows = kept.cpu().numpy()
+        return Stored(tensors, type(self.points)(*(part[rows] for part in self.points)), self._config.inputs)
+
+    def _splats(self, iteration: int, rows: Sequence[int]) -> list[dict[str, Tensor]]:
+        """Splats of some timesteps; the neutral ones before the blendshapes are trained."""
+        splats: dict[str, Tensor] = {name: self.optimiser[name] for name in self._rates}
+        if iteration <= self._timeline.at(self._config.join):
+            return [splats] * len(rows)
+        return blended(splats, blend_weights(splats, self._inputs[rows]))
+
+    @torch.no_grad()
+    def _posed(self, row: int) -> PosedSurface:
+        return self._surface.posed({name: values[row : row + 1] for name, values in self._arguments.items()})
+
+    def _on_background(self, pixels: Tensor, iteration: int, image: int) -> tuple[Tensor, Tensor]:
+        """(H, W, 3) colours, on a random background if there are masks, and that background."""
+        if not self._masks:
+            return pixels, self._background
+        random = numpy_generator(self._seed, "background", iteration * len(self.keys) + image).random(3)
+        background = torch.from_numpy(random).to(self._background)
+        return recomposited(pixels[:, :, :3], pixels[:, :, 3:], self._background, background), background
+
+    def _take_colors(self) -> None:
+        """Set colours of splats whose weights over the batch's foreground add up to enough for the first time.
+
+        The colour is the mean of the images' colours, weighted by what the splat contributes to each pixel. These sums are
+        gradients: of a rendering times the image, with respect to the colours of the splats.
+        """
+        sums = torch.zeros(len(self.colored), 4, device=self.colored.device)
+        for world, opacities, view, pixels in self._seen:
+            truth = torch.cat([pixels[:, :, :3], torch.ones_like(pixels[:, :, :1])], dim=2)
+            if self._masks:
+                truth = truth * (pixels[:, :, 3:] > 0.5)
+            values = torch.zeros_like(sums).requires_grad_()
+            camera = view.camera
+            with torch.enable_grad():
+                means, quats, scales, opacity = (part.detach() for part in (*world, opacities))
+                rendering = rasterize(
+                    *(means, quats, scales, opacity, values),
+                    *(view.world_to_camera, view.K, camera.width, camera.height),
+                    check_values=False,
+                )
+                (sums_of_view,) = torch.autograd.grad((rendering.image * truth).sum(), values)
+            sums += sums_of_view
+        new = (sums[:, 3] > self._config.color_weight) & ~self.colored
+        rows = new.nonzero().squeeze(1)
+        parameter = self.optimiser["colors"]
+        parameter.data[rows] = (sums[rows, :3] / sums[rows, 3:] - 0.5) / C0
+        if parameter.grad is not None:
+            parameter.grad[rows] = 0
+        self.colored = self.colored | new
+
+    def _initial(self, device: str) -> Initial:
+        """Grey splats of equal size on the surface, blendshapes of zero, a random network."""
+        config, count = self._config, len(self.points.triangles)
+        scale = 1e-3 * config.initial_scale_mm * (PUBLISHED_SAMPLES / count) ** 0.5
+        quats = torch.zeros(count, 4)
+        quats[:, 0] = 1
+        splats = {
+            "means": (torch.zeros(count, 3), config.position_lr),
+            "quats": (quats, config.rotation_lr),
+            "colors": (torch.zeros(count, 3), config.color_lr),
+            "log_scales": (torch.full((count, 3), float(np.log(scale))), config.scale_lr),
+            "opacities": (torch.full((count,), logit(config.initial_opacity)), config.opacity_lr),
+        }
+        shares = {
+            "means": config.position_share,
+            "quats": config.rotation_share,
+            "colors": config.color_share,
+        }
+        shapes = {
+            SHAPES[name]: (torch.zeros(config.blendshapes, *splats[name][0].shape), share * splats[name][1])
+            for name, share in shares.items()
+        }
+        network = initial_network(self._inputs.shape[1], config.hidden, config.blendshapes, self._seed)
+        layers = {name: (value, config.network_lr) for name, value in network.items()}
+        initial = {**splats, **shapes, **layers}
+        return {name: (value.to(device), rate) for name, (value, rate) in initial.items()}

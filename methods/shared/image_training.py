@@ -1,0 +1,92 @@
+"""Training on the images of a clip, independent of what is rendered: images, cameras, optimiser, the run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ...bench.contracts import Clip, FrameKey
+from .loop import Fit, TrainingImages, TrainingSummary, train
+from .optimisation import Optimiser
+from .rendering import view_of
+from .schedule import Sampler, Timeline
+
+Initial = Mapping[str, tuple[Tensor, float]]
+"""Initial tensors with their learning rates, by name."""
+
+
+class RunSettings(Protocol):
+    """Settings of every training: iterations of the published run, and seconds between checkpoints."""
+
+    @property
+    def schedule_length(self) -> int: ...
+    @property
+    def checkpoint_every_s(self) -> float: ...
+
+
+class ImageTrainer:
+    """A `Trainable` except for its loss. A derived class calls `_optimise` in its initialiser.
+
+    Attributes
+    ----------
+    keys, cameras : Sequence[FrameKey], dict[str, Camera]
+        The training frames, in the order of the sampler's indices, and their cameras by name.
+    """
+
+    optimiser: Optimiser
+
+    def __init__(
+        self, clip: Clip, settings: RunSettings, sampler: Sampler, device: str, *, masks: bool = False
+    ):
+        self._run_settings, self._sampler = settings, sampler
+        self.keys: Sequence[FrameKey] = clip.splits["train"]
+        self._images = TrainingImages(clip, self.keys, sampler, device, masks=masks)
+        self.cameras = {key.camera: clip.cameras[key.camera] for key in self.keys}
+        self._views = {name: view_of(camera, device) for name, camera in self.cameras.items()}
+        self._background = torch.tensor(np.asarray(clip.background), dtype=torch.float32, device=device)
+
+    def _optimise(self, initial: Initial) -> None:
+        """Set the initial tensors."""
+        self.optimiser = Optimiser(
+            {name: nn.Parameter(value) for name, (value, _) in initial.items()},
+            {name: rate for name, (_, rate) in initial.items()},
+        )
+
+    def begin(self, timeline: Timeline) -> None:
+        """Fit schedules to the length of the run."""
+        self._timeline = timeline
+
+    def loss(self, iteration: int, index: int) -> Tensor:
+        """Loss of one image."""
+        raise NotImplementedError
+
+    def after_backward(self, iteration: int) -> None:
+        """Hook between gradients and step."""
+
+    def state(self) -> dict[str, Any]:
+        """Parameters and moments."""
+        return {"optimiser": self.optimiser.state()}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Restore what `state` returned."""
+        self.optimiser.load_state(state["optimiser"])
+
+    def note(self) -> str:
+        """Short description of the state of training."""
+        return ""
+
+    def run(self, fit: Fit) -> TrainingSummary:
+        """Train to the end of the budget; see `train`."""
+        length, seconds = self._run_settings.schedule_length, self._run_settings.checkpoint_every_s
+        try:
+            return train(self, self._sampler, fit, published_length=length, checkpoint_every_s=seconds)
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Stop background work."""
+        self._images.close()
