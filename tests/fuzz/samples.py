@@ -42,6 +42,7 @@ from ..datasets.tracker_files.trackers import write_flashavatar
 from ..methods.gha.small import SMALL as SMALL_GHA
 from ..methods.insta.small import SMALL as SMALL_INSTA
 from ..methods.official.repository import lip_numbers, make_interpreter, make_repository
+from ..methods.rgbavatar.small import SMALL as SMALL_RGBAVATAR
 
 AVATAR = "run/901/{}/seed-0/avatar"
 GA, OURS = AVATAR.format("ga"), AVATAR.format("ours")
@@ -51,7 +52,7 @@ PREPARE = (
     "prepare nersemble --root recording --tracking tracking --head head.npz --subjects 901 "
     "--sequences EMO-1,FREE --downscale 2 --every 1"
 )
-METHODS = ("mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours")
+METHODS = ("mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "rgbavatar", "ours")
 ITERATIONS = {"budget": {"iterations": 2}}
 NUMBERS = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
 SETTINGS = {
@@ -59,6 +60,7 @@ SETTINGS = {
     "gbs": {**ITERATIONS, "samples": 200, "teeth_samples": 20},
     "gha": {**ITERATIONS, **SMALL_GHA, "start_steps": 2, "motion_steps": 2},
     "insta": {**ITERATIONS, **SMALL_INSTA},
+    "rgbavatar": {**ITERATIONS, **SMALL_RGBAVATAR},
     "ours": {
         **ITERATIONS,
         "planes": {"resolution": 8},

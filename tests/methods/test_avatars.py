@@ -24,9 +24,12 @@ from headbench.methods.ga.storage import COLUMNS, read_ga_splats, write_ga_splat
 from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
 from headbench.methods.gbs.method import GBS
 from headbench.methods.ours.method import Ours
+from headbench.methods.rgbavatar.config import RGBAvatarConfig
+from headbench.methods.rgbavatar.method import RGBAvatar
 from headbench.methods.shared.config import SplatTraining
 
 from .ours.toy import SMALL, changed
+from .rgbavatar.small import SMALL as SMALL_RGBAVATAR
 from .toy_clip import first_view
 
 FAST = SplatTraining(max_splats=1200, min_densify_every=40, min_settle=20)
@@ -37,8 +40,9 @@ CONFIGS = {
     "ga": lambda: GA(GAConfig(splats=FAST)),
     "ours": lambda: Ours(changed(SMALL, splats=FAST, hidden=16, planes={"resolution": 16})),
     "gbs": lambda: GBS(GBSConfig(splats=BLENDSHAPES, samples=600, teeth_samples=40, min_sh_every=30)),
+    "rgbavatar": lambda: RGBAvatar(RGBAvatarConfig(**SMALL_RGBAVATAR)),
 }
-STORED = {"ga": "point_cloud.ply", "ours": "avatar.safetensors", "gbs": "avatar.safetensors"}
+STORED = {name: "point_cloud.ply" if name == "ga" else "avatar.safetensors" for name in CONFIGS}
 
 
 @pytest.fixture(scope="module", params=[*CONFIGS])

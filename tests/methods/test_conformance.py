@@ -16,6 +16,7 @@ from headbench.bench.registry import discover
 from headbench.bench.specs import MethodSpec
 
 from .insta.small import SMALL as SMALL_INSTA
+from .rgbavatar.small import SMALL as SMALL_RGBAVATAR
 from .toy_clip import toy_pose
 
 TRAINED = {
@@ -26,6 +27,7 @@ TRAINED = {
 OWN_TRAINING = {
     "gha": {"budget": {"iterations": 24}, "grid_vertices": 3_000, "start_steps": 20, "motion_steps": 20},
     "insta": {"budget": {"iterations": 24}, "checkpoint_every_s": 0.0, **SMALL_INSTA},
+    "rgbavatar": {"budget": {"iterations": 24}, "checkpoint_every_s": 0.0, **SMALL_RGBAVATAR},
 }
 """Methods that do not train splats bound to the mesh, with their own short settings."""
 SMALL = {
@@ -66,7 +68,7 @@ def altered(clip, head):
 
 
 def test_our_methods_are_registered():
-    assert {"ours", "ga", "gbs", "gha", "insta", "mean-image", "nearest-camera"} <= set(SPECS)
+    assert {"ours", "ga", "gbs", "gha", "insta", "rgbavatar", "mean-image", "nearest-camera"} <= set(SPECS)
 
 
 @pytest.mark.parametrize("name", SPECS)

@@ -20,6 +20,8 @@ from headbench.methods.gha.method import GHA
 from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.method import Insta
 from headbench.methods.ours.method import Ours
+from headbench.methods.rgbavatar.config import RGBAvatarConfig
+from headbench.methods.rgbavatar.method import RGBAvatar
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.loop import CHECKPOINT
 from headbench.methods.shared.optimisation import Optimiser
@@ -28,6 +30,7 @@ from ..datasets.head.toy import toy_head
 from .gha.small import small_config
 from .insta.small import SMALL as SMALL_INSTA
 from .ours.toy import REPAIRED, changed
+from .rgbavatar.small import SMALL as SMALL_RGBAVATAR
 from .toy_clip import toy_clip
 
 # Rounds at 8, 16, ..., 32, resets at 10, 30; lines from iteration 4 on.
@@ -48,8 +51,9 @@ METHODS = {
     "gbs": lambda: GBS(GBSConfig(splats=BLENDSHAPES, samples=400, teeth_samples=40, mask_floor_mm=0.5)),
     "gha": lambda: GHA(small_config()),
     "insta": lambda: Insta(InstaConfig(**SMALL_INSTA, checkpoint_every_s=0.0)),
+    "rgbavatar": lambda: RGBAvatar(RGBAvatarConfig(**SMALL_RGBAVATAR, checkpoint_every_s=0.0)),
 }
-ITERATIONS = {"gha": 30, "insta": 24}  # of gha, 12 are of the mesh phase
+ITERATIONS = {"gha": 30, "insta": 24, "rgbavatar": 24}  # of gha, 12 are of the mesh phase
 KILLS = [
     # Right after a densification, after a reset, right before a densification and right after it, and near the end.
     *((name, (8, 10, 15, 16, 33)) for name in ("ga", "ours", "gbs")),
@@ -58,6 +62,8 @@ KILLS = [
     *(pytest.param("gha", (kill,), marks=pytest.mark.slow) for kill in (5, 12, 13, 25, 29)),
     # Between refreshes of the occupancy grid, right after one.
     ("insta", (3, 6, 8, 17)),
+    # Before the blendshapes are trained, right after that, between two searches for colours and right after one.
+    ("rgbavatar", (3, 4, 5, 12)),
 ]
 
 

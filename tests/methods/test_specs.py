@@ -25,11 +25,12 @@ from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.spec import INSTA
 from headbench.methods.ours.config import Lines, OursConfig, OuterLayers, Penalty, Planes, PlannedCapacity
 from headbench.methods.ours.spec import OURS
+from headbench.methods.rgbavatar.spec import RGBAVATAR
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, Timeline
 from headbench.methods.trivial.spec import MEAN_IMAGE, NEAREST_CAMERA
 
-SPECS = {spec.name: spec for spec in (OURS, GA, GBS, GHA, INSTA, MEAN_IMAGE, NEAREST_CAMERA)}
+SPECS = {spec.name: spec for spec in (OURS, GA, GBS, GHA, INSTA, RGBAVATAR, MEAN_IMAGE, NEAREST_CAMERA)}
 PRESETS = ("smoke", "demo", "fast", "gpu", "paper")
 
 
@@ -100,12 +101,12 @@ def test_short_presets_share_rates_that_paper_leaves_alone(preset):
     assert values(gbs, "sh_dc_lr", "sh_rest_lr") == values(ga, "sh_dc_lr", "sh_rest_lr") == (0.02, 1e-3)
 
 
-@pytest.mark.parametrize("spec", [OURS, GA, GBS, GHA, INSTA], ids=lambda spec: spec.name)
+@pytest.mark.parametrize("spec", [OURS, GA, GBS, GHA, INSTA, RGBAVATAR], ids=lambda spec: spec.name)
 def test_the_gpu_preset_is_the_published_one_but_shorter(spec):
     gpu, paper = (resolve_method(spec, preset, {}) for preset in ("gpu", "paper"))
     assert gpu.config == paper.config
     assert gpu.spec.resolution == paper.spec.resolution
-    # INSTA's published training is short already.
+    # INSTA's and RGBAvatar's published trainings are short already.
     assert min(paper.budget.iterations, 30_000) <= gpu.budget.iterations <= 60_000
     assert list(spec.presets)[-2:] == ["gpu", "paper"]
 

@@ -16,6 +16,7 @@ from headbench.methods.gbs.spec import GBS
 from headbench.methods.gha.spec import GHA
 from headbench.methods.insta.spec import INSTA
 from headbench.methods.ours.spec import OURS
+from headbench.methods.rgbavatar.spec import RGBAVATAR
 
 from ..datasets.flat_renderer import flat_pictures
 
@@ -68,7 +69,9 @@ def psnr(spec, clip, folder):
 
 
 @pytest.mark.parametrize(
-    "spec", [GA, GBS, GHA, pytest.param(INSTA, marks=pytest.mark.slow), OURS], ids=lambda spec: spec.name
+    "spec",
+    [GA, GBS, GHA, pytest.param(INSTA, marks=pytest.mark.slow), OURS, RGBAVATAR],
+    ids=lambda spec: spec.name,
 )
 def test_a_world_far_from_its_origin_is_as_good(clip, tmp_path, spec):
     near, far = (psnr(spec, moved(clip, shift), tmp_path / str(shift[0])) for shift in (0 * FAR, FAR))

@@ -14,6 +14,7 @@ from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.schedule import (
     BLOCK,
     DensifySchedule,
+    GroupedBatches,
     ShuffledEpochs,
     Timeline,
     Weighted,
@@ -132,3 +133,28 @@ def test_the_global_generator_is_left_alone():
     before = torch.random.get_rng_state()
     draw(0, "a", 0)
     assert torch.equal(torch.random.get_rng_state(), before)
+
+
+@given(
+    groups=st.lists(st.integers(0, 4), min_size=1, max_size=40),
+    size=st.integers(1, 7),
+    together=st.integers(1, 7),
+)
+def test_batches_hold_every_image_once_per_epoch(groups, size, together):
+    batches = GroupedBatches(groups, size, together, seed=1)
+    length = -(-len(groups) // size)
+    for epoch in (0, 3):
+        numbers = [epoch * length + at + 1 for at in range(length)]
+        images = [image for number in numbers for image in batches.batch(number)]
+        assert sorted(images) == list(range(len(groups)))
+        for number in numbers:
+            for at, image in batches.positions(number):
+                assert batches(at) == image
+            following = batches.positions(number)[-1][0] + 1
+            assert batches(following) == batches.batch(number + 1)[0]
+
+
+def test_batches_share_a_group_where_it_is_large_enough():
+    batches = GroupedBatches([0] * 15 + [1] * 15, 4, 4, seed=0)
+    shared = [len({image // 15 for image in batches.batch(number)}) == 1 for number in range(1, 9)]
+    assert shared[:6] == [True] * 6

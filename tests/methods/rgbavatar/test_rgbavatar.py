@@ -1,0 +1,246 @@
+"""RGBAvatar's own part: blendshapes, their weights, splats on a moving surface, colours from images, batches."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from headbench.bench.errors import InputError
+from headbench.datasets.head.rotations import axis_angle_to_matrix
+from headbench.methods.ops.harmonics import C0
+from headbench.methods.rgbavatar.config import INPUTS, RGBAvatarConfig
+from headbench.methods.rgbavatar.model import (
+    AVATAR_FILE,
+    SHAPES,
+    Surface,
+    blend_weights,
+    blended,
+    initial_network,
+    input_count,
+    read_avatar,
+    seen_colors,
+    tracked_inputs,
+    write_avatar,
+)
+from headbench.methods.rgbavatar.training import RGBAvatarTraining
+from headbench.methods.shared.schedule import Timeline
+from headbench.methods.shared.subject_mesh import SubjectMesh
+from headbench.methods.shared.surface_points import poisson_disk
+from headbench.methods.splats import rasterize
+
+SMALL = {"samples": 400, "hidden": 8, "blendshapes": 3, "schedule_length": 40, "join": 4}
+
+
+def make(clip, **settings):
+    training = RGBAvatarTraining(clip, RGBAvatarConfig(**{**SMALL, **settings}), "cpu", 0)
+    training.begin(Timeline(40, 40))
+    return training
+
+
+@pytest.fixture
+def splats():
+    """Five random splats with three blendshapes and the network of their weights, in double precision."""
+    generator = torch.Generator().manual_seed(0)
+    widths = {"means": 3, "quats": 4, "colors": 3}
+    tensors = {name: torch.randn(5, width, generator=generator) for name, width in widths.items()}
+    tensors |= {SHAPES[name]: torch.randn(3, 5, width, generator=generator) for name, width in widths.items()}
+    tensors |= initial_network(7, 8, 3, 0)
+    return {name: value.double() for name, value in tensors.items()}
+
+
+def test_blendshapes_are_added_in_proportion_to_their_weights(splats):
+    weights = torch.tensor([[0.0, 0.0, 0.0], [2.0, -1.0, 0.5]], dtype=torch.float64)
+    neutral, posed = blended(splats, weights)
+    for name, shapes in SHAPES.items():
+        assert torch.equal(neutral[name], splats[name])
+        expected = splats[name].numpy() + np.einsum("k,knc->nc", weights[1].numpy(), splats[shapes].numpy())
+        np.testing.assert_allclose(posed[name], expected, rtol=1e-12)
+
+
+def test_the_network_is_three_layers_with_relu_between(splats):
+    inputs = np.random.default_rng(0).normal(size=(2, 7))
+    values = inputs
+    for layer in range(3):
+        weight, bias = (splats[f"network_{part}_{layer}"].numpy() for part in ("weight", "bias"))
+        values = (np.maximum(values, 0) if layer else values) @ weight.T + bias
+    np.testing.assert_allclose(blend_weights(splats, torch.from_numpy(inputs)), values, rtol=1e-12)
+
+
+def test_gradients_of_blending_are_those_of_differences(splats):
+    inputs = torch.randn(2, 7, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    names = [*SHAPES, *SHAPES.values(), "network_weight_0", "network_bias_2"]
+
+    def posed(*values):
+        changed = {**splats, **dict(zip(names, values))}
+        return tuple(
+            each[name] for each in blended(changed, blend_weights(changed, inputs)) for name in SHAPES
+        )
+
+    assert torch.autograd.gradcheck(posed, tuple(splats[name].requires_grad_() for name in names))
+
+
+def test_inputs_are_coefficients_and_two_rows_of_each_rotation(clip, head):
+    mesh = SubjectMesh(head, clip.shape, clip.static_offset, "cpu")
+    pose = clip.poses[0]
+    (found,) = tracked_inputs(mesh.arguments([pose]), INPUTS).numpy()
+    expected = [pose.expression]
+    for vector in (pose.neck, pose.jaw, pose.eyes[:3], pose.eyes[3:]):
+        expected.append(axis_angle_to_matrix(torch.tensor(vector))[:2].flatten().numpy())
+    expected += (
+        [] if head.eyelid_basis is None else [pose.eyelids if pose.eyelids is not None else np.zeros(2)]
+    )
+    np.testing.assert_allclose(found, np.concatenate([*expected, pose.translation]), atol=1e-6)
+    assert len(found) == input_count(head, INPUTS)
+
+
+def test_splats_sit_on_the_surface_and_turn_with_the_head(clip, head):
+    mesh = SubjectMesh(head, clip.shape, clip.static_offset, "cpu")
+    vertices, faces = mesh.canonical.double().numpy(), np.asarray(head.faces)
+    points = poisson_disk(vertices, faces, np.arange(len(faces)), 200, 0)
+    surface, count = Surface(mesh, points), len(points.triangles)
+    generator = torch.Generator().manual_seed(0)
+    splats = {
+        "means": 0.01 * torch.randn(count, 3, generator=generator),
+        "quats": torch.randn(count, 4, generator=generator),
+        "log_scales": torch.randn(count, 3, generator=generator) - 6,
+    }
+    still = replace(clip.poses[0], rotation=np.zeros(3, np.float32), translation=np.zeros(3, np.float32))
+    arguments = mesh.arguments([still])
+    posed = mesh.posed(arguments).double().numpy()
+    on_surface = surface.place(surface.posed(arguments), {**splats, "means": torch.zeros(count, 3)})
+    np.testing.assert_allclose(on_surface.means, points.positions(posed, faces), atol=1e-6)
+
+    vector, shift = np.array([0.3, -0.5, 0.2], np.float32), np.array([0.1, 0.2, -0.3], np.float32)
+    moved = mesh.arguments([replace(still, rotation=vector, translation=shift)])
+    one, other = (surface.place(surface.posed(each), splats) for each in (arguments, moved))
+    turn = axis_angle_to_matrix(torch.from_numpy(vector))
+    root = mesh.model.rest_joints(mesh.canonical[None], arguments["expression"])[0, 0]
+    expected = (one.means - root) @ turn.t() + root + torch.from_numpy(shift)
+    np.testing.assert_allclose(other.means, expected, atol=2e-6)
+
+    def covariance(world):
+        w, x, y, z = world.quats.unbind(1)
+        rows = [
+            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        ]
+        axes = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+        return axes @ torch.diag_embed(world.scales**2) @ axes.mT
+
+    np.testing.assert_allclose(covariance(other), turn @ covariance(one) @ turn.t(), atol=1e-5)
+
+
+def test_a_batch_has_the_mean_gradient_of_its_images(clip):
+    together = make(clip, batch=3, random_background=False)
+    (batch,) = {together._batches.batch(5)}
+    together.loss(5, 0).backward()
+    gradients = []
+    for image in batch:
+        single = make(clip, batch=1, random_background=False)
+        single._batches.batch = lambda iteration, image=image: (image,)
+        single.loss(5, 0).backward()
+        gradients.append({name: single.optimiser[name].grad for name in SHAPES.values()})
+        single.close()
+    for name in SHAPES.values():
+        mean = sum(each[name] for each in gradients) / len(batch)
+        np.testing.assert_allclose(together.optimiser[name].grad, mean, atol=1e-6)
+    together.close()
+
+
+def test_blendshapes_join_after_their_step(clip):
+    training = make(clip)
+    for iteration in (4, 5):
+        training.loss(iteration, 0).backward()
+        assert (training.optimiser["color_shapes"].grad is not None) == (iteration == 5)
+    training.close()
+
+
+def test_colours_of_images_are_taken_once(clip):
+    red = np.array([200, 30, 90], np.uint8)
+    plain = replace(
+        clip, images={key: np.broadcast_to(red, image.shape) for key, image in clip.images.items()}
+    )
+    training = make(plain, random_background=False, color_weight=0.6)
+    training.loss(1, 0).backward()
+    training.after_backward(1)
+    seen = training.colored.clone()
+    assert 0 < int(seen.sum()) < len(seen)
+    colors = seen_colors(training.optimiser["colors"].detach())
+    np.testing.assert_allclose(colors[seen], np.broadcast_to(red / 255, (int(seen.sum()), 3)), atol=1e-4)
+    assert (colors[~seen] == 0.5).all()
+    training.optimiser["colors"].data[seen] = 0.25 / C0
+    training.loss(11, 0).backward()
+    training.after_backward(11)
+    assert (training.optimiser["colors"].detach()[seen] == 0.25 / C0).all()
+    training.close()
+
+
+def test_a_colour_is_weighted_by_what_a_splat_contributes(clip):
+    """Against the sum over pixels of weight times colour, the weights from renderings of single splats in order."""
+    training = make(clip, random_background=False, samples=60, color_weight=1e-3, batch=1)
+    training.loss(1, 0).backward()
+    (world, opacities, view, pixels), *_ = training._seen
+    count, camera = len(opacities), view.camera
+    depth = world.means.detach() @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3]
+    transmittance = np.ones((camera.height, camera.width))
+    sums = np.zeros((count, 4))
+    for index in depth.argsort().tolist():
+        one = [value.detach()[index : index + 1] for value in (*world, opacities)]
+        drawn = rasterize(*one, torch.ones(1, 1), view.world_to_camera, view.K, camera.width, camera.height)
+        weight = transmittance * drawn.alpha.double().numpy()
+        sums[index] = [*np.einsum("hw,hwc->c", weight, pixels.double().numpy()[:, :, :3]), weight.sum()]
+        transmittance = transmittance * (1 - drawn.alpha.double().numpy())
+    training.after_backward(1)
+    enough = sums[:, 3] > 1
+    assert enough.sum() > 10
+    found = seen_colors(training.optimiser["colors"].detach()).numpy()
+    np.testing.assert_allclose(found[enough], sums[enough, :3] / sums[enough, 3:], atol=5e-3)
+    training.close()
+
+
+def test_files_that_do_not_fit_are_refused(clip, head, tmp_path):
+    training = make(clip)
+    training.colored[:] = True
+    stored = training.result()
+    training.close()
+    path = tmp_path / AVATAR_FILE
+    write_avatar(path, stored)
+    again = read_avatar(path, head, "cpu")
+    assert all(torch.equal(again.tensors[name], value) for name, value in stored.tensors.items())
+    broken = {
+        "triangles": stored._replace(
+            points=stored.points._replace(triangles=stored.points.triangles + 10**6)
+        ),
+        "inputs": stored._replace(inputs=("expression", "smile")),
+        "network_weight_0": stored._replace(inputs=("neck",)),
+        "color_shapes": stored._replace(
+            tensors={**stored.tensors, "color_shapes": stored.tensors["color_shapes"][:-1]}
+        ),
+    }
+    for name, each in broken.items():
+        write_avatar(path, each)
+        with pytest.raises(InputError, match=name):
+            read_avatar(path, head, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"samples": 0}, "samples"),
+        ({"inputs": ()}, "inputs"),
+        ({"inputs": ("smile",)}, "inputs"),
+        ({"batch": 0}, "batch"),
+    ],
+)
+def test_settings_out_of_range_are_refused(settings, says):
+    with pytest.raises(ValueError, match=says):
+        RGBAvatarConfig(**settings)
+
+
+def test_a_batch_larger_than_the_capture_takes_all_its_images(clip):
+    training = make(clip, batch=100)
+    assert sorted(training._batches.batch(1)) == list(range(len(clip.splits["train"])))
+    assert torch.isfinite(training.loss(1, 0))
+    training.close()
