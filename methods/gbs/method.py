@@ -15,7 +15,6 @@ from ..shared.capacity import CapacityPlan, CapacityPlanner
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.schedule import ShuffledEpochs
-from ..shared.surface_points import SurfacePoints
 from .avatar import GBSAvatar
 from .config import GBSConfig
 from .mouth import padded_offset, with_mouth
@@ -50,7 +49,7 @@ class GBS(TrainedMethod[GBSConfig, GBSAvatar]):
 
     def _write(self, path: Path, training: GBSTraining) -> None:
         binding = training.binding.cpu().numpy()
-        points = SurfacePoints(*(values[binding] for values in training.points))
+        points = training.points.rows(binding)
         neutral = {name: training.optimiser[name].detach() for name in training.splat_names}
         differences = training.merged_differences()
         write_avatar(path, neutral, points, training.rig.expressions, training.entries, differences)

@@ -13,7 +13,15 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import FloatArray, HeadPose
-from ..shared.avatar_files import SUBJECT_FILE, Subject, finish_fit, read_shared_head, read_subject
+from ..avatars.compact.reduced import read_reduced
+from ..shared.avatar_files import (
+    COMPACT_FILE,
+    SUBJECT_FILE,
+    Subject,
+    finish_fit,
+    read_shared_head,
+    read_subject,
+)
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
@@ -38,7 +46,10 @@ HARMONICS = 15
 
 
 class RGBAvatarAvatar(StoredSplatAvatar):
-    """A trained head. ``avatar.safetensors`` and ``subject.npz`` count as storage; the shared head model is beside them."""
+    """A trained head. Files: ``avatar.safetensors`` and ``subject.npz``, or the coded file in place of both, count as storage.
+
+    The folder also has the shared head model.
+    """
 
     def __init__(
         self, files: Sequence[Path], mesh: SubjectMesh, subject: Subject, stored: Stored, device: str
@@ -50,9 +61,14 @@ class RGBAvatarAvatar(StoredSplatAvatar):
     @classmethod
     def read(cls, folder: Path, device: str) -> RGBAvatarAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        head, files = read_shared_head(folder), [folder / AVATAR_FILE, folder / SUBJECT_FILE]
-        subject = read_subject(folder / SUBJECT_FILE, head)
-        stored = read_avatar(folder / AVATAR_FILE, head, device)
+        head, coded = read_shared_head(folder), folder / COMPACT_FILE
+        if coded.exists():
+            files = [coded]
+            subject, stored = read_reduced(coded, head, device)
+        else:
+            files = [folder / AVATAR_FILE, folder / SUBJECT_FILE]
+            subject = read_subject(folder / SUBJECT_FILE, head)
+            stored = read_avatar(folder / AVATAR_FILE, head, device)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
         return cls(files, mesh, subject, stored, device)
 
@@ -62,10 +78,13 @@ class RGBAvatarAvatar(StoredSplatAvatar):
         colors = self._blended(self.mesh.arguments([pose]))["colors"].cpu().numpy()
         return colors, np.zeros((*colors.shape, HARMONICS), np.float32)
 
+    @torch.no_grad()
+    def weights(self, arguments: Mapping[str, Tensor]) -> Tensor:
+        """(T, K) weights of the blendshapes for T poses, given as `SubjectMesh.arguments` gives them."""
+        return blend_weights(self.stored.tensors, tracked_inputs(arguments, self.stored.inputs))
+
     def _blended(self, arguments: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        tensors = self.stored.tensors
-        weights = blend_weights(tensors, tracked_inputs(arguments, self.stored.inputs))
-        (splats,) = blended(tensors, weights)
+        (splats,) = blended(self.stored.tensors, self.weights(arguments))
         return splats
 
     def _posed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:

@@ -39,19 +39,20 @@ _SPLATS: dict[str, tuple[int | str, ...]] = {
     "colors": ("N", 3),
     "log_scales": ("N", 3),
     "opacities": ("N",),
-    "barycentric": ("N", 2),
     "mean_shapes": ("K", "N", 3),
     "quat_shapes": ("K", "N", 4),
     "color_shapes": ("K", "N", 3),
     **dict(zip(WEIGHTS, (("hidden", "inputs"), ("hidden 2", "hidden"), ("K", "hidden 2")))),
     **dict(zip(BIASES, (("hidden",), ("hidden 2",), ("K",)))),
 }
-MEMBERS = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in _SPLATS.items()} | {
-    "triangles": Member("i", ("N",), dtype="i4")
-}
+MEMBERS = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in _SPLATS.items()}
 """Tensors of an avatar of N splats and K blendshapes. Positions are in metres along the axes of the triangle, quaternions wxyz,
-colours harmonics of degree 0, scales logarithms of metres, opacities logits; triangle and the last two barycentric coordinates of the
-surface point; weights and biases of the network."""
+colours harmonics of degree 0, scales logarithms of metres, opacities logits; weights and biases of the network."""
+POINTS = {
+    "triangles": Member("i", ("N",), dtype="i4"),
+    "barycentric": Member("f", ("N", 2), MAX_MAGNITUDE, "f4"),
+}
+"""Triangle and last two barycentric coordinates of the surface points."""
 ROTATIONS = ("neck", "jaw", "eyes")
 """Inputs that are rotations."""
 
@@ -146,7 +147,7 @@ class Stored(NamedTuple):
     Attributes
     ----------
     tensors : dict[str, Tensor]
-        By the names of `MEMBERS`, without triangles and barycentric coordinates.
+        By the names of `MEMBERS`.
     points : SurfacePoints
         Surface point of each splat.
     inputs : tuple[str, ...]
@@ -156,6 +157,17 @@ class Stored(NamedTuple):
     tensors: dict[str, Tensor]
     points: SurfacePoints
     inputs: tuple[str, ...]
+
+    def checked(self, path: Path, head: HeadAsset, device: str) -> Stored:
+        """The same on a device. Raises `InputError`, naming ``path``, where the tensors do not fit each other or the head."""
+        sizes = {"inputs": input_count(head, self.inputs), "N": len(self.points.triangles)}
+        check_tensors(path, self.tensors, MEMBERS, sizes)
+        triangles, count = self.points.triangles, len(head.faces)
+        if not len(triangles) or not (0 <= triangles.min() and triangles.max() < count):
+            expected = f"at least one, each from 0 to {count - 1}"
+            raise InputError(path, "triangles", expected, f"{len(triangles)}, or others")
+        check_sizes(path, self.tensors["log_scales"])
+        return self._replace(tensors={name: self.tensors[name].to(device) for name in MEMBERS})
 
 
 def write_avatar(path: Path, stored: Stored) -> None:
@@ -170,15 +182,16 @@ def write_avatar(path: Path, stored: Stored) -> None:
 def read_avatar(path: Path, head: HeadAsset, device: str) -> Stored:
     """Read and check what `write_avatar` wrote. Raises `InputError` where a tensor is missing or does not fit."""
     tensors, metadata = read_safetensors(path)
-    inputs = tuple(metadata.get(INPUTS_KEY, "").split(","))
+    inputs = input_names(path, metadata.get(INPUTS_KEY, ""))
+    check_tensors(path, tensors, POINTS)
+    triangles, last_two = (tensors.pop(name).numpy() for name in POINTS)
+    points = SurfacePoints(triangles.astype(np.int64), full_barycentric(last_two))
+    return Stored(tensors, points, inputs).checked(path, head, device)
+
+
+def input_names(path: Path, names: str) -> tuple[str, ...]:
+    """The names of a comma-separated list. Raises `InputError`, naming ``path``, for others than `INPUTS`."""
+    inputs = tuple(names.split(","))
     if not set(inputs) <= set(INPUTS) or len(set(inputs)) != len(inputs):
-        expected = f"names among {', '.join(INPUTS)}, each once"
-        raise InputError(path, INPUTS_KEY, expected, repr(metadata.get(INPUTS_KEY))[:80])
-    sizes = check_tensors(path, tensors, MEMBERS, {"inputs": input_count(head, inputs)})
-    triangles = tensors.pop("triangles").numpy().astype(np.int64)
-    if not sizes["N"] or not (0 <= triangles.min() and triangles.max() < len(head.faces)):
-        expected = f"at least one, each from 0 to {len(head.faces) - 1}"
-        raise InputError(path, "triangles", expected, f"{sizes['N']}, or others")
-    check_sizes(path, tensors["log_scales"])
-    points = SurfacePoints(triangles, full_barycentric(tensors.pop("barycentric").numpy()))
-    return Stored({name: tensors[name].to(device) for name in MEMBERS if name in tensors}, points, inputs)
+        raise InputError(path, INPUTS_KEY, f"names among {', '.join(INPUTS)}, each once", repr(names)[:80])
+    return inputs

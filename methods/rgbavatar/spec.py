@@ -46,6 +46,7 @@ RGBAVATAR = MethodSpec(
     summary="RGBAvatar: splats on the mesh with a few learnt blendshapes, weighted by a network of the tracked parameters.",
     implementation="headbench.methods.rgbavatar.method:RGBAvatar",
     config="headbench.methods.rgbavatar.config:RGBAvatarConfig",
+    variants="headbench.methods.avatars.derived.coded:rgbavatar_variants",
     needs="headbench.methods.shared.needs:splats",
     presets=PRESETS,
     source="RGBAvatar: Reduced Gaussian Blendshapes for Online Modeling of Head Avatars, CVPR 2025, arXiv 2503.12886",

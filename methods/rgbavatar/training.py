@@ -135,8 +135,7 @@ class RGBAvatarTraining(ImageTrainer):
                 tensors[name] = value[:, kept]
             elif name not in (*WEIGHTS, *BIASES):
                 tensors[name] = value[kept]
-        rows = kept.cpu().numpy()
-        return Stored(tensors, type(self.points)(*(part[rows] for part in self.points)), self._config.inputs)
+        return Stored(tensors, self.points.rows(kept.cpu().numpy()), self._config.inputs)
 
     def _splats(self, iteration: int, rows: Sequence[int]) -> list[dict[str, Tensor]]:
         """Splats of some timesteps; the neutral ones before the blendshapes are trained."""

@@ -32,6 +32,10 @@ class SurfacePoints(NamedTuple):
     triangles: IntArray
     barycentric: FloatArray
 
+    def rows(self, chosen: IntArray) -> SurfacePoints:
+        """Some of the points, by index or by a mask."""
+        return SurfacePoints(self.triangles[chosen], self.barycentric[chosen])
+
     def positions(self, vertices: FloatArray, faces: IntArray) -> FloatArray:
         """(P, 3) positions on a mesh of (V, 3) vertices."""
         return (self.barycentric[:, :, None] * vertices[faces[self.triangles]]).sum(1)

@@ -14,9 +14,9 @@ from ...gbs.blendshapes import Entries, difference_widths
 from ...gbs.storage import Stored
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import SubjectMesh
-from ...shared.surface_points import SurfacePoints, full_barycentric
+from ...shared.surface_points import SurfacePoints
 from ...shared.tensor_files import check_sizes
-from .container import Arrays, Content, coded, narrow, read_content
+from .container import Arrays, Content, read_content
 from .encoding import (
     C0,
     COARSEST_SHAPE,
@@ -28,11 +28,11 @@ from .encoding import (
 )
 from .file import decode_subject, encode_subject
 from .precision import Precision
+from .surface import decode_points, encode_points, points_as_read
 from .transform import decode_vectors, encode_vectors, read_classes, store_classes, visibility_classes
 
 FLOOR = 5e-5
 """Splats smaller than this, metres, are placed as finely as one of this size."""
-BARYCENTRIC_STEP = 1 / 16
 DIFFERENCE_STEP = 0.5
 """Step of differences, in the steps of what they change: in a pose several of them add up."""
 
@@ -57,20 +57,13 @@ def encode_blended(
     precision = precision.scaled
     order = np.argsort(stored.points.triangles, kind="stable")
     neutral = {name: value.detach().cpu().numpy()[order] for name, value in stored.neutral.items()}
-    triangles = stored.points.triangles[order]
     own = None if weights is None else weights[order]
     classes = visibility_classes(own, len(order))
     person = encode_subject(subject, precision)
     read = decode_subject(Arrays(Path(), person), head)
-    inside = stored.points.barycentric[order, 1:].T
-    barycentric = coded(inside, BARYCENTRIC_STEP if precision.positions else 0.0)
-    as_read = Arrays(Path(), Content({"barycentric": barycentric}))
-    points = _points(triangles, as_read.decoded("barycentric", BARYCENTRIC_STEP, 2, len(order)))
-    arrays = {
-        "classes": store_classes(classes),
-        "triangles": narrow(np.diff(triangles, prepend=0)),
-        "barycentric": barycentric,
-    }
+    on_surface = encode_points(stored.points.rows(order), precision)
+    points = points_as_read(on_surface, head)
+    arrays = {"classes": store_classes(classes), **on_surface}
     local = neutral["means"] - _rest(points, read, head)
     geometry = neutral["log_scales"], neutral["quats"], neutral["opacities"]
     shapes, steps = encode_shapes(local, *geometry, precision, classes, turned=True, floor=FLOOR)
@@ -123,12 +116,9 @@ def read_blended(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Sto
     """Subject and splats of a file of `encode_blended`. Raises `InputError` for anything else."""
     arrays = Arrays(path, read_content(path))
     subject = decode_subject(arrays, head)
-    triangles = np.cumsum(arrays.integers("triangles", None).astype(np.int64))
-    count = len(triangles)
-    if not count or triangles[-1] >= len(head.faces):
-        raise InputError(path, "triangles", f"triangles 0 to {len(head.faces) - 1}", "none or others")
+    points = decode_points(arrays, head)
+    count = len(points.triangles)
     classes = read_classes(arrays, "classes", count)
-    points = _points(triangles, arrays.decoded("barycentric", BARYCENTRIC_STEP, 2, count))
     shapes = decode_shapes(arrays, classes, FLOOR)
     if shapes["quats"].shape[1] != 4:
         raise InputError(path, "rotations", f"shape (4, {count})", "3 components")
@@ -173,11 +163,6 @@ PARTS = ("positions", "scales", "rotations", "opacities")
 
 def _tensor(values: FloatArray, device: str) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, np.float32)).to(device)
-
-
-def _points(triangles: IntArray, barycentric: FloatArray) -> SurfacePoints:
-    """Points of (2, N) last barycentric coordinates."""
-    return SurfacePoints(triangles, full_barycentric(barycentric.T.astype(np.float32)))
 
 
 def _rest(points: SurfacePoints, subject: Subject, head: HeadAsset) -> FloatArray:

@@ -27,6 +27,7 @@ from ...insta.avatar import OCCUPIED, SETTINGS, SETTINGS_FILE, InstaAvatar, read
 from ...insta.avatar import TABLE as GRID
 from ...insta.field import Architecture
 from ...ours.avatar import OursAvatar
+from ...rgbavatar.method import RGBAvatarAvatar
 from ...shared.avatar_files import COMPACT_FILE, SUBJECT_FILE, read_subject, save_shared_head
 from ...shared.capacity import training_poses
 from ...shared.tensor_files import read_safetensors
@@ -37,6 +38,7 @@ from .container import CODEC, Content, write_content
 from .file import encode
 from .networks import encode_networks
 from .precision import Precision
+from .reduced import encode_reduced
 from .simplify import simplify
 
 CODEC_VERSION = 3
@@ -54,7 +56,7 @@ def encode_avatar(avatar: Avatar, head: HeadAsset, precision: Precision, clip: C
     """
     encoder = ENCODERS.get(type(avatar))
     if encoder is None:
-        methods = "ours, ga, gbs, gha or insta"
+        methods = "ours, ga, gbs, gha, insta or rgbavatar"
         raise InputError("avatar", "", f"one of {methods}", f"a {type(avatar).__name__}")
     if any(path.name == COMPACT_FILE for path in avatar.files()):
         raise InputError(avatar.files()[0], "", "the files of a training", "a coded avatar")
@@ -136,6 +138,17 @@ def _encode_insta(avatar: InstaAvatar, head: HeadAsset, precision: Precision, cl
     return encode_networks(arrays, subject, precision, grid=GRID, text=text)
 
 
+def _encode_rgbavatar(
+    avatar: RGBAvatarAvatar, head: HeadAsset, precision: Precision, clip: Clip | None
+) -> Content:
+    moments = None
+    if clip is not None:
+        poses = avatar.mesh.arguments(training_poses(clip))
+        found = avatar.weights(poses).double().cpu().numpy()
+        moments = found.T @ found / len(found)
+    return encode_reduced(avatar.stored, avatar.subject, head, precision, weights_of(avatar, clip), moments)
+
+
 def _exact(avatar: Avatar, name: str) -> Path:
     return next(path for path in avatar.files() if path.name == name)
 
@@ -147,5 +160,6 @@ ENCODERS: Mapping[type, Encoder] = {
     GBSAvatar: _encode_gbs,
     GHAAvatar: _encode_gha,
     InstaAvatar: _encode_insta,
+    RGBAvatarAvatar: _encode_rgbavatar,
 }
 """How the avatars of each method are encoded; each method reads its own coded file."""

@@ -36,9 +36,9 @@ PARTS: Mapping[str, tuple[str, ...]] = {
     "colors": (RESIDUAL,),
     "planes": PLANES,
     "lines": ("lines",),
-    "differences": ("difference", "moved_by"),
+    "differences": ("difference", "moved_by", "shapes", "exact_shapes"),
     "tables": ("features", "grid/"),
-    "networks": (*MATRICES, "line_gain", "line_bias", "matrix/"),
+    "networks": (*MATRICES, "network_", "line_gain", "line_bias", "matrix/"),
     "subject": ("shape", "static_offset"),
 }
 """Parts of an avatar by the prefixes of their array names; all other arrays are "other"."""

@@ -42,6 +42,11 @@ def insta_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
     return _variants("insta.avatar", "InstaAvatar", folder, clip, device)
 
 
+def rgbavatar_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
+    """The coded variants of an avatar of RGBAvatar."""
+    return _variants("rgbavatar.method", "RGBAvatarAvatar", folder, clip, device)
+
+
 def _variants(module: str, name: str, folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
     avatar_class = getattr(import_module(f"...{module}", __package__), name)
     for step in STEPS:

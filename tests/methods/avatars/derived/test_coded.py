@@ -21,12 +21,15 @@ from headbench.methods.gha.method import GHA
 from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.method import Insta
 from headbench.methods.ours.method import Ours
+from headbench.methods.rgbavatar.config import RGBAvatarConfig
+from headbench.methods.rgbavatar.method import RGBAvatar
 from headbench.methods.shared.avatar_files import COMPACT_FILE, read_shared_head
 from headbench.methods.shared.config import SplatTraining
 
 from ...gha.small import SMALL as SMALL_GHA
 from ...insta.small import SMALL as SMALL_INSTA
 from ...ours.toy import SMALL as SMALL_OURS
+from ...rgbavatar.small import SMALL as SMALL_RGBAVATAR
 
 SPLATS = SplatTraining(max_splats=900, min_settle=4)
 METHODS = {
@@ -35,6 +38,7 @@ METHODS = {
     "gbs": lambda: GBS(GBSConfig(samples=300)),
     "gha": lambda: GHA(GHAConfig(**SMALL_GHA)),
     "insta": lambda: Insta(InstaConfig(**SMALL_INSTA)),
+    "rgbavatar": lambda: RGBAvatar(RGBAvatarConfig(**SMALL_RGBAVATAR)),
 }
 
 
