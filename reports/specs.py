@@ -99,6 +99,14 @@ PROTOCOLS = CommandSpec(
     function="headbench.reports.protocols:protocols_command",
 )
 
+RECOMMEND = CommandSpec(
+    name="recommend",
+    group="compare",
+    summary="Recommend a method for a budget of training time, file size and frame time, from the rows of runs.",
+    settings="headbench.reports.recommend:RecommendSettings",
+    function="headbench.reports.recommend:recommend",
+)
+
 COMPARE = CommandSpec(
     name="compare",
     group="compare",
