@@ -33,6 +33,14 @@ def part_of_text(text: str, name: str) -> Fraction:
     return value
 
 
+def seconds_of_text(text: str) -> float | None:
+    """Training time of text such as "30 s"; None for other text. Raises `ValueError` for 0 s."""
+    found = re.fullmatch(r"(\d{1,6}(?:\.\d{1,6})?) s", text)
+    if found and not float(found[1]):
+        raise ValueError(f"budget is {text!r}; more than 0 s")
+    return float(found[1]) if found else None
+
+
 @dataclass(frozen=True)
 class Named:
     """A registered change and its parameters.
@@ -65,7 +73,7 @@ class Condition:
     settings : dict
         Changes of the method's settings, laid over those of the run.
     budget : str
-        Part of the method's budget, above 0 and at most 1, such as "1/4".
+        Part of the method's budget, above 0 and at most 1, such as "1/4"; or a training time in its place, such as "30 s".
     as_tracked : bool
         The method gets the head model, neck, static offset and cameras of the capture, without the conversion to a head model and to
         one video that it usually has (`MethodSpec.conversion`).
@@ -88,16 +96,25 @@ class Condition:
     drive: Named = field(default_factory=Named)
 
     def __post_init__(self) -> None:
-        """Refuse a budget that is not a part."""
-        part_of_text(self.budget, "budget")
+        """Refuse a budget that is neither a part nor a time."""
+        if seconds_of_text(self.budget) is None:
+            part_of_text(self.budget, "budget")
 
     @property
     def part(self) -> Fraction:
-        """Part of the budget as a number."""
-        return part_of_text(self.budget, "budget")
+        """Part of the budget as a number; 1 for a training time."""
+        return Fraction(1) if seconds_of_text(self.budget) else part_of_text(self.budget, "budget")
+
+    @property
+    def changes_budget(self) -> bool:
+        """Whether methods train with another budget than that of the run."""
+        return seconds_of_text(self.budget) is not None or self.part != 1
 
     def part_of(self, whole: Budget) -> Budget:
-        """The part of a budget, an iteration at least."""
+        """The part of a budget, an iteration at least; or the training time in its place."""
+        seconds = seconds_of_text(self.budget)
+        if seconds is not None:
+            return Budget(None, seconds)
         return Budget(
             None if whole.iterations is None else max(1, round(whole.iterations * self.part)),
             None if whole.seconds is None else whole.seconds * float(self.part),

@@ -122,7 +122,7 @@ class RunConfig:
             if condition.derive and not self.source and PLAIN not in self.conditions:
                 expected = "the plain comparison beside it, or a source that names their run"
                 raise ValueError(f"conditions: {condition.name} derives avatars; {expected}")
-            trains = condition.settings or condition.clip or condition.part != 1
+            trains = condition.settings or condition.clip or condition.changes_budget
             if trains and (self.source or condition.derive):
                 expected = "nothing is trained with a source or for a derived avatar; derive or drive alone"
                 raise ValueError(f"conditions, {condition.name}: {expected}")
@@ -282,7 +282,7 @@ def resolve_cells(config: RunConfig) -> list[tuple[ResolvedMethod, Condition]]:
                 changed = replace(changed, spec=replace(changed.spec, name=method.spec.name))
             if condition.as_tracked:
                 changed = replace(changed, spec=_unconverted(changed.spec, condition.name))
-            if condition.part != 1 and changed.budget == Budget():
+            if condition.changes_budget and changed.budget == Budget():
                 if condition.methods:
                     where = f"conditions, budget of {condition.name}"
                     raise InputError(

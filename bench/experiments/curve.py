@@ -1,4 +1,4 @@
-"""``headbench run curve``: quality over training time, cameras, timesteps or tracking error, as conditions of one run."""
+"""``headbench run curve``: quality over training time, cameras, timesteps, pictures or tracking error, as conditions of one run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..io.files import check_kind, output_inside, refuse_links
 from ..io.lock import locked
 from ..registry import get, resolve
 from ..specs import CommandResult
-from .curve_settings import CurveSettings
+from .curve_settings import PICTURES, SECONDS, CurveSettings
 from .held_out import CAMERA, TIMESTEPS, count_of
 
 log = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ METRICS: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "primitives")
 
 
 def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> CommandResult:
-    """Plot quality against training time, cameras, timesteps or tracking error, measured on held-out training frames.
+    """Plot quality against training time, cameras, timesteps, pictures or tracking error, measured on held-out training frames.
 
     Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. A restart keeps finished
     trainings; an interrupted training starts over, since its time is measured.
@@ -86,6 +86,13 @@ def conditions(
         for level in settings.tracking_errors:
             yield Condition(f"tracking-{level:g}", clip=Named("tracking-error", {"level": level}))
         return
+    if settings.over == "seconds":
+        for seconds in sorted(settings.seconds or SECONDS, reverse=True):
+            yield Condition(f"seconds-{seconds:g}", budget=f"{seconds:.6f} s")
+        return
+    if settings.over == "pictures":
+        yield from _pictures(sorted(settings.pictures or PICTURES, reverse=True), clips)
+        return
     texts = [str(part) for part in reversed(settings.parts)]
     if settings.over == "budget":
         for text in texts:
@@ -107,6 +114,16 @@ def conditions(
         if count not in counts:
             counts.add(count)
             yield Condition(f"{settings.over}-{_named(text)}", clip=Named(settings.over, {"part": text}))
+
+
+def _pictures(counts: Sequence[int], clips: Sequence[Clip]) -> Iterator[Condition]:
+    """Conditions of numbers of pictures; of those that no capture exceeds, only the largest."""
+    whole = max(len(clip.splits["train"]) for clip in clips)
+    seen = set()
+    for count in counts:
+        if min(count, whole) not in seen:
+            seen.add(min(count, whole))
+            yield Condition(f"pictures-{count}", clip=Named("pictures", {"count": count}))
 
 
 def _named(text: str) -> str:

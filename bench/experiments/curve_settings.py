@@ -17,13 +17,14 @@ MOST_TRACKING_ERROR = 4.0
 """Maximum level of `headbench synth`."""
 FRACTIONS = ("1/16", "1/8", "1/4", "1/2", "1")
 LEVELS = (0.0, 1.0, 2.0)
+SECONDS, PICTURES = (5.0, 30.0, 120.0), (1, 4, 16)
 
 
 @dataclass(frozen=True)
 class CurveSettings(RunOptions, ExecutionOptions):
-    """Quality against training time, cameras, timesteps or tracking error: trains each method with parts of them.
+    """Quality against training time, cameras, timesteps, pictures or tracking error: trains each method with parts of them.
 
-    Each part or level is a whole training of its own. Quality is measured on training frames that are held out of every training,
+    Each part, number or level is a whole training of its own. Quality is measured on training frames that are held out of every training,
     the same for all parts, never on test frames."""
 
     run: tyro.conf.Positional[str]
@@ -35,12 +36,20 @@ class CurveSettings(RunOptions, ExecutionOptions):
     methods: tuple[str, ...] = ()
     """Methods to train; default: all but the trivial baselines."""
 
-    over: Literal["budget", "cameras", "timesteps", "tracking_error"] = "budget"
-    """What to take parts of; or the error of tracking, of a synthetic capture, whose pictures stay."""
+    over: Literal["budget", "seconds", "cameras", "timesteps", "pictures", "tracking_error"] = "budget"
+    """What to take parts of (budget, cameras, timesteps) or a number of (seconds of training, pictures); or the error of tracking, of
+    a synthetic capture, whose pictures stay."""
 
     fractions: tuple[str, ...] = ()
     """Parts of the method's budget, or of the training cameras or timesteps, above 0 and at most 1; default: 1/16 1/8 1/4 1/2
     1. Not with `--over tracking_error`."""
+
+    seconds: tuple[float, ...] = ()
+    """Training times for `--over seconds`; default: 5 30 120. Trainings that a time ends are not reproducible to the bit. Not with
+    another `--over`."""
+
+    pictures: tuple[int, ...] = ()
+    """Numbers of training frames for `--over pictures`; default: 1 4 16. Not with another `--over`."""
 
     levels: tuple[float, ...] = ()
     """Levels for `--over tracking_error`, as for `headbench synth`; default: 0 1 2. Not with another `--over`."""
@@ -56,6 +65,8 @@ class CurveSettings(RunOptions, ExecutionOptions):
 
     dependent = (
         DependentOptions(("levels",), "over", ("tracking_error",)),
+        DependentOptions(("seconds",), "over", ("seconds",)),
+        DependentOptions(("pictures",), "over", ("pictures",)),
         DependentOptions(("fractions",), "over", ("budget", "cameras", "timesteps")),
     )
 
@@ -64,6 +75,10 @@ class CurveSettings(RunOptions, ExecutionOptions):
             raise ValueError(f"fractions: each once; found {' '.join(self.fractions)}")
         if len(set(self.levels)) != len(self.levels):
             raise ValueError(f"levels: each once; found {' '.join(map(str, self.levels))}")
+        for name in ("seconds", "pictures"):
+            values = getattr(self, name)
+            if len(set(values)) != len(values) or not all(value > 0 for value in values):
+                raise ValueError(f"{name}: numbers above 0, each once; found {' '.join(map(str, values))}")
         if not all(0 <= level <= MOST_TRACKING_ERROR for level in self.levels):
             expected = f"from 0 to {MOST_TRACKING_ERROR:g}"
             raise ValueError(f"levels: {expected}; found {' '.join(map(str, self.levels))}")

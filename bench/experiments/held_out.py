@@ -136,6 +136,32 @@ def fewer_timesteps(clip: Clip, config: RunConfig | None = None, *, part: str) -
     return _reduced(clip, "timesteps", evenly(timesteps, count_of(len(timesteps), part)))
 
 
+def fewer_pictures(clip: Clip, config: RunConfig | None = None, *, count: int) -> Clip:
+    """A clip with a number of its training frames: timesteps spread evenly, cameras as in `fewer_cameras`, in turn."""
+    train = clip.splits["train"]
+    if not isinstance(count, int) or count < 1:
+        raise InputError("conditions", "count", "a whole number from 1", repr(count))
+    cameras = _spread(clip.cameras, sorted({key.camera for key in train}))
+    left: dict[int, list[FrameKey]] = {timestep: [] for timestep in sorted({key.timestep for key in train})}
+    for key in train:
+        left[key.timestep].append(key)
+    chosen: list[FrameKey] = []
+    while len(chosen) < min(count, len(train)):
+        # One frame of each timestep before a second of any.
+        open_ones = [timestep for timestep, keys in left.items() if keys]
+        for timestep in evenly(open_ones, min(count - len(chosen), len(open_ones))):
+            wanted = cameras[len(chosen) % len(cameras) :] + cameras[: len(chosen) % len(cameras)]
+            key = min(left[timestep], key=lambda key: wanted.index(key.camera))
+            left[timestep].remove(key)
+            chosen.append(key)
+    named = {"pictures": sorted(map(str, chosen)), "cameras": sorted({key.camera for key in chosen})}
+    return _with_frames(
+        clip,
+        sorted(chosen, key=train.index),
+        {**named, "timesteps": sorted({key.timestep for key in chosen})},
+    )
+
+
 def count_of(whole: int, part: str) -> int:
     """Number of items in a part of a total, at least one."""
     try:
@@ -147,15 +173,21 @@ def count_of(whole: int, part: str) -> int:
 def _reduced(clip: Clip, what: str, chosen: Sequence[Any]) -> Clip:
     """A clip whose training frames are those of some cameras or timesteps; held-out frames stay."""
     train = clip.splits["train"]
-    keys = tuple(key for key in train if getattr(key, what.removesuffix("s")) in chosen)
-    if len(keys) == len(train):
+    keys = [key for key in train if getattr(key, what.removesuffix("s")) in chosen]
+    return _with_frames(clip, keys, {what: list(chosen)})
+
+
+def _with_frames(clip: Clip, keys: Sequence[FrameKey], chosen: dict[str, list[Any]]) -> Clip:
+    """A clip with these training frames alone; ``chosen`` is the record, whose first entry identifies them."""
+    if len(keys) == len(clip.splits["train"]):
         return clip
-    step = StepRecord("reduce_training", {what: list(chosen)}, clip.fingerprint)
+    step = StepRecord("reduce_training", chosen, clip.fingerprint)
+    what, names = next(iter(chosen.items()))
     return replace(
         clip if isinstance(clip, HeldOutClip) else _as_held_out(clip),
-        splits={**clip.splits, "train": keys},
+        splits={**clip.splits, "train": tuple(keys)},
         steps=(*clip.steps, step),
-        fingerprint=digest(clip.fingerprint, what, list(chosen)),
+        fingerprint=digest(clip.fingerprint, what, names),
     )
 
 

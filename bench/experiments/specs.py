@@ -66,6 +66,13 @@ TIMESTEPS = ConditionSpec(
     implementation="headbench.bench.experiments.held_out:fewer_timesteps",
 )
 
+PICTURES = ConditionSpec(
+    name="pictures",
+    summary="Clip: a number of training frames, over all timesteps and cameras; parameter count.",
+    kind="clip",
+    implementation="headbench.bench.experiments.held_out:fewer_pictures",
+)
+
 TRACKING_ERROR = ConditionSpec(
     name="tracking-error",
     summary="Clip: another level of tracking error, of synthetic captures; parameter level.",

@@ -21,9 +21,12 @@ from ..writers import csv_text
 from .plot import CurvePanel, write_plot
 from .points import HELD_OUT, MEASURED, CurvePoint, column, mean, mean_point, points_text
 
+TIMED = ("budget", "seconds")
+"""Quantities whose axis is the measured training time."""
 AXES = {
     "cameras": "Training cameras",
     "timesteps": "Training timesteps",
+    "pictures": "Training pictures",
     "tracking_error": "Level of tracking error",
 }
 
@@ -34,7 +37,7 @@ def curve_report(out: Path, over: str) -> CommandResult:
     Parameters
     ----------
     over : str
-        Quantity that varies between the trainings: "budget", "cameras", "timesteps" or
+        Quantity that varies between the trainings: "budget", "seconds", "cameras", "timesteps", "pictures" or
         "tracking_error".
 
     Raises
@@ -50,16 +53,14 @@ def curve_report(out: Path, over: str) -> CommandResult:
         _point(run, record, conditions[record.condition], clip)
         for record in run.manifest.methods
         for clip in run.manifest.clips
-        if conditions[record.condition].clip.name == ("" if over == "budget" else over.replace("_", "-"))
+        if conditions[record.condition].clip.name == ("" if over in TIMED else over.replace("_", "-"))
     ]
     names = list(dict.fromkeys(point.method for point in points))
     order = [clip.subject for clip in run.manifest.clips]
-    points.sort(
-        key=lambda p: (names.index(p.method), p.part, p.tracking_error or 0.0, order.index(p.subject))
-    )
-    groups: dict[tuple[str, Fraction, float | None], list[CurvePoint]] = {}
+    points.sort(key=lambda p: (names.index(p.method), p.place, order.index(p.subject)))
+    groups: dict[tuple[str, tuple[float, ...]], list[CurvePoint]] = {}
     for point in points:
-        groups.setdefault((point.method, point.part, point.tracking_error), []).append(point)
+        groups.setdefault((point.method, point.place), []).append(point)
     means = [mean_point(group) for group in groups.values()]
     missing = {
         spec.label: _reason(run.rows, spec) for spec in metrics if spec.per_frame and _reason(run.rows, spec)
@@ -69,12 +70,12 @@ def curve_report(out: Path, over: str) -> CommandResult:
     every = config.clip.parameters["every"]
     where = f"{every}th training timestep" if every > 2 else "second training timestep"
     axis = f"{'Processor seconds' if clock == MEASURED[0] else 'Seconds'} of training"
-    axis = axis if over == "budget" else AXES[over]
+    axis = axis if over in TIMED else AXES[over]
     write_plot(
         out / "curve.png",
         [
             [
-                _panel(means, spec, task, clock if over == "budget" else over, missing)
+                _panel(means, spec, task, clock if over in TIMED else over, missing)
                 for spec in metrics
                 if spec.per_frame
             ]
@@ -114,14 +115,18 @@ def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipR
     )
     given = {**_step(clip.steps, "hold_out")["training"], **_step(added, "reduce_training")}
     part = condition.part if condition.part != 1 else Fraction(condition.clip.parameters.get("part", "1"))
+    budget, level = Budget(**record.budget), condition.clip.parameters.get("level")
+    asked = float(condition.clip.parameters.get("count", 0))
     return CurvePoint(
         record.name,
         clip.subject,
+        (float(part), budget.seconds or 0.0, asked, level or 0.0),
         part,
-        Budget(**record.budget),
+        budget,
         len(given["cameras"]),
         len(given["timesteps"]),
-        condition.clip.parameters.get("level", tracking_error(clip.steps)),
+        len(given.get("pictures", ())) or len(given["cameras"]) * len(given["timesteps"]),
+        tracking_error(clip.steps) if level is None else level,
         cost,
         values,
         {},

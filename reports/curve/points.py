@@ -24,7 +24,7 @@ MEASURED = ("processor_seconds", "seconds", "peak_memory_bytes")
 class CurvePoint:
     """A method trained with a part of its budget or of the frames, or with a level of tracking error.
 
-    Means over seeds of one subject, or over subjects (""). ``cameras`` and ``timesteps`` count the training
+    ``place`` orders the points of a method and tells them apart. Means over seeds of one subject, or over subjects (""). ``cameras``, ``timesteps`` and ``pictures`` count the training
     data. ``tracking_error`` is the level of a synthetic capture, None for a recording. ``cost`` is `MEASURED`
     by name, ``values`` are the metrics by name and held-out data, such as "psnr_camera"; None: not measured.
     ``halves`` are half the widths of the 95 % intervals of means over subjects, by the same names, where
@@ -33,10 +33,12 @@ class CurvePoint:
 
     method: str
     subject: str
+    place: tuple[float, ...]
     part: Fraction
     budget: Budget
     cameras: float
     timesteps: float
+    pictures: float
     tracking_error: float | None
     cost: Mapping[str, float | None]
     values: Mapping[str, float | None]
@@ -53,6 +55,7 @@ class CurvePoint:
             "budget_seconds": budget["seconds"],
             "cameras": self.cameras,
             "timesteps": self.timesteps,
+            "pictures": self.pictures,
             "tracking_error": self.tracking_error,
             **self.cost,
             **self.values,
@@ -77,14 +80,15 @@ def mean_point(points: Sequence[CurvePoint]) -> CurvePoint:
     """The mean over subjects of points that are otherwise equal."""
     first = points[0]
     by_name = {key: [point.values[key] for point in points] for key in first.values}
-    cameras, timesteps = (
-        fmean(getattr(point, name) for point in points) for name in ("cameras", "timesteps")
+    cameras, timesteps, pictures = (
+        fmean(getattr(point, name) for point in points) for name in ("cameras", "timesteps", "pictures")
     )
     return replace(
         first,
         subject="",
         cameras=cameras,
         timesteps=timesteps,
+        pictures=pictures,
         cost={key: mean([point.cost[key] for point in points]) for key in first.cost},
         values={key: mean(values) for key, values in by_name.items()},
         halves={key: half_width(values) for key, values in by_name.items()},
@@ -113,7 +117,7 @@ def points_text(
     head = "".join(f"{'held-out ' + HELD_OUT[task]:>{group}}" for task in tasks)
     names = "".join(f"{spec.label:>9}" for _ in tasks for spec in frame)
     names += "".join(f"{spec.label + (f' {spec.unit}' if spec.unit else ''):>12}" for spec in avatar)
-    columns = f"{'method':<{wide}}{'part':>7}{'budget':>10}{'cameras':>8}{'timesteps':>11}"
+    columns = f"{'method':<{wide}}{'part':>7}{'budget':>10}{'cameras':>8}{'timesteps':>11}{'pictures':>10}"
     columns += f"{'tracking':>10}" if tracked else ""
     columns += f"{'CPU s':>10}{'s':>10}"
     lines = [f"{'':<{len(columns)}}{head}", f"{columns}{names}"]
@@ -123,7 +127,7 @@ def points_text(
         cells += [_shown(point.values[spec.name], spec.digits, 12) for spec in avatar]
         cost = [_shown(point.cost[key], 1, 10) for key in MEASURED[:2]]
         size = f"{budget.seconds:g} s" if budget.iterations is None else f"{budget.iterations}"
-        given = f"{point.part!s:>7}{size:>10}{point.cameras:>8g}{point.timesteps:>11g}"
+        given = f"{point.part!s:>7}{size:>10}{point.cameras:>8g}{point.timesteps:>11g}{point.pictures:>10g}"
         given += _shown(point.tracking_error, 2, 10) if tracked else ""
         lines.append(f"{point.method:<{wide}}{given}{''.join([*cost, *cells])}")
     lines.append("Means over subjects. Held out of every training; no test frame was looked at:")

@@ -122,6 +122,28 @@ def test_less_to_train_on_is_measured_on_the_same_frames(make_run, plugin, over,
     assert (run / f"curve-{over}" / "curve.png").is_file()
 
 
+def test_pictures_are_counted_over_timesteps_and_cameras(make_run, plugin):
+    run = make_run("curve_plugin:METHOD")
+    findings = curve_run(settings(run, over="pictures", pictures=(1, 4, 30)))
+    trained = [{(key.timestep, key.camera) for key in train} for train, _ in plugin.FITS]
+    assert [len(keys) for keys in trained] == [9, 4, 1]
+    assert trained[2] == {(1, "3")}  # the timestep and the camera in the middle
+    assert {timestep for timestep, _ in trained[1]} == {0, 1, 3}
+    assert {camera for _, camera in trained[1]} == set("034")
+    assert [point["pictures"] for point in findings.data["points"]] == [1, 4, 9]
+    assert [point["timesteps"] for point in findings.data["points"]] == [1, 3, 3]
+    assert (run / "curve-pictures" / "curve.png").is_file()
+
+
+def test_seconds_take_the_place_of_the_budget(make_run, plugin):
+    run = make_run("curve_plugin:METHOD")
+    findings = curve_run(settings(run, over="seconds", seconds=(0.5, 2)))
+    assert [budget for _, budget in plugin.FITS] == [Budget(None, 2.0), Budget(None, 0.5)]
+    assert [point["budget_seconds"] for point in findings.data["points"]] == [0.5, 2.0]
+    assert [point["fraction"] for point in findings.data["points"]] == [1.0, 1.0]
+    assert "0.5 s" in findings.text
+
+
 def test_tracking_error_changes_poses_alone(plugin, tmp_path):
     capture = tmp_path / "capture"
     with flat_pictures():
@@ -233,6 +255,8 @@ def test_with_one_camera_timesteps_alone_are_held_out(plugin, tmp_path):
         ({"over": "tracking_error", "levels": (1.0, 1.0)}, "each once"),
         ({"over": "tracking_error", "levels": (4.5,)}, "from 0 to 4"),
         ({"over": "tracking_error", "levels": (float("nan"),)}, "from 0 to 4"),
+        ({"over": "seconds", "seconds": (0.0,)}, "above 0"),
+        ({"over": "pictures", "pictures": (4, 4)}, "each once"),
         ({"every": 1}, "at least 2"),
         ({"frames": 0}, "at least 1"),
     ],
