@@ -139,6 +139,8 @@ class RunData:
         return clips
 
 
+OWN_CODE = "headbench."
+"""Start of the implementations of this package."""
 LONGEST_DIFFERENCE = 48
 """Characters of settings in a label; more than that and the run's folder names the method."""
 
@@ -319,6 +321,19 @@ class RunSet:
         return tuple(missing_tasks([*asked], done).values())
 
     @property
+    def mixed_code(self) -> tuple[str, ...]:
+        """A sentence on methods of this package whose code changed between the runs without a change of their version."""
+        codes: dict[str, set[str]] = {}
+        for run in self.runs:
+            for record in run.manifest.methods:
+                if record.code and record.implementation.startswith(OWN_CODE):
+                    codes.setdefault(f"{record.name} (version {record.version})", set()).add(record.code)
+        changed = [name for name, found in codes.items() if len(found) > 1]
+        return (f"Code changed between the runs, with the same version: {', '.join(changed)}.",) * bool(
+            changed
+        )
+
+    @property
     def image_size(self) -> str:
         """Sizes of the rendered images."""
         return "; ".join(dict.fromkeys(run.image_size for run in self.runs if run.image_size))
@@ -388,6 +403,12 @@ class _Training:
     cells: set[tuple[str, int]]
 
 
+def _same_training(one: MethodRecord, other: MethodRecord) -> bool:
+    """Whether two records are of one training; methods of this package state by their version what their code gives."""
+    native = one.implementation.startswith(OWN_CODE)
+    return one == (replace(other, code=one.code) if native else other)
+
+
 def _labels(runs: Sequence[RunData]) -> list[dict[str, str]]:
     """Label of each run's methods, by name."""
     trainings: dict[str, list[_Training]] = {}
@@ -395,7 +416,7 @@ def _labels(runs: Sequence[RunData]) -> list[dict[str, str]]:
         for record in run.manifest.methods:
             cells = {*product(sorted(run.rows.subjects), run.rows.seeds(record.label))}
             known = trainings.setdefault(record.label, [])
-            same = next((t for t in known if t.record == record and not t.cells & cells), None)
+            same = next((t for t in known if _same_training(t.record, record) and not t.cells & cells), None)
             if same is None:
                 known.append(_Training(record, [index], cells))
             else:

@@ -28,6 +28,32 @@ def test_other_settings_are_told_apart_by_what_differs(make_run):
     assert labelled["value"].tolist() == alone["value"].tolist() != []
 
 
+@pytest.mark.parametrize(
+    ("implementation", "version", "methods"),
+    [
+        ("headbench.methods.toy.method:Toy", "1", ("toy",)),
+        ("headbench.methods.toy.method:Toy", "2", ("toy (version=1, code=0)", "toy (version=2, code=1)")),
+        ("toy_plugin:Method", "1", ("toy (code=0)", "toy (code=1)")),
+    ],
+)
+def test_versions_tell_the_code_of_this_package_apart(
+    make_run, change_manifest, implementation, version, methods
+):
+    """A plug-in's version says nothing of its code."""
+    folders = [make_run("a", seeds=(0,)), make_run("b", seeds=(1,))]
+    for code, (folder, own) in enumerate(zip(folders, ("1", version))):
+        change_manifest(
+            folder,
+            lambda m, code=code, own=own: m["methods"][0].update(
+                implementation=implementation, version=own, code=str(code)
+            ),
+        )
+    runs = RunSet.read(folders)
+    assert runs.methods == methods
+    said = "Code changed between the runs, with the same version: toy (version 1)."
+    assert (said in table_of(runs).facts) == (len(methods) == 1)
+
+
 def test_settings_too_long_for_a_label_give_way_to_the_folder(make_run, change_manifest):
     first, second = make_run("a"), make_run("b")
     change_manifest(first, lambda m: m["methods"][0].update(config={"level": "x" * 60}))
