@@ -29,7 +29,7 @@ from ..shared.subject_mesh import SubjectMesh
 from .config import RGBAvatarConfig
 from .model import (
     AVATAR_FILE,
-    Stored,
+    StoredShapes,
     Surface,
     blend_weights,
     blended,
@@ -52,7 +52,7 @@ class RGBAvatarAvatar(StoredSplatAvatar):
     """
 
     def __init__(
-        self, files: Sequence[Path], mesh: SubjectMesh, subject: Subject, stored: Stored, device: str
+        self, files: Sequence[Path], mesh: SubjectMesh, subject: Subject, stored: StoredShapes, device: str
     ):
         super().__init__(files, LastPose(self._posed), device)
         self.mesh, self.subject, self.stored = mesh, subject, stored

@@ -108,7 +108,7 @@ def blended(splats: Mapping[str, Tensor], weights: Tensor) -> list[dict[str, Ten
     return posed
 
 
-class PosedSurface(NamedTuple):
+class PointsOfPose(NamedTuple):
     """Surface of a pose: the triangles' axes, of size 1 and without position, and the (N, 3) points of the splats."""
 
     axes: TriangleFrames
@@ -122,14 +122,14 @@ class Surface:
         self.mesh, self._at_points = mesh, MeshPoints(points, mesh.faces, mesh.canonical)
 
     @torch.no_grad()
-    def posed(self, arguments: Mapping[str, Tensor]) -> PosedSurface:
+    def posed(self, arguments: Mapping[str, Tensor]) -> PointsOfPose:
         """The surface for the arguments of one timestep."""
         vertices = self.mesh.posed(arguments)
         frames = self.mesh.frames(vertices)
         axes = frames._replace(center=torch.zeros_like(frames.center), size=torch.ones_like(frames.size))
-        return PosedSurface(axes, self._at_points(vertices))
+        return PointsOfPose(axes, self._at_points(vertices))
 
-    def place(self, surface: PosedSurface, splats: Mapping[str, Tensor]) -> WorldSplats:
+    def place(self, surface: PointsOfPose, splats: Mapping[str, Tensor]) -> WorldSplats:
         """Splats in the world: turned with their triangle, moved with their surface point, of unchanged size."""
         means, log_scales, quats = (splats[name] for name in ("means", "log_scales", "quats"))
         world = to_world(surface.axes, self._at_points.triangles, means, log_scales, quats)
@@ -141,7 +141,7 @@ def seen_colors(values: Tensor) -> Tensor:
     return (0.5 + C0 * values).relu()
 
 
-class Stored(NamedTuple):
+class StoredShapes(NamedTuple):
     """Content of an avatar's file.
 
     Attributes
@@ -158,7 +158,7 @@ class Stored(NamedTuple):
     points: SurfacePoints
     inputs: tuple[str, ...]
 
-    def checked(self, path: Path, head: HeadAsset, device: str) -> Stored:
+    def checked(self, path: Path, head: HeadAsset, device: str) -> StoredShapes:
         """The same on a device. Raises `InputError`, naming ``path``, where the tensors do not fit each other or the head."""
         sizes = {"inputs": input_count(head, self.inputs), "N": len(self.points.triangles)}
         check_tensors(path, self.tensors, MEMBERS, sizes)
@@ -170,7 +170,7 @@ class Stored(NamedTuple):
         return self._replace(tensors={name: self.tensors[name].to(device) for name in MEMBERS})
 
 
-def write_avatar(path: Path, stored: Stored) -> None:
+def write_avatar(path: Path, stored: StoredShapes) -> None:
     """Write an avatar as safetensors, exact: 68 bytes for each splat and 40 for each of its blendshapes."""
     tensors = {name: value.detach().to("cpu", torch.float32) for name, value in stored.tensors.items()}
     tensors["triangles"] = torch.from_numpy(stored.points.triangles.astype(np.int32))
@@ -179,14 +179,14 @@ def write_avatar(path: Path, stored: Stored) -> None:
     write_bytes(path, save(contiguous, {INPUTS_KEY: ",".join(stored.inputs)}))
 
 
-def read_avatar(path: Path, head: HeadAsset, device: str) -> Stored:
+def read_avatar(path: Path, head: HeadAsset, device: str) -> StoredShapes:
     """Read and check what `write_avatar` wrote. Raises `InputError` where a tensor is missing or does not fit."""
     tensors, metadata = read_safetensors(path)
     inputs = input_names(path, metadata.get(INPUTS_KEY, ""))
     check_tensors(path, tensors, POINTS)
     triangles, last_two = (tensors.pop(name).numpy() for name in POINTS)
     points = SurfacePoints(triangles.astype(np.int64), full_barycentric(last_two))
-    return Stored(tensors, points, inputs).checked(path, head, device)
+    return StoredShapes(tensors, points, inputs).checked(path, head, device)
 
 
 def input_names(path: Path, names: str) -> tuple[str, ...]:

@@ -22,18 +22,25 @@ NERSEMBLE: dict[str, Any] = {
 }
 """Values of the authors' program for several cameras (``config/nersemble.yaml``)."""
 SHORT: dict[str, Any] = {
-    "inputs": ("expression",),
+    "inputs": ("expression", "jaw", "eyes"),
     "ssim_weight": 0.2,
     "batch": 4,
     "together": 4,
-    "color_every": 10,
+    "random_background": False,
+    "position_lr": 3e-3,
+    "position_lr_final": 3e-5,
+    "opacity_lr": 0.1,
+    "scale_lr": 0.1,
+    "rotation_lr": 0.05,
+    "color_lr": 0.08,
     "final_rate": 0.1,
+    "color_every": 10,
 }
 """Settings of runs much shorter than published (docs/explanation/methods/rgbavatar.md, "Presets")."""
 
 PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {"budget": {"iterations": 60}, **SHORT, "samples": 3_000},
-    "demo": {"budget": {"iterations": 500}, **SHORT, "samples": 20_000},
+    "demo": {"budget": {"iterations": 700}, **SHORT, "samples": 20_000},
     "fast": {"budget": {"iterations": 1_000}, **SHORT, "samples": 40_000},
     "nersemble": {"budget": {"iterations": 30_000}, **NERSEMBLE},
     "gpu": {"budget": {"iterations": 5_000}},

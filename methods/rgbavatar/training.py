@@ -27,8 +27,8 @@ from .model import (
     BIASES,
     SHAPES,
     WEIGHTS,
-    PosedSurface,
-    Stored,
+    PointsOfPose,
+    StoredShapes,
     Surface,
     blend_weights,
     blended,
@@ -124,7 +124,7 @@ class RGBAvatarTraining(ImageTrainer):
         """Number of splats."""
         return f"{len(self.colored)} splats"
 
-    def result(self) -> Stored:
+    def result(self) -> StoredShapes:
         """The trained avatar, without splats that no image has given a colour: nothing was learnt about them."""
         kept = self.colored if self._config.color_weight else torch.ones_like(self.colored)
         if not bool(kept.any()):
@@ -135,7 +135,7 @@ class RGBAvatarTraining(ImageTrainer):
                 tensors[name] = value[:, kept]
             elif name not in (*WEIGHTS, *BIASES):
                 tensors[name] = value[kept]
-        return Stored(tensors, self.points.rows(kept.cpu().numpy()), self._config.inputs)
+        return StoredShapes(tensors, self.points.rows(kept.cpu().numpy()), self._config.inputs)
 
     def _splats(self, iteration: int, rows: Sequence[int]) -> list[dict[str, Tensor]]:
         """Splats of some timesteps; the neutral ones before the blendshapes are trained."""
@@ -145,7 +145,7 @@ class RGBAvatarTraining(ImageTrainer):
         return blended(splats, blend_weights(splats, self._inputs[rows]))
 
     @torch.no_grad()
-    def _posed(self, row: int) -> PosedSurface:
+    def _posed(self, row: int) -> PointsOfPose:
         return self._surface.posed({name: values[row : row + 1] for name, values in self._arguments.items()})
 
     def _on_background(self, pixels: Tensor, iteration: int, image: int) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,7 @@ Initial = Mapping[str, tuple[Tensor, float]]
 """Initial tensors with their learning rates, by name."""
 
 
-class RunSettings(Protocol):
+class TrainingRun(Protocol):
     """Settings of every training: iterations of the published run, and seconds between checkpoints."""
 
     @property
@@ -40,7 +40,7 @@ class ImageTrainer:
     optimiser: Optimiser
 
     def __init__(
-        self, clip: Clip, settings: RunSettings, sampler: Sampler, device: str, *, masks: bool = False
+        self, clip: Clip, settings: TrainingRun, sampler: Sampler, device: str, *, masks: bool = False
     ):
         self._run_settings, self._sampler = settings, sampler
         self.keys: Sequence[FrameKey] = clip.splits["train"]

@@ -9,7 +9,7 @@ import torch
 
 from ....bench.contracts import FloatArray, HeadAsset
 from ....bench.errors import InputError
-from ...rgbavatar.model import BIASES, INPUTS_KEY, SHAPES, WEIGHTS, Stored, input_names
+from ...rgbavatar.model import BIASES, INPUTS_KEY, SHAPES, WEIGHTS, StoredShapes, input_names
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import SubjectMesh
 from ...shared.surface_points import SurfacePoints
@@ -39,7 +39,7 @@ CHANGES = 10
 
 
 def encode_reduced(
-    stored: Stored,
+    stored: StoredShapes,
     subject: Subject,
     head: HeadAsset,
     precision: Precision,
@@ -94,7 +94,7 @@ def encode_reduced(
     return Content({**arrays, **person.arrays}, text, {**steps, **person.steps})
 
 
-def read_reduced(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Stored]:
+def read_reduced(path: Path, head: HeadAsset, device: str) -> tuple[Subject, StoredShapes]:
     """Subject and splats of a file of `encode_reduced`. Raises `InputError` for anything else."""
     arrays = Arrays(path, read_content(path))
     subject, inputs = decode_subject(arrays, head), input_names(path, arrays.text.get(INPUTS_KEY, ""))
@@ -121,7 +121,7 @@ def read_reduced(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Sto
         table = vectors.reshape(len(classes), count, CHANGES).swapaxes(0, 1) * units
     tensors |= dict(zip(SHAPES.values(), np.split(table, (3, 7), axis=2)))
     content = {name: torch.from_numpy(np.array(values, np.float32)) for name, values in tensors.items()}
-    return subject, Stored(content, points, inputs).checked(path, head, device)
+    return subject, StoredShapes(content, points, inputs).checked(path, head, device)
 
 
 def _moved(points: SurfacePoints, as_read: SurfacePoints, subject: Subject, head: HeadAsset) -> FloatArray:
