@@ -24,6 +24,7 @@ from ..shared.avatar_files import (
 )
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
+from ..shared.networks import tracked_inputs
 from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
 from ..shared.subject_mesh import SubjectMesh
 from .config import RGBAvatarConfig
@@ -35,7 +36,6 @@ from .model import (
     blended,
     read_avatar,
     seen_colors,
-    tracked_inputs,
     write_avatar,
 )
 from .spec import RGBAVATAR as SPEC

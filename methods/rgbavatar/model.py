@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from safetensors.torch import save
 from torch import Tensor
@@ -17,13 +15,12 @@ from ...bench.contracts import HeadAsset
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.files import write_bytes
-from ...datasets.head.rotations import axis_angle_to_matrix
 from ..ops.harmonics import C0
 from ..ops.mesh import TriangleFrames
 from ..ops.splats import WorldSplats, to_world
-from ..shared.schedule import torch_generator
+from ..shared.networks import input_count, layer_names
 from ..shared.subject_mesh import SubjectMesh
-from ..shared.surface_points import MeshPoints, SurfacePoints, full_barycentric
+from ..shared.surface_points import POINT_MEMBERS, MeshPoints, SurfacePoints, point_tensors, read_points
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .config import INPUTS
 
@@ -32,7 +29,7 @@ INPUTS_KEY = "inputs"
 """Key of the file's metadata: the network's inputs."""
 SHAPES = {"means": "mean_shapes", "quats": "quat_shapes", "colors": "color_shapes"}
 """Attributes that blendshapes change, and the names of their blendshapes."""
-WEIGHTS, BIASES = (tuple(f"network_{part}_{layer}" for layer in range(3)) for part in ("weight", "bias"))
+WEIGHTS, BIASES = layer_names(3)
 _SPLATS: dict[str, tuple[int | str, ...]] = {
     "means": ("N", 3),
     "quats": ("N", 4),
@@ -46,47 +43,9 @@ _SPLATS: dict[str, tuple[int | str, ...]] = {
     **dict(zip(BIASES, (("hidden",), ("hidden 2",), ("K",)))),
 }
 MEMBERS = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in _SPLATS.items()}
-"""Tensors of an avatar of N splats and K blendshapes. Positions are in metres along the axes of the triangle, quaternions wxyz,
-colours harmonics of degree 0, scales logarithms of metres, opacities logits; weights and biases of the network."""
-POINTS = {
-    "triangles": Member("i", ("N",), dtype="i4"),
-    "barycentric": Member("f", ("N", 2), MAX_MAGNITUDE, "f4"),
-}
-"""Triangle and last two barycentric coordinates of the surface points."""
-ROTATIONS = ("neck", "jaw", "eyes")
-"""Inputs that are rotations."""
-
-
-def tracked_inputs(arguments: Mapping[str, Tensor], names: Sequence[str]) -> Tensor:
-    """(T, I) inputs of the network: coefficients as they are, each rotation as the first two rows of its matrix.
-
-    Eyelids are left out for a head model without them.
-    """
-    columns = []
-    for name in names:
-        values = arguments.get(name)
-        if values is not None and name in ROTATIONS:
-            values = axis_angle_to_matrix(values.unflatten(1, (-1, 3)))[:, :, :2].flatten(1)
-        columns += [] if values is None else [values]
-    return torch.cat(columns, dim=1)
-
-
-def input_count(head: HeadAsset, names: Sequence[str]) -> int:
-    """Number of the network's inputs for a head model."""
-    lids = 0 if head.eyelid_basis is None else 2
-    sizes = {"expression": head.expression_basis.shape[2], "neck": 6, "jaw": 6, "eyes": 12, "eyelids": lids}
-    return sum({**sizes, "translation": 3}[name] for name in names)
-
-
-def initial_network(inputs: int, hidden: int, outputs: int, seed: int) -> dict[str, Tensor]:
-    """Weights and biases by name, uniform in the inverse root of the layer's inputs, as `torch.nn.Linear` has them."""
-    generator = torch_generator(seed, "network")
-    sizes = (inputs, *(len(WEIGHTS) - 1) * (hidden,), outputs)
-    tensors = {}
-    for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
-        for name, shape in ((WEIGHTS[layer], (fan_out, fan_in)), (BIASES[layer], (fan_out,))):
-            tensors[name] = (2 * torch.rand(shape, generator=generator) - 1) * fan_in**-0.5
-    return tensors
+"""Tensors of an avatar of N splats and K blendshapes, beside its `POINT_MEMBERS`. Positions are in metres along the axes of the
+triangle, quaternions wxyz, colours harmonics of degree 0, scales logarithms of metres, opacities logits; weights and biases of the
+network."""
 
 
 def blend_weights(network: Mapping[str, Tensor], inputs: Tensor) -> Tensor:
@@ -162,10 +121,6 @@ class StoredShapes(NamedTuple):
         """The same on a device. Raises `InputError`, naming ``path``, where the tensors do not fit each other or the head."""
         sizes = {"inputs": input_count(head, self.inputs), "N": len(self.points.triangles)}
         check_tensors(path, self.tensors, MEMBERS, sizes)
-        triangles, count = self.points.triangles, len(head.faces)
-        if not len(triangles) or not (0 <= triangles.min() and triangles.max() < count):
-            expected = f"at least one, each from 0 to {count - 1}"
-            raise InputError(path, "triangles", expected, f"{len(triangles)}, or others")
         check_sizes(path, self.tensors["log_scales"])
         return self._replace(tensors={name: self.tensors[name].to(device) for name in MEMBERS})
 
@@ -173,9 +128,9 @@ class StoredShapes(NamedTuple):
 def write_avatar(path: Path, stored: StoredShapes) -> None:
     """Write an avatar as safetensors, exact: 68 bytes for each splat and 40 for each of its blendshapes."""
     tensors = {name: value.detach().to("cpu", torch.float32) for name, value in stored.tensors.items()}
-    tensors["triangles"] = torch.from_numpy(stored.points.triangles.astype(np.int32))
-    tensors["barycentric"] = torch.from_numpy(stored.points.barycentric[:, 1:].astype(np.float32))
-    contiguous = {name: value.contiguous() for name, value in tensors.items()}
+    contiguous = {
+        name: value.contiguous() for name, value in (tensors | point_tensors(stored.points)).items()
+    }
     write_bytes(path, save(contiguous, {INPUTS_KEY: ",".join(stored.inputs)}))
 
 
@@ -183,9 +138,8 @@ def read_avatar(path: Path, head: HeadAsset, device: str) -> StoredShapes:
     """Read and check what `write_avatar` wrote. Raises `InputError` where a tensor is missing or does not fit."""
     tensors, metadata = read_safetensors(path)
     inputs = input_names(path, metadata.get(INPUTS_KEY, ""))
-    check_tensors(path, tensors, POINTS)
-    triangles, last_two = (tensors.pop(name).numpy() for name in POINTS)
-    points = SurfacePoints(triangles.astype(np.int64), full_barycentric(last_two))
+    check_tensors(path, tensors, POINT_MEMBERS)
+    points = read_points(path, tensors.pop("triangles"), tensors.pop("barycentric"), len(head.faces))
     return StoredShapes(tensors, points, inputs).checked(path, head, device)
 
 

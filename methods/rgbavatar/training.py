@@ -16,6 +16,7 @@ from ..ops.splats import WorldSplats
 from ..shared.avatar_files import clip_mesh
 from ..shared.image_training import ImageTrainer, Initial
 from ..shared.loop import recomposited
+from ..shared.networks import initial_network, tracked_inputs
 from ..shared.optimisation import logit
 from ..shared.rendering import View
 from ..shared.schedule import GroupedBatches, log_linear, numpy_generator
@@ -32,9 +33,7 @@ from .model import (
     Surface,
     blend_weights,
     blended,
-    initial_network,
     seen_colors,
-    tracked_inputs,
 )
 
 PUBLISHED_SAMPLES = 60_000
@@ -208,7 +207,8 @@ class RGBAvatarTraining(ImageTrainer):
             SHAPES[name]: (torch.zeros(config.blendshapes, *splats[name][0].shape), share * splats[name][1])
             for name, share in shares.items()
         }
-        network = initial_network(self._inputs.shape[1], config.hidden, config.blendshapes, self._seed)
+        sizes = (self._inputs.shape[1], config.hidden, config.hidden, config.blendshapes)
+        network = initial_network(sizes, self._seed)
         layers = {name: (value, config.network_lr) for name, value in network.items()}
         initial = {**splats, **shapes, **layers}
         return {name: (value.to(device), rate) for name, (value, rate) in initial.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +11,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ...bench.contracts import FloatArray, IntArray
+from ...bench.errors import InputError
+from ...bench.io.arrays import Member
 from ...datasets.head.geometry import triangle_areas
 from .schedule import numpy_generator
+from .tensor_files import MAX_MAGNITUDE
 
 CANDIDATES = 20
 """Number of random candidates per accepted point."""
@@ -21,6 +25,11 @@ measured between 1,000 and 50,000 samples of a head."""
 NEIGHBOURS = 3
 SMALLEST_SQUARE = 1e-7
 """Square metres; the minimum mean squared distance to neighbours, as published."""
+POINT_MEMBERS = {
+    "triangles": Member("i", ("N",), dtype="i4"),
+    "barycentric": Member("f", ("N", 2), MAX_MAGNITUDE, "f4"),
+}
+"""Tensors of N points in an avatar's file: triangles, and the last two barycentric coordinates."""
 
 
 class SurfacePoints(NamedTuple):
@@ -99,6 +108,22 @@ def poisson_disk(
             rows.append(row)
             left[tree.query_ball_point(points[row], radius)] = False
     return SurfacePoints(np.asarray(triangles, np.int64)[chosen[rows]], barycentric[rows])
+
+
+def point_tensors(points: SurfacePoints) -> dict[str, Tensor]:
+    """Points as the tensors of `POINT_MEMBERS`."""
+    return {
+        "triangles": torch.from_numpy(points.triangles.astype(np.int32)),
+        "barycentric": torch.from_numpy(points.barycentric[:, 1:].astype(np.float32)),
+    }
+
+
+def read_points(path: Path, triangles: Tensor, barycentric: Tensor, face_count: int) -> SurfacePoints:
+    """Points from the tensors of `POINT_MEMBERS`. Raises `InputError` if there are none, or for triangles that a mesh lacks."""
+    if not len(triangles) or not (0 <= int(triangles.min()) and int(triangles.max()) < face_count):
+        expected = f"at least one, each from 0 to {face_count - 1}"
+        raise InputError(path, "triangles", expected, f"{len(triangles)}, or others")
+    return SurfacePoints(triangles.numpy().astype(np.int64), full_barycentric(barycentric.numpy()))
 
 
 def full_barycentric(last_two: FloatArray) -> FloatArray:
