@@ -19,7 +19,7 @@ from .datasets.tiny_capture import make_plan, rig, write_tiny_capture
 from .fuzz.samples import SETTINGS
 
 LENGTHS = {"FREE": 2, "EMO-1-shout+laugh": 2, "SEN-01-cramp_small_danger": 1}
-ALL = ("ga", "gbs", "gha", "insta", "ours", "rgbavatar")
+ALL = ("flashavatar", "ga", "gbs", "gha", "insta", "ours", "rgbavatar")
 
 
 @pytest.fixture(scope="module")

@@ -39,6 +39,7 @@ from ..datasets.nersemble.benchmark_folder import write_benchmark
 from ..datasets.nersemble.recordings import write_recording
 from ..datasets.tiny_capture import make_plan, rig, write_tiny_capture
 from ..datasets.tracker_files.trackers import write_flashavatar
+from ..methods.flashavatar.small import SMALL as SMALL_FLASHAVATAR
 from ..methods.gha.small import SMALL as SMALL_GHA
 from ..methods.insta.small import SMALL as SMALL_INSTA
 from ..methods.official.repository import lip_numbers, make_interpreter, make_repository
@@ -52,10 +53,11 @@ PREPARE = (
     "prepare nersemble --root recording --tracking tracking --head head.npz --subjects 901 "
     "--sequences EMO-1,FREE --downscale 2 --every 1"
 )
-METHODS = ("mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "rgbavatar", "ours")
+METHODS = ("mean-image", "nearest-camera", "flashavatar", "ga", "gbs", "gha", "insta", "rgbavatar", "ours")
 ITERATIONS = {"budget": {"iterations": 2}}
 NUMBERS = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
 SETTINGS = {
+    "flashavatar": {**ITERATIONS, **SMALL_FLASHAVATAR},
     "ga": ITERATIONS,
     "gbs": {**ITERATIONS, "samples": 200, "teeth_samples": 20},
     "gha": {**ITERATIONS, **SMALL_GHA, "start_steps": 2, "motion_steps": 2},
@@ -198,7 +200,8 @@ def unfinished(folder: Path, samples: Path) -> None:
     values = configuration(METHODS)
     for name, settings in values["settings"].items():
         often = {"checkpoint_every_s": 0.0}
-        values["settings"][name] = {**settings, **(often if name in ("gha", "insta") else {"splats": often})}
+        bound = name in ("ga", "gbs", "ours")
+        values["settings"][name] = {**settings, **({"splats": often} if bound else often)}
     (folder / "config.json").write_text(json.dumps(values))
 
 

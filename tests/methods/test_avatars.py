@@ -18,6 +18,8 @@ from headbench.bench.contracts import (
     no_progress,
 )
 from headbench.bench.errors import InputError
+from headbench.methods.flashavatar.config import FlashAvatarConfig
+from headbench.methods.flashavatar.method import FlashAvatar
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
 from headbench.methods.ga.storage import COLUMNS, read_ga_splats, write_ga_splats
@@ -28,6 +30,7 @@ from headbench.methods.rgbavatar.config import RGBAvatarConfig
 from headbench.methods.rgbavatar.method import RGBAvatar
 from headbench.methods.shared.config import SplatTraining
 
+from .flashavatar.small import SMALL as SMALL_FLASHAVATAR
 from .ours.toy import SMALL, changed
 from .rgbavatar.small import SMALL as SMALL_RGBAVATAR
 from .toy_clip import first_view
@@ -38,6 +41,7 @@ BLENDSHAPES = BlendshapeTraining(
 )
 CONFIGS = {
     "ga": lambda: GA(GAConfig(splats=FAST)),
+    "flashavatar": lambda: FlashAvatar(FlashAvatarConfig(**SMALL_FLASHAVATAR)),
     "ours": lambda: Ours(changed(SMALL, splats=FAST, hidden=16, planes={"resolution": 16})),
     "gbs": lambda: GBS(GBSConfig(splats=BLENDSHAPES, samples=600, teeth_samples=40, min_sh_every=30)),
     "rgbavatar": lambda: RGBAvatar(RGBAvatarConfig(**SMALL_RGBAVATAR)),

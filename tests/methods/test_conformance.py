@@ -15,6 +15,7 @@ from headbench.bench.io.files import digest_file
 from headbench.bench.registry import discover
 from headbench.bench.specs import MethodSpec
 
+from .flashavatar.small import SMALL as SMALL_FLASHAVATAR
 from .insta.small import SMALL as SMALL_INSTA
 from .rgbavatar.small import SMALL as SMALL_RGBAVATAR
 from .toy_clip import toy_pose
@@ -25,6 +26,7 @@ TRAINED = {
     "splats": {"min_densify_every": 8, "min_reset_every": 10, "min_settle": 2, "checkpoint_every_s": 0.0},
 }
 OWN_TRAINING = {
+    "flashavatar": {"budget": {"iterations": 24}, "checkpoint_every_s": 0.0, **SMALL_FLASHAVATAR},
     "gha": {"budget": {"iterations": 24}, "grid_vertices": 3_000, "start_steps": 20, "motion_steps": 20},
     "insta": {"budget": {"iterations": 24}, "checkpoint_every_s": 0.0, **SMALL_INSTA},
     "rgbavatar": {"budget": {"iterations": 24}, "checkpoint_every_s": 0.0, **SMALL_RGBAVATAR},
@@ -68,7 +70,17 @@ def altered(clip, head):
 
 
 def test_our_methods_are_registered():
-    assert {"ours", "ga", "gbs", "gha", "insta", "rgbavatar", "mean-image", "nearest-camera"} <= set(SPECS)
+    assert {
+        "flashavatar",
+        "ours",
+        "ga",
+        "gbs",
+        "gha",
+        "insta",
+        "rgbavatar",
+        "mean-image",
+        "nearest-camera",
+    } <= set(SPECS)
 
 
 @pytest.mark.parametrize("name", SPECS)

@@ -11,6 +11,7 @@ from headbench.bench.engine.adaptation import MethodNeeds
 from headbench.bench.engine.config import resolve_method
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
+from headbench.methods.flashavatar.spec import FLASHAVATAR
 from headbench.methods.ga.spec import GA
 from headbench.methods.gbs.spec import GBS
 from headbench.methods.gha.spec import GHA
@@ -19,6 +20,7 @@ from headbench.methods.ours.spec import OURS
 from headbench.methods.rgbavatar.spec import RGBAVATAR
 
 OVER = {
+    "flashavatar": {"samples": 2_000},
     "ours": {"sampling": {"balanced": False}},  # one timestep has no clusters
     "rgbavatar": {"samples": 2_000},
     "gbs": {"sample_spacing": 0.5},  # the toy's texture changes from triangle to triangle
@@ -38,7 +40,7 @@ def psnr_by_heart(spec, clip, key, folder, iterations, settings):
 @pytest.mark.parametrize(
     ("iterations", "enough_db"), [(250, 27.0), pytest.param(500, 45.0, marks=pytest.mark.slow)]
 )
-@pytest.mark.parametrize("spec", [GA, GBS, OURS, RGBAVATAR], ids=lambda spec: spec.name)
+@pytest.mark.parametrize("spec", [FLASHAVATAR, GA, GBS, OURS, RGBAVATAR], ids=lambda spec: spec.name)
 def test_one_frame_is_learnt_by_heart(clip, tmp_path, spec, iterations, enough_db):
     settings = OVER.get(spec.name, {})
     assert psnr_by_heart(spec, clip, clip.splits["train"][0], tmp_path, iterations, settings) >= enough_db

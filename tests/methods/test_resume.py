@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from headbench.bench.contracts import Budget, no_progress
+from headbench.methods.flashavatar.config import FlashAvatarConfig
+from headbench.methods.flashavatar.method import FlashAvatar
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
 from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
@@ -27,6 +29,7 @@ from headbench.methods.shared.loop import CHECKPOINT
 from headbench.methods.shared.optimisation import Optimiser
 
 from ..datasets.head.toy import toy_head
+from .flashavatar.small import SMALL as SMALL_FLASHAVATAR
 from .gha.small import small_config
 from .insta.small import SMALL as SMALL_INSTA
 from .ours.toy import REPAIRED, changed
@@ -47,16 +50,19 @@ BLENDSHAPES = BlendshapeTraining(
 )
 METHODS = {
     "ga": lambda: GA(GAConfig(splats=SPLATS, min_sh_every=5)),
+    "flashavatar": lambda: FlashAvatar(FlashAvatarConfig(**SMALL_FLASHAVATAR, checkpoint_every_s=0.0)),
     "ours": lambda: Ours(changed(REPAIRED, splats=SPLATS, hidden=16)),
     "gbs": lambda: GBS(GBSConfig(splats=BLENDSHAPES, samples=400, teeth_samples=40, mask_floor_mm=0.5)),
     "gha": lambda: GHA(small_config()),
     "insta": lambda: Insta(InstaConfig(**SMALL_INSTA, checkpoint_every_s=0.0)),
     "rgbavatar": lambda: RGBAvatar(RGBAvatarConfig(**SMALL_RGBAVATAR, checkpoint_every_s=0.0)),
 }
-ITERATIONS = {"gha": 30, "insta": 24, "rgbavatar": 24}  # of gha, 12 are of the mesh phase
+ITERATIONS = {"flashavatar": 24, "gha": 30, "insta": 24, "rgbavatar": 24}  # of gha, 12 are of the mesh phase
 KILLS = [
     # Right after a densification, after a reset, right before a densification and right after it, and near the end.
     *((name, (8, 10, 15, 16, 33)) for name in ("ga", "ours", "gbs")),
+    # Around a rise of the degree of the harmonics, and near the end.
+    ("flashavatar", (3, 7, 8, 20)),
     # Within the mesh phase, right after it, right before its result is used, within the Gaussian phase.
     ("gha", (5, 12, 13, 25)),
     *(pytest.param("gha", (kill,), marks=pytest.mark.slow) for kill in (5, 12, 13, 25, 29)),

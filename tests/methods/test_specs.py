@@ -15,6 +15,8 @@ from headbench.bench.engine.config import (
 )
 from headbench.bench.errors import InputError
 from headbench.bench.registry import resolve
+from headbench.methods.flashavatar.config import FlashAvatarConfig
+from headbench.methods.flashavatar.spec import FLASHAVATAR
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.spec import GA
 from headbench.methods.gbs.config import GBSConfig
@@ -30,7 +32,10 @@ from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, Timeline
 from headbench.methods.trivial.spec import MEAN_IMAGE, NEAREST_CAMERA
 
-SPECS = {spec.name: spec for spec in (OURS, GA, GBS, GHA, INSTA, RGBAVATAR, MEAN_IMAGE, NEAREST_CAMERA)}
+SPECS = {
+    spec.name: spec
+    for spec in (FLASHAVATAR, OURS, GA, GBS, GHA, INSTA, RGBAVATAR, MEAN_IMAGE, NEAREST_CAMERA)
+}
 PRESETS = ("smoke", "demo", "fast", "gpu", "paper")
 
 
@@ -101,7 +106,9 @@ def test_short_presets_share_rates_that_paper_leaves_alone(preset):
     assert values(gbs, "sh_dc_lr", "sh_rest_lr") == values(ga, "sh_dc_lr", "sh_rest_lr") == (0.02, 1e-3)
 
 
-@pytest.mark.parametrize("spec", [OURS, GA, GBS, GHA, INSTA, RGBAVATAR], ids=lambda spec: spec.name)
+@pytest.mark.parametrize(
+    "spec", [FLASHAVATAR, OURS, GA, GBS, GHA, INSTA, RGBAVATAR], ids=lambda spec: spec.name
+)
 def test_the_gpu_preset_is_the_published_one_but_shorter(spec):
     gpu, paper = (resolve_method(spec, preset, {}) for preset in ("gpu", "paper"))
     assert gpu.config == paper.config
@@ -147,6 +154,12 @@ def test_the_paper_preset_of_gbs_is_the_paper():
         (SplatTraining, {"ssim_weight": 1.5}),
         (SplatTraining, {"max_splats": 0}),
         (SplatTraining, {"final_rate": 0.0}),
+        (FlashAvatarConfig, {"samples": 0}),
+        (FlashAvatarConfig, {"final_rate": 0.0}),
+        (FlashAvatarConfig, {"frequencies": 17}),
+        (FlashAvatarConfig, {"layers": 10**9}),
+        (FlashAvatarConfig, {"offset_m": float("nan")}),
+        (FlashAvatarConfig, {"mouth_weight": -1.0}),
         (GAConfig, {"sh_degree": 4}),
         (GHAConfig, {"channels": 33}),
         (GHAConfig, {"mesh_fraction": 1.0}),

@@ -11,6 +11,7 @@ from headbench.bench.engine.adaptation import MethodNeeds
 from headbench.bench.engine.config import resolve_method
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
+from headbench.methods.flashavatar.spec import FLASHAVATAR
 from headbench.methods.ga.spec import GA
 from headbench.methods.gbs.spec import GBS
 from headbench.methods.gha.spec import GHA
@@ -70,7 +71,7 @@ def psnr(spec, clip, folder):
 
 @pytest.mark.parametrize(
     "spec",
-    [GA, GBS, GHA, pytest.param(INSTA, marks=pytest.mark.slow), OURS, RGBAVATAR],
+    [FLASHAVATAR, GA, GBS, GHA, pytest.param(INSTA, marks=pytest.mark.slow), OURS, RGBAVATAR],
     ids=lambda spec: spec.name,
 )
 def test_a_world_far_from_its_origin_is_as_good(clip, tmp_path, spec):
