@@ -16,14 +16,12 @@ from headbench.methods.rgbavatar.model import (
     Surface,
     blend_weights,
     blended,
-    initial_network,
-    input_count,
     read_avatar,
     seen_colors,
-    tracked_inputs,
     write_avatar,
 )
 from headbench.methods.rgbavatar.training import RGBAvatarTraining
+from headbench.methods.shared.networks import initial_network, input_count, tracked_inputs
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.subject_mesh import SubjectMesh
 from headbench.methods.shared.surface_points import poisson_disk
@@ -45,7 +43,7 @@ def splats():
     widths = {"means": 3, "quats": 4, "colors": 3}
     tensors = {name: torch.randn(5, width, generator=generator) for name, width in widths.items()}
     tensors |= {SHAPES[name]: torch.randn(3, 5, width, generator=generator) for name, width in widths.items()}
-    tensors |= initial_network(7, 8, 3, 0)
+    tensors |= initial_network((7, 8, 8, 3), 0)
     return {name: value.double() for name, value in tensors.items()}
 
 
