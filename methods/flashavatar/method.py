@@ -12,8 +12,16 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import FloatArray, HeadPose
+from ..avatars.compact.offsets import read_offsets
 from ..avatars.harmonics import turn_harmonics
-from ..shared.avatar_files import SUBJECT_FILE, Subject, finish_fit, read_shared_head, read_subject
+from ..shared.avatar_files import (
+    COMPACT_FILE,
+    SUBJECT_FILE,
+    Subject,
+    finish_fit,
+    read_shared_head,
+    read_subject,
+)
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.networks import tracked_inputs
@@ -38,7 +46,10 @@ from .training import FlashAvatarTraining
 
 
 class FlashAvatarAvatar(StoredSplatAvatar):
-    """A trained head. ``avatar.safetensors`` and ``subject.npz`` count as storage; the shared head model is beside them."""
+    """A trained head. Files: ``avatar.safetensors`` and ``subject.npz``, or the coded file in place of both, count as storage.
+
+    The folder also has the shared head model.
+    """
 
     def __init__(
         self, files: Sequence[Path], mesh: SubjectMesh, subject: Subject, trained: TrainedSplats, device: str
@@ -53,9 +64,14 @@ class FlashAvatarAvatar(StoredSplatAvatar):
     @classmethod
     def read(cls, folder: Path, device: str) -> FlashAvatarAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        head, files = read_shared_head(folder), [folder / AVATAR_FILE, folder / SUBJECT_FILE]
-        subject = read_subject(folder / SUBJECT_FILE, head)
-        trained = read_avatar(folder / AVATAR_FILE, head, device)
+        head, coded = read_shared_head(folder), folder / COMPACT_FILE
+        if coded.exists():
+            files = [coded]
+            subject, trained = read_offsets(coded, head, device)
+        else:
+            files = [folder / AVATAR_FILE, folder / SUBJECT_FILE]
+            subject = read_subject(folder / SUBJECT_FILE, head)
+            trained = read_avatar(folder / AVATAR_FILE, head, device)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
         return cls(files, mesh, subject, trained, device)
 

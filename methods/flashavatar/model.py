@@ -166,32 +166,46 @@ class TrainedSplats(NamedTuple):
     points: SurfacePoints
     config: FlashAvatarConfig
 
+    def checked(self, path: Path, head: HeadAsset, device: str) -> TrainedSplats:
+        """The same on a device. Raises `InputError`, naming ``path``, where the tensors do not fit each other or the head."""
+        config = self.config
+        shapes: dict[str, tuple[int | str, ...]] = {name: ("N", *shape) for name, shape in PER_SPLAT.items()}
+        shapes["sh_rest"] = ("N", 3, coefficient_count(config.sh_degree) - 1)
+        sizes = network_sizes(config, input_count(head, INPUTS))
+        for layer, (weight, bias) in enumerate(zip(*layer_names(len(sizes) - 1))):
+            shapes |= {weight: (sizes[layer + 1], sizes[layer]), bias: (sizes[layer + 1],)}
+        members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in shapes.items()}
+        check_tensors(path, self.tensors, members, {"N": len(self.points.triangles)})
+        check_sizes(path, math.e * self.tensors["log_scales"])  # the largest that the network makes of them
+        return self._replace(tensors={name: self.tensors[name].to(device) for name in shapes})
+
+
+def rendering_text(config: FlashAvatarConfig) -> str:
+    """The settings that affect rendering, as JSON."""
+    return json.dumps({name: value for name, value in asdict(config).items() if name in RENDERING})
+
+
+def rendering_of_text(path: Path, text: str) -> FlashAvatarConfig:
+    """Settings with those of a `rendering_text`. Raises `InputError`, naming ``path``, for other text."""
+    settings = parse_json(text, path, SETTINGS_KEY)
+    if set(settings) != set(RENDERING):
+        raise InputError(path, SETTINGS_KEY, f"the settings {', '.join(RENDERING)}", repr(text)[:80])
+    return build(FlashAvatarConfig, settings, str(path))
+
 
 def write_avatar(path: Path, trained: TrainedSplats) -> None:
     """Write an avatar as safetensors, exact: 56 bytes for each splat, 12 for each of its harmonics above degree 0, and
     the network."""
     tensors = {name: value.detach().to("cpu", torch.float32) for name, value in trained.tensors.items()}
     tensors |= point_tensors(trained.points)
-    settings = {name: value for name, value in asdict(trained.config).items() if name in RENDERING}
     contiguous = {name: value.contiguous() for name, value in tensors.items()}
-    write_bytes(path, save(contiguous, {SETTINGS_KEY: json.dumps(settings)}))
+    write_bytes(path, save(contiguous, {SETTINGS_KEY: rendering_text(trained.config)}))
 
 
 def read_avatar(path: Path, head: HeadAsset, device: str) -> TrainedSplats:
     """Read and check what `write_avatar` wrote. Raises `InputError` where a tensor is missing or does not fit."""
     tensors, metadata = read_safetensors(path)
-    text = metadata.get(SETTINGS_KEY, "")
-    settings = parse_json(text, path, SETTINGS_KEY)
-    if set(settings) != set(RENDERING):
-        raise InputError(path, SETTINGS_KEY, f"the settings {', '.join(RENDERING)}", repr(text)[:80])
-    config = build(FlashAvatarConfig, settings, str(path))
-    shapes: dict[str, tuple[int | str, ...]] = {name: ("N", *shape) for name, shape in PER_SPLAT.items()}
-    shapes["sh_rest"] = ("N", 3, coefficient_count(config.sh_degree) - 1)
-    sizes = network_sizes(config, input_count(head, INPUTS))
-    for layer, (weight, bias) in enumerate(zip(*layer_names(len(sizes) - 1))):
-        shapes |= {weight: (sizes[layer + 1], sizes[layer]), bias: (sizes[layer + 1],)}
-    members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in shapes.items()}
-    check_tensors(path, tensors, members | POINT_MEMBERS)
-    points = read_points(path, tensors["triangles"], tensors["barycentric"], len(head.faces))
-    check_sizes(path, math.e * tensors["log_scales"])  # the largest that the network makes of them
-    return TrainedSplats({name: tensors[name].to(device) for name in shapes}, points, config)
+    config = rendering_of_text(path, metadata.get(SETTINGS_KEY, ""))
+    check_tensors(path, tensors, POINT_MEMBERS)
+    points = read_points(path, tensors.pop("triangles"), tensors.pop("barycentric"), len(head.faces))
+    return TrainedSplats(tensors, points, config).checked(path, head, device)

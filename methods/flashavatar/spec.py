@@ -36,6 +36,7 @@ FLASHAVATAR = MethodSpec(
     summary="FlashAvatar: splats on the mesh, moved, turned and scaled by a network of the tracked parameters.",
     implementation="headbench.methods.flashavatar.method:FlashAvatar",
     config="headbench.methods.flashavatar.config:FlashAvatarConfig",
+    variants="headbench.methods.avatars.derived.coded:flashavatar_variants",
     needs="headbench.methods.shared.needs:splats",
     presets=PRESETS,
     source="FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Embedding, CVPR 2024, arXiv 2312.02214",

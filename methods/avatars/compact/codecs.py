@@ -18,6 +18,7 @@ from ....bench.contracts import Avatar, Clip, FloatArray, HeadAsset, HeadPose, S
 from ....bench.errors import InputError
 from ....bench.io.arrays import Member, read_arrays
 from ....bench.io.files import digest, read_bytes
+from ...flashavatar.method import FlashAvatarAvatar
 from ...ga.method import GAAvatar
 from ...gbs.avatar import GBSAvatar
 from ...gha.avatar import AVATAR_FILE as GHA_FILE
@@ -37,6 +38,7 @@ from .bound import encode_bound
 from .container import CODEC, Content, write_content
 from .file import encode
 from .networks import encode_networks
+from .offsets import encode_offsets
 from .precision import Precision
 from .reduced import encode_reduced
 from .simplify import simplify
@@ -56,7 +58,7 @@ def encode_avatar(avatar: Avatar, head: HeadAsset, precision: Precision, clip: C
     """
     encoder = ENCODERS.get(type(avatar))
     if encoder is None:
-        methods = "ours, ga, gbs, gha, insta or rgbavatar"
+        methods = "ours, ga, gbs, gha, insta, rgbavatar or flashavatar"
         raise InputError("avatar", "", f"one of {methods}", f"a {type(avatar).__name__}")
     if any(path.name == COMPACT_FILE for path in avatar.files()):
         raise InputError(avatar.files()[0], "", "the files of a training", "a coded avatar")
@@ -149,6 +151,12 @@ def _encode_rgbavatar(
     return encode_reduced(avatar.stored, avatar.subject, head, precision, weights_of(avatar, clip), moments)
 
 
+def _encode_flashavatar(
+    avatar: FlashAvatarAvatar, head: HeadAsset, precision: Precision, clip: Clip | None
+) -> Content:
+    return encode_offsets(avatar.trained, avatar.subject, precision, weights_of(avatar, clip))
+
+
 def _exact(avatar: Avatar, name: str) -> Path:
     return next(path for path in avatar.files() if path.name == name)
 
@@ -161,5 +169,6 @@ ENCODERS: Mapping[type, Encoder] = {
     GHAAvatar: _encode_gha,
     InstaAvatar: _encode_insta,
     RGBAvatarAvatar: _encode_rgbavatar,
+    FlashAvatarAvatar: _encode_flashavatar,
 }
 """How the avatars of each method are encoded; each method reads its own coded file."""

@@ -47,6 +47,11 @@ def rgbavatar_variants(folder: Path, clip: Clip, device: str) -> Iterator[Varian
     return _variants("rgbavatar.method", "RGBAvatarAvatar", folder, clip, device)
 
 
+def flashavatar_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
+    """The coded variants of an avatar of FlashAvatar."""
+    return _variants("flashavatar.method", "FlashAvatarAvatar", folder, clip, device)
+
+
 def _variants(module: str, name: str, folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
     avatar_class = getattr(import_module(f"...{module}", __package__), name)
     for step in STEPS:

@@ -12,6 +12,8 @@ from headbench.methods.avatars.compact.codecs import encode_avatar, write_coded
 from headbench.methods.avatars.compact.container import read_content, write_content
 from headbench.methods.avatars.compact.precision import EXACT, Precision
 from headbench.methods.avatars.derived.coded import STEPS, coded_name
+from headbench.methods.flashavatar.config import FlashAvatarConfig
+from headbench.methods.flashavatar.method import FlashAvatar
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
 from headbench.methods.gbs.config import GBSConfig
@@ -26,6 +28,7 @@ from headbench.methods.rgbavatar.method import RGBAvatar
 from headbench.methods.shared.avatar_files import COMPACT_FILE, read_shared_head
 from headbench.methods.shared.config import SplatTraining
 
+from ...flashavatar.small import SMALL as SMALL_FLASHAVATAR
 from ...gha.small import SMALL as SMALL_GHA
 from ...insta.small import SMALL as SMALL_INSTA
 from ...ours.toy import SMALL as SMALL_OURS
@@ -38,6 +41,7 @@ METHODS = {
     "gbs": lambda: GBS(GBSConfig(samples=300)),
     "gha": lambda: GHA(GHAConfig(**SMALL_GHA)),
     "insta": lambda: Insta(InstaConfig(**SMALL_INSTA)),
+    "flashavatar": lambda: FlashAvatar(FlashAvatarConfig(**SMALL_FLASHAVATAR)),
     "rgbavatar": lambda: RGBAvatar(RGBAvatarConfig(**SMALL_RGBAVATAR)),
 }
 
