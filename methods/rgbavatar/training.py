@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip
+from ...bench.native.dispatch import to_device
 from ..ops.harmonics import C0
 from ..ops.photometric import photometric_loss
 from ..ops.splats import WorldSplats
@@ -152,7 +153,7 @@ class RGBAvatarTraining(ImageTrainer):
         if not self._masks:
             return pixels, self._background
         random = numpy_generator(self._seed, "background", iteration * len(self.keys) + image).random(3)
-        background = torch.from_numpy(random).to(self._background)
+        background = to_device(torch.from_numpy(random.astype(np.float32)), self._background.device)
         return recomposited(pixels[:, :, :3], pixels[:, :, 3:], self._background, background), background
 
     def _take_colors(self) -> None:

@@ -20,7 +20,7 @@ from headbench.bench.engine.jobs import trained
 from ..small_run import small_run
 from . import pretended
 
-METHODS = ("ga", "gbs", "gha", "ours")
+METHODS = ("flashavatar", "ga", "gbs", "gha", "ours", "rgbavatar")
 ITERATIONS = 3
 
 
