@@ -37,6 +37,13 @@ class RGBAvatarConfig:
     batch, together : int
         Images of a step, and how many of them show the same timestep, if it has so many cameras. The published
         batch draws its images independently, as 1 does.
+    online : bool
+        Train as if the images, sorted by timestep, arrived one after another, and draw mostly the newest
+        (local-global sampling); blendshapes are trained from the start, and every splat is kept. Not with another
+        ``together`` than 1.
+    trained_per_arrival : int
+        Images trained on for each that arrives in ``online``: 25 at the published 630 images a second and 25
+        frames a second. After 10 s of video 250 images have arrived in 625 steps of 10.
     random_background : bool
         Train on a random background for each image; ignored without masks.
     ssim_weight : float
@@ -72,6 +79,8 @@ class RGBAvatarConfig:
     hidden: int = 128
     batch: int = 10
     together: int = 1
+    online: bool = False
+    trained_per_arrival: int = 25
     random_background: bool = True
     ssim_weight: float = 0.0
     join: int = 300
@@ -101,6 +110,7 @@ class RGBAvatarConfig:
             "batch",
             "together",
             "color_every",
+            "trained_per_arrival",
         ):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
@@ -112,5 +122,7 @@ class RGBAvatarConfig:
             or not self.inputs
         ):
             raise ValueError(f"inputs must be among {', '.join(INPUTS)}, each once, found {self.inputs}")
+        if self.online and self.together != 1:
+            raise ValueError(f"together must be 1 with online, found {self.together}")
         if not 0 <= self.ssim_weight <= 1:
             raise ValueError(f"ssim_weight must lie in [0, 1], found {self.ssim_weight}")

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Clip
+from ...bench.contracts import Clip, FrameKey
 from ...bench.native.dispatch import to_device
 from ..ops.harmonics import C0
 from ..ops.photometric import photometric_loss
@@ -20,7 +20,7 @@ from ..shared.loop import recomposited
 from ..shared.networks import initial_network, tracked_inputs
 from ..shared.optimisation import logit
 from ..shared.rendering import View
-from ..shared.schedule import GroupedBatches, log_linear, numpy_generator
+from ..shared.schedule import Batches, GroupedBatches, log_linear, numpy_generator
 from ..shared.subject_mesh import BoundedCache
 from ..shared.surface_points import poisson_disk
 from ..splats import rasterize
@@ -36,9 +36,18 @@ from .model import (
     blended,
     seen_colors,
 )
+from .online import OnlineBatches
 
 PUBLISHED_SAMPLES = 60_000
 """Number of splats for which the published size at the start is given: texels of 256 x 256 that show FLAME, rounded."""
+
+
+def _batches(keys: Sequence[FrameKey], config: RGBAvatarConfig, seed: int) -> Batches:
+    """How images are drawn: in epochs, or as they arrive."""
+    if config.online:
+        order = sorted(range(len(keys)), key=lambda index: (keys[index].timestep, keys[index].camera))
+        return OnlineBatches(order, config.batch, config.trained_per_arrival, seed)
+    return GroupedBatches([key.timestep for key in keys], config.batch, config.together, seed)
 
 
 class RGBAvatarTraining(ImageTrainer):
@@ -52,7 +61,7 @@ class RGBAvatarTraining(ImageTrainer):
 
     def __init__(self, clip: Clip, config: RGBAvatarConfig, device: str, seed: int):
         keys = clip.splits["train"]
-        batches = GroupedBatches([key.timestep for key in keys], config.batch, config.together, seed)
+        batches = _batches(keys, config, seed)
         masks = config.random_background and clip.mask(keys[0]) is not None
         super().__init__(clip, config, batches, device, masks=masks)
         self._config, self._batches, self._seed, self._masks = config, batches, seed, masks
@@ -126,7 +135,8 @@ class RGBAvatarTraining(ImageTrainer):
 
     def result(self) -> StoredShapes:
         """The trained avatar, without splats that no image has given a colour: nothing was learnt about them."""
-        kept = self.colored if self._config.color_weight else torch.ones_like(self.colored)
+        prunes = self._config.color_weight > 0 and not self._config.online
+        kept = self.colored if prunes else torch.ones_like(self.colored)
         if not bool(kept.any()):
             kept = torch.ones_like(kept)
         tensors = {name: self.optimiser[name].detach() for name in self._rates}
@@ -140,7 +150,7 @@ class RGBAvatarTraining(ImageTrainer):
     def _splats(self, iteration: int, rows: Sequence[int]) -> list[dict[str, Tensor]]:
         """Splats of some timesteps; the neutral ones before the blendshapes are trained."""
         splats: dict[str, Tensor] = {name: self.optimiser[name] for name in self._rates}
-        if iteration <= self._timeline.at(self._config.join):
+        if not self._config.online and iteration <= self._timeline.at(self._config.join):
             return [splats] * len(rows)
         return blended(splats, blend_weights(splats, self._inputs[rows]))
 

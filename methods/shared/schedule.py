@@ -147,10 +147,33 @@ class Weighted:
         return int(self._draws(block)[position])
 
 
-class GroupedBatches:
-    """Batches of images, each image once per epoch, in a new random order each epoch. Batches are numbered from 1.
+class Batches:
+    """Batches of up to ``size`` images, numbered from 1; a derived class draws them.
 
     As a `Sampler` it gives the images of the batches one after another; every batch occupies ``size`` numbers.
+    """
+
+    def __init__(self, size: int):
+        self._size = size
+
+    def batch(self, iteration: int) -> tuple[int, ...]:
+        """The images of a batch; depends on ``iteration`` alone."""
+        raise NotImplementedError
+
+    def positions(self, iteration: int) -> list[tuple[int, int]]:
+        """Number, as for the sampler, and index of each image of a batch."""
+        batch, end = self.batch(iteration), iteration * self._size
+        numbers = [*range(end - self._size + 1, end - self._size + len(batch)), end]
+        return list(zip(numbers, batch))
+
+    def __call__(self, iteration: int) -> int:
+        batch, member = divmod(iteration - 1, self._size)
+        images = self.batch(batch + 1)
+        return images[min(member, len(images) - 1)]
+
+
+class GroupedBatches(Batches):
+    """Each image once per epoch, in a new random order each epoch.
 
     Parameters
     ----------
@@ -163,7 +186,8 @@ class GroupedBatches:
     """
 
     def __init__(self, groups: Sequence[int], size: int, together: int, seed: int):
-        self._groups, self._size, self._together, self._seed = np.asarray(groups), size, together, seed
+        super().__init__(size)
+        self._groups, self._together, self._seed = np.asarray(groups), together, seed
         self._epoch = -(-len(groups) // size)
         self._order = lru_cache(maxsize=2)(self._batches)
 
@@ -171,17 +195,6 @@ class GroupedBatches:
         """The images of a batch."""
         epoch, position = divmod(iteration - 1, self._epoch)
         return self._order(epoch)[position]
-
-    def positions(self, iteration: int) -> list[tuple[int, int]]:
-        """Number, as for the sampler, and index of each image of a batch."""
-        batch, end = self.batch(iteration), iteration * self._size
-        numbers = [*range(end - self._size + 1, end - self._size + len(batch)), end]
-        return list(zip(numbers, batch))
-
-    def __call__(self, iteration: int) -> int:
-        batch, member = divmod(iteration - 1, self._size)
-        images = self.batch(batch + 1)
-        return images[min(member, len(images) - 1)]
 
     def _batches(self, epoch: int) -> list[tuple[int, ...]]:
         random = numpy_generator(self._seed, "batches", epoch)

@@ -1,0 +1,70 @@
+"""Local-global sampling: training while frames arrive, with the published sizes of pools."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..shared.schedule import Batches, numpy_generator
+
+LOCAL, GLOBAL = 150, 1_000
+"""Newest frames, and frames kept of all older ones."""
+MOST_GLOBAL, RAMP = 0.7, 599
+"""Maximum share of draws from the older frames, and the number of older frames from which on it holds."""
+
+
+class OnlineBatches(Batches):
+    """Batches of the images that have arrived so far, mostly of the newest.
+
+    Each draw is from the older images with a probability that rises with their number, else from the newest `LOCAL`, of which newer
+    ones are more probable. Of the older ones a uniform sample of `GLOBAL` is kept (reservoir sampling; Vitter, ACM TOMS 1985,
+    algorithm R).
+
+    Parameters
+    ----------
+    order : Sequence[int]
+        Indices of the images in the order of their arrival.
+    size : int
+        Images of a batch; fewer before so many have arrived.
+    trained : int
+        Images trained on for each that arrives.
+    """
+
+    def __init__(self, order: Sequence[int], size: int, trained: int, seed: int):
+        super().__init__(size)
+        self._images, self._trained, self._seed = tuple(order), trained, seed
+        self._kept: list[int] = []
+        self._passed = 0
+
+    def arrived(self, iteration: int) -> int:
+        """Number of images that a batch can have; the images of the first batch are there at the start."""
+        return min(len(self._images), self._size + (iteration - 1) * self._size // self._trained)
+
+    def batch(self, iteration: int) -> tuple[int, ...]:
+        """The images of a batch, each once."""
+        random, arrived = numpy_generator(self._seed, "online", iteration), self.arrived(iteration)
+        older = max(arrived - LOCAL, 0)
+        size = min(self._size, arrived)
+        share = MOST_GLOBAL * min(older / RAMP, 1.0)
+        kept = self._older(older)
+        from_older = min(int((random.random(size) < share).sum()), len(kept))
+        newest = np.arange(older, arrived)
+        weights = np.exp((np.arange(len(newest)) + LOCAL - len(newest)) / LOCAL)
+        places = random.choice(newest, size - from_older, replace=False, p=weights / weights.sum()).tolist()
+        places += random.choice(kept, from_older, replace=False).tolist() if from_older else []
+        return tuple(self._images[place] for place in places)
+
+    def _older(self, count: int) -> list[int]:
+        """Places of the kept images among the first ``count``."""
+        if count < self._passed:
+            self._kept, self._passed = [], 0
+        for place in range(self._passed, count):
+            if place < GLOBAL:
+                self._kept.append(place)
+                continue
+            replaced = int(numpy_generator(self._seed, "reservoir", place).integers(place + 1))
+            if replaced < GLOBAL:
+                self._kept[replaced] = place
+        self._passed = count
+        return self._kept
