@@ -16,8 +16,8 @@ from ..shared.avatar_files import clip_mesh
 from ..shared.image_training import ImageTrainer, Initial
 from ..shared.networks import initial_network, layer_names, tracked_inputs
 from ..shared.optimisation import logit
-from ..shared.schedule import ShuffledEpochs, Timeline, log_linear
-from ..shared.subject_mesh import BoundedCache
+from ..shared.schedule import ShuffledEpochs, Timeline
+from ..shared.subject_mesh import BoundedCache, TrainingPoses
 from ..shared.surface_points import poisson_disk, spacing
 from ..splats import rasterize
 from .config import FlashAvatarConfig
@@ -51,10 +51,8 @@ class FlashAvatarTraining(ImageTrainer):
         self.points = poisson_disk(vertices, faces, np.arange(len(faces)), config.samples, seed)
         self._surface = HeadSurface(mesh, self.points)
         self._encoded = positional_encoding(self._surface.rest, config.frequencies)
-        timesteps = sorted({key.timestep for key in keys})
-        self._row = {timestep: row for row, timestep in enumerate(timesteps)}
-        self._arguments = mesh.arguments([clip.poses[timestep] for timestep in timesteps])
-        self._inputs = tracked_inputs(self._arguments, INPUTS)
+        self._tracked = TrainingPoses(clip, mesh)
+        self._inputs = tracked_inputs(self._tracked.arguments, INPUTS)
         mouth = clip.head.regions.get(MOUTH, ()) if config.mouth_weight else ()
         self._mouth = torch.tensor(np.asarray(mouth, np.int64), device=device)
         memory, pixels = config.mesh_cache_mb * 2**19, max(c.width * c.height for c in self.cameras.values())
@@ -71,7 +69,7 @@ class FlashAvatarTraining(ImageTrainer):
     def loss(self, iteration: int, index: int) -> Tensor:
         """Loss of one image, see `image_loss`."""
         config, key = self._config, self.keys[index]
-        view, row = self._views[key.camera], self._row[key.timestep]
+        view, row = self._views[key.camera], self._tracked.row[key.timestep]
         tensors = {name: self.optimiser[name] for name in self._rates}
         of_points = layer_of_points(tensors, self._encoded)
         outputs = network_outputs(tensors, of_points, self._inputs[row], config)
@@ -90,10 +88,7 @@ class FlashAvatarTraining(ImageTrainer):
 
     def after_backward(self, iteration: int) -> None:
         """Set the learning rates."""
-        late = max(0.0, 2 * self._timeline.fraction(iteration) - 1)
-        decay = log_linear(1.0, self._config.final_rate, late)
-        for name, rate in self._rates.items():
-            self.optimiser.set_learning_rate(name, decay * rate)
+        self._decay_rates(iteration, self._config.final_rate)
 
     def note(self) -> str:
         """Number of splats."""
@@ -104,11 +99,8 @@ class FlashAvatarTraining(ImageTrainer):
         tensors = {name: self.optimiser[name].detach() for name in self._rates}
         return TrainedSplats(tensors, self.points, self._config)
 
-    def _timestep(self, row: int) -> dict[str, Tensor]:
-        return {name: values[row : row + 1] for name, values in self._arguments.items()}
-
     def _posed(self, row: int) -> TriangleFrames:
-        return self._surface.posed(self._timestep(row))
+        return self._surface.posed(self._tracked.at(row))
 
     @torch.no_grad()
     def _mask(self, index: int) -> Tensor | None:
@@ -116,7 +108,7 @@ class FlashAvatarTraining(ImageTrainer):
         if not len(self._mouth):
             return None
         key = self.keys[index]
-        vertices = self._surface.mesh.posed(self._timestep(self._row[key.timestep]))
+        vertices = self._surface.mesh.posed(self._tracked.at(self._tracked.row[key.timestep]))
         mouth, middle = vertices[self._mouth].cpu().numpy(), vertices.mean(0).cpu().numpy()
         mask = mouth_mask(self.cameras[key.camera], mouth, middle)
         return torch.from_numpy(mask).to(self._device)
@@ -142,7 +134,6 @@ class FlashAvatarTraining(ImageTrainer):
             for names in layer_names(config.layers + 1):
                 network[names[-1]].zero_()
         initial |= {name: (value, config.network_lr) for name, value in network.items()}
-        self._rates = {name: rate for name, (_, rate) in initial.items()}
         return {name: (value.to(self._device), rate) for name, (value, rate) in initial.items()}
 
 

@@ -21,7 +21,7 @@ from ..shared.networks import initial_network, tracked_inputs
 from ..shared.optimisation import logit
 from ..shared.rendering import View
 from ..shared.schedule import Batches, GroupedBatches, log_linear, numpy_generator
-from ..shared.subject_mesh import BoundedCache
+from ..shared.subject_mesh import BoundedCache, TrainingPoses
 from ..shared.surface_points import poisson_disk
 from ..splats import rasterize
 from .config import RGBAvatarConfig
@@ -69,15 +69,12 @@ class RGBAvatarTraining(ImageTrainer):
         faces, vertices = np.asarray(clip.head.faces), mesh.canonical.cpu().numpy().astype(np.float64)
         self.points = poisson_disk(vertices, faces, np.arange(len(faces)), config.samples, seed)
         self._surface = Surface(mesh, self.points)
-        timesteps = sorted({key.timestep for key in keys})
-        self._row = {timestep: row for row, timestep in enumerate(timesteps)}
-        self._arguments = mesh.arguments([clip.poses[timestep] for timestep in timesteps])
-        self._inputs = tracked_inputs(self._arguments, config.inputs)
+        self._tracked = TrainingPoses(clip, mesh)
+        self._row = self._tracked.row
+        self._inputs = tracked_inputs(self._tracked.arguments, config.inputs)
         entry = 4 * (17 * len(faces) + 3 * len(self.points.triangles))
         self._surfaces = BoundedCache(self._posed, config.mesh_cache_mb * 2**20 // entry)
-        initial = self._initial(device)
-        self._rates = {name: rate for name, (_, rate) in initial.items()}
-        self._optimise(initial)
+        self._optimise(self._initial(device))
         self.colored = torch.zeros(len(self.points.triangles), dtype=torch.bool, device=device)
 
     def loss(self, iteration: int, index: int) -> Tensor:
@@ -114,11 +111,9 @@ class RGBAvatarTraining(ImageTrainer):
         if due and not bool(self.colored.all()):
             self._take_colors()
         progress = iteration / max(self._timeline.at(config.position_settles), 1)
-        positions = log_linear(config.position_lr, config.position_lr_final, progress) / config.position_lr
-        late = max(0.0, 2 * self._timeline.fraction(iteration) - 1)
-        others = log_linear(1.0, config.final_rate, late)
-        for name, rate in self._rates.items():
-            self.optimiser.set_learning_rate(name, rate * (positions if name == "means" else others))
+        rate = log_linear(config.position_lr, config.position_lr_final, progress)
+        self.optimiser.set_learning_rate("means", rate)
+        self._decay_rates(iteration, config.final_rate, apart=("means",))
 
     def state(self) -> dict[str, Any]:
         """Parameters, moments, and which splats have a colour."""
@@ -154,9 +149,8 @@ class RGBAvatarTraining(ImageTrainer):
             return [splats] * len(rows)
         return blended(splats, blend_weights(splats, self._inputs[rows]))
 
-    @torch.no_grad()
     def _posed(self, row: int) -> PointsOfPose:
-        return self._surface.posed({name: values[row : row + 1] for name, values in self._arguments.items()})
+        return self._surface.posed(self._tracked.at(row))
 
     def _on_background(self, pixels: Tensor, iteration: int, image: int) -> tuple[Tensor, Tensor]:
         """(H, W, 3) colours, on a random background if there are masks, and that background."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,7 +13,7 @@ from ...bench.contracts import Clip, FrameKey
 from .loop import Fit, TrainingImages, TrainingSummary, train
 from .optimisation import Optimiser
 from .rendering import view_of
-from .schedule import Sampler, Timeline
+from .schedule import Sampler, Timeline, log_linear
 
 Initial = Mapping[str, tuple[Tensor, float]]
 """Initial tensors with their learning rates, by name."""
@@ -55,6 +55,19 @@ class ImageTrainer:
             {name: nn.Parameter(value) for name, (value, _) in initial.items()},
             {name: rate for name, (_, rate) in initial.items()},
         )
+        self._rates = {name: rate for name, (_, rate) in initial.items()}
+
+    def _decay_rates(self, iteration: int, final_rate: float, apart: Collection[str] = ()) -> None:
+        """Set learning rates: the initial ones, falling to ``final_rate`` of them, log-linear over the last half of the run.
+
+        Those of the tensors in ``apart`` are not changed.
+        """
+        if final_rate == 1:
+            return
+        decay = log_linear(1.0, final_rate, max(0.0, 2 * self._timeline.fraction(iteration) - 1))
+        for name, rate in self._rates.items():
+            if name not in apart:
+                self.optimiser.set_learning_rate(name, decay * rate)
 
     def begin(self, timeline: Timeline) -> None:
         """Fit schedules to the length of the run."""

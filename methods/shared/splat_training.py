@@ -55,7 +55,6 @@ class SplatTrainer(ImageTrainer):
         initial = {**splats, **shared}
         self.splat_names, self.extent = tuple(splats), extent
         self._optimise(initial)
-        self._rates = {name: rate for name, (_, rate) in initial.items() if name != "means"}
         self._densifier = Densifier(
             self._settings, self.optimiser, self.splat_names, binding, face_count, extent, seed, **density
         )
@@ -84,10 +83,7 @@ class SplatTrainer(ImageTrainer):
         progress = self._position_progress(iteration)
         rate = log_linear(settings.position_lr, settings.position_lr_final, progress)
         self.optimiser.set_learning_rate("means", rate * self.extent)
-        if settings.final_rate < 1:
-            decay = log_linear(1.0, settings.final_rate, max(0.0, 2 * self._timeline.fraction(iteration) - 1))
-            for name, initial in self._rates.items():
-                self.optimiser.set_learning_rate(name, decay * initial)
+        self._decay_rates(iteration, settings.final_rate, apart=("means",))
 
     def state(self) -> dict[str, Any]:
         """Parameters, moments, binding and densification statistics."""

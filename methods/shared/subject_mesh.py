@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import FloatArray, HeadAsset, HeadPose
+from ...bench.contracts import Clip, FloatArray, HeadAsset, HeadPose
 from ...datasets.head.arrays import check_size
 from ...datasets.head.model import HeadModel
 from ..ops.mesh import TriangleFrames, triangle_frames
@@ -76,6 +76,27 @@ class SubjectMesh:
     def drive(self, pose: HeadPose) -> TriangleFrames:
         """Triangle frames of a pose in the world. Raises `InputError` for another head model's pose."""
         return self.frames(self.posed(self.arguments([pose])))
+
+
+class TrainingPoses:
+    """Tracked values of the training timesteps of a clip, as arguments of its subject's mesh.
+
+    Attributes
+    ----------
+    row : dict[int, int]
+        Row of each timestep, in rising order.
+    arguments : dict[str, Tensor]
+        (T, n) values by name, as `SubjectMesh.arguments` gives them.
+    """
+
+    def __init__(self, clip: Clip, mesh: SubjectMesh):
+        timesteps = sorted({key.timestep for key in clip.splits["train"]})
+        self.row = {timestep: row for row, timestep in enumerate(timesteps)}
+        self.arguments = mesh.arguments([clip.poses[timestep] for timestep in timesteps])
+
+    def at(self, row: int) -> dict[str, Tensor]:
+        """The arguments of one timestep, with a batch axis."""
+        return {name: values[row : row + 1] for name, values in self.arguments.items()}
 
 
 def centroid_displacements(one: Tensor, other: Tensor, faces: Tensor) -> Tensor:
