@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -14,9 +15,9 @@ from ..bench.engine.scoring import FULL
 from ..bench.errors import InputError
 from ..bench.rows import ALL, Rows
 from ..bench.specs import CommandResult, MetricSpec
-from .aggregate import subject_means
-from .runs import RunData, RunSet
-from .statistics.comparisons import best_set, sign_flip_p
+from .aggregate import subject_means, whole_images
+from .runs import RunData, RunSet, training_labels
+from .statistics.comparisons import best_set
 from .writers import pipe_table
 
 COSTS = {
@@ -29,10 +30,10 @@ COSTS = {
 
 @dataclass(frozen=True)
 class RecommendSettings:
-    """The best method within a budget, as far as finished runs show it, and how sure that is.
+    """The best method within a budget by the rows of finished runs, and methods that cannot be told apart from it.
 
-    Every method is a choice, also with other settings, with a part of the training, and coded. A choice fits if no subject
-    exceeds a limit. Among those that fit, the one with the best mean over subjects is recommended. The answer is tested on each
+    Every method is a choice, also with other settings, with a part of the training, and coded. A choice fits if no subject and
+    no seed exceeds a limit. Among those that fit, the one with the best mean over subjects is recommended. The answer is tested on each
     subject with the rows of the others.
     """
 
@@ -85,13 +86,12 @@ class Choice:
 
 @dataclass(frozen=True)
 class Trial:
-    """The recommendation for a subject without its rows: the choice, its loss against the best one for the subject, and whether
-    it exceeds a limit there."""
+    """The recommendation for a subject without its rows: the choice, and its loss against the best one for the subject; None if the
+    choice exceeds a limit there."""
 
     subject: str
     choice: str
-    loss: float
-    exceeds: bool
+    loss: float | None
 
 
 def recommend(settings: RecommendSettings, progress: Progress = no_progress) -> CommandResult:
@@ -99,14 +99,15 @@ def recommend(settings: RecommendSettings, progress: Progress = no_progress) -> 
 
     Raises `InputError` for runs that do not belong together, for a task or metric that they lack, and where nothing fits.
     """
+    limits = settings.limits
     choices, metric, without = read_choices(
-        [Path(run) for run in settings.runs], settings.task, settings.metric
+        [Path(run) for run in settings.runs], settings.task, settings.metric, limits
     )
     subjects = sorted(next(iter(choices.values())).quality)
-    limits, sign = settings.limits, 1.0 if metric.higher_is_better else -1.0
+    sign = 1.0 if metric.higher_is_better else -1.0
     fitting = {name: choice for name, choice in choices.items() if choice.fits(limits, subjects)}
     if not fitting:
-        raise InputError("runs", "limits", f"a method within {_limits(limits)}", _least(choices, limits))
+        raise InputError("runs", "limits", f"a method within {_limits(limits)}", _nearest(choices, limits))
     best = best_of(fitting, subjects, sign)
     means = {name: dict(choice.quality) for name, choice in fitting.items()}
     alike: frozenset[str] | None = frozenset([best])
@@ -134,20 +135,22 @@ def recommend(settings: RecommendSettings, progress: Progress = no_progress) -> 
 
 
 def read_choices(
-    folders: Sequence[Path], task: str, metric_name: str
+    folders: Sequence[Path], task: str, metric_name: str, limits: Collection[str] = ()
 ) -> tuple[dict[str, Choice], MetricSpec, list[str]]:
     """The choices of runs that all subjects have, the metric of quality, and what was left out with the reason.
+
+    ``limits`` are the names of the costs that every choice should have.
 
     Conditions that change what a method is trained on are no choices. Raises `InputError` as `recommend` does.
     """
     RunSet.read(folders)  # whether they belong together
+    runs = [RunData.read(folder) for folder in folders]
     quality: dict[str, dict[str, float]] = {}
     costs: dict[str, dict[str, dict[str, float]]] = {}
-    without: list[str] = []
     everybody: set[str] = set()
     spec = None
-    for folder in folders:
-        run = RunData.read(folder)
+    for run, labels in zip(runs, training_labels(runs)):
+        folder = run.folder.root
         spec = next((each for each in run.metrics if each.name == metric_name and each.per_frame), None)
         if spec is None:
             known = ", ".join(each.name for each in run.metrics if each.per_frame)
@@ -163,25 +166,27 @@ def read_choices(
             )
             if record.trivial or changed:
                 continue
-            label = record.label
-            quality.setdefault(label, {}).update(_by_subject(run.rows, label, metric_name, task))
+            label, own = labels[record.label], record.label
+            quality.setdefault(label, {}).update(_quality(run.rows, own, metric_name, task))
             derived = condition is not None and condition.derive.name
             for cost, (name, factor) in COSTS.items():
-                source = record.name if derived and cost == "seconds" else label
-                found = _by_subject(run.rows, source, name, "")
-                own = costs.setdefault(label, {}).setdefault(cost, {})
-                own.update({subject: factor * value for subject, value in found.items()})
-    choices = {}
+                source = record.name if derived and cost == "seconds" else own
+                found = _costs(run.rows, source, name)
+                known_costs = costs.setdefault(label, {}).setdefault(cost, {})
+                known_costs.update({subject: factor * value for subject, value in found.items()})
+    choices, without = {}, []
     for label, values in quality.items():
         if set(values) != everybody:
             without.append(f"{label}: no {metric_name} of {len(everybody - set(values))} subjects")
             continue
-        known_costs = {name: own for name, own in costs[label].items() if set(own) >= everybody}
-        choices[label] = Choice(values, known_costs)
-    if spec is None or not choices:
-        raise InputError(
-            "runs", "methods", "a method with values of every subject", "; ".join(without) or "none"
+        unknown = {name: len(everybody - set(costs[label][name])) for name in limits}
+        without += [f"{label}: no measured {name} of {n} subjects" for name, n in unknown.items() if n]
+        choices[label] = Choice(
+            values, {name: own for name, own in costs[label].items() if set(own) >= everybody}
         )
+    if spec is None or not choices:
+        found_instead = "; ".join(without) or "none"
+        raise InputError("runs", "methods", "a method with values of every subject", found_instead)
     return choices, spec, without
 
 
@@ -198,54 +203,84 @@ def held_out(
     for subject in subjects:
         others = [each for each in subjects if each != subject]
         fitting = {name: each for name, each in choices.items() if each.fits(limits, others)}
-        possible = [each for each in choices.values() if each.fits(limits, [subject])]
-        if not others or not fitting or not possible:
+        if not others or not fitting:
             continue
         taken = best_of(fitting, others, sign)
-        loss = max(sign * each.quality[subject] for each in possible) - sign * choices[taken].quality[subject]
-        trials.append(Trial(subject, taken, loss, not choices[taken].fits(limits, [subject])))
+        loss = None
+        if choices[taken].fits(limits, [subject]):
+            possible = [each.quality[subject] for each in choices.values() if each.fits(limits, [subject])]
+            loss = max(sign * value for value in possible) - sign * choices[taken].quality[subject]
+        trials.append(Trial(subject, taken, loss))
     return trials
 
 
 def against_always(
     choices: Mapping[str, Choice], costs: Sequence[str], subjects: Sequence[str], sign: float
 ) -> dict[str, object] | None:
-    """Whether following recommendations is better than one choice for all budgets, on subjects that were left out.
+    """What following recommendations gains over one choice for all budgets, on subjects that were left out.
 
-    Budgets are the largest costs of each choice. The one choice is the best on average among those that fit the most budgets.
-    Quality is compared over the budgets that it fits; None with fewer than two subjects or without costs.
+    Budgets are the largest costs of each choice over the other subjects. The one choice is the best on average; where it does
+    not fit, the one that fits the most budgets takes its place. Budgets that one of the two exceeds on the subject are left out.
+    None with fewer than two subjects or without costs.
     """
     known = {name: each for name, each in choices.items() if set(costs) <= set(each.costs)}
     if len(subjects) < 2 or not known:
         return None
-    budgets = [{cost: max(each.costs[cost].values()) for cost in costs} for each in known.values()]
-    gains, names = [], []
+    gains: dict[str, float] = {}
+    exceeded = 0
     for subject in subjects:
         others = [each for each in subjects if each != subject]
-        fits = {name: [b for b in budgets if each.fits(b, others)] for name, each in known.items()}
-        most = max(len(own) for own in fits.values())
-        always = best_of({n: known[n] for n, own in fits.items() if len(own) == most}, others, sign)
-        names.append(always)
-        followed = [
-            best_of({n: each for n, each in known.items() if each.fits(budget, others)}, others, sign)
-            for budget in fits[always]
+        budgets = [
+            {c: max(each.costs[c][other] for other in others) for c in costs} for each in known.values()
         ]
-        own = [sign * known[name].quality[subject] for name in followed]
-        gains.append(fmean(own) - sign * known[always].quality[subject])
+        fits = {name: [each.fits(budget, others) for budget in budgets] for name, each in known.items()}
+        always = best_of(known, others, sign)
+        spare = max(fits, key=lambda name: sum(fits[name]))
+        own = []
+        for index, budget in enumerate(budgets):
+            taken = best_of({n: each for n, each in known.items() if fits[n][index]}, others, sign)
+            usual = always if fits[always][index] else spare
+            if not fits[usual][index]:
+                continue
+            if known[taken].fits(budget, [subject]) and known[usual].fits(budget, [subject]):
+                own.append(sign * (known[taken].quality[subject] - known[usual].quality[subject]))
+            else:
+                exceeded += 1
+        if own:
+            gains[subject] = fmean(own)
     return {
-        "always": max(set(names), key=names.count),
-        "budgets": len(budgets),
-        "gain": fmean(gains),
-        "p": sign_flip_p(gains),
+        "always": best_of(known, subjects, sign),
+        "budgets": len(known),
+        "gains": gains,
+        "exceeded": exceeded,
     }
 
 
-def _by_subject(rows: Rows, label: str, metric: str, task: str) -> dict[str, float]:
-    """Mean of each subject whose values are all there."""
-    found = rows.select(method=label, metric=metric, task=task, region=FULL, seeds=ALL)
-    whole = found.groupby("subject")["status"].agg(lambda column: bool((column == "ok").all()))
-    kept = found[found["subject"].isin(whole.index[whole])] if len(found) else found
+def _quality(rows: Rows, label: str, metric: str, task: str) -> dict[str, float]:
+    """Mean of each subject all of whose frames have a value, or were left out by the metric for every method."""
+    found = whole_images(rows, label, metric, task)
+    if found.empty:
+        return {}
+    frames = Counter(subject for subject, *_ in rows.frames(task, FULL))
+    given = Counter(rows.select(method=label, metric=metric, task=task, region=FULL, seeds=ALL)["subject"])
+    whole = {
+        subject
+        for subject, own in found.groupby("subject")
+        if (own["status"] == "ok").all()
+        and given[str(subject)] == frames[str(subject)] * own["seed"].nunique()
+    }
+    kept = found[found["subject"].isin(whole)]
     return subject_means(kept) if len(kept) else {}
+
+
+def _costs(rows: Rows, label: str, metric: str) -> dict[str, float]:
+    """Largest value of each subject over the seeds, of subjects that have it for all."""
+    found = rows.select(method=label, metric=metric, task="", region=FULL, seeds=ALL)
+    return {
+        str(subject): float(own["value"].max())
+        for subject, own in found.groupby("subject")
+        if (own["status"] == "ok").all()
+    }
 
 
 UNITS = {"seconds": "s of training", "megabytes": "MB", "milliseconds": "ms a frame"}
@@ -255,19 +290,18 @@ def _limits(limits: Mapping[str, float]) -> str:
     return " and ".join(f"{limit:g} {UNITS[name]}" for name, limit in limits.items()) or "no limit"
 
 
-def _least(choices: Mapping[str, Choice], limits: Mapping[str, float]) -> str:
-    """The lowest cost of each limited kind, in words."""
-    parts = []
-    for name in limits:
-        known = {
-            label: max(each.costs[name].values()) for label, each in choices.items() if name in each.costs
-        }
-        if known:
-            label = min(known, key=known.__getitem__)
-            parts.append(f"at least {known[label]:.3g} {UNITS[name]} ({label})")
-        else:
-            parts.append(f"no measured {name}")
-    return ", ".join(parts)
+def _nearest(choices: Mapping[str, Choice], limits: Mapping[str, float]) -> str:
+    """The choice that exceeds the limits by the smallest factor, in words."""
+    known = {
+        label: {name: max(each.costs[name].values()) for name in limits}
+        for label, each in choices.items()
+        if set(limits) <= set(each.costs)
+    }
+    if not known:
+        return f"none with measured {' and '.join(limits)}"
+    label = min(known, key=lambda label: max(known[label][name] / limit for name, limit in limits.items()))
+    needs = " and ".join(f"{value:.3g} {UNITS[name]}" for name, value in known[label].items())
+    return f"{label} nearest, with {needs}"
 
 
 def _text(
@@ -301,17 +335,26 @@ def _text(
     trials = data["held_out"]
     assert isinstance(trials, list)
     if trials:
-        same, exceeding = sum(t.choice == best for t in trials), sum(t.exceeds for t in trials)
-        loss = fmean(t.loss for t in trials)
+        same = sum(trial.choice == best for trial in trials)
+        losses = [trial.loss for trial in trials if trial.loss is not None]
+        behind = (
+            f"on average {fmean(losses):.{metric.digits}f}{unit} behind"
+            if losses
+            else "never within the limits, so not compared with"
+        )
         parts.append(
-            f"On each subject from the rows of the others: the same recommendation for {same} of {len(trials)}, on average "
-            f"{loss:.{metric.digits}f}{unit} behind the best choice for the subject, beyond a limit for {exceeding}."
+            f"On each subject from the rows of the others: the same recommendation for {same} of {len(trials)}, {behind} "
+            f"the best choice for the subject, beyond a limit for {len(trials) - len(losses)}."
         )
     always = data["against_always"]
-    if isinstance(always, dict):
+    if isinstance(always, dict) and always["gains"]:
+        gains = list(always["gains"].values())
+        spread = f"from {min(gains):+.{metric.digits}f} to {max(gains):+.{metric.digits}f} by subject"
         parts.append(
-            f"Over {always['budgets']} budgets, those of the choices, recommendations are {always['gain']:+.{metric.digits}f}{unit} "
-            f"better than always {always['always']} on subjects that were left out (p = {always['p']:.2g})."
+            f"Over the budgets of the {always['budgets']} choices, recommendations change {metric.label} by "
+            f"{sign * fmean(gains):+.{metric.digits}f}{unit} on subjects that were left out ({spread}), compared with always taking the best on "
+            "average, now "
+            f"{always['always']}, and the most frugal choice where that does not fit."
         )
     without = data["without"]
     assert isinstance(without, list)

@@ -19,6 +19,7 @@ from ..bench.errors import InputError
 from ..bench.manifest import Manifest, MethodRecord
 from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, joined_protocol, missing_tasks
 from ..bench.rows import ALL, Rows
+from ..bench.source import is_outside
 from ..bench.specs import MetricSpec
 from .cameras import EXPLAINED, SPLIT_TASK, unseen_cameras
 from .coded import check_codecs, with_coded
@@ -139,8 +140,6 @@ class RunData:
         return clips
 
 
-OWN_CODE = "headbench."
-"""Start of the implementations of this package."""
 LONGEST_DIFFERENCE = 48
 """Characters of settings in a label; more than that and the run's folder names the method."""
 
@@ -207,7 +206,7 @@ class RunSet:
         if not folders:
             raise InputError("runs", "", "at least one folder", "none")
         runs = tuple(RunData.read(folder) for folder in folders)
-        return cls.of_runs(_with_one_protocol(runs), _labels(runs)).of(part)
+        return cls.of_runs(_with_one_protocol(runs), training_labels(runs)).of(part)
 
     @classmethod
     def of_runs(cls, runs: tuple[RunData, ...], labels: Sequence[Mapping[str, str]]) -> RunSet:
@@ -326,12 +325,12 @@ class RunSet:
         codes: dict[str, set[str]] = {}
         for run in self.runs:
             for record in run.manifest.methods:
-                if record.code and record.implementation.startswith(OWN_CODE):
+                if record.code and not is_outside(record.implementation):
                     codes.setdefault(f"{record.name} (version {record.version})", set()).add(record.code)
         changed = [name for name, found in codes.items() if len(found) > 1]
-        return (f"Code changed between the runs, with the same version: {', '.join(changed)}.",) * bool(
-            changed
-        )
+        return (
+            f"Files in the folders of these methods changed between the runs, their version did not: {', '.join(changed)}.",
+        ) * bool(changed)
 
     @property
     def image_size(self) -> str:
@@ -405,11 +404,11 @@ class _Training:
 
 def _same_training(one: MethodRecord, other: MethodRecord) -> bool:
     """Whether two records are of one training; methods of this package state by their version what their code gives."""
-    native = one.implementation.startswith(OWN_CODE)
+    native = not is_outside(one.implementation)
     return one == (replace(other, code=one.code) if native else other)
 
 
-def _labels(runs: Sequence[RunData]) -> list[dict[str, str]]:
+def training_labels(runs: Sequence[RunData]) -> list[dict[str, str]]:
     """Label of each run's methods, by name."""
     trainings: dict[str, list[_Training]] = {}
     for index, run in enumerate(runs):

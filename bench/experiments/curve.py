@@ -25,7 +25,7 @@ from .curve_settings import PICTURES, SECONDS, CurveSettings
 from .held_out import CAMERA, TIMESTEPS, count_of
 
 log = logging.getLogger(__name__)
-METRICS: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "primitives")
+METRICS: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "primitives", "training_time")
 """Metrics of a curve, independent of the run's, as defined by the canonical profile."""
 
 
@@ -88,7 +88,7 @@ def conditions(
         return
     if settings.over == "seconds":
         for seconds in sorted(settings.seconds or SECONDS, reverse=True):
-            yield Condition(f"seconds-{seconds:g}", budget=f"{seconds:.6f} s")
+            yield Condition(f"seconds-{seconds:g}", budget=f"{seconds:g} s")
         return
     if settings.over == "pictures":
         yield from _pictures(sorted(settings.pictures or PICTURES, reverse=True), clips)

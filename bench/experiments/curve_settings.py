@@ -79,6 +79,9 @@ class CurveSettings(RunOptions, ExecutionOptions):
             values = getattr(self, name)
             if len(set(values)) != len(values) or not all(value > 0 for value in values):
                 raise ValueError(f"{name}: numbers above 0, each once; found {' '.join(map(str, values))}")
+        if not all(1e-3 <= value < 1e6 and float(f"{value:g}") == value for value in self.seconds):
+            expected = "from 0.001 to below 1,000,000, with at most six digits"
+            raise ValueError(f"seconds: {expected}; found {' '.join(map(str, self.seconds))}")
         if not all(0 <= level <= MOST_TRACKING_ERROR for level in self.levels):
             expected = f"from 0 to {MOST_TRACKING_ERROR:g}"
             raise ValueError(f"levels: {expected}; found {' '.join(map(str, self.levels))}")

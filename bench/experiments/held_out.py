@@ -181,7 +181,7 @@ def _with_frames(clip: Clip, keys: Sequence[FrameKey], chosen: dict[str, list[An
     """A clip with these training frames alone; ``chosen`` is the record, whose first entry identifies them."""
     if len(keys) == len(clip.splits["train"]):
         return clip
-    step = StepRecord("reduce_training", chosen, clip.fingerprint)
+    step = StepRecord("reduce_training", {**chosen, "count": len(keys)}, clip.fingerprint)
     what, names = next(iter(chosen.items()))
     return replace(
         clip if isinstance(clip, HeldOutClip) else _as_held_out(clip),

@@ -84,7 +84,7 @@ class FlashAvatarConfig:
                 raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
         if not 0 < self.initial_opacity < 1 or not 0 < self.final_rate <= 1:
             raise ValueError("initial_opacity must lie between 0 and 1, and final_rate in (0, 1]")
-        for name, most in (("frequencies", 16), ("layers", 100), ("sh_degree", 3)):
+        for name, most in (("frequencies", 16), ("layers", 100), ("hidden", 1_024), ("sh_degree", 3)):
             if not 0 <= getattr(self, name) <= most:
                 raise ValueError(f"{name} must be 0 to {most}, found {getattr(self, name)}")
         if not 0 < self.offset_m <= 100:

@@ -61,7 +61,7 @@ class RGBAvatarConfig:
         run; 1 keeps it constant, as published.
     color_weight : float
         A splat takes its initial colour from the images of the first step in which its weights over all pixels
-        add up to more than this; 0 disables it. Those that never do are removed from the trained avatar.
+        add up to more than this; 0 disables it.
     color_every : int
         Steps between searches for splats without a colour, each of which costs as much as the step.
     mesh_cache_mb : int
@@ -122,6 +122,9 @@ class RGBAvatarConfig:
             or not self.inputs
         ):
             raise ValueError(f"inputs must be among {', '.join(INPUTS)}, each once, found {self.inputs}")
+        for name in ("initial_scale_mm", "position_lr", "position_lr_final"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be above 0, found {getattr(self, name)}")
         if self.online and self.together != 1:
             raise ValueError(f"together must be 1 with online, found {self.together}")
         if not 0 <= self.ssim_weight <= 1:

@@ -62,8 +62,9 @@ class RGBAvatarTraining(ImageTrainer):
     def __init__(self, clip: Clip, config: RGBAvatarConfig, device: str, seed: int):
         keys = clip.splits["train"]
         batches = _batches(keys, config, seed)
-        masks = config.random_background and clip.mask(keys[0]) is not None
+        masks = clip.mask(keys[0]) is not None
         super().__init__(clip, config, batches, device, masks=masks)
+        self._sampler = lambda iteration: batches.batch(iteration)[0]
         self._config, self._batches, self._seed, self._masks = config, batches, seed, masks
         mesh = clip_mesh(clip, device)
         faces, vertices = np.asarray(clip.head.faces), mesh.canonical.cpu().numpy().astype(np.float64)
@@ -78,7 +79,7 @@ class RGBAvatarTraining(ImageTrainer):
         self.colored = torch.zeros(len(self.points.triangles), dtype=torch.bool, device=device)
 
     def loss(self, iteration: int, index: int) -> Tensor:
-        """Mean loss of the images of a batch; ``index`` is that of one of them."""
+        """Mean loss of the images of a batch; ``index`` is that of the first."""
         self._seen: list[tuple[WorldSplats, Tensor, View, Tensor]] = []
         batch = self._batches.batch(iteration)
         rows = sorted({self._row[self.keys[image].timestep] for image in batch})
@@ -110,10 +111,13 @@ class RGBAvatarTraining(ImageTrainer):
         due = config.color_weight > 0 and (iteration - 1) % config.color_every == 0
         if due and not bool(self.colored.all()):
             self._take_colors()
-        progress = iteration / max(self._timeline.at(config.position_settles), 1)
-        rate = log_linear(config.position_lr, config.position_lr_final, progress)
-        self.optimiser.set_learning_rate("means", rate)
-        self._decay_rates(iteration, config.final_rate, apart=("means",))
+        # While images arrive, time is counted from the first one, whatever the length of the run.
+        settles = config.position_settles if config.online else self._timeline.at(config.position_settles)
+        rate = log_linear(config.position_lr, config.position_lr_final, iteration / max(settles, 1))
+        positions = {"means": rate, SHAPES["means"]: config.position_share * rate}
+        for name, value in positions.items():
+            self.optimiser.set_learning_rate(name, value)
+        self._decay_rates(iteration, config.final_rate, apart=positions)
 
     def state(self) -> dict[str, Any]:
         """Parameters, moments, and which splats have a colour."""
@@ -129,11 +133,12 @@ class RGBAvatarTraining(ImageTrainer):
         return f"{len(self.colored)} splats"
 
     def result(self) -> StoredShapes:
-        """The trained avatar, without splats that no image has given a colour: nothing was learnt about them."""
-        prunes = self._config.color_weight > 0 and not self._config.online
-        kept = self.colored if prunes else torch.ones_like(self.colored)
-        if not bool(kept.any()):
-            kept = torch.ones_like(kept)
+        """The trained avatar, without splats that never had a gradient: no image has shown them."""
+        moments = self.optimiser.moments("colors")
+        kept = torch.ones_like(self.colored)
+        if moments and not self._config.online:
+            kept = self.colored | (moments["exp_avg_sq"] > 0).any(1)
+        kept = kept if bool(kept.any()) else torch.ones_like(kept)
         tensors = {name: self.optimiser[name].detach() for name in self._rates}
         for name, value in tensors.items():
             if name in SHAPES.values():
@@ -154,8 +159,8 @@ class RGBAvatarTraining(ImageTrainer):
 
     def _on_background(self, pixels: Tensor, iteration: int, image: int) -> tuple[Tensor, Tensor]:
         """(H, W, 3) colours, on a random background if there are masks, and that background."""
-        if not self._masks:
-            return pixels, self._background
+        if not self._masks or not self._config.random_background:
+            return pixels[:, :, :3], self._background
         random = numpy_generator(self._seed, "background", iteration * len(self.keys) + image).random(3)
         background = to_device(torch.from_numpy(random.astype(np.float32)), self._background.device)
         return recomposited(pixels[:, :, :3], pixels[:, :, 3:], self._background, background), background
@@ -186,8 +191,12 @@ class RGBAvatarTraining(ImageTrainer):
         rows = new.nonzero().squeeze(1)
         parameter = self.optimiser["colors"]
         parameter.data[rows] = (sums[rows, :3] / sums[rows, 3:] - 0.5) / C0
+        # The step that follows does not move them.
         if parameter.grad is not None:
             parameter.grad[rows] = 0
+        for name, moment in self.optimiser.moments("colors").items():
+            if name == "exp_avg":
+                moment[rows] = 0
         self.colored = self.colored | new
 
     def _initial(self, device: str) -> Initial:

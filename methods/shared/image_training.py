@@ -38,6 +38,8 @@ class ImageTrainer:
     """
 
     optimiser: Optimiser
+    cost_growth: float = 1.0
+    """Cost of a late step relative to an early one with the same parts, to turn a time into iterations."""
 
     def __init__(
         self, clip: Clip, settings: TrainingRun, sampler: Sampler, device: str, *, masks: bool = False

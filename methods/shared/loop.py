@@ -204,17 +204,20 @@ def _estimate(
 ) -> int:
     """Number of iterations in a number of seconds, at least one, estimated from a few steps without effect."""
     trainable.begin(Timeline(published_length, published_length))
+    growth = getattr(trainable, "cost_growth", COST_GROWTH)
+    # With a fixed number of splats, steps late in the run have all parts of the model and cost the same.
+    step_number = 1 if growth > 1 else published_length
     durations = []
     for step in range(1, TIMED_STEPS + 2):
         wait()
         before = clock()
-        trainable.loss(1, sampler(step)).backward()
+        trainable.loss(step_number, sampler(step)).backward()
         trainable.optimiser.zero_grad()
         wait()
         durations.append(clock() - before)
     # The first step pays for lazy initialisation; the median of the rest is robust to an outlier.
     typical = sorted(durations[1:])[TIMED_STEPS // 2]
-    return max(1, int(seconds / max(typical * COST_GROWTH, 1e-6)))
+    return max(1, int(seconds / max(typical * growth, 1e-6)))
 
 
 class TrainingImages:

@@ -15,6 +15,7 @@ from ..splats import rasterize
 from ..splats.request import Rendering
 from .config import DensifiedTraining, SplatTraining
 from .image_training import ImageTrainer, Initial
+from .loop import COST_GROWTH
 from .losses import position_penalty, scale_penalty
 from .optimisation import Densifier, Optimiser
 from .rendering import View, scene_center, scene_extent
@@ -26,6 +27,8 @@ class SplatTrainer(ImageTrainer):
 
     A derived class calls `_start` at the end of its initialiser and `_render` in its ``loss``.
     """
+
+    cost_growth = COST_GROWTH
 
     def __init__(
         self, clip: Clip, settings: DensifiedTraining, sampler: Sampler, device: str, *, masks: bool = False

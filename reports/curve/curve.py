@@ -125,7 +125,7 @@ def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipR
         budget,
         len(given["cameras"]),
         len(given["timesteps"]),
-        len(given.get("pictures", ())) or len(given["cameras"]) * len(given["timesteps"]),
+        given.get("count", clip.splits["train"]),
         tracking_error(clip.steps) if level is None else level,
         cost,
         values,

@@ -1,4 +1,4 @@
-"""``headbench recommend``: which method fits a budget, how sure that is, and what it is worth on subjects left out."""
+"""``headbench recommend``: choices within limits, and tests of the answer on subjects left out."""
 
 import re
 
@@ -81,10 +81,12 @@ def test_lower_is_better_where_the_metric_says_so(run):
     assert asked(run, metric="lpips").data["recommended"] == "large"
 
 
-def test_what_no_method_reaches_is_refused_with_the_least(run):
-    with pytest.raises(InputError, match=re.escape("at least 120 s of training (large)")):
+def test_limits_that_nothing_fits_are_refused_with_the_nearest(run):
+    with pytest.raises(InputError, match=re.escape("large nearest, with 120 s of training")):
         asked(run, seconds=60.0)
-    with pytest.raises(InputError, match="no measured milliseconds"):
+    with pytest.raises(InputError, match="small nearest, with 240 s of training and 1 MB"):
+        asked(run, seconds=180.0, megabytes=1.0)  # ``large`` exceeds the second limit by a factor of 8
+    with pytest.raises(InputError, match="none with measured milliseconds"):
         asked(run, milliseconds=5.0)
 
 
@@ -115,28 +117,79 @@ def test_held_out_subjects_are_judged_by_the_others_alone():
     assert held_out(choices, {}, SUBJECTS[:1], 1.0) == []
 
 
-def test_a_limit_that_a_subject_left_out_exceeds_is_counted():
+def test_a_choice_that_exceeds_a_limit_has_no_loss():
     sizes = dict(zip(SUBJECTS, [1, 1, 1, 1, 1, 3]))
     choices = {
         "a": Choice(dict.fromkeys(SUBJECTS, 31.0), {"megabytes": sizes}),
         "b": choice([30.0] * 6, megabytes=1),
     }
     trials = held_out(choices, {"megabytes": 2}, SUBJECTS, 1.0)
-    assert [trial.exceeds for trial in trials] == [False] * 5 + [True]
+    # Without the last subject ``a`` fits; with it, ``b`` is all that is left to recommend for the others.
+    assert [(trial.choice, trial.loss) for trial in trials] == [("b", 1.0)] * 5 + [("a", None)]
 
 
-def test_recommendations_gain_what_larger_budgets_allow():
-    """Budgets of 1 and 8 MB, of which only ``small`` fits both: the gain is half of the difference."""
-    small, large = choice([29.0] * 6, megabytes=1), choice([31.0] * 6, megabytes=8)
-    found = against_always({"small": small, "large": large}, ["megabytes"], SUBJECTS, 1.0)
-    assert found["always"] == "small"
-    assert found["budgets"] == 2
-    assert found["gain"] == pytest.approx(1.0)
-    assert found["p"] == pytest.approx(2 / 2**6)
+def test_recommendations_gain_what_budgets_allow():
+    """The best on average fits one of three budgets, the smallest all: in the second budget ``middle`` is 1 dB better."""
+    sizes = {"small": (29.0, 1), "middle": (30.0, 4), "large": (31.0, 8)}
+    choices = {name: choice([quality] * 6, megabytes=size) for name, (quality, size) in sizes.items()}
+    found = against_always(choices, ["megabytes"], SUBJECTS, 1.0)
+    assert found["always"] == "large"
+    assert found["gains"] == dict.fromkeys(SUBJECTS, pytest.approx(1 / 3))
+    assert found["exceeded"] == 0
 
 
-def test_recommendations_gain_nothing_where_order_is_chance():
-    rng = np.random.default_rng(0)
-    choices = {str(n): choice(30 + rng.normal(size=6), megabytes=1) for n in range(5)}
-    gain = against_always(choices, ["megabytes"], SUBJECTS, 1.0)["gain"]
-    assert gain == pytest.approx(0.0)
+def test_budgets_exceeded_on_the_subject_left_out_do_not_count():
+    sizes = dict(zip(SUBJECTS, [2, 2, 2, 2, 2, 9]))
+    choices = {
+        "big": Choice(dict.fromkeys(SUBJECTS, 35.0), {"megabytes": sizes}),
+        "small": choice([30.0] * 6, megabytes=3),
+    }
+    found = against_always(choices, ["megabytes"], SUBJECTS, 1.0)
+    assert found["exceeded"] == 2
+    assert "s5" not in found["gains"]
+
+
+def test_recommendations_lose_where_the_order_is_chance():
+    """Qualities that are noise: what was best for the others is no better than the best on average, on the mean over draws."""
+    rng, gains = np.random.default_rng(0), []
+    for _ in range(200):
+        choices = {str(n): choice(30 + rng.normal(size=6), megabytes=n + 1) for n in range(4)}
+        gains += against_always(choices, ["megabytes"], SUBJECTS, 1.0)["gains"].values()
+    assert abs(np.mean(gains)) < 4 * np.std(gains) / np.sqrt(len(gains))
+    assert min(gains) < -0.1
+
+
+def test_trainings_of_one_method_stay_apart(tmp_path, write_manifest, run):
+    """Two runs with other settings of one method: each is a choice, in any order of the runs."""
+    other, rows = RunFolder(tmp_path / "other"), []
+    for subject in SUBJECTS:
+        frames = [("large", "1", 0, "novel_view", subject, "EMO", t, "a", "full") for t in range(2)]
+        rows += [
+            Row(*frame, metric, value, "p")
+            for frame in frames
+            for metric, value in (("psnr", 20.0), ("lpips", 0.2))
+        ]
+        avatar = ("large", "1", 0, "", subject, "", -1, "", "full")
+        rows += [Row(*avatar, "storage", 0.5, ""), Row(*avatar, "training_time", 1.0, "")]
+    Rows.of(rows).write(other.rows)
+    write_manifest(other, METRICS, {"large": {"size": 1}}, {"novel_view": "p"})
+    for folders in ((run, str(other.root)), (str(other.root), run)):
+        found = recommend(RecommendSettings(folders, task="novel_view")).data["fitting"]
+        assert len(found) == 3
+        assert sorted(found.values()) == pytest.approx([20.0, 32.0, 33.0])
+
+
+def test_choices_without_a_measured_cost_are_named(tmp_path, write_manifest):
+    folder, rows = RunFolder(tmp_path / "run"), []
+    for method in ("known", "unknown"):
+        for index, subject in enumerate(SUBJECTS):
+            frame = (method, "1", 0, "novel_view", subject, "EMO", 0, "a", "full")
+            rows.append(Row(*frame, "psnr", 30.0, "p"))
+            if method == "known" or index:
+                avatar = (method, "1", 0, "", subject, "", -1, "", "full")
+                rows.append(Row(*avatar, "training_time", 1.0, ""))
+    Rows.of(rows).write(folder.rows)
+    write_manifest(folder, METRICS[:1] + METRICS[3:], {"known": None, "unknown": None}, {"novel_view": "p"})
+    result = asked(str(folder.root), seconds=100.0)
+    assert list(result.data["fitting"]) == ["known"]
+    assert "Left out: unknown: no measured seconds of 1 subjects." in result.text

@@ -11,11 +11,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from ....bench.contracts import FloatArray, IntArray
+from ....bench.errors import InputError
 from .container import Arrays, dequantise, fold, narrow
 
 RATE_WEIGHT = 2 * np.log(2) / 12
 """Squared error, in squared steps, that a bit is worth: the slope of a fine uniform quantiser, 2 ln 2 / 12."""
 BASIS_BITS = 16
+MOST_NUMBERS = 2**25
+"""Maximum of all numbers of decoded vectors, which may take no bytes: 83,000 splats with 20 blendshapes of 10 numbers are half."""
 FINEST, COARSEST = -3, 6
 """Limits of the classes of visibility: steps are multiplied by 2^class."""
 
@@ -126,6 +129,9 @@ def encode_vectors(
 def decode_vectors(arrays: Arrays, name: str, step: float, classes: IntArray) -> FloatArray:
     """(N, C) vectors of `encode_vectors`, float32. Raises `InputError` where the arrays do not fit."""
     mean = arrays.floats(f"{name}_mean", None)
+    if len(mean) * len(classes) > MOST_NUMBERS:
+        expected = f"at most {MOST_NUMBERS} numbers"
+        raise InputError(arrays.path, f"{name}_mean", expected, f"{len(classes)} vectors of {len(mean)}")
     basis = arrays.floats(f"{name}_basis", None, len(mean))
     whole = arrays.integers(name, len(basis), len(classes))
     coordinates = dequantise(whole, step * scale_of(classes)[None]).astype(np.float64)

@@ -257,6 +257,8 @@ def test_with_one_camera_timesteps_alone_are_held_out(plugin, tmp_path):
         ({"over": "tracking_error", "levels": (float("nan"),)}, "from 0 to 4"),
         ({"over": "seconds", "seconds": (0.0,)}, "above 0"),
         ({"over": "pictures", "pictures": (4, 4)}, "each once"),
+        ({"over": "seconds", "seconds": (1e6,)}, "below 1,000,000"),
+        ({"over": "seconds", "seconds": (30.0, 30.0000001)}, "six digits"),
         ({"every": 1}, "at least 2"),
         ({"frames": 0}, "at least 1"),
     ],

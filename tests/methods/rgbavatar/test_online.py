@@ -1,4 +1,4 @@
-"""Local-global sampling: nothing of the future, mostly the newest, a uniform sample of the rest."""
+"""Local-global sampling: images that have arrived, mostly the newest ones, and a uniform sample of the others."""
 
 from collections import Counter
 from dataclasses import replace

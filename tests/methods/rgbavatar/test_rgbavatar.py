@@ -155,6 +155,67 @@ def test_blendshapes_join_after_their_step(clip):
     training.close()
 
 
+def test_the_defaults_are_the_values_of_the_authors_program():
+    """``config/offline.yaml``, whose iterations are images, ten for each step."""
+    config = RGBAvatarConfig()
+    positions = config.position_lr, config.position_lr_final, 10 * config.position_settles
+    assert positions == (0.0008, 0.000008, 30_000)
+    others = config.opacity_lr, config.scale_lr, config.rotation_lr, config.color_lr, config.network_lr
+    assert others == (0.25, 0.025, 0.005, 0.0125, 0.001)
+    assert (config.position_share, config.rotation_share, config.color_share) == (0.05, 0.5, 0.5)
+    steps = config.batch, config.batch * config.schedule_length, config.batch * config.join
+    assert steps == (10, 50_000, 3_000)
+    assert (config.blendshapes, config.hidden, config.initial_scale_mm, config.initial_opacity) == (
+        20,
+        128,
+        0.8,
+        0.5,
+    )
+    assert (config.ssim_weight, config.final_rate, config.random_background) == (0.0, 1.0, True)
+
+
+@pytest.mark.parametrize(("online", "length"), [(False, 40), (False, 80), (True, 40), (True, 80)])
+def test_positions_and_their_blendshapes_decay_together(clip, online, length):
+    """Relative to the length of the run; while images arrive, from the first of them."""
+    training = make(clip, position_settles=20, position_lr=1e-2, position_lr_final=1e-4, online=online)
+    training.begin(Timeline(length, 40))
+    settles = 20 if online else length // 2
+    for iteration, rate in ((settles // 2, 1e-3), (settles, 1e-4), (length, 1e-4)):
+        training.loss(iteration, 0).backward()
+        training.after_backward(iteration)
+        groups = training.optimiser.state()
+        assert groups["means"]["lr"] == pytest.approx(rate)
+        assert groups["mean_shapes"]["lr"] == pytest.approx(0.05 * rate)
+        assert groups["colors"]["lr"] == 0.0125
+        training.optimiser.zero_grad()
+    training.close()
+
+
+def test_splats_without_a_gradient_alone_are_removed(clip):
+    training = make(clip, samples=2_000, batch=1, color_weight=0.0, initial_opacity=0.99)
+    shown = torch.zeros_like(training.colored)
+    for iteration in (1, 2):
+        training.loss(iteration, 0).backward()
+        shown |= training.optimiser["colors"].grad.abs().sum(1) > 0
+        training.after_backward(iteration)
+        training.optimiser.step()
+        training.optimiser.zero_grad()
+    assert 0 < int(shown.sum()) < len(shown)
+    assert len(training.result().points.triangles) == int(shown.sum())
+    training.close()
+
+
+def test_colours_are_those_of_the_foreground(clip):
+    """Splats take no colour from pixels outside of the mask, whether or not backgrounds are random."""
+    empty = {key: np.zeros_like(mask) for key, mask in clip.masks.items()}
+    for random_background in (False, True):
+        training = make(replace(clip, masks=empty), random_background=random_background)
+        training.loss(1, 0).backward()
+        training.after_backward(1)
+        assert not training.colored.any()
+        training.close()
+
+
 def test_colours_of_images_are_taken_once(clip):
     red = np.array([200, 30, 90], np.uint8)
     plain = replace(
@@ -187,7 +248,7 @@ def test_a_colour_is_weighted_by_what_a_splat_contributes(clip):
     for index in depth.argsort().tolist():
         one = [value.detach()[index : index + 1] for value in (*world, opacities)]
         drawn = rasterize(*one, torch.ones(1, 1), view.world_to_camera, view.K, camera.width, camera.height)
-        weight = transmittance * drawn.alpha.double().numpy()
+        weight = transmittance * drawn.alpha.double().numpy() * (pixels[:, :, 3] > 0.5).numpy()
         sums[index] = [*np.einsum("hw,hwc->c", weight, pixels.double().numpy()[:, :, :3]), weight.sum()]
         transmittance = transmittance * (1 - drawn.alpha.double().numpy())
     training.after_backward(1)
@@ -230,6 +291,8 @@ def test_files_that_do_not_fit_are_refused(clip, head, tmp_path):
         ({"inputs": ()}, "inputs"),
         ({"inputs": ("smile",)}, "inputs"),
         ({"batch": 0}, "batch"),
+        ({"initial_scale_mm": 0.0}, "initial_scale_mm"),
+        ({"position_lr_final": 0.0}, "position_lr_final"),
     ],
 )
 def test_settings_out_of_range_are_refused(settings, says):
