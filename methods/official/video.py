@@ -1,16 +1,35 @@
-"""Common code for repositories that train on a tracked video: straight alpha, 6D rotations, the head's frame."""
+"""Common code for repositories that train on a tracked video: straight alpha, 6D rotations, the head's frame, and files of
+Metrical Tracker."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
-from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, HeadPose
+from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, Frame, FrameKey, HeadPose, Progress
 from ...bench.errors import InputError
+from ...bench.io.documents import read_json
+from ...bench.io.files import atomic_path, grouped_writes, write_json
+from ...bench.io.images import read_pixels
+from ...datasets.head.loaders import FLAME_IDENTITY_SIZE
 from ...datasets.head.subject import PosedSubject, camera_in_head_frame
+from ...datasets.images import write_image
 from ...datasets.steps.masks import recomposite
+from ..shared.avatar_files import Subject
+from .ga.head_files import EXPRESSION_SIZE, ArrayPickler, padded
+from .method import Listed, Workplace
+
+BACKGROUND_FILE = "background.json"
+SAME_INTRINSICS = 0.05
+"""Tolerance of focal lengths and principal points of one video, pixels."""
+
+Views = Sequence[tuple[Camera, HeadPose]]
 
 
 def check_masks(clip: Clip) -> None:
@@ -58,3 +77,144 @@ def cameras_at_rest(
         motions = subject.motions([pose for _, pose in part])
         cameras += [camera_in_head_frame(camera, motion) for (camera, _), motion in zip(part, motions)]
     return cameras
+
+
+# ------------------------------------------------------------------ cameras
+
+
+def check_no_skew(camera: Camera) -> None:
+    """Raise `InputError` for a camera with skew, which the code does not read."""
+    if camera.K[0, 1]:
+        raise InputError(f"camera {camera.id}", "K[0, 1]", "no skew", f"{camera.K[0, 1]:g}")
+
+
+def check_one_camera(clip: Clip) -> Camera:
+    """The camera of the first training frame.
+
+    Raises `InputError` if other training frames have another image size, focal length or principal point, for code
+    that reads those of the first frame.
+    """
+    first = clip.cameras[clip.splits["train"][0].camera]
+    for name in sorted({key.camera for key in clip.splits["train"]}):
+        camera = clip.cameras[name]
+        same_size = (camera.width, camera.height) == (first.width, first.height)
+        if not same_size or np.abs(camera.K - first.K).max() > SAME_INTRINSICS:
+            expected = f"size and intrinsics of camera {first.id}; the code reads those of the first frame"
+            found = f"{camera.width}x{camera.height}, K {np.round(camera.K[:2], 2).tolist()}"
+            remedy = "Give it a capture whose cameras are equal, or of one camera."
+            raise InputError(f"clip {clip.subject}", f"camera {name}", expected, found, remedy)
+    return first
+
+
+# ------------------------------------------------------------------ Metrical Tracker's files
+
+
+def image_name(number: int) -> str:
+    """Path of a frame's image, as INSTA's ``generate.sh`` names it."""
+    return f"images/{number:05d}.png"
+
+
+def frame_name(number: int) -> str:
+    """Path of a frame's parameters."""
+    return f"checkpoint/{number:05d}.frame"
+
+
+def flame_values(subject: Subject, pose: HeadPose) -> dict[str, FloatArray]:
+    """Coefficients (300,) and (100,), jaw (6,) and eyes (12,) as 6D rotations, eyelids (2,); without rigid motion."""
+    return {
+        "shape": padded(np.asarray(subject.shape), FLAME_IDENTITY_SIZE),
+        "exp": padded(np.asarray(pose.expression), EXPRESSION_SIZE),
+        "jaw": six_numbers(pose.jaw),
+        "eyes": six_numbers(pose.eyes),
+        "eyelids": np.zeros(2) if pose.eyelids is None else np.asarray(pose.eyelids),
+    }
+
+
+def opencv_values(camera: Camera) -> dict[str, FloatArray]:
+    """Rotation (3, 3) and translation (3,) from the head's frame, metres, and K (3, 3), pixels."""
+    world = np.asarray(camera.world_to_camera, np.float64)
+    return {"R": world[:3, :3], "t": world[:3, 3], "K": np.asarray(camera.K, np.float64)}
+
+
+def frame_parts(**parts: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    """Content of a frame's file: arrays in float32 with a leading axis of one."""
+    return {
+        part: {name: np.asarray(array, np.float32)[None] for name, array in values.items()}
+        for part, values in parts.items()
+    }
+
+
+def sized_frame(subject: Subject, camera: Camera, pose: HeadPose) -> dict[str, Any]:
+    """A frame of RGBAvatar's and FlashAvatar's loaders, its camera in the head's frame.
+
+    Both read ``img_size`` as width and height. The tracker writes height and width, which is the same for the square
+    images that their authors use.
+    """
+    parts = frame_parts(flame=flame_values(subject, pose), opencv=opencv_values(camera))
+    return {**parts, "img_size": np.array([camera.width, camera.height])}
+
+
+def write_torch(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a file for ``torch.load`` with numpy arrays that every version of numpy can read."""
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        torch.save(dict(content), stream, pickle_module=_ArrayPickles)
+
+
+class _ArrayPickles:
+    """The part of a pickle module that ``torch.save`` uses."""
+
+    Pickler = ArrayPickler
+
+
+def training_views(clip: Clip) -> tuple[list[FrameKey], Views]:
+    """Training frames in the order of the video, by timestep and camera, and their cameras and poses."""
+    keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
+    return keys, [(clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys]
+
+
+def write_video(
+    clip: Clip,
+    posed: PosedSubject,
+    folder: Path,
+    frame: Callable[[Camera, HeadPose], Mapping[str, Any]],
+    progress: Progress,
+) -> tuple[list[FrameKey], Mapping[str, Any]]:
+    """Write images with straight alpha and parameters of the training frames, numbered from 0 without gaps.
+
+    ``frame`` makes the content of a file of a camera in the head's frame. Returns the frames in order and the content
+    of the first file.
+    """
+    keys, views = training_views(clip)
+    cameras = cameras_at_rest(posed, views)
+    with grouped_writes():
+        for number, (key, camera, (_, pose)) in enumerate(zip(keys, cameras, views)):
+            write_image(folder / image_name(number), straight_rgba(clip, key))
+            write_torch(folder / frame_name(number), frame(camera, pose))
+            progress(number + 1, len(keys), "exporting")
+    return keys, frame(cameras[0], views[0][1])
+
+
+# ------------------------------------------------------------------ renders with coverage
+
+
+def write_background(work: Workplace, background: Sequence[float]) -> None:
+    """Write the background of a list of frames, for `on_background`."""
+    write_json(work.root / BACKGROUND_FILE, {"background": [float(level) for level in background]})
+
+
+def on_background(rgb: FloatArray, alpha: FloatArray, work: Workplace) -> Frame:
+    """A frame of colours on black (H, W, 3) and coverage (H, W), on the background of the list."""
+    ground = np.array(read_json(work.root / BACKGROUND_FILE)["background"], np.float32)
+    return Frame(np.clip(rgb + (1 - alpha[..., None]) * ground, 0, 1), np.ascontiguousarray(alpha))
+
+
+def read_covered(frame: Listed, path: Path, work: Workplace) -> Frame:
+    """A render (RGBA) on black, on the background of the list.
+
+    Raises `InputError` for a file of another size or without coverage.
+    """
+    pixels = read_pixels(path, size=(frame.camera.width, frame.camera.height))
+    if pixels.ndim != 3 or pixels.shape[2] != 4:
+        raise InputError(path, str(frame.key), "colours and coverage (RGBA)", f"shape {pixels.shape}")
+    rgba = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA).astype(np.float32) / 255
+    return on_background(rgba[..., :3], rgba[..., 3], work)

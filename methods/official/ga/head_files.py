@@ -23,6 +23,7 @@ from ....datasets.ga.writer import pose_to_parameters, save_npz
 from ....datasets.head.arrays import JOINT_NAMES, RING_REGIONS, HeadArrays
 from ....datasets.head.loaders import FLAME_IDENTITY_SIZE
 from ....datasets.head.teeth import lip_rings
+from ...shared.avatar_files import head_arrays
 from ..checkout import find_constant
 
 ASSETS = Path("flame_model/assets/flame")
@@ -150,6 +151,14 @@ class OfficialHead:
             "kintree_table": np.stack([parents, np.arange(len(parents))]).astype(np.int64),
             "weights": weights,
         }
+
+    def write_eyelids(self, left: Path, right: Path) -> None:
+        """Write the eyelid bases (V', 3), metres; zeros for a head without them."""
+        basis = head_arrays(self.head).eyelid_basis
+        for side, path in enumerate((left, right)):
+            values = np.zeros((len(self.head.template), 3)) if basis is None else basis[:, :, side]
+            with atomic_path(path) as temporary, temporary.open("wb") as stream:
+                np.save(stream, self.vertices(values).astype(np.float64), allow_pickle=False)
 
     def _region(self, name: str) -> IntArray:
         return np.flatnonzero(np.isin(self.order, self.head.regions.get(name, []))).astype(np.int64)

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from ....bench.errors import InputError
 from ....bench.io.arrays import read_npy
 from ....bench.io.files import atomic_path, grouped_writes, read_bytes, write_bytes, write_text
 from ....datasets.head.arrays import faces_in_region
-from ....datasets.head.loaders import FLAME_IDENTITY_SIZE
 from ....datasets.head.subject import PosedSubject
 from ....datasets.head.teeth import with_teeth_where_possible
 from ....datasets.images import write_image
@@ -26,17 +25,23 @@ from ...shared.avatar_files import Subject, head_arrays
 from ..checkout import Checkout
 from ..ga.export import mark
 from ..ga.head_files import (
-    EXPRESSION_SIZE,
     MOST_TEMPLATE,
-    ArrayPickler,
     OfficialHead,
     obj_text,
-    padded,
     pickled,
     write_landmarks,
 )
 from ..method import Listed, Workplace, write_placeholder
-from ..video import cameras_at_rest, six_numbers, straight_rgba
+from ..video import (
+    cameras_at_rest,
+    flame_values,
+    frame_name,
+    frame_parts,
+    image_name,
+    opencv_values,
+    write_torch,
+    write_video,
+)
 
 SOURCES = ("*.py", "config/*.py", "FLAME/*.py", "utils/*.py")
 """Their program, which is run from a copy because it opens the eyelid bases beside its own file."""
@@ -94,11 +99,7 @@ class VideoHead:
         }
         with atomic_path(folder / MEDIAPIPE_FILE) as temporary, temporary.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **landmarks)
-        basis = head_arrays(self.official.head).eyelid_basis
-        for side, name in enumerate(EYELID_FILES):
-            values = np.zeros((len(self.official.head.template), 3)) if basis is None else basis[:, :, side]
-            with atomic_path(folder / name) as temporary, temporary.open("wb") as stream:
-                np.save(stream, self.official.vertices(values).astype(np.float64), allow_pickle=False)
+        self.official.write_eyelids(*(folder / name for name in EYELID_FILES))
         self._write_lists(folder)
 
     def write_identity(self, folder: Path) -> None:
@@ -111,17 +112,8 @@ class VideoHead:
     def frame(self, camera: Camera, pose: HeadPose) -> dict[str, dict[str, np.ndarray]]:
         """Content of a frame's file with the camera in the head's frame: arrays with a leading axis of one."""
         world, K = np.asarray(camera.world_to_camera, np.float64), np.asarray(camera.K, np.float64)
-        eyelids = np.zeros(2) if pose.eyelids is None else pose.eyelids
-        flame: dict[str, FloatArray] = {
-            "shape": padded(np.asarray(self.identity.shape), FLAME_IDENTITY_SIZE),
-            "exp": padded(np.asarray(pose.expression), EXPRESSION_SIZE),
-            "tex": np.zeros(TEXTURE_SIZE),
-            "jaw": six_numbers(pose.jaw),
-            "eyes": six_numbers(pose.eyes),
-            "eyelids": eyelids,
-        }
         # PyTorch3D's camera, x to the left and y up, lengths in halves of the image's smaller side. It draws the mesh
-        # beside the renders; splats are projected by the OpenCV camera below.
+        # beside the renders; splats are projected by the OpenCV camera.
         turned = np.diag([-1.0, -1.0, 1.0])
         half = min(camera.width, camera.height) / 2
         middle = np.array([camera.width, camera.height]) / 2
@@ -131,12 +123,8 @@ class VideoHead:
             "fl": K[:1, 0] / half,
             "pp": -(K[:2, 2] - middle) / half,
         }
-        opencv = {"R": world[:3, :3], "t": world[:3, 3], "K": K}
-        parts: dict[str, Mapping[str, np.ndarray]] = {"flame": flame, "camera": pytorch3d, "opencv": opencv}
-        return {
-            part: {name: np.asarray(array, np.float32)[None] for name, array in values.items()}
-            for part, values in parts.items()
-        }
+        flame = flame_values(self.identity, pose) | {"tex": np.zeros(TEXTURE_SIZE)}
+        return frame_parts(flame=flame, camera=pytorch3d, opencv=opencv_values(camera))
 
     def _write_lists(self, folder: Path) -> None:
         """Triangles of the back of the head and vertices of the neck: theirs for FLAME, else those of the head's regions."""
@@ -188,22 +176,13 @@ def write_training(
     A placeholder has an image of one pixel, and pose and camera of the first training frame. Returns the key of every
     other image by its path.
     """
-    keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
-    views = [(clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys]
-    cameras = cameras_at_rest(head.posed, views)
-    images: dict[str, FrameKey] = {}
     head.write_identity(work.input)
+    keys, first = write_video(clip, head.posed, work.input, head.frame, progress)
     with grouped_writes():
-        for number, (key, camera, (_, pose)) in enumerate(zip(keys, cameras, views)):
-            write_image(work.input / image_name(number), straight_rgba(clip, key))
-            write_torch(work.input / frame_name(number), head.frame(camera, pose))
-            images[f"input/{image_name(number)}"] = key
-            progress(number + 1, len(keys), "exporting")
-        first = head.frame(cameras[0], views[0][1])
         for number in range(len(keys), len(keys) + placeholders):
             write_placeholder(work.input / image_name(number))
             write_torch(work.input / frame_name(number), first)
-    return images
+    return {f"input/{image_name(number)}": key for number, key in enumerate(keys)}
 
 
 def write_list(frames: Sequence[Listed], head: VideoHead, work: Workplace) -> None:
@@ -223,25 +202,3 @@ def write_list(frames: Sequence[Listed], head: VideoHead, work: Workplace) -> No
     for file, name in GRIDS.items():
         box = {"bbox_min": torch.zeros(3), "bbox_max": torch.ones(3), "grid_size": [1, 1, 1]}
         write_torch(work.input / file, {**box, name: torch.zeros(1, 1, 1, 1)})
-
-
-def image_name(number: int) -> str:
-    """Path of a frame's image."""
-    return f"images/{number:05d}.png"
-
-
-def frame_name(number: int) -> str:
-    """Path of a frame's parameters."""
-    return f"checkpoint/{number:05d}.frame"
-
-
-def write_torch(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a file for ``torch.load`` with numpy arrays that every version of numpy can read."""
-    with atomic_path(path) as temporary, temporary.open("wb") as stream:
-        torch.save(dict(content), stream, pickle_module=_ArrayPickles)
-
-
-class _ArrayPickles:
-    """The part of a pickle module that ``torch.save`` uses."""
-
-    Pickler = ArrayPickler

@@ -13,8 +13,6 @@ import numpy as np
 
 from ....bench.contracts import Clip, Frame, FrameKey, HeadAsset, Progress
 from ....bench.errors import InputError
-from ....bench.io.documents import read_json
-from ....bench.io.files import write_json
 from ....bench.io.images import read_png
 from ...gbs.config import BlendshapeTraining, GBSConfig
 from ...shared.avatar_files import (
@@ -32,7 +30,7 @@ from ..ga.head_files import EXPRESSION_SIZE
 from ..ga.method import copy_file, rendered, trained
 from ..method import Listed, OfficialMethod, Patch, Workplace
 from ..spec import GBS_OFFICIAL
-from ..video import check_masks
+from ..video import check_masks, on_background, write_background
 from .export import VideoHead, held_out, write_list, write_training
 
 FILES = {
@@ -45,7 +43,6 @@ FILES = {
     }.items()
 }
 """Prefixes of the files that their renderer opens, which end in the iteration, and their stored names."""
-BACKGROUND_FILE = "background.json"
 MODEL_SOURCE, GRID_NODES = "FLAME/face_gs_model.py", 256
 """Places in their code that fill grids of nearest triangles and skinning weights, and number of nodes per side."""
 SHRINK = """
@@ -170,7 +167,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         for name, ours in FILES.items():
             # Gigabytes, which are only read.
             (work.model / f"{name}1{Path(ours).suffix}").symlink_to((folder / ours).absolute())
-        write_json(work.root / BACKGROUND_FILE, {"background": [float(level) for level in background]})
+        write_background(work, background)
 
     def render_command(self, folder: Path, checkout: Checkout, work: Workplace) -> list[str]:
         """Their script for all frames of a video, regardless of their loader's split."""
@@ -212,9 +209,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
                 expected = f"{frame.camera.width}x{frame.camera.height} pixels"
                 raise InputError(file, str(frame.key), expected, f"{image.shape[1]}x{image.shape[0]}")
             parts.append(image.astype(np.float32) / 255)
-        rgb, alpha = parts[0], parts[1][..., 0]
-        ground = np.array(read_json(work.root / BACKGROUND_FILE)["background"], np.float32)
-        return Frame(np.clip(rgb + (1 - alpha[..., None]) * ground, 0, 1), alpha)
+        return on_background(parts[0], parts[1][..., 0], work)
 
     def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
         """Leaks and differences, for readers of results."""

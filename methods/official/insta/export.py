@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from ....bench.contracts import (
     ByteArray,
@@ -32,15 +31,15 @@ from ....bench.io.files import grouped_writes, read_bytes, write_bytes, write_js
 from ....datasets.head.subject import BATCH, PosedSubject, pose_in_head_frame
 from ....datasets.images import write_image
 from ...insta.config import InstaConfig
-from ...insta.marching import CanonicalSurface, PosedSurface
-from ...insta.rendering import camera_rays
 from ...insta.warp import bare_triangles, mouth_triangles
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import pose_key
 from ..checkout import Checkout
 from ..ga.head_files import MOST_TEMPLATE
+from ..in_parts import in_parts
 from ..method import Listed, Workplace, write_placeholder
-from ..video import cameras_at_rest, straight_rgba
+from ..surface import VisibleMesh
+from ..video import cameras_at_rest, check_no_skew, straight_rgba, training_views
 
 MASKS: Mapping[str, tuple[str, ...]] = {
     "lips": ("lips", "mouth_socket"),
@@ -192,12 +191,6 @@ def frame_name(number: int) -> str:
     return f"{number:06d}"
 
 
-def check_camera(camera: Camera) -> None:
-    """Raise `InputError` for a camera that their JSON cannot describe."""
-    if camera.K[0, 1]:
-        raise InputError(f"camera {camera.id}", "K[0, 1]", "no skew", f"{camera.K[0, 1]:g}")
-
-
 def write_training(clip: Clip, head: VideoMesh, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
     """Write the training frames, and a placeholder as the split that their program renders at the end.
 
@@ -205,8 +198,7 @@ def write_training(clip: Clip, head: VideoMesh, work: Workplace, progress: Progr
     pixels are those of the mesh instead of those of a tracker and a face parsing network. Returns the key of every
     other image by its path.
     """
-    keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
-    views = [(clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys]
+    keys, views = training_views(clip)
     cameras = cameras_at_rest(head.posed, views)
     surfaces = _Surfaces(head)
     images: dict[str, FrameKey] = {}
@@ -232,37 +224,27 @@ def write_training(clip: Clip, head: VideoMesh, work: Workplace, progress: Progr
 
 
 class _Surfaces:
-    """Parts of the mesh visible in the pixels of a clip's frames."""
+    """Classes of pixels and depths by the mesh visible in a clip's frames."""
 
     def __init__(self, head: VideoMesh):
-        self._posed = head.posed
-        self._surface = CanonicalSurface(head.head, torch.from_numpy(head.posed.neutral))
+        self._mesh = VisibleMesh(head.head, head.posed)
         mouth, bare = mouth_triangles(head.head).numpy(), bare_triangles(head.head).numpy()
         self._classes = np.select([mouth, bare], [MOUTH, SKIN], HAIR).astype(np.uint8)
-        self._last: tuple[bytes, PosedSurface] | None = None
 
     def seen(self, pose: HeadPose, camera: Camera, coverage: ByteArray) -> tuple[ByteArray, np.ndarray]:
         """(H, W, 3) class in the red channel and (H, W) uint16 depth, millimetres along the axis; 0 for background.
 
         Covered pixels beside the mesh are hair.
         """
-        rows, columns = np.nonzero(coverage)
-        rays = camera_rays(camera, columns, rows, 0.0)
-        found = self._of(pose).first_hit(rays)
-        hit = (found.triangles >= 0).numpy()
+        found = self._mesh.seen(pose, camera, coverage)
         classes = np.zeros((*coverage.shape, 3), np.uint8)
-        classes[rows, columns, 0] = np.where(hit, self._classes[found.triangles.clamp_min(0).numpy()], HAIR)
-        along = found.values.numpy() * (rays.directions @ np.asarray(camera.world_to_camera[2, :3]))
+        classes[found.rows, found.columns, 0] = np.where(
+            found.hit, self._classes[found.triangles.clip(0)], HAIR
+        )
         depth = np.zeros(coverage.shape, np.uint16)
-        depth[rows, columns] = np.rint(np.where(hit, MILLIMETRES * along, 0)).clip(0, FARTHEST)
+        millimetres = np.rint(np.where(found.hit, MILLIMETRES * found.depths, 0))
+        depth[found.rows, found.columns] = millimetres.clip(0, FARTHEST)
         return classes, depth
-
-    def _of(self, pose: HeadPose) -> PosedSurface:
-        still = pose_in_head_frame(pose)
-        key = pose_key(still)
-        if self._last is None or self._last[0] != key:
-            self._last = key, self._surface.pose(torch.from_numpy(self._posed.meshes([still])[0]))
-        return self._last[1]
 
 
 def record(name: str, camera: Camera, image: str, *, height: int | None = None) -> dict[str, Any]:
@@ -300,22 +282,19 @@ def write_list(frames: Sequence[Listed], head: VideoMesh, work: Workplace) -> li
     Each entry has ``folder``, ``width``, ``height`` and the ``numbers`` of its frames in order. Images have one pixel:
     rendering reads none, and their program would keep all of them in GPU memory.
     """
-    by_size: dict[tuple[int, int], list[Listed]] = {}
     for frame in frames:
-        check_camera(frame.camera)
-        by_size.setdefault((frame.camera.width, frame.camera.height), []).append(frame)
+        check_no_skew(frame.camera)
     parts: list[dict[str, Any]] = []
-    for (width, height), same in by_size.items():
-        for start in range(0, len(same), PART):
-            part, folder = same[start : start + PART], f"part_{len(parts):04d}"
-            cameras = cameras_at_rest(head.posed, [(frame.camera, frame.pose) for frame in part])
-            names = [frame_name(index) for index in range(len(part))]
-            with grouped_writes():
-                head.write_canonical(work.input / folder)
-                head.write_poses(work.input / folder, dict(zip(names, (frame.pose for frame in part))))
-                write_placeholder(work.input / folder / PLACEHOLDER)
-                records = [record(n, c, PLACEHOLDER, height=1) for n, c in zip(names, cameras)]
-                write_json(work.input / folder / TEST, {"frames": records})
-            numbers = [frame.number for frame in part]
-            parts.append({"folder": folder, "width": width, "height": height, "numbers": numbers})
+    for part in in_parts(frames, lambda frame: (frame.camera.width, frame.camera.height), PART):
+        folder = f"part_{len(parts):04d}"
+        cameras = cameras_at_rest(head.posed, [(frame.camera, frame.pose) for frame in part])
+        names = [frame_name(index) for index in range(len(part))]
+        with grouped_writes():
+            head.write_canonical(work.input / folder)
+            head.write_poses(work.input / folder, dict(zip(names, (frame.pose for frame in part))))
+            write_placeholder(work.input / folder / PLACEHOLDER)
+            records = [record(n, c, PLACEHOLDER, height=1) for n, c in zip(names, cameras)]
+            write_json(work.input / folder / TEST, {"frames": records})
+        size = {"width": cameras[0].width, "height": cameras[0].height}
+        parts.append({"folder": folder, **size, "numbers": [frame.number for frame in part]})
     return parts

@@ -7,19 +7,12 @@ instant-ngp. It takes a scene and a configuration, trains, records the frames of
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-
 from ....bench.contracts import Clip, Frame, FrameKey, Progress
-from ....bench.errors import InputError
-from ....bench.io.documents import read_json
 from ....bench.io.files import read_bytes, write_bytes, write_json
-from ....bench.io.images import read_pixels
 from ...shared.avatar_files import (
     SUBJECT_FILE,
     Subject,
@@ -30,9 +23,10 @@ from ...shared.loop import Fit
 from ..checkout import Checkout, Environment, Repository, inspect_program
 from ..config import INSTAOfficialConfig
 from ..ga.method import copy_file
-from ..method import Listed, OfficialMethod, Workplace
+from ..in_parts import PartsMethod, RenderCall
+from ..method import Listed, Workplace
 from ..spec import INSTA_OFFICIAL
-from ..video import check_masks
+from ..video import check_masks, check_no_skew, read_covered, write_background
 from .export import (
     CONDITIONS,
     MASK_FOLDER,
@@ -40,7 +34,6 @@ from .export import (
     PART,
     TEST,
     VideoMesh,
-    check_camera,
     write_list,
     write_training,
 )
@@ -51,13 +44,12 @@ INPUT, EXPERIMENTS = "../input", "experiments"
 passes paths to a shell, so none may be absolute because a run folder can have any name."""
 RECORDED = Path("headbench/debug")
 """Folder of its output, named after its configuration."""
-SNAPSHOT, BACKGROUND_FILE, RENDERS = "snapshot.msgpack", "background.json", "renders"
-PLAN, LAUNCHER = "parts.json", Path(__file__).with_name("parts.py")
+SNAPSHOT = "snapshot.msgpack"
 LAST_SIZE = 16
 """Side of the unused final render of a training."""
 MOST_CONFIG = 1 << 16
 _ITERATION = re.compile(r"iteration=(\d+) loss=([-+.\de]+|-?nan|inf)")
-_DRAWN = re.compile(r"^headbench: drawn (\d+)")
+_RECORDED = r"Recording frame \[(\d+)/\d+\]"
 
 INSTA_REPOSITORY = Repository(
     "https://github.com/Zielon/INSTA",
@@ -67,7 +59,7 @@ INSTA_REPOSITORY = Repository(
 )
 
 
-class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
+class INSTAOfficial(PartsMethod[INSTAOfficialConfig]):
     """The method: see the module."""
 
     name, version = INSTA_OFFICIAL.name, INSTA_OFFICIAL.version
@@ -81,7 +73,7 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
         """Refuse a clip without masks, a skewed camera, and a head outside their scene."""
         check_masks(clip)
         for name in sorted({key.camera for key in clip.splits["train"]}):
-            check_camera(clip.cameras[name])
+            check_no_skew(clip.cameras[name])
         VideoMesh.of(Subject.of(clip), clip.head, checkout)
 
     def export(
@@ -123,52 +115,27 @@ class INSTAOfficial(OfficialMethod[INSTAOfficialConfig]):
         checkout: Checkout,
         work: Workplace,
     ) -> None:
-        """Write the frames as test splits, each rendered in a separate call by the launcher."""
+        """Write the frames as test splits, each rendered in a separate call."""
         model = read_shared_head(folder)
         head = VideoMesh.of(read_subject(folder / SUBJECT_FILE, model), model, checkout)
         head.write_masks(work.program)
         _copy_main(checkout, work)
         _write_config(work, max_images_gpu=PART, max_cached_bvh=PART, render_from_snapshot=True)
         (work.program / SNAPSHOT).symlink_to((folder / SNAPSHOT).absolute())
-        self.render_folder(folder, work).mkdir(parents=True)
-        plan = {
-            "program": [*_program(checkout), "--snapshot", SNAPSHOT],
-            "input": INPUT,
-            "list": TEST,
-            "output": str(EXPERIMENTS / RECORDED),
-            "renders": str(Path("..") / work.model.name / RENDERS),
-            "parts": write_list(frames, head, work),
-        }
-        write_json(work.root / PLAN, plan)
-        write_json(work.root / BACKGROUND_FILE, {"background": [float(level) for level in background]})
-        write_bytes(work.root / LAUNCHER.name, read_bytes(LAUNCHER, "the launcher", MOST_CONFIG))
-
-    def render_command(self, folder: Path, checkout: Checkout, work: Workplace) -> list[str]:
-        """The launcher, with the plan that was written with the list, run by headbench's interpreter."""
-        return [sys.executable, str(work.root / LAUNCHER.name), str(work.root / PLAN)]
-
-    def drawn(self, line: str) -> int | None:
-        """From the launcher."""
-        match = _DRAWN.search(line)
-        return None if match is None else int(match[1])
-
-    def render_folder(self, folder: Path, work: Workplace) -> Path:
-        """Output folder of the launcher."""
-        return work.model / RENDERS
-
-    def render_name(self, number: int) -> str:
-        """Render by the number that the plan gives to each frame of a list."""
-        return f"{number:06d}.png"
+        calls = []
+        for part in write_list(frames, head, work):
+            listed = Path(INPUT) / part["folder"] / TEST
+            recorded = listed.parent / EXPERIMENTS / RECORDED
+            size = _size(part["width"], part["height"])
+            call = [*_program(checkout), "--snapshot", SNAPSHOT, "--scene", str(listed), *size]
+            shown = [str(listed), str(recorded / "transforms_overlay.json")]
+            calls.append(RenderCall(call, part["numbers"], str(recorded / "overlay"), shown))
+        self.write_calls(folder, calls, _RECORDED, work)
+        write_background(work, background)
 
     def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
         """A render on black, composited on the background by its coverage."""
-        pixels = read_pixels(path, size=(frame.camera.width, frame.camera.height))
-        if pixels.ndim != 3 or pixels.shape[2] != 4:
-            raise InputError(path, str(frame.key), "colours and coverage (RGBA)", f"shape {pixels.shape}")
-        rgba = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA).astype(np.float32) / 255
-        rgb, alpha = rgba[..., :3], rgba[..., 3]
-        ground = np.array(read_json(work.root / BACKGROUND_FILE)["background"], np.float32)
-        return Frame(np.clip(rgb + (1 - alpha[..., None]) * ground, 0, 1), np.ascontiguousarray(alpha))
+        return read_covered(frame, path, work)
 
     def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
         """Leaks and differences, for readers of results."""

@@ -1,8 +1,9 @@
-"""Renders lists of frames by INSTA's program, one after the other; run as a script.
+"""Renders lists of frames by calls of the authors' program, one after the other; run as a script.
 
-The program renders one list at one image size in a call, beside the list. A plan (JSON) names the lists. Each render
-is named by the number of its frame, after the cameras that the program writes beside its renders are compared with the
-list. This file requires only the standard library.
+A call renders one list, whose frames share what the program fixes in a call: the image size, or the intrinsics. A plan
+(JSON) names the calls and where each leaves its renders, which are then named by the numbers of their frames. If a
+call writes the cameras of its renders, they are compared with the list first. This file requires only the standard
+library.
 """
 
 import json
@@ -11,43 +12,46 @@ import re
 import subprocess
 import sys
 
-RECORDED = re.compile(rb"Recording frame \[(\d+)/\d+\]")
+TAIL = 2000
 TOLERANCE = 1e-3
 
 
 def main():
-    """Render the parts of a plan."""
+    """Run the calls of a plan."""
     with open(sys.argv[1]) as stream:
         plan = json.load(stream)
+    drawn = re.compile(plan["drawn"].encode())
     done = 0
     for part in plan["parts"]:
-        render(plan, part, done)
+        run(part["command"], drawn, done)
+        if part.get("cameras"):
+            check_cameras(*part["cameras"])
+        for index, number in enumerate(part["numbers"]):
+            made = os.path.join(part["renders"], f"{index:05d}.png")
+            if os.path.exists(made):
+                os.rename(made, os.path.join(plan["renders"], f"{number:06d}.png"))
         done += len(part["numbers"])
         print(f"\nheadbench: drawn {done}", flush=True)
 
 
-def render(plan, part, before):
-    """One call of the program."""
-    scene = os.path.join(plan["input"], part["folder"])
-    listed = os.path.join(scene, plan["list"])
-    size = ["--width", str(part["width"]), "--height", str(part["height"])]
-    command = [*plan["program"], "--scene", listed, *size]
+def run(command, drawn, before):
+    """Run one call; its output is passed on, with the number of frames drawn in all calls."""
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
-        for line in process.stdout or ():
-            sys.stdout.buffer.write(line)
-            recorded = RECORDED.search(line)
-            if recorded:
-                sys.stdout.buffer.write(b"\nheadbench: drawn %d\n" % (before + int(recorded[1])))
+        tail, told = b"", 0
+        while process.stdout is not None:
+            chunk = os.read(process.stdout.fileno(), 1 << 16)
+            if not chunk:
+                break
+            sys.stdout.buffer.write(chunk)
+            tail = (tail + chunk)[-TAIL:]
+            found = [int(number) for number in drawn.findall(tail)]
+            if found and found[-1] > told:
+                told = found[-1]
+                sys.stdout.buffer.write(b"\nheadbench: drawn %d\n" % (before + told))
             sys.stdout.buffer.flush()
     code = process.returncode
     if code:
         sys.exit(code if code > 0 else 128 - code)
-    output = os.path.join(scene, plan["output"])
-    check_cameras(listed, os.path.join(output, "transforms_overlay.json"))
-    for index, number in enumerate(part["numbers"]):
-        made = os.path.join(output, "overlay", f"{index:05d}.png")
-        if os.path.exists(made):
-            os.rename(made, os.path.join(plan["renders"], f"{number:06d}.png"))
 
 
 def check_cameras(listed, shown):
