@@ -185,13 +185,13 @@ def _broken(error: str | None) -> Need:
 
 
 def _lines(statuses: list[PluginStatus]) -> Iterator[str]:
-    group = ""
+    group, width = "", max([17, *(len(status.name) for status in statuses)]) + 1
     for status in statuses:
         if status.group != group:
             group = status.group
             yield f"\n{group}"
         there = "; ".join(f"{need.what}: {need.found}" for need in status.needs if need.found)
-        yield f"  {status.name:<18}{status.state:<9}{there}".rstrip()
+        yield f"  {status.name:<{width}}{status.state:<9}{there}".rstrip()
         for need in status.missing:
             effect = "" if need.required else " (works without)"
             yield f"    no {need.what}{effect}. {need.remedy}".rstrip()

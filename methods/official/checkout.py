@@ -120,13 +120,15 @@ Environment = tuple[tuple[str, ...], dict[str, Any]]
 """Command that runs the code of a checkout, and versions for the avatar's record."""
 
 
-def inspect_interpreter(method: str, config: OfficialConfig, repository: Repository) -> Environment:
-    """Command and versions of the interpreter; see `look`."""
+def inspect_interpreter(
+    method: str, config: OfficialConfig, repository: Repository, *, shim: bool = True
+) -> Environment:
+    """Command and versions of the interpreter; see `inspect_checkout`. ``shim``: whether the CPU shim supports the code."""
     python = _interpreter(method, config)
     if config.device != "cuda":
         needed = tuple(name for name in repository.modules if not {name, name.partition(".")[0]} & {*SHIMMED})
         repository = replace(repository, modules=(*needed, SHIM), trial="")
-    return python, _probed(method, python, repository, cuda=config.device == "cuda")
+    return python, _probed(method, python, repository, cuda=config.device == "cuda", shim=shim)
 
 
 def inspect_program(method: str, config: INSTAOfficialConfig, repository: Repository) -> Environment:
@@ -295,7 +297,9 @@ def _interpreter(method: str, config: OfficialConfig) -> tuple[str, ...]:
     return (str(absolute), *words[1:])
 
 
-def _probed(method: str, python: Sequence[str], repository: Repository, *, cuda: bool) -> dict[str, Any]:
+def _probed(
+    method: str, python: Sequence[str], repository: Repository, *, cuda: bool, shim: bool
+) -> dict[str, Any]:
     """Versions of the interpreter, if it can import what the code needs."""
     source = f"settings.{method}.python"
     program = _PROBE.replace("TRIAL", repository.trial or "pass")
@@ -330,7 +334,7 @@ def _probed(method: str, python: Sequence[str], repository: Repository, *, cuda:
         raise InputError(python[0], source, expected, found.failed, repository.trial_remedy)
     if cuda and found.cuda is False:
         remedy = "Run it on a machine with an NVIDIA GPU and a CUDA build of PyTorch"
-        remedy += f", or with headbench's renderer: --set settings.{method}.device=cpu-shim."
+        remedy += f", or with headbench's renderer: --set settings.{method}.device=cpu-shim." if shim else "."
         raise InputError(python[0], source, "PyTorch that finds a CUDA device", "none", remedy)
     return {"python": found.python, "torch": found.torch}
 

@@ -215,6 +215,10 @@ class OfficialMethod(ABC, Generic[Config]):
         """For the record: ``leaks`` of held-out data, and ``differences`` from the published code."""
         return {"leaks": [], "differences": []}
 
+    def changes(self) -> list[Patch]:
+        """Texts in their sources that every training replaces in memory, for what no option of theirs allows."""
+        return []
+
     def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
         """Texts in their sources that the CPU shim replaces in memory for a training with this number of iterations."""
         return []
@@ -292,7 +296,7 @@ class OfficialMethod(ABC, Generic[Config]):
 
     def inspect_environment(self) -> Environment:
         """Check the interpreter or program that runs their code."""
-        return inspect_interpreter(self.name, self.config, self.repository)
+        return inspect_interpreter(self.name, self.config, self.repository, shim=bool(self.shimmed))
 
     def check(self, clip: Clip | None, budget: Budget) -> None:
         """Raise `InputError` for a missing checkout or interpreter, and for a clip or budget that the code does not support."""
@@ -352,7 +356,7 @@ class OfficialMethod(ABC, Generic[Config]):
                 fit.progress(frames + min(found[0], iterations), frames + iterations, found[1])
 
         shim = self.config.device != "cuda"
-        patches = self.patches(fit.clip.head, iterations, checkout) if shim else []
+        patches = self.changes() + (self.patches(fit.clip.head, iterations, checkout) if shim else [])
         patches += self.patches_for_order() if self.config.order == "native" else []
         command = self._launched(
             [*command, *self.config.arguments],

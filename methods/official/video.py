@@ -4,6 +4,7 @@ Metrical Tracker."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,17 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, Frame, FrameKey, HeadPose, Progress
+from ...bench.contracts import (
+    ByteArray,
+    Camera,
+    Clip,
+    FloatArray,
+    Frame,
+    FrameKey,
+    HeadAsset,
+    HeadPose,
+    Progress,
+)
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.files import atomic_path, grouped_writes, write_json
@@ -22,7 +33,7 @@ from ...datasets.head.subject import PosedSubject, camera_in_head_frame
 from ...datasets.images import write_image
 from ...datasets.steps.masks import recomposite
 from ..shared.avatar_files import Subject
-from .ga.head_files import EXPRESSION_SIZE, ArrayPickler, padded
+from .ga.head_files import EXPRESSION_SIZE, ArrayPickler, OfficialHead, padded
 from .method import Listed, Workplace
 
 BACKGROUND_FILE = "background.json"
@@ -152,6 +163,37 @@ def sized_frame(subject: Subject, camera: Camera, pose: HeadPose) -> dict[str, A
     """
     parts = frame_parts(flame=flame_values(subject, pose), opencv=opencv_values(camera))
     return {**parts, "img_size": np.array([camera.width, camera.height])}
+
+
+@dataclass(frozen=True, eq=False)
+class FlameSubject:
+    """A head model with FLAME's vertices and one identity, for loaders of tracked videos.
+
+    Attributes
+    ----------
+    official : OfficialHead
+        The model without teeth.
+    posed : PosedSubject
+        The clip's own, with teeth if it has them.
+    """
+
+    official: OfficialHead
+    identity: Subject
+    posed: PosedSubject
+
+    @classmethod
+    def of(cls, head: HeadAsset, subject: Subject, vertices: int, file: Path) -> FlameSubject:
+        """See `OfficialHead.of_flame`."""
+        official = OfficialHead.of_flame(head, vertices, file)
+        return cls(official, subject, PosedSubject(head, subject.shape, subject.static_offset))
+
+    def model(self) -> dict[str, np.ndarray]:
+        """Arrays of FLAME's file, with the static offset in the template."""
+        return self.official.model(self.identity.static_offset)
+
+    def frame(self, camera: Camera, pose: HeadPose) -> dict[str, Any]:
+        """Content of the file of a frame; see `sized_frame`."""
+        return sized_frame(self.identity, camera, pose)
 
 
 def write_torch(path: Path, content: Mapping[str, Any]) -> None:

@@ -7,6 +7,8 @@ head of another topology is renumbered so that these vertices are its lips, one 
 
 from __future__ import annotations
 
+import importlib
+import operator
 import pickle
 import re
 from collections.abc import Mapping
@@ -97,6 +99,20 @@ class OfficialHead:
         number = np.full(len(head.template), -1)
         number[kept] = np.arange(len(kept))
         return cls(head, kept, number[faces])
+
+    @classmethod
+    def of_flame(cls, head: HeadAsset, vertices: int, file: Path) -> OfficialHead:
+        """A head whose vertices and triangles are FLAME's, for code with a texture chart of FLAME.
+
+        ``vertices`` is the number in ``file`` of the checkout. Raises `InputError` for another topology.
+        """
+        own = cls.numbered(head)
+        if len(own.order) != vertices:
+            expected = f"{vertices} vertices, as {file} has, since their code needs FLAME's texture chart"
+            remedy = "Refit the capture to FLAME 2020 (headbench prepare refit)."
+            where = f"head model {head.version!r}"
+            raise InputError(where, "template", expected, str(len(own.order)), remedy)
+        return own
 
     def _with_lips(self, wanted: tuple[IntArray, IntArray], where: str) -> OfficialHead:
         """Renumber the vertices so that the given indices are the rings of the lips."""
@@ -213,13 +229,36 @@ def write_landmarks(path: Path, sizes: Mapping[str, tuple[int, ...]]) -> None:
         np.save(stream, landmarks, allow_pickle=False)
 
 
-def pickled(arrays: Mapping[str, np.ndarray]) -> bytes:
+def pickled(arrays: Mapping[str, np.ndarray | SparseMatrix]) -> bytes:
     """Arrays by name as a pickle that every version of numpy can read: it only calls ``numpy.ndarray``."""
     from io import BytesIO
 
     stream = BytesIO()
     ArrayPickler(stream, protocol=4).dump(dict(arrays))
     return stream.getvalue()
+
+
+class SparseMatrix:
+    """A matrix that is pickled as a ``scipy.sparse.csc_matrix``, which FLAME's file has.
+
+    Pickles by SciPy itself name a module that differs between its versions.
+    """
+
+    def __init__(self, dense: FloatArray):
+        self.dense = dense
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return operator.methodcaller("csc_matrix", self.dense), (_ModuleReference("scipy.sparse"),)
+
+
+class _ModuleReference:
+    """A module that is imported where the pickle is read."""
+
+    def __init__(self, name: str):
+        self.name = name
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return importlib.import_module, (self.name,)
 
 
 class ArrayPickler(pickle.Pickler):

@@ -7,6 +7,7 @@ import pytest
 
 from headbench.bench.process import ProgramError
 
+from ...datasets.head.toy import toy_head
 from ..toy_clip import toy_clip
 from .repository import lip_numbers, make_repository
 
@@ -23,6 +24,27 @@ def official_clip(head):
         K[:2, 2] += OFFSETS[name]
         cameras[name] = replace(camera, K=K)
     return replace(clip, cameras=cameras)
+
+
+@pytest.fixture(scope="session")
+def video_clip():
+    """Twelve training frames of two equal cameras and three of another, eyelids, and a boundary below the neck."""
+    plain = toy_head(16, eyelids=True)
+    boundary = np.flatnonzero(plain.template[:, 1] < -0.1)
+    clip = toy_clip(
+        replace(plain, regions=plain.regions | {"boundary": boundary}),
+        timesteps=6,
+        cameras=3,
+        width=28,
+        height=36,
+    )
+    cameras = {}
+    for name, camera in clip.cameras.items():
+        K = camera.K.copy()
+        K[:2, 2] += (1.3, -2.2) if name != "02" else (-1.6, 4.1)
+        cameras[name] = replace(camera, K=K)
+    lids = {t: replace(pose, eyelids=np.array([0.1 * t, 0.5])) for t, pose in clip.poses.items()}
+    return replace(clip, cameras=cameras, poses=lids)
 
 
 @pytest.fixture

@@ -7,9 +7,15 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import torch
+
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.engine.guard import TrainingView
+from headbench.bench.io.arrays import check_arrays
+from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.head.teeth import lip_rings
+from headbench.datasets.tracker_files.metrical import MEMBERS, metrical_frame
 from headbench.methods.official.config import GAOfficialConfig
 from headbench.methods.official.ga.method import GAOfficial
 from headbench.methods.official.gha.method import GHAOfficial
@@ -45,6 +51,59 @@ def export(method, clip, folder):
     """Export the clip's training frames: the place, and the images in it by key."""
     work = workplace(folder)
     return work, method.export(TrainingView(clip), method.inspect(), work, no_progress)
+
+
+class Killed(KeyboardInterrupt):
+    """What a signal raises."""
+
+
+def kill_at(iteration, clip):
+    """A progress that raises `Killed` in this iteration of a training."""
+    frames = len(clip.splits["train"])
+
+    def progress(done, total, note=""):
+        if done >= frames + iteration:
+            raise Killed
+
+    return progress
+
+
+def read_tracked(path):
+    """A frame's file by torch and the formulae of the reader of the tracker's files.
+
+    That reader has height before width, the programs that the file is for have width first.
+    """
+    with torch.serialization.safe_globals([np.ndarray]):
+        content = torch.load(path, weights_only=True)
+    arrays = {
+        f"{part}.{name}": array for part in ("flame", "opencv") for name, array in content[part].items()
+    }
+    arrays["img_size"] = content["img_size"][::-1]
+    check_arrays(path, arrays, MEMBERS)
+    return metrical_frame(path, int(path.stem), arrays)
+
+
+def check_tracked(found, clip, key, window=None):
+    """A frame's file has the pose of a clip's frame, and the camera of its image, or of a window of it."""
+    camera, pose = clip.cameras[key.camera], clip.poses[key.timestep]
+    shown = camera if window is None else window.camera
+    assert (found.width, found.height) == (shown.width, shown.height)
+    size = len(pose.expression)
+    assert np.array_equal(found.expression[:size], pose.expression)
+    assert found.expression.shape == (100,)
+    assert not found.expression[size:].any()
+    assert found.shape.shape == (300,)
+    assert np.abs(found.shape[: len(clip.shape)] - clip.shape).max() < 1e-6
+    for name in ("eyelids", "jaw", "eyes"):
+        assert np.abs(getattr(found, name) - getattr(pose, name)).max() < 1e-6
+    subject = PosedSubject.of(clip)
+    points, motion = subject.neutral[::7], subject.motions([pose])[0]
+    world = points @ motion[:3, :3].T + motion[:3, 3]
+    local = world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    theirs = points @ found.world_to_camera[:3, :3].T + found.world_to_camera[:3, 3]
+    here, there = ((p @ K.T)[:, :2] / p[:, 2:] for p, K in ((local, camera.K), (theirs, found.K)))
+    there = there if window is None else there + [window.left, window.top]
+    return float(np.abs(here - there).max())
 
 
 LINES_BEGIN = 12

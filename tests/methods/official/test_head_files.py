@@ -1,15 +1,23 @@
 """A head model as their code is given it: padded and renumbered, the same head all the same."""
 
+import pickle
 import sys
 
 import numpy as np
 import pytest
+import scipy.sparse
 
 from headbench.bench.io.files import write_bytes
 from headbench.bench.process import run_program
 from headbench.datasets.head.teeth import lip_rings, with_teeth
 from headbench.methods.official.ga.export import MARK_STEP, mark
-from headbench.methods.official.ga.head_files import TEMPLATE_FILE, OfficialHead, OfficialTracking, pickled
+from headbench.methods.official.ga.head_files import (
+    TEMPLATE_FILE,
+    OfficialHead,
+    OfficialTracking,
+    SparseMatrix,
+    pickled,
+)
 
 from ...datasets.head.toy import toy_head
 
@@ -94,6 +102,17 @@ def test_arrays_are_pickled_without_a_module_that_moved(tmp_path):
     command = [sys.executable, "-c", READ, str(tmp_path / "head.pkl")]
     assert run_program(command, tmp_path, tmp_path / "log", lines.append).code == 0
     assert lines[-1] == str({name: (str(array.dtype), array.tolist()) for name, array in arrays.items()})
+
+
+def test_a_sparse_matrix_is_named_by_its_public_module():
+    dense = np.random.default_rng(0).standard_normal((5, 7)) * (np.arange(7) % 2)
+    content = pickled({"J_regressor": SparseMatrix(dense)})
+    assert b"_csc" not in content
+    assert b"numpy._core" not in content
+    assert b"multiarray" not in content
+    found = pickle.loads(content)["J_regressor"]
+    assert isinstance(found, scipy.sparse.csc_matrix)
+    assert np.array_equal(found.todense(), dense)
 
 
 def test_marks_of_neighbours_are_told_apart():

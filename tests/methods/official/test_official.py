@@ -28,7 +28,17 @@ from headbench.methods.official.method import (
 )
 
 from .conftest import brightness
-from .repository import StandIn, fit, lip_numbers, make_repository, renders, settings, views
+from .repository import (
+    Killed,
+    StandIn,
+    fit,
+    kill_at,
+    lip_numbers,
+    make_repository,
+    renders,
+    settings,
+    views,
+)
 
 
 @pytest.fixture(scope="module")
@@ -55,20 +65,6 @@ def trained(repository, official_clip, tmp_path_factory):
 def avatar(method, trained, tmp_path):
     shutil.copytree(trained, tmp_path / "avatar")
     return method.load(tmp_path / "avatar", device="cpu")
-
-
-class Killed(KeyboardInterrupt):
-    """What a signal raises."""
-
-
-def kill_at(iteration, clip):
-    frames = len(clip.splits["train"])
-
-    def progress(done, total, note=""):
-        if done >= frames + iteration:
-            raise Killed
-
-    return progress
 
 
 def test_an_avatar_is_trained_kept_and_read_again(method, avatar, official_clip, tmp_path):
