@@ -190,6 +190,7 @@ READ_IN_ONE_PLACE = {
     },
     r"\bcv2\.im(read|readmulti|decode|decodemulti|write|writemulti|encode)\b": {
         "bench/io/images.py",
+        "methods/official/flashavatar/method.py",  # a text for the authors' program
         "methods/official/gha/stages.py",  # a program for the authors' interpreter, run there
     },
     r"\bImage\.open\(|\bimageio\b|\bimread\(|\bimsave\(|skimage\.io\b|mimread|\.fromarray\(.*\.save\(": {
@@ -204,7 +205,8 @@ READ_IN_ONE_PLACE = {
     },
     r"\bsafe_open\(|\bload_file\(": {"methods/shared/tensor_files.py"},
     r"\btorch\.load\(": {
-        "methods/official/gbs/method.py",  # a program for the authors' interpreter, run there
+        "methods/official/flashavatar/method.py",  # programs for the authors' interpreters, run there
+        "methods/official/gbs/method.py",
         "metrics/torch_file.py",
     },
 }

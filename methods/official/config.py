@@ -124,3 +124,17 @@ class INSTAOfficialConfig(OfficialConfig):
             raise ValueError("python must be empty: the authors' code is a program; set program")
         if self.images_on_gpu < 1:
             raise ValueError(f"images_on_gpu must be at least 1, found {self.images_on_gpu}")
+
+
+@dataclass(frozen=True)
+class RGBAvatarOfficialConfig(OfficialConfig):
+    """RGBAvatar by its authors' code; the default commit is the one that the adapter was written for."""
+
+    commit: str = "54a960cd947d236a65f43e0c4b13ce54631a2290"
+
+
+@dataclass(frozen=True)
+class FlashAvatarOfficialConfig(OfficialConfig):
+    """FlashAvatar by its authors' code; the default commit is the one that the adapter was written for."""
+
+    commit: str = "2d4cb25ca9166b795c03692aec12114d595eff15"

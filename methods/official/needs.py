@@ -9,11 +9,13 @@ from ...bench.errors import InputError
 from ...bench.specs import Need
 from .checkout import inspect_folder
 from .config import OfficialConfig
+from .flashavatar.method import FlashAvatarOfficial
 from .ga.method import GAOfficial
 from .gbs.method import GBSOfficial
 from .gha.method import GHAOfficial
 from .insta.method import INSTAOfficial
 from .method import OfficialMethod
+from .rgbavatar.method import RGBAvatarOfficial
 from .tga.method import TGAOfficial
 
 
@@ -40,6 +42,16 @@ def gha(config: OfficialConfig, device: str) -> Iterator[Need]:
 def insta(config: OfficialConfig, device: str) -> Iterator[Need]:
     """Checkout of INSTA, the program built in it, and a GPU."""
     return _needs(INSTAOfficial, config)
+
+
+def rgbavatar(config: OfficialConfig, device: str) -> Iterator[Need]:
+    """Checkout and environment of RGBAvatar."""
+    return _needs(RGBAvatarOfficial, config)
+
+
+def flashavatar(config: OfficialConfig, device: str) -> Iterator[Need]:
+    """Checkout of FlashAvatar, and its environment with the weights of its perceptual loss."""
+    return _needs(FlashAvatarOfficial, config)
 
 
 def _needs(method: type[OfficialMethod[Any]], config: OfficialConfig) -> Iterator[Need]:

@@ -13,6 +13,7 @@ from ..gbs.spec import SHORT_SPLATS as GBS_SHORT_SPLATS
 from ..gha.spec import GHA
 from ..insta.spec import INSTA
 from ..ours.spec import OURS
+from ..rgbavatar.spec import RGBAVATAR
 from ..shared.config import PAPER_ITERATIONS, SHORT_SPLATS
 
 
@@ -126,4 +127,47 @@ INSTA_OFFICIAL = MethodSpec(
     native=False,
     source=INSTA.source,
     bibtex=INSTA.bibtex,
+)
+
+RGBAVATAR_OFFICIAL = MethodSpec(
+    name="rgbavatar-official",
+    summary="RGBAvatar by its authors' code, in your checkout and environment; needs CUDA.",
+    implementation="headbench.methods.official.rgbavatar.method:RGBAvatarOfficial",
+    config="headbench.methods.official.config:RGBAvatarOfficialConfig",
+    needs="headbench.methods.official.needs:rgbavatar",
+    # The published schedule, shortened; one iteration is a batch of ten images.
+    presets={
+        name: {"budget": RGBAVATAR.presets[name]["budget"]} for name in ("smoke", "demo", "fast", "paper")
+    },
+    head_models=("flame2020",),
+    monocular=True,
+    native=False,
+    source=RGBAVATAR.source,
+    bibtex=RGBAVATAR.bibtex,
+)
+
+FLASHAVATAR_OFFICIAL = MethodSpec(
+    name="flashavatar-official",
+    summary="FlashAvatar by its authors' code, in your checkout and environment; needs CUDA.",
+    implementation="headbench.methods.official.flashavatar.method:FlashAvatarOfficial",
+    config="headbench.methods.official.config:FlashAvatarOfficialConfig",
+    needs="headbench.methods.official.needs:flashavatar",
+    # The paper's number of iterations is not stated; "paper" is the default of their script.
+    presets={
+        "smoke": {"budget": {"iterations": 60}},
+        "demo": {"budget": {"iterations": 2_000}},
+        "fast": {"budget": {"iterations": 4_000}},
+        "paper": {"budget": {"iterations": 150_000}},
+    },
+    head_models=("flame2020",),
+    monocular=True,
+    native=False,
+    source="FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Embedding, CVPR 2024, arXiv 2312.02214",
+    bibtex=r"""@inproceedings{xiang2024flashavatar,
+  title     = {{FlashAvatar}: High-fidelity Head Avatar with Efficient {Gaussian} Embedding},
+  author    = {Xiang, Jun and Gao, Xuan and Guo, Yudong and Zhang, Juyong},
+  booktitle = {Proceedings of the IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
+  year      = {2024},
+  eprint    = {2312.02214},
+}""",
 )

@@ -1,0 +1,237 @@
+"""FlashAvatar by its authors' code.
+
+Xiang et al., "FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Embedding", CVPR 2024.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ....bench.contracts import Clip, FloatArray, Frame, FrameKey, Progress
+from ....bench.errors import InputError
+from ....bench.io.documents import read_json
+from ....bench.io.files import write_json
+from ....bench.io.images import read_png
+from ...shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
+from ...shared.loop import Fit
+from ..checkout import Checkout, Repository
+from ..config import FlashAvatarOfficialConfig
+from ..ga.export import check_mark_in
+from ..ga.head_files import EXPRESSION_SIZE
+from ..ga.method import copy_file
+from ..ga.windows import around, check_square_pixels, inside
+from ..in_parts import PartsMethod, RenderCall, in_parts, same_intrinsics
+from ..method import Listed, Patch, Workplace, opaque
+from ..spec import FLASHAVATAR_OFFICIAL
+from ..video import check_masks, check_one_camera
+from .export import EYELID_FILES, MESH_FILE, flame_subject, write_list, write_program, write_training
+
+NAME, LOG = "head", "log"
+CHECKPOINT_FILE, OPTIONS_FILE = "chkpnt.pth", "options.json"
+LOADER = "scene/__init__.py"
+PART = 500
+"""Maximum number of frames in one call, whose images are in the GPU's memory; as many as their test split has."""
+GREEN = (0.0, 1.0, 0.0)
+PICTURES: Patch = (
+    "train.py",
+    "np.zeros((args.image_res, args.image_res*2, 3))",
+    "np.zeros((image.shape[1], args.image_res*2, 3))",
+)
+CHANGES: tuple[Patch, ...] = (
+    (LOADER, "torch.zeros((3, 512, 512))", "torch.zeros((3, 1, 1))"),
+    (LOADER, "test_num = 500", "test_num = 0 if train_type == 0 else self.N_frames"),
+    PICTURES,
+    ("train.py", "if iteration % 5000 == 0:", "if iteration == opt.iterations:"),
+)
+"""Images of any size, no frames that are held out, and a checkpoint at the end of a run of any length."""
+RENDERING_CHANGES: tuple[Patch, ...] = (
+    *CHANGES[:2],
+    ("test.py", *PICTURES[1:]),
+    (
+        "test.py",
+        "out.write(save_image)",
+        'cv2.imwrite(os.path.join(logdir, "%05d.png" % iteration), save_image); print("drawn", iteration + 1)',
+    ),
+)
+"""Every frame of the list is rendered, and written as PNG instead of a video that loses detail."""
+SHRINK = """
+import sys, torch
+path = sys.argv[1]
+network, splats, iteration = torch.load(path)
+def lean(part):
+    return {**part, "state": {}} if isinstance(part, dict) and "param_groups" in part else part
+torch.save((tuple(map(lean, network)), tuple(map(lean, splats)), iteration), path)
+"""
+"""Removes the state of both optimisers, two thirds of the file, from a checkpoint, since rendering takes no step."""
+_DONE = re.compile(r"^step: (\d+), huber: ([\d.]+|nan|inf)")
+_DRAWN = r"drawn (\d+)"
+
+FLASHAVATAR_REPOSITORY = Repository(
+    "https://github.com/USTC3DV/FlashAvatar-code",
+    FlashAvatarOfficialConfig().commit,
+    (
+        *("train.py", "test.py", LOADER, "src/deform_model.py", "flame/flame_mica.py"),
+        *(path.as_posix() for path in (MESH_FILE, *EYELID_FILES)),
+    ),
+    (
+        *("torch", "lpips", "pytorch3d.renderer.mesh", "pytorch3d.transforms", "pytorch3d.io"),
+        *("diff_gaussian_rasterization", "simple_knn._C", "yacs.config", "loguru", "skimage"),
+        *("plyfile", "cv2", "tqdm", "PIL", "numpy"),
+    ),
+    "import torch; open(torch.hub.get_dir() + '/checkpoints/vgg16-397923af.pth').close()",
+    "Its loss needs VGG's weights: run python -c \"import lpips; lpips.LPIPS(net='vgg')\" once in that environment, "
+    "which fetches them.",
+)
+
+
+class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
+    """The method: see the module."""
+
+    name, version = FLASHAVATAR_OFFICIAL.name, FLASHAVATAR_OFFICIAL.version
+    config_class, repository = FlashAvatarOfficialConfig, FLASHAVATAR_REPOSITORY
+    # Frames and checkpoints contain more than tensors, which newer versions of torch read only if requested.
+    variables: ClassVar[Mapping[str, str]] = {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}
+
+    def check_clip(self, clip: Clip, checkout: Checkout) -> None:
+        """Refuse a clip without masks, on another background, of several intrinsics or too many frames, and a head that is
+        not FLAME's or lacks regions."""
+        where = f"clip {clip.subject}"
+        check_masks(clip)
+        _white(clip.background, where)
+        check_one_camera(clip)
+        for name in sorted({key.camera for keys in clip.splits.values() for key in keys}):
+            check_square_pixels(clip.cameras[name], where)
+        most = int(checkout.constant(LOADER, r"max_train_num = (\d+)", "max_train_num"))
+        if len(clip.splits["train"]) > most:
+            expected = f"at most {most} training frames, as many as their loader reads"
+            raise InputError(where, "train", expected, f"{len(clip.splits['train'])}")
+        flame_subject(Subject.of(clip), clip.head, checkout)
+
+    def export(
+        self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
+    ) -> dict[str, FrameKey]:
+        """Write the training frames as an identity, and their program with the files that it opens."""
+        subject = flame_subject(Subject.of(clip), clip.head, checkout)
+        write_program(subject, checkout, work.program)
+        return write_training(clip, subject, NAME, work, progress)
+
+    def changes(self) -> list[Patch]:
+        """Their loader and their training, for images and runs of any size."""
+        return list(CHANGES)
+
+    def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
+        """Their script; its output folder inside the identity's is a link to ``model``."""
+        link = work.program / "dataset" / NAME / LOG
+        link.unlink(missing_ok=True)
+        link.symlink_to(Path("../../..") / work.model.name)
+        camera = inside(check_one_camera(fit.clip)).camera
+        options = ["--idname", NAME, "--image_res", str(camera.width), "--seed", str(fit.seed)]
+        options += ["--iterations", str(fit.budget.iterations)]
+        ground = _flags(_white(fit.clip.background, f"clip {fit.clip.subject}"))
+        return [*checkout.python, str(work.program / "train.py"), *options, *ground]
+
+    def shrink_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str] | None:
+        """Run in their interpreter, on the device to which tensors are loaded."""
+        return [*checkout.python, "-c", SHRINK, str(_checkpoint(fit, work))]
+
+    def done(self, line: str) -> tuple[int, str] | None:
+        """Parse the line that their training writes every 500 iterations."""
+        match = _DONE.search(line)
+        return None if match is None else (int(match[1]), f"loss {match[2]}")
+
+    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
+        """The checkpoint, and the background of the training, which their renderer needs as an option."""
+        copy_file(_checkpoint(fit, work), fit.out / CHECKPOINT_FILE)
+        white = _white(fit.clip.background, f"clip {fit.clip.subject}")
+        write_json(fit.out / OPTIONS_FILE, {"white_background": white})
+        return {}
+
+    def files(self, folder: Path) -> list[Path]:
+        """Splats and network, background, and the subject."""
+        return [folder / name for name in (CHECKPOINT_FILE, OPTIONS_FILE, SUBJECT_FILE)]
+
+    def write_list(
+        self,
+        folder: Path,
+        frames: Sequence[Listed],
+        background: Sequence[float],
+        checkout: Checkout,
+        work: Workplace,
+    ) -> None:
+        """Write the frames of each camera's intrinsics as an identity."""
+        white = _white(background, "render")
+        if white != bool(read_json(folder / OPTIONS_FILE).get("white_background")):
+            expected = "the background that it was trained on; their renders have no coverage"
+            raise InputError(folder, "background", expected, str(tuple(background)))
+        for frame in frames:
+            check_square_pixels(frame.camera, "render")
+        head = read_shared_head(folder)
+        subject = flame_subject(read_subject(folder / SUBJECT_FILE, head), head, checkout)
+        write_program(subject, checkout, work.program)
+        script = [*checkout.python, str(work.program / "test.py")]
+        command = self._launched(script, checkout, work, patches=RENDERING_CHANGES)
+        calls = []
+        for index, part in enumerate(in_parts(frames, same_intrinsics, PART)):
+            name = f"part_{index:04d}"
+            write_list(part, subject, name, work)
+            renders = work.program / "dataset" / name / LOG
+            renders.mkdir()
+            width = around(part[0].camera).camera.width
+            options = ["--idname", name, "--image_res", str(width), *_flags(white)]
+            options += ["--checkpoint", str((folder / CHECKPOINT_FILE).absolute())]
+            calls.append(RenderCall([*command, *options], [f.number for f in part], str(renders), []))
+        self.write_calls(folder, calls, _DRAWN, work)
+
+    def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
+        """A render, after its frame is verified by the image on its left."""
+        window = around(frame.camera)
+        image, width, height = read_png(path), window.camera.width, window.camera.height
+        if image.shape[:2] != (height, 2 * width):
+            found = f"{image.shape[1]}x{image.shape[0]}"
+            raise InputError(path, str(frame.key), f"{2 * width}x{height} pixels", found)
+        check_mark_in(image[:, :width], path, frame.number)
+        return opaque(window.uncut(image[:, width:], frame.camera))
+
+    def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
+        """Leaks and differences, for readers of results."""
+        camera = check_one_camera(clip)
+        window = inside(camera).camera
+        differences = [
+            "frames are renumbered and all of them are used; their code holds out the last 500",
+            "masks of head and neck and of the mouth are those of the head model's mesh, not of a network that parses faces",
+            "the background is removed from partly covered pixels, and the static offset is part of the template",
+            f"images of {window.width}x{window.height} pixels as PNG in place of JPEG of 512x512; renders are PNG in place "
+            + "of a video, rounded down to 8 bits",
+            "whatever the length of the run, their perceptual loss begins at iteration 15,000 and a degree of the harmonics "
+            + "is added every 500 iterations",
+        ]
+        if (window.width, window.height) != (camera.width, camera.height):
+            differences.append(
+                "their code assumes the principal point in the middle of the image: images are cropped accordingly"
+            )
+        size = clip.head.expression_basis.shape[2]
+        if size < EXPRESSION_SIZE:
+            differences.append(f"an expression basis of {size} directions is padded with zeros")
+        return {"leaks": [], "differences": differences}
+
+
+def _checkpoint(fit: Fit, work: Workplace) -> Path:
+    return work.model / "ckpt" / f"chkpnt{fit.budget.iterations}.pth"
+
+
+def _flags(white: bool) -> list[str]:
+    return ["--white_background"] if white else []
+
+
+def _white(background: Sequence[float] | FloatArray, where: str) -> bool:
+    """Whether a background is white. Raises `InputError` for one that is neither white nor green."""
+    levels = tuple(float(value) for value in background)
+    if not any(np.array_equal(levels, known) for known in ((1.0, 1.0, 1.0), GREEN)):
+        expected = "white, or green (0, 1, 0), which the code supports"
+        raise InputError(where, "background", expected, str(levels))
+    return levels[0] == 1.0

@@ -1,0 +1,81 @@
+"""Export of videos and lists of frames for RGBAvatar's loader, in the layout of Metrical Tracker and INSTA.
+
+A folder of a subject has ``images/00000.png``, straight alpha, and ``checkpoint/00000.frame``, numbered alike without
+gaps. Of a frame's file the loader reads coefficients, jaw, eyes and eyelids, the rotation and translation of the OpenCV
+camera, and of frame 0 K and the image size too: all frames share them. It moves the head's motion into the neck joint.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ....bench.contracts import HeadAsset
+from ....bench.errors import InputError
+from ....bench.io.arrays import read_npy, read_npz
+from ....bench.io.files import grouped_writes, read_bytes, write_bytes, write_text
+from ...shared.avatar_files import Subject
+from ..checkout import Checkout
+from ..ga.head_files import MOST_TEMPLATE, SparseMatrix, pickled
+from ..method import Listed, write_placeholder
+from ..video import FlameSubject, cameras_at_rest, frame_name, image_name, write_torch
+
+DATA = Path("data/FLAME2020")
+MODEL_FILE, CHART_FILE = DATA / "generic_model.pkl", DATA / "flame_uv.npz"
+EYELID_FILES = (DATA / "l_eyelid.npy", DATA / "r_eyelid.npy")
+CONFIG = Path("config/offline.yaml")
+MOST_CONFIG = 1 << 16
+
+
+def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout) -> FlameSubject:
+    """The head model and one identity. Raises `InputError` unless its triangles are those of the checkout's texture chart."""
+    lid = EYELID_FILES[0]
+    found = FlameSubject.of(head, subject, len(read_npy(checkout.folder / lid)), lid)
+    chart = read_npz(checkout.folder / CHART_FILE)
+    triangles = np.asarray(chart.get("ft", ()))
+    if triangles.shape != found.official.faces.shape:
+        expected = f"{len(triangles)} triangles, as {CHART_FILE} has"
+        count = str(len(found.official.faces))
+        raise InputError(f"head model {head.version!r}", "faces", expected, count)
+    return found
+
+
+def write_program(subject: FlameSubject, checkout: Checkout, folder: Path) -> None:
+    """Write the files that the program opens relative to its working directory: head model, chart and eyelids."""
+    model = subject.model()
+    sparse = SparseMatrix(model["J_regressor"])
+    write_bytes(folder / MODEL_FILE, pickled({**model, "J_regressor": sparse}))
+    subject.official.write_eyelids(*(folder / name for name in EYELID_FILES))
+    chart = read_bytes(checkout.folder / CHART_FILE, "a texture chart", MOST_TEMPLATE)
+    write_bytes(folder / CHART_FILE, chart)
+
+
+def write_config(path: Path, checkout: Checkout, changes: Mapping[str, Any]) -> None:
+    """Write their published configuration with other values of some entries.
+
+    Raises `InputError` if the published one does not have each of them once.
+    """
+    source = checkout.folder / CONFIG
+    text = read_bytes(source, "a configuration", MOST_CONFIG).decode(errors="replace")
+    for name, value in changes.items():
+        text, count = re.subn(rf"^(\s*{name}:).*$", rf"\g<1> {value}", text, flags=re.MULTILINE)
+        if count != 1:
+            remedy = "Check out the commit that the adapter was written for."
+            raise InputError(source, name, "one entry", f"{count}", remedy)
+    write_text(path, text)
+
+
+def write_list(frames: Sequence[Listed], subject: FlameSubject, folder: Path) -> None:
+    """Write frames of one camera's intrinsics as a video.
+
+    Images have one pixel: their renderer loads them and uses none, and takes the size from the first frame's file.
+    """
+    cameras = cameras_at_rest(subject.posed, [(frame.camera, frame.pose) for frame in frames])
+    with grouped_writes():
+        for index, (frame, camera) in enumerate(zip(frames, cameras)):
+            write_placeholder(folder / image_name(index))
+            write_torch(folder / frame_name(index), subject.frame(camera, frame.pose))

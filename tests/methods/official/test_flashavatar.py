@@ -1,0 +1,343 @@
+"""FlashAvatar's adapter: images, masks and numbers that their loader reads, texts changed, renders read back by key."""
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from headbench.bench.contracts import Budget
+from headbench.bench.errors import InputError
+from headbench.bench.io.documents import read_json
+from headbench.bench.io.images import read_pixels
+from headbench.bench.process import ProgramError
+from headbench.datasets.head.subject import pose_in_head_frame
+from headbench.methods.official import needs
+from headbench.methods.official.config import FlashAvatarOfficialConfig
+from headbench.methods.official.flashavatar import method as implementation
+from headbench.methods.official.flashavatar.export import ParsingMasks, flame_subject, image_names
+from headbench.methods.official.flashavatar.method import FLASHAVATAR_REPOSITORY, SHRINK
+from headbench.methods.official.ga.windows import inside
+from headbench.methods.official.method import TRAINING_LOG, check_export
+from headbench.methods.official.spec import FLASHAVATAR_OFFICIAL
+from headbench.methods.official.surface import VisibleMesh
+from headbench.methods.official.video import cameras_at_rest
+from headbench.methods.shared.avatar_files import Subject
+
+from .flashavatar_repository import FlashAvatarStandIn, make_flashavatar_repository
+from .repository import (
+    BUDGET,
+    Killed,
+    check_tracked,
+    export,
+    fit,
+    kill_at,
+    read_tracked,
+    renders,
+    views,
+)
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@pytest.fixture
+def repository(tmp_path, video_clip):
+    folder = tmp_path / "repository"
+    return folder, make_flashavatar_repository(folder, len(video_clip.head.template))
+
+
+@pytest.fixture
+def method(repository):
+    return FlashAvatarStandIn(FlashAvatarOfficialConfig(str(repository[0]), sys.executable, repository[1]))
+
+
+@pytest.fixture
+def exported(method, video_clip, tmp_path):
+    return export(method, video_clip, tmp_path / "work")
+
+
+@pytest.fixture
+def avatar(method, video_clip, tmp_path):
+    return fit(method, video_clip, tmp_path / "a")
+
+
+def test_frames_are_rendered_under_their_keys(avatar, video_clip, monkeypatch):
+    monkeypatch.setattr(implementation, "PART", 8)  # more than one call for a camera's frames
+    assert {path.name for path in avatar.files()} == {"chkpnt.pth", "options.json", "subject.npz"}
+    wanted = views(video_clip, "self_reenactment", "novel_view", "train")
+    odd = next(iter(wanted))
+    wanted[odd] = (replace(wanted[odd][0], width=30), wanted[odd][1])  # and one of another size
+    done: list[int] = []
+    found = dict(avatar.render_listed(wanted, WHITE, lambda count, total, note="": done.append(count)))
+    assert found.keys() == wanted.keys()
+    assert done == sorted(done)
+    assert done[-1] == len(wanted)
+    for key, (camera, pose) in wanted.items():
+        frame = found[key]
+        assert frame.rgb.shape == (camera.height, camera.width, 3)
+        assert np.ptp(frame.rgb, axis=(0, 1)).max() == 0
+        levels = [60 + 20 * pose.expression[0], 60 + 200 * -np.sin(pose.jaw[0]), camera.K[0, 0]]
+        assert np.abs(frame.rgb[0, 0] * 255 - np.floor(levels)).max() < 1.01
+
+
+def test_the_program_gets_options_of_the_run(method, repository, video_clip, tmp_path):
+    calls = []
+    progress = lambda done, total, note="": calls.append((done, note))
+    fit(method, video_clip, tmp_path / "a", progress, seed=3)
+    frames = len(video_clip.splits["train"])
+    assert calls[-1][0] == frames + 20
+    assert (frames + 10, "loss 0.50000") in calls
+    log = (tmp_path / "a" / TRAINING_LOG).read_text()
+    width = inside(video_clip.cameras["00"]).camera.width
+    assert f"--idname head --image_res {width} --seed 3 --iterations 20 --white_background" in log
+    assert f"options 3 {frames} corner [255, 255, 255]" in log
+    record = read_json(tmp_path / "a" / "training.json")
+    assert record["official"]["commit"] == repository[1]
+    assert record["leaks"] == []
+    told = " ".join(record["differences"])
+    for word in ("network that parses faces", "principal point", "8 directions", "'test_num = 500' read as"):
+        assert word in told
+    assert not [*repository[0].rglob("__pycache__")]
+
+
+def test_a_green_background_is_that_of_their_default(method, video_clip, tmp_path):
+    green = np.array([0.0, 1.0, 0.0])
+    clip = replace(video_clip, background=green)
+    avatar = fit(method, clip, tmp_path / "a")
+    log = (tmp_path / "a" / TRAINING_LOG).read_text()
+    assert "--white_background" not in log
+    assert "corner [0, 255, 0]" in log
+    with pytest.raises(InputError, match="background that it was trained on"):
+        renders(avatar, clip, WHITE)
+    assert renders(avatar, clip, tuple(green))
+
+
+# ------------------------------------------------------------------ what the program is given
+
+
+def test_frames_begin_with_0_and_images_with_1(exported, video_clip):
+    work, images = exported
+    keys = sorted(video_clip.splits["train"], key=lambda key: (key.timestep, key.camera))
+    check_export(work, images, video_clip)
+    tracked = work.program / "metrical-tracker/output/head/checkpoint"
+    assert sorted(path.name for path in tracked.iterdir()) == [f"{n:05d}.frame" for n in range(len(keys))]
+    data = work.program / "dataset/head"
+    for name, suffixes in (
+        ("imgs", [".jpg"]),
+        ("alpha", [".jpg"]),
+        ("parsing", ["_mouth.png", "_neckhead.png"]),
+    ):
+        made = sorted(path.name for path in (data / name).iterdir())
+        assert made == [f"{n:05d}{suffix}" for n in range(1, len(keys) + 1) for suffix in suffixes]
+    for number, key in enumerate(keys):
+        assert {images[f"program/{place}"] for place in image_names("head", number)} == {key}
+        found = read_tracked(tracked / f"{number:05d}.frame")
+        window = inside(video_clip.cameras[key.camera])
+        assert check_tracked(found, video_clip, key, window) < 0.05  # a part of a pixel is taken up by a turn
+        middle = np.array([window.camera.width, window.camera.height]) / 2
+        assert np.array_equal(found.K[:2, 2], middle), "which their code takes it to be"
+
+
+def test_images_are_the_frames_around_the_principal_point(exported, video_clip):
+    work, images = exported
+    for number in range(len(images) // 4):
+        image, alpha, head, mouth = (read_pixels(work.program / name) for name in image_names("head", number))
+        key = images[f"program/{image_names('head', number)[0]}"]
+        window = inside(video_clip.cameras[key.camera])
+        mask = window.cut(video_clip.masks[key])
+        assert np.array_equal(alpha, mask)
+        share = mask[..., None] / 255
+        truth = window.cut(video_clip.images[key])[..., ::-1]
+        on_black = np.clip(truth - (1 - share) * 255 * video_clip.background, 0, 255 * share)
+        assert np.abs(image * share - on_black).max() < 0.51
+        for parsed in (head, mouth):
+            assert set(np.unique(parsed)) <= {0, 255}
+            assert not parsed[mask == 0].any()
+
+
+def test_masks_of_head_and_mouth_are_those_of_the_mesh(method, video_clip):
+    """Of triangles that nothing is in front of: lips are mouth, the forehead is head alone, the boundary neither."""
+    head = video_clip.head
+    subject = flame_subject(Subject.of(video_clip), head, method.inspect())
+    masks = ParsingMasks(head, subject)
+    frames = [(video_clip.cameras[name], video_clip.poses[t]) for name, t in (("00", 0), ("01", 3))]
+    counts = np.zeros(3, int)
+    for camera, (_, pose) in zip(cameras_at_rest(subject.posed, frames), frames):
+        large = camera.resized(16 * camera.width, 16 * camera.height)
+        whole = np.full((large.height, large.width), 255, np.uint8)
+        inside_head, mouth = masks.of(pose, large, whole)
+        mesh = subject.posed.meshes([pose_in_head_frame(pose)])[0]
+        world = large.world_to_camera
+        points = mesh[head.faces].mean(1) @ world[:3, :3].T + world[:3, 3]
+        columns, rows = ((points @ large.K.T)[:, :2] / points[:, 2:]).T.astype(int)
+        surface = VisibleMesh(head, subject.posed).seen(pose, large, whole)
+        first = np.full(whole.shape, -1)
+        first[surface.rows, surface.columns] = surface.triangles
+        shown = first[rows, columns] == np.arange(len(points))
+        lips, forehead, boundary = (
+            shown & np.isin(head.faces, head.regions[name]).any(1)
+            for name in ("lips", "forehead", "boundary")
+        )
+        counts += [lips.sum(), forehead.sum(), boundary.sum()]
+        assert mouth[rows[lips], columns[lips]].all()
+        assert not mouth[rows[forehead], columns[forehead]].any()
+        assert inside_head[rows[forehead], columns[forehead]].all()
+        assert not inside_head[rows[boundary], columns[boundary]].any()
+        # Beside the mesh: hair above it, shoulders below it.
+        assert inside_head[0, large.width // 2]
+        assert not inside_head[-1, large.width // 2]
+    assert counts.min() > 10
+
+
+def test_head_model_regions_and_eyelids_are_the_clips_own(exported, repository, video_clip):
+    work, _ = exported
+    for index, side in enumerate("lr"):
+        name = f"flame/blendshapes/{side}_eyelid.npy"
+        assert np.array_equal(np.load(work.program / name), video_clip.head.eyelid_basis[..., index])
+        assert not np.load(repository[0] / name).any()
+    for name in ("flame/FlameMesh.obj", "scene/__init__.py", "train.py"):
+        assert (work.program / name).read_bytes() == (repository[0] / name).read_bytes()
+
+
+# ------------------------------------------------------------------ what happens where it fails
+
+
+def test_trainings_that_fail_say_so(method, video_clip, faults_are_found, tmp_path):
+    faults = {"crash": "exit code 1.*out of memory", "no checkpoint": "no whole avatar.*chkpnt20.pth"}
+    for name, expected in faults.items():
+        faults_are_found({name: expected}, lambda name=name: fit(method, video_clip, tmp_path / name).files())
+
+
+def test_a_killed_training_begins_anew_on_its_export(method, video_clip, behave, tmp_path):
+    behave("hang")
+    with pytest.raises(Killed):
+        fit(method, video_clip, tmp_path / "a", kill_at(5, video_clip))
+    behave("")
+    calls = []
+    assert fit(method, video_clip, tmp_path / "a", lambda done, *_: calls.append(done)).files()
+    assert min(calls) > len(video_clip.splits["train"]), "the export was kept"
+    found = re.findall(r"^finds (.*)", (tmp_path / "a" / TRAINING_LOG).read_text(), re.MULTILINE)
+    assert found == ["[]", "[]"], "nothing of the killed training is left"
+
+
+def test_renders_that_are_not_what_was_listed_are_found(avatar, faults_are_found, video_clip):
+    faults = {
+        "crash in rendering": "exit code 1.*out of memory",
+        "one too few": r"lacks 1 of 6 renders, first 000001.png \(toy/",
+        "other size": r"expected \d+x\d+ pixels, found \d+x\d+",
+        "reversed": "the mark of frame 0",
+    }
+    faults_are_found(faults, lambda: renders(avatar, video_clip))
+
+
+@pytest.mark.parametrize(
+    ("case", "expected"),
+    [
+        ("mask", "a mask"),
+        ("background", r"white, or green \(0, 1, 0\)"),
+        ("intrinsics", "camera 01: expected size and intrinsics of camera 00"),
+        ("pixels", "square pixels"),
+        ("boundary", r"regions\[boundary\].*FLAME_masks.pkl"),
+        ("topology", "FlameMesh.obj has.*Refit the capture to FLAME 2020"),
+        ("frames", "at most 7 training frames"),
+    ],
+)
+def test_clips_that_their_code_cannot_take_are_refused(method, repository, video_clip, case, expected):
+    clip, cameras, head = video_clip, video_clip.cameras, video_clip.head
+    if case == "mask":
+        clip = replace(clip, masks=dict.fromkeys(clip.masks))
+    elif case == "background":
+        clip = replace(clip, background=np.zeros(3))
+    elif case in ("intrinsics", "pixels"):
+        name, place = ("01", (0, 0)) if case == "intrinsics" else ("02", (1, 1))
+        K = cameras[name].K.copy()
+        K[place] *= 1.05
+        clip = replace(clip, cameras={**cameras, name: replace(cameras[name], K=K)})
+    elif case == "boundary":
+        regions = {name: members for name, members in head.regions.items() if name != "boundary"}
+        clip = replace(clip, head=replace(head, regions=regions))
+    else:
+        path = repository[0] / ("flame/FlameMesh.obj" if case == "topology" else "scene/__init__.py")
+        path.write_text(
+            path.read_text().replace("max_train_num = 10000", "max_train_num = 7") + "\nv 0 0 0\n"
+        )
+    with pytest.raises(InputError, match=expected):
+        method.check(clip, BUDGET)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"commit": "0" * 40}, "expected commit 000000000000, found commit"),
+        ({"checkout": "/nowhere"}, "no such folder.*git clone.*USTC3DV/FlashAvatar-code"),
+        ({"python": ""}, "settings.flashavatar-official.python="),
+        ({"device": "cpu-shim"}, "device: expected cuda"),
+    ],
+)
+def test_faults_of_settings_are_named_before_any_work(method, video_clip, changes, expected):
+    method.config = replace(method.config, **changes)
+    with pytest.raises(InputError, match=expected):
+        method.check(video_clip, BUDGET)
+
+
+def test_missing_weights_are_named_before_any_work(method, video_clip, tmp_path, monkeypatch):
+    repository = replace(FLASHAVATAR_REPOSITORY, modules=("torch",))
+    monkeypatch.setattr(FlashAvatarStandIn, "repository", repository)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "hub"))
+    with pytest.raises(InputError, match=r"No such file.*vgg16-397923af\.pth.*VGG's weights: run python -c"):
+        method.check(video_clip, BUDGET)
+    weights = tmp_path / "hub/hub/checkpoints/vgg16-397923af.pth"
+    weights.parent.mkdir(parents=True)
+    weights.write_bytes(b"")
+    monkeypatch.setattr(needs, "FlashAvatarOfficial", FlashAvatarStandIn)
+    (_, environment) = needs.flashavatar(method.config, "cpu")
+    assert "CUDA build of PyTorch" in environment.remedy or environment.found
+
+
+def test_another_source_than_that_of_the_commit_is_refused(method, repository, video_clip, tmp_path):
+    path = repository[0] / "scene/__init__.py"
+    path.write_text(path.read_text().replace("test_num = 500", "test_num = 400"))
+    with pytest.raises(ProgramError, match="expected .test_num = 500., found none"):
+        fit(method, video_clip, tmp_path / "a")
+
+
+def test_checkpoints_lose_their_optimisers_and_nothing_else(tmp_path):
+    def trained(*values):
+        parameters = [torch.nn.Parameter(value) for value in values]
+        optimiser = torch.optim.Adam(parameters)
+        sum(parameter.sum() for parameter in parameters).backward()
+        optimiser.step()
+        return parameters, optimiser
+
+    network, first = trained(torch.arange(4.0))
+    splats, second = trained(torch.arange(3.0), torch.ones(2))
+    path = tmp_path / "chkpnt20.pth"
+    state = ({"weight": network[0].detach()}, first.state_dict())
+    torch.save((state, (3, *splats, second.state_dict(), 0), 20), path)
+    before = [value.detach().clone() for value in (*network, *splats)]
+    size = path.stat().st_size
+    subprocess.run([sys.executable, "-c", SHRINK, str(path)], check=True)
+    (net, lean), (degree, *found, leaner, scale), iteration = torch.load(path, weights_only=True)
+    assert path.stat().st_size < size
+    assert (degree, scale, iteration) == (3, 0, 20)
+    assert [torch.equal(a, b) for a, b in zip(before, (net["weight"], *found), strict=True)] == [True] * 3
+    for optimiser, values in ((first, lean), (second, leaner)):
+        assert values["state"] == {}
+        optimiser.load_state_dict(values)  # as their renderer does
+
+
+def test_presets_and_needs_are_those_of_the_spec():
+    assert set(FLASHAVATAR_OFFICIAL.presets) == {"smoke", "demo", "fast", "paper"}
+    assert FLASHAVATAR_OFFICIAL.presets["paper"]["budget"] == {"iterations": 150_000}
+    assert FLASHAVATAR_OFFICIAL.monocular
+    assert FLASHAVATAR_OFFICIAL.head_models == ("flame2020",)
+    assert [need.found for need in needs.flashavatar(FlashAvatarOfficialConfig(), "cpu")] == ["", ""]
+    compile(FLASHAVATAR_REPOSITORY.trial, "trial", "exec")
+
+
+def test_a_budget_in_seconds_is_refused(method, video_clip):
+    with pytest.raises(InputError, match="only iterations"):
+        method.check(video_clip, Budget(seconds=5.0))
