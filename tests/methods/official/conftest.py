@@ -28,7 +28,7 @@ def official_clip(head):
 
 @pytest.fixture(scope="session")
 def video_clip():
-    """Twelve training frames of two equal cameras and three of another, eyelids, and a boundary below the neck."""
+    """Twelve training frames of two equal cameras, a held-out one of other intrinsics, eyelids, and a lower end of the neck."""
     plain = toy_head(16, eyelids=True)
     boundary = np.flatnonzero(plain.template[:, 1] < -0.1)
     clip = toy_clip(

@@ -132,7 +132,7 @@ assert (output / "model.ply").read_bytes() == b"splats" and args.alpha
 frames, images, K, size = load_video(Path(config["data_dir"]) / args.subject)
 assert images[0].size == (1, 1)
 (output / "render_image").mkdir()
-for index, frame in enumerate(frames[::-1] if behaviour == "reversed" else frames):
+for index, frame in enumerate(frames):
     if behaviour == "crash in rendering":
         raise RuntimeError("CUDA out of memory")
     width, height = size[0] - (behaviour == "other size"), size[1]
