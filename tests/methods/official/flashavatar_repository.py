@@ -37,34 +37,31 @@ def tensor(path):
 class Scene_mica:
     def __init__(self, datadir, mica_datadir, train_type, white_background):
         self.bg_image = torch.zeros((3, 512, 512))
-        if white_background:
-            self.bg_image[:, :, :] = 1
-        else:
-            self.bg_image[1, :, :] = 1
+        self.bg_image[:] = np.reshape([white_background, 1, white_background], (3, 1, 1))
         checkpoints = os.path.join(mica_datadir, "checkpoint")
         self.N_frames = len(os.listdir(checkpoints))
         test_num = 500
         max_train_num = 10000
-        train_num = min(max_train_num, self.N_frames - test_num)
+        numbers = list(range(self.N_frames))
+        held_out = self.N_frames - test_num
+        assert held_out >= 0
+        numbers = numbers[:held_out][:max_train_num] if train_type == 0 else numbers[held_out:]
         first = read(os.path.join(checkpoints, "00000.frame"))
         self.width, self.height = first["img_size"]
         self.K = first["opencv"]["K"][0]
-        numbers = range(train_num) if train_type == 0 else range(self.N_frames - test_num, self.N_frames)
-        self.cameras = []
+        self.cameras = [self.load(number, checkpoints, datadir) for number in numbers]
+
+    def load(self, number, checkpoints, folder):
+        frame = read(os.path.join(checkpoints, "%05d.frame" % number))
         sizes = {"shape": 300, "exp": 100, "jaw": 6, "eyes": 12, "eyelids": 2}
-        for number in numbers:
-            frame = read(os.path.join(checkpoints, str(number).zfill(5) + ".frame"))
-            shapes = {name: array.shape for name, array in frame["flame"].items()}
-            assert shapes == {name: (1, size) for name, size in sizes.items()}
-            name = str(number + 1).zfill(5)
-            image = tensor(os.path.join(datadir, "imgs", name + ".jpg"))
-            alpha = tensor(os.path.join(datadir, "alpha", name + ".jpg"))
-            head = tensor(os.path.join(datadir, "parsing", name + "_neckhead.png"))
-            mouth = tensor(os.path.join(datadir, "parsing", name + "_mouth.png"))
-            image = image * alpha + self.bg_image * (1 - alpha)
-            image = image * head + self.bg_image * (1 - head)
-            assert image.shape == (3, self.height, self.width) and mouth.shape == head.shape == alpha.shape
-            self.cameras.append((image, frame))
+        shapes = {name: array.shape for name, array in frame["flame"].items()}
+        assert shapes == {name: (1, size) for name, size in sizes.items()}
+        names = ("imgs/%05d.jpg", "alpha/%05d.jpg", "parsing/%05d_neckhead.png", "parsing/%05d_mouth.png")
+        image, alpha, head, mouth = (tensor(os.path.join(folder, name % (number + 1))) for name in names)
+        for mask in (alpha, head):
+            image = self.bg_image + mask * (image - self.bg_image)
+        assert image.shape == (3, self.height, self.width) and mouth.shape == head.shape == alpha.shape
+        return image, frame
 """
 
 COMMON = """

@@ -11,7 +11,7 @@ from headbench.methods.official.rgbavatar.method import RGBAvatarOfficial
 
 from .repository import committed
 
-CONFIG = """data_dir: /somewhere/INSTA # Please set your own dataset path
+CONFIG = """data_dir: /somewhere/INSTA # a comment
 output_dir: ./output/
 template_type: Flame
 
