@@ -127,6 +127,7 @@ def recommend(settings: RecommendSettings, progress: Progress = no_progress) -> 
         "not_told_apart": None if alike is None else sorted(alike - {best}),
         "subjects_needed": needed,
         "fitting": {name: fmean(choice.quality.values()) for name, choice in fitting.items()},
+        "by_cost": {cost: best_by_cost(choices, cost, subjects, sign) for cost in COSTS},
         "held_out": trials,
         "against_always": always,
         "without": without,
@@ -193,6 +194,22 @@ def read_choices(
 def best_of(choices: Mapping[str, Choice], subjects: Sequence[str], sign: float) -> str:
     """The choice with the best mean over some subjects; the first of equal ones."""
     return max(choices, key=lambda name: sign * fmean(choices[name].quality[subject] for subject in subjects))
+
+
+def best_by_cost(
+    choices: Mapping[str, Choice], cost: str, subjects: Sequence[str], sign: float
+) -> list[tuple[float, str]]:
+    """The choice that is best up to each cost, largest over subjects, by rising cost; choices whose cost is unknown are left out."""
+    known = {name: each for name, each in choices.items() if cost in each.costs}
+    at = {name: max(each.costs[cost][subject] for subject in subjects) for name, each in known.items()}
+    steps: list[tuple[float, str]] = []
+    for name in sorted(known, key=lambda name: (at[name], name)):
+        better = best_of(
+            {best: known[best] for best in (name, *(last for _, last in steps[-1:]))}, subjects, sign
+        )
+        if better == name and (not steps or known[name].quality != known[steps[-1][1]].quality):
+            steps.append((at[name], name))
+    return steps
 
 
 def held_out(
@@ -321,6 +338,13 @@ def _text(
     parts = [
         f"Recommended for {_limits(limits)}: {best}. Mean over {len(subjects)} subjects, {task}; costs are the largest of a subject.",
         pipe_table(lines),
+    ]
+    by_cost = data["by_cost"]
+    assert isinstance(by_cost, dict)
+    parts += [
+        f"By {UNITS[cost]} alone, all choices: {', '.join(f'{name} from {at:.3g}' for at, name in steps)}."
+        for cost, steps in by_cost.items()
+        if steps
     ]
     alike = data["not_told_apart"]
     if alike is None:

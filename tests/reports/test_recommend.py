@@ -13,6 +13,7 @@ from headbench.reports.recommend import (
     Choice,
     RecommendSettings,
     against_always,
+    best_by_cost,
     best_of,
     held_out,
     recommend,
@@ -115,6 +116,21 @@ def test_held_out_subjects_are_judged_by_the_others_alone():
     assert [trial.choice for trial in trials] == ["a"] * 5 + ["b"]
     assert [trial.loss for trial in trials] == [1.0] * 5 + [9.0]
     assert held_out(choices, {}, SUBJECTS[:1], 1.0) == []
+
+
+def test_the_best_choice_up_to_each_cost():
+    made = {
+        "small": (29.0, 1),
+        "worse": (28.0, 2),
+        "middle": (30.0, 4),
+        "equal": (30.0, 5),
+        "large": (31.0, 8),
+    }
+    choices = {name: choice([quality] * 6, megabytes=size) for name, (quality, size) in made.items()}
+    choices["unknown"] = choice([50.0] * 6)
+    found = best_by_cost(choices, "megabytes", SUBJECTS, 1.0)
+    assert found == [(1, "small"), (4, "middle"), (8, "large")]
+    assert best_by_cost(choices, "megabytes", SUBJECTS, -1.0) == [(1, "small"), (2, "worse")]
 
 
 def test_a_choice_that_exceeds_a_limit_has_no_loss():
