@@ -61,7 +61,7 @@ def test_the_first_batches_have_what_is_there():
     assert sorted(OnlineBatches((4, 2, 0), 10, 25, seed=0).batch(1)) == [0, 2, 4]
 
 
-def test_timesteps_arrive_in_order_and_blendshapes_train_from_the_start(clip):
+def test_timesteps_arrive_in_order(clip):
     config = RGBAvatarConfig(**{**SMALL, "online": True, "together": 1, "batch": 2, "join": 20})
     training = RGBAvatarTraining(clip, config, "cpu", 0)
     training.begin(Timeline(24, 24))
