@@ -173,6 +173,10 @@ def read_choices(
             for cost, (name, factor) in COSTS.items():
                 source = record.name if derived and cost == "seconds" else own
                 found = _costs(run.rows, source, name)
+                if cost == "seconds" and not found:
+                    found = {
+                        subject: value / factor for subject, value in _recorded_seconds(run, source).items()
+                    }
                 known_costs = costs.setdefault(label, {}).setdefault(cost, {})
                 known_costs.update({subject: factor * value for subject, value in found.items()})
     choices, without = {}, []
@@ -298,6 +302,18 @@ def _costs(rows: Rows, label: str, metric: str) -> dict[str, float]:
         for subject, own in found.groupby("subject")
         if (own["status"] == "ok").all()
     }
+
+
+def _recorded_seconds(run: RunData, label: str) -> dict[str, float]:
+    """Largest training time of each subject over the seeds, from the records of the trainings, where the rows have none (a curve)."""
+    found = {}
+    for subject in sorted(run.rows.subjects):
+        cells = [run.folder.cell(subject, label, seed) for seed in run.manifest.configuration.seeds]
+        records = [record for cell in cells if (record := cell.step("fit")) is not None]
+        known = [record["seconds"] for record in records if "seconds" in record]
+        if known and len(known) == len(cells):
+            found[subject] = max(known)
+    return found
 
 
 UNITS = {"seconds": "s of training", "megabytes": "MB", "milliseconds": "ms a frame"}

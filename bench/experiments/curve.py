@@ -25,7 +25,7 @@ from .curve_settings import PICTURES, SECONDS, CurveSettings
 from .held_out import CAMERA, TIMESTEPS, count_of
 
 log = logging.getLogger(__name__)
-METRICS: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "primitives", "training_time")
+METRICS: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "primitives")
 """Metrics of a curve, independent of the run's, as defined by the canonical profile."""
 
 
