@@ -13,6 +13,7 @@ import tyro
 from ..bench.contracts import Progress, no_progress
 from ..bench.engine.scoring import FULL
 from ..bench.errors import InputError
+from ..bench.progress import counted
 from ..bench.rows import ALL, Rows
 from ..bench.specs import CommandResult, MetricSpec
 from .aggregate import subject_means, whole_images
@@ -182,10 +183,12 @@ def read_choices(
     choices, without = {}, []
     for label, values in quality.items():
         if set(values) != everybody:
-            without.append(f"{label}: no {metric_name} of {len(everybody - set(values))} subjects")
+            without.append(f"{label}: no {metric_name} of {counted(len(everybody - set(values)), 'subject')}")
             continue
         unknown = {name: len(everybody - set(costs[label][name])) for name in limits}
-        without += [f"{label}: no measured {name} of {n} subjects" for name, n in unknown.items() if n]
+        without += [
+            f"{label}: no measured {name} of {counted(n, 'subject')}" for name, n in unknown.items() if n
+        ]
         choices[label] = Choice(
             values, {name: own for name, own in costs[label].items() if set(own) >= everybody}
         )
@@ -352,7 +355,7 @@ def _text(
         shown = [f"{max(costs[cost].values()):.3g}" if cost in costs else "–" for cost in COSTS]
         lines.append([name, f"{fmean(fitting[name].quality.values()):.{metric.digits}f}", *shown])
     parts = [
-        f"Recommended for {_limits(limits)}: {best}. Mean over {len(subjects)} subjects, {task}; costs are the largest of a subject.",
+        f"Recommended for {_limits(limits)}: {best}. Mean over {counted(len(subjects), 'subject')}, {task}; costs are the largest of a subject.",
         pipe_table(lines),
     ]
     by_cost = data["by_cost"]
@@ -365,7 +368,8 @@ def _text(
     alike = data["not_told_apart"]
     if alike is None:
         parts.append(
-            f"{len(subjects)} subjects are too few to tell these methods apart: {data['subjects_needed']} are needed."
+            f"It takes {data['subjects_needed']} subjects to tell these methods apart; there {'is' if len(subjects) == 1 else 'are'} "
+            f"{len(subjects)}."
         )
     elif alike:
         assert isinstance(alike, list)

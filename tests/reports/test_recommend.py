@@ -208,7 +208,7 @@ def test_choices_without_a_measured_cost_are_named(tmp_path, write_manifest):
     write_manifest(folder, METRICS[:1] + METRICS[3:], {"known": None, "unknown": None}, {"novel_view": "p"})
     result = asked(str(folder.root), seconds=100.0)
     assert list(result.data["fitting"]) == ["known"]
-    assert "Left out: unknown: no measured seconds of 1 subjects." in result.text
+    assert "Left out: unknown: no measured seconds of 1 subject." in result.text
 
 
 def test_training_times_of_a_curve_are_those_of_its_records(tmp_path, write_manifest):
