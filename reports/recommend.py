@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import tyro
 
@@ -17,6 +18,7 @@ from ..bench.progress import counted
 from ..bench.rows import ALL, Rows
 from ..bench.specs import CommandResult, MetricSpec
 from .aggregate import subject_means, whole_images
+from .pareto.points import pareto_front
 from .runs import RunData, RunSet, training_labels
 from .statistics.comparisons import best_set
 from .writers import pipe_table
@@ -145,8 +147,8 @@ def read_choices(
 
     Conditions that change what a method is trained on are no choices. Raises `InputError` as `recommend` does.
     """
-    RunSet.read(folders)  # whether they belong together
-    runs = [RunData.read(folder) for folder in folders]
+    runs = tuple(RunData.read(folder) for folder in folders)
+    RunSet.joined(runs)  # whether they belong together
     quality: dict[str, dict[str, float]] = {}
     costs: dict[str, dict[str, dict[str, float]]] = {}
     everybody: set[str] = set()
@@ -206,17 +208,11 @@ def best_of(choices: Mapping[str, Choice], subjects: Sequence[str], sign: float)
 def best_by_cost(
     choices: Mapping[str, Choice], cost: str, subjects: Sequence[str], sign: float
 ) -> list[tuple[float, str]]:
-    """The choice that is best up to each cost, largest over subjects, by rising cost; choices whose cost is unknown are left out."""
-    known = {name: each for name, each in choices.items() if cost in each.costs}
-    at = {name: max(each.costs[cost][subject] for subject in subjects) for name, each in known.items()}
-    steps: list[tuple[float, str]] = []
-    for name in sorted(known, key=lambda name: (at[name], name)):
-        better = best_of(
-            {best: known[best] for best in (name, *(last for _, last in steps[-1:]))}, subjects, sign
-        )
-        if better == name and (not steps or known[name].quality != known[steps[-1][1]].quality):
-            steps.append((at[name], name))
-    return steps
+    """The choices that no other beats in both, by rising cost, the largest over subjects; those whose cost is unknown are left out."""
+    known = [name for name, each in choices.items() if cost in each.costs]
+    at = [max(choices[name].costs[cost][subject] for subject in subjects) for name in known]
+    means = [sign * fmean(choices[name].quality[subject] for subject in subjects) for name in known]
+    return [(at[index], known[index]) for index in pareto_front(at, means)]
 
 
 def held_out(
@@ -240,7 +236,7 @@ def held_out(
 
 def against_always(
     choices: Mapping[str, Choice], costs: Sequence[str], subjects: Sequence[str], sign: float
-) -> dict[str, object] | None:
+) -> dict[str, Any] | None:
     """What following recommendations gains over one choice for all budgets, on subjects that were left out.
 
     Budgets are the largest costs of each choice over the other subjects. The one choice is the best on average; where it does
@@ -341,12 +337,10 @@ def _nearest(choices: Mapping[str, Choice], limits: Mapping[str, float]) -> str:
 
 
 def _text(
-    data: Mapping[str, object], fitting: Mapping[str, Choice], subjects: Sequence[str], metric: MetricSpec
+    data: Mapping[str, Any], fitting: Mapping[str, Choice], subjects: Sequence[str], metric: MetricSpec
 ) -> str:
     unit = f" {metric.unit}" if metric.unit else ""
     limits, best = data["limits"], data["recommended"]
-    assert isinstance(limits, dict)
-    assert isinstance(best, str)
     task = str(data["task"]).replace("_", " ")
     lines = [["method", f"{metric.label}{unit}", *(UNITS[name] for name in COSTS)], [":--", *["--:"] * 4]]
     sign = 1.0 if metric.higher_is_better else -1.0
@@ -359,7 +353,6 @@ def _text(
         pipe_table(lines),
     ]
     by_cost = data["by_cost"]
-    assert isinstance(by_cost, dict)
     parts += [
         f"By {UNITS[cost]} alone, all choices: {', '.join(f'{name} from {at:.3g}' for at, name in steps)}."
         for cost, steps in by_cost.items()
@@ -372,12 +365,10 @@ def _text(
             f"{len(subjects)}."
         )
     elif alike:
-        assert isinstance(alike, list)
         parts.append(f"Not told apart from it (sign-flip tests, Holm, 5 %): {', '.join(alike)}.")
     else:
         parts.append("No other method that fits can be the best (sign-flip tests, Holm, 5 %).")
     trials = data["held_out"]
-    assert isinstance(trials, list)
     if trials:
         same = sum(trial.choice == best for trial in trials)
         losses = [trial.loss for trial in trials if trial.loss is not None]
@@ -391,7 +382,7 @@ def _text(
             f"the best choice for the subject, beyond a limit for {len(trials) - len(losses)}."
         )
     always = data["against_always"]
-    if isinstance(always, dict) and always["gains"]:
+    if always is not None and always["gains"]:
         gains = list(always["gains"].values())
         spread = f"from {min(gains):+.{metric.digits}f} to {max(gains):+.{metric.digits}f} by subject"
         parts.append(
@@ -401,5 +392,4 @@ def _text(
             f"{always['always']}, and the most frugal choice where that does not fit."
         )
     without = data["without"]
-    assert isinstance(without, list)
     return "\n\n".join([*parts, *(f"Left out: {each}." for each in without)])

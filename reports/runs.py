@@ -205,8 +205,12 @@ class RunSet:
         """
         if not folders:
             raise InputError("runs", "", "at least one folder", "none")
-        runs = tuple(RunData.read(folder) for folder in folders)
-        return cls.of_runs(_with_one_protocol(runs), training_labels(runs)).of(part)
+        return cls.joined(tuple(RunData.read(folder) for folder in folders)).of(part)
+
+    @classmethod
+    def joined(cls, runs: tuple[RunData, ...]) -> RunSet:
+        """Runs that were read, with one protocol and labels of their own; see `read`."""
+        return cls.of_runs(_with_one_protocol(runs), training_labels(runs))
 
     @classmethod
     def of_runs(cls, runs: tuple[RunData, ...], labels: Sequence[Mapping[str, str]]) -> RunSet:

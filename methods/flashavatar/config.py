@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from ..shared.config import check_at_least_one
+
 
 @dataclass(frozen=True)
 class FlashAvatarConfig:
@@ -79,9 +81,8 @@ class FlashAvatarConfig:
     checkpoint_every_s: float = 120.0
 
     def __post_init__(self) -> None:
-        for name in ("schedule_length", "samples", "layers", "hidden", "sh_every", "min_sh_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
+        check_at_least_one(self, "schedule_length", "samples", "layers")
+        check_at_least_one(self, "hidden", "sh_every", "min_sh_every")
         if not 0 < self.initial_opacity < 1 or not 0 < self.final_rate <= 1:
             raise ValueError("initial_opacity must lie between 0 and 1, and final_rate in (0, 1]")
         for name, most in (("frequencies", 16), ("layers", 100), ("hidden", 1_024), ("sh_degree", 3)):

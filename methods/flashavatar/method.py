@@ -6,6 +6,7 @@ Xiang et al., "FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Em
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -14,14 +15,7 @@ from torch import Tensor
 from ...bench.contracts import FloatArray, HeadPose
 from ..avatars.compact.offsets import read_offsets
 from ..avatars.harmonics import turn_harmonics
-from ..shared.avatar_files import (
-    COMPACT_FILE,
-    SUBJECT_FILE,
-    Subject,
-    finish_fit,
-    read_shared_head,
-    read_subject,
-)
+from ..shared.avatar_files import Subject, finish_fit, read_stored
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.networks import tracked_inputs
@@ -64,14 +58,8 @@ class FlashAvatarAvatar(StoredSplatAvatar):
     @classmethod
     def read(cls, folder: Path, device: str) -> FlashAvatarAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        head, coded = read_shared_head(folder), folder / COMPACT_FILE
-        if coded.exists():
-            files = [coded]
-            subject, trained = read_offsets(coded, head, device)
-        else:
-            files = [folder / AVATAR_FILE, folder / SUBJECT_FILE]
-            subject = read_subject(folder / SUBJECT_FILE, head)
-            trained = read_avatar(folder / AVATAR_FILE, head, device)
+        readers = partial(read_avatar, device=device), partial(read_offsets, device=device)
+        files, head, subject, trained = read_stored(folder, AVATAR_FILE, *readers)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
         return cls(files, mesh, subject, trained, device)
 

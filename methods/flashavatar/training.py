@@ -12,6 +12,7 @@ from ...bench.contracts import BoolArray, Camera, Clip, FloatArray
 from ..ops.harmonics import coefficient_count
 from ..ops.mesh import TriangleFrames
 from ..ops.photometric import photometric_loss
+from ..ops.splats import unturned
 from ..shared.avatar_files import clip_mesh
 from ..shared.image_training import ImageTrainer, Initial
 from ..shared.networks import initial_network, layer_names, tracked_inputs
@@ -45,7 +46,7 @@ class FlashAvatarTraining(ImageTrainer):
     def __init__(self, clip: Clip, config: FlashAvatarConfig, device: str, seed: int):
         keys = clip.splits["train"]
         super().__init__(clip, config, ShuffledEpochs(len(keys), seed), device)
-        self._config, self._device = config, device
+        self._config = config
         mesh = clip_mesh(clip, device)
         faces, vertices = np.asarray(clip.head.faces), mesh.canonical.cpu().numpy().astype(np.float64)
         self.points = poisson_disk(vertices, faces, np.arange(len(faces)), config.samples, seed)
@@ -116,12 +117,10 @@ class FlashAvatarTraining(ImageTrainer):
     def _initial(self, distances: FloatArray, seed: int) -> Initial:
         """Grey splats as large as the distance to their neighbours, and a random network."""
         config, count = self._config, len(distances)
-        quats = torch.zeros(count, 4)
-        quats[:, 0] = 1
         log_scales = torch.from_numpy(np.log(distances)).float()[:, None].repeat(1, 3)
         initial = {
             "log_scales": (log_scales, config.scale_lr),
-            "quats": (quats, config.rotation_lr),
+            "quats": (unturned(count), config.rotation_lr),
             "opacities": (torch.full((count,), logit(config.initial_opacity)), config.opacity_lr),
             "sh_dc": (torch.zeros(count, 3), config.sh_dc_lr),
             "sh_rest": (
@@ -134,7 +133,7 @@ class FlashAvatarTraining(ImageTrainer):
             for names in layer_names(config.layers + 1):
                 network[names[-1]].zero_()
         initial |= {name: (value, config.network_lr) for name, value in network.items()}
-        return {name: (value.to(self._device), rate) for name, (value, rate) in initial.items()}
+        return initial
 
 
 def image_loss(image: Tensor, truth: Tensor, mouth: Tensor | None, config: FlashAvatarConfig) -> Tensor:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from ...bench.contracts import FloatArray, HeadPose, no_stage
+from ...datasets.head.arrays import HeadArrays
 from ..avatars.compact.blended import read_blended
 from ..avatars.harmonics import turn_harmonics
 from ..ops.harmonics import sh_degree
-from ..shared.avatar_files import COMPACT_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
+from ..shared.avatar_files import Subject, read_stored
 from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
 from .blendshapes import PointMotions, PosedAttributes, Rig, apply_pose
 from .storage import AVATAR_FILE, Stored, read_avatar
@@ -32,15 +34,12 @@ class GBSAvatar(StoredSplatAvatar):
     @classmethod
     def read(cls, folder: Path, device: str) -> GBSAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        head, coded = read_shared_head(folder), folder / COMPACT_FILE
-        if coded.exists():
-            files = [coded]
-            subject, stored = read_blended(coded, head, device)
-        else:
-            files = [folder / AVATAR_FILE, folder / SUBJECT_FILE]
-            subject = read_subject(folder / SUBJECT_FILE, head)
-            expressions = head.expression_basis.shape[2]
-            stored = read_avatar(folder / AVATAR_FILE, len(head.faces), expressions, device)
+
+        def exact(path: Path, head: HeadArrays) -> Stored:
+            return read_avatar(path, len(head.faces), head.expression_basis.shape[2], device)
+
+        coded = partial(read_blended, device=device)
+        files, head, subject, stored = read_stored(folder, AVATAR_FILE, exact, coded)
         rig = Rig(head, subject.shape, subject.static_offset, stored.points, stored.expressions, device)
         return cls(files, subject, rig, stored, device)
 

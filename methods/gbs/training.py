@@ -14,6 +14,7 @@ from ...datasets.head.arrays import HeadArrays
 from ...datasets.head.geometry import triangle_areas
 from ..ops.harmonics import initial_coefficients
 from ..ops.photometric import photometric_loss
+from ..ops.splats import unturned
 from ..shared.avatar_files import Subject
 from ..shared.image_training import Initial
 from ..shared.loop import recomposited
@@ -213,14 +214,12 @@ class GBSTraining(SplatTrainer):
         columns = [torch.full((width,), rates[name] / RATE) for name, width in widths.items()]
         self._column_scales = torch.cat(columns).to(device)
         harmonics = initial_coefficients(count, config.sh_degree, torch_generator(seed, "sh"))
-        quats = torch.zeros(count, 4)
-        quats[:, 0] = 1
         log_scales = torch.from_numpy(np.log(start.spacing)).float()[:, None].repeat(1, 3)
         opacities = torch.full((count,), logit(settings.initial_opacity))
         splats = {
             "means": (self.rig.rest.clone(), settings.position_lr),
             "log_scales": (log_scales.to(device), settings.scale_lr),
-            "quats": (quats.to(device), settings.rotation_lr),
+            "quats": (unturned(count).to(device), settings.rotation_lr),
             "opacities": (opacities.to(device), settings.opacity_lr),
             "sh_dc": (harmonics["sh_dc"].to(device), config.sh_dc_lr),
             "sh_rest": (harmonics["sh_rest"].to(device), config.sh_rest_lr),

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from ..shared.config import check_at_least_one
+
 
 @dataclass(frozen=True)
 class GHAConfig:
@@ -161,13 +163,8 @@ class GHAConfig:
     checkpoint_every_s: float = 120.0
 
     def __post_init__(self) -> None:
-        counts = (
-            *("schedule_length", "landmarks", "grid_vertices", "features"),
-            *("mesh_views", "mesh_size", "landmark_timesteps"),
-        )
-        for name in counts:
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
+        check_at_least_one(self, "schedule_length", "landmarks", "grid_vertices", "features")
+        check_at_least_one(self, "mesh_views", "mesh_size", "landmark_timesteps")
         if not 3 <= self.channels <= 32:
             raise ValueError(f"channels must be 3 to 32, found {self.channels}")
         if not 0 < self.mesh_fraction < 1 or not 0 < self.initial_opacity < 1:

@@ -14,6 +14,7 @@ from ...bench.contracts import Camera
 from ...bench.errors import InputError
 from ...bench.native.dispatch import to_device
 from ..ops.photometric import photometric_loss
+from ..ops.splats import unturned
 from ..shared.loop import TrainingImages
 from ..shared.optimisation import Optimiser, logit
 from ..shared.schedule import Sampler, Timeline, log_linear, torch_generator
@@ -183,13 +184,11 @@ def first_points(
     places = points.cpu().double().numpy()
     distances = cKDTree(places).query(places, k=min(NEIGHBOURS + 1, len(places)))[0].reshape(len(places), -1)
     squared = np.maximum(np.square(distances[:, 1:]).mean(1), SMALLEST_SQUARED)
-    quats = torch.zeros(len(points), 4, device=device)
-    quats[:, 0] = 1
     return {
         "points": points,
         "features": torch.atanh(features.clamp(-ALMOST_ONE, ALMOST_ONE)),
         "log_scales": torch.as_tensor(0.5 * np.log(squared)).to(points)[:, None].repeat(1, 3),
-        "quats": quats,
+        "quats": unturned(len(points)).to(device),
         "opacities": torch.full((len(points),), logit(config.initial_opacity), device=device),
     }
 

@@ -26,6 +26,8 @@ MOST = {
 }
 """Upper limits of settings; the published values are far below."""
 
+from ..shared.config import check_at_least_one
+
 
 @dataclass(frozen=True)
 class InstaConfig:
@@ -159,13 +161,11 @@ class InstaConfig:
             raise ValueError(f"step must be at least {STEP_MIN} metres, found {self.step}")
         if not 2 <= self.base_resolution <= self.finest_resolution:
             raise ValueError("base_resolution must be at least 2 and at most finest_resolution")
-        for name in (
-            *("schedule_length", "levels", "hidden", "density_layers", "color_layers", "latent"),
-            *("occupancy_resolution", "occupancy_every", "samples_per_iteration", "first_rays"),
-            *("images_per_iteration", "round_samples"),
-        ):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
+        check_at_least_one(self, "schedule_length", "levels", "hidden", "density_layers")
+        check_at_least_one(self, "color_layers", "latent", "occupancy_resolution", "occupancy_every")
+        check_at_least_one(
+            self, "samples_per_iteration", "first_rays", "images_per_iteration", "round_samples"
+        )
         for name in ("step", "shell_outside", "shell_inside", "prior_scale", "huber", "learning_rate"):
             # The kernel computes in float32, where smaller numbers are 0.
             if not getattr(self, name) >= SMALLEST:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ...bench.specs import MethodSpec
+from ..flashavatar.spec import FLASHAVATAR
 from ..ga.spec import GA, SHORT
 from ..gbs.spec import GBS
 from ..gbs.spec import SHORT as GBS_SHORT
@@ -157,17 +158,11 @@ FLASHAVATAR_OFFICIAL = MethodSpec(
         "smoke": {"budget": {"iterations": 60}},
         "demo": {"budget": {"iterations": 2_000}},
         "fast": {"budget": {"iterations": 4_000}},
-        "paper": {"budget": {"iterations": 150_000}},
+        "paper": {"budget": FLASHAVATAR.presets["paper"]["budget"]},
     },
     head_models=("flame2020",),
     monocular=True,
     native=False,
-    source="FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Embedding, CVPR 2024, arXiv 2312.02214",
-    bibtex=r"""@inproceedings{xiang2024flashavatar,
-  title     = {{FlashAvatar}: High-fidelity Head Avatar with Efficient {Gaussian} Embedding},
-  author    = {Xiang, Jun and Gao, Xuan and Guo, Yudong and Zhang, Juyong},
-  booktitle = {Proceedings of the IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
-  year      = {2024},
-  eprint    = {2312.02214},
-}""",
+    source=FLASHAVATAR.source,
+    bibtex=FLASHAVATAR.bibtex,
 )

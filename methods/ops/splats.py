@@ -197,6 +197,13 @@ class _DirectionsTo(torch.autograd.Function):
         return by_means, None, None, None, None
 
 
+def unturned(count: int) -> Tensor:
+    """(N, 4) quaternions of no rotation, real part first."""
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1
+    return quats
+
+
 def left_products(quaternions: Tensor) -> Tensor:
     """(F, 4, 4) matrices: ``left_products(q) @ p`` is the Hamilton product q p, real parts first."""
     w, x, y, z = quaternions.unbind(1)

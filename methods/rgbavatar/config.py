@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..shared.config import check_at_least_one
+
 INPUTS = ("expression", "neck", "jaw", "eyes", "eyelids", "translation")
 """Tracked parameters that the weights may depend on."""
 
@@ -35,7 +37,7 @@ class RGBAvatarConfig:
     hidden : int
         Width of the network's two hidden layers.
     batch, together : int
-        Images of a step, and how many of them show the same timestep, if it has so many cameras. The published
+        Images of a step, and how many of them show the same timestep, if it has that many cameras. The published
         batch draws its images independently, as 1 does.
     online : bool
         Train as if the images, sorted by timestep, arrived one after another, and draw mostly the newest
@@ -102,18 +104,8 @@ class RGBAvatarConfig:
     checkpoint_every_s: float = 120.0
 
     def __post_init__(self) -> None:
-        for name in (
-            "schedule_length",
-            "samples",
-            "blendshapes",
-            "hidden",
-            "batch",
-            "together",
-            "color_every",
-            "trained_per_arrival",
-        ):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, found {getattr(self, name)}")
+        check_at_least_one(self, "schedule_length", "samples", "blendshapes", "hidden")
+        check_at_least_one(self, "batch", "together", "color_every", "trained_per_arrival")
         if not 0 < self.initial_opacity < 1 or not 0 < self.final_rate <= 1:
             raise ValueError("initial_opacity must lie between 0 and 1, and final_rate in (0, 1]")
         if (

@@ -6,6 +6,7 @@ Li et al., "RGBAvatar: Reduced Gaussian Blendshapes for Online Modeling of Head 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +15,7 @@ from torch import Tensor
 
 from ...bench.contracts import FloatArray, HeadPose
 from ..avatars.compact.reduced import read_reduced
-from ..shared.avatar_files import (
-    COMPACT_FILE,
-    SUBJECT_FILE,
-    Subject,
-    finish_fit,
-    read_shared_head,
-    read_subject,
-)
+from ..shared.avatar_files import Subject, finish_fit, read_stored
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.networks import tracked_inputs
@@ -61,14 +55,8 @@ class RGBAvatarAvatar(StoredSplatAvatar):
     @classmethod
     def read(cls, folder: Path, device: str) -> RGBAvatarAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        head, coded = read_shared_head(folder), folder / COMPACT_FILE
-        if coded.exists():
-            files = [coded]
-            subject, stored = read_reduced(coded, head, device)
-        else:
-            files = [folder / AVATAR_FILE, folder / SUBJECT_FILE]
-            subject = read_subject(folder / SUBJECT_FILE, head)
-            stored = read_avatar(folder / AVATAR_FILE, head, device)
+        readers = partial(read_avatar, device=device), partial(read_reduced, device=device)
+        files, head, subject, stored = read_stored(folder, AVATAR_FILE, *readers)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
         return cls(files, mesh, subject, stored, device)
 

@@ -26,7 +26,7 @@ class OnlineBatches(Batches):
     order : Sequence[int]
         Indices of the images in the order of their arrival.
     size : int
-        Images of a batch; fewer before so many have arrived.
+        Images of a batch; fewer before that many have arrived.
     trained : int
         Images trained on for each that arrives.
     """

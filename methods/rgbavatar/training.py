@@ -13,7 +13,7 @@ from ...bench.contracts import Clip, FrameKey
 from ...bench.native.dispatch import to_device
 from ..ops.harmonics import C0
 from ..ops.photometric import photometric_loss
-from ..ops.splats import WorldSplats
+from ..ops.splats import WorldSplats, unturned
 from ..shared.avatar_files import clip_mesh
 from ..shared.image_training import ImageTrainer, Initial
 from ..shared.loop import recomposited
@@ -71,18 +71,17 @@ class RGBAvatarTraining(ImageTrainer):
         self.points = poisson_disk(vertices, faces, np.arange(len(faces)), config.samples, seed)
         self._surface = Surface(mesh, self.points)
         self._tracked = TrainingPoses(clip, mesh)
-        self._row = self._tracked.row
         self._inputs = tracked_inputs(self._tracked.arguments, config.inputs)
         entry = 4 * (17 * len(faces) + 3 * len(self.points.triangles))
         self._surfaces = BoundedCache(self._posed, config.mesh_cache_mb * 2**20 // entry)
-        self._optimise(self._initial(device))
+        self._optimise(self._initial())
         self.colored = torch.zeros(len(self.points.triangles), dtype=torch.bool, device=device)
 
     def loss(self, iteration: int, index: int) -> Tensor:
         """Mean loss of the images of a batch; ``index`` is that of the first."""
         self._seen: list[tuple[WorldSplats, Tensor, View, Tensor]] = []
         batch = self._batches.batch(iteration)
-        rows = sorted({self._row[self.keys[image].timestep] for image in batch})
+        rows = sorted({self._tracked.row[self.keys[image].timestep] for image in batch})
         splats = dict(zip(rows, self._splats(iteration, rows)))
         placed = {
             row: (self._surface.place(self._surfaces(row), splats[row]), seen_colors(splats[row]["colors"]))
@@ -92,7 +91,7 @@ class RGBAvatarTraining(ImageTrainer):
         total = opacities.new_zeros(())
         for position, image in self._batches.positions(iteration):
             key = self.keys[image]
-            view, (world, colors) = self._views[key.camera], placed[self._row[key.timestep]]
+            view, (world, colors) = self._views[key.camera], placed[self._tracked.row[key.timestep]]
             pixels = self._images.get(position, image)
             truth, background = self._on_background(pixels, iteration, image)
             camera = view.camera
@@ -178,14 +177,13 @@ class RGBAvatarTraining(ImageTrainer):
                 truth = truth * (pixels[:, :, 3:] > 0.5)
             values = torch.zeros_like(sums).requires_grad_()
             camera = view.camera
-            with torch.enable_grad():
-                means, quats, scales, opacity = (part.detach() for part in (*world, opacities))
-                rendering = rasterize(
-                    *(means, quats, scales, opacity, values),
-                    *(view.world_to_camera, view.K, camera.width, camera.height),
-                    check_values=False,
-                )
-                (sums_of_view,) = torch.autograd.grad((rendering.image * truth).sum(), values)
+            means, quats, scales, opacity = (part.detach() for part in (*world, opacities))
+            rendering = rasterize(
+                *(means, quats, scales, opacity, values),
+                *(view.world_to_camera, view.K, camera.width, camera.height),
+                check_values=False,
+            )
+            (sums_of_view,) = torch.autograd.grad((rendering.image * truth).sum(), values)
             sums += sums_of_view
         new = (sums[:, 3] > self._config.color_weight) & ~self.colored
         rows = new.nonzero().squeeze(1)
@@ -194,20 +192,18 @@ class RGBAvatarTraining(ImageTrainer):
         # The step that follows does not move them.
         if parameter.grad is not None:
             parameter.grad[rows] = 0
-        for name, moment in self.optimiser.moments("colors").items():
-            if name == "exp_avg":
-                moment[rows] = 0
+        moments = self.optimiser.moments("colors")
+        if moments:
+            moments["exp_avg"][rows] = 0
         self.colored = self.colored | new
 
-    def _initial(self, device: str) -> Initial:
+    def _initial(self) -> Initial:
         """Grey splats of equal size on the surface, blendshapes of zero, a random network."""
         config, count = self._config, len(self.points.triangles)
         scale = 1e-3 * config.initial_scale_mm * (PUBLISHED_SAMPLES / count) ** 0.5
-        quats = torch.zeros(count, 4)
-        quats[:, 0] = 1
         splats = {
             "means": (torch.zeros(count, 3), config.position_lr),
-            "quats": (quats, config.rotation_lr),
+            "quats": (unturned(count), config.rotation_lr),
             "colors": (torch.zeros(count, 3), config.color_lr),
             "log_scales": (torch.full((count, 3), float(np.log(scale))), config.scale_lr),
             "opacities": (torch.full((count,), logit(config.initial_opacity)), config.opacity_lr),
@@ -224,5 +220,4 @@ class RGBAvatarTraining(ImageTrainer):
         sizes = (self._inputs.shape[1], config.hidden, config.hidden, config.blendshapes)
         network = initial_network(sizes, self._seed)
         layers = {name: (value, config.network_lr) for name, value in network.items()}
-        initial = {**splats, **shapes, **layers}
-        return {name: (value.to(device), rate) for name, (value, rate) in initial.items()}
+        return {**splats, **shapes, **layers}

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from ...datasets.head.arrays import STORED, HeadArrays, read_head, save_head
 from .loop import Fit, TrainingSummary
 from .subject_mesh import SubjectMesh
 
+Content = TypeVar("Content")
 COMPACT_FILE = "compact.safetensors"
 """The coded file of an avatar (`avatars.compact`), which stands in place of the files of its training."""
 RECORDED_LOSSES = 200  # maximum number of losses in an avatar's record
@@ -93,6 +94,32 @@ def read_subject(path: Path, head: HeadAsset) -> Subject:
     if version != head.version:
         raise InputError(path, "head_model", repr(head.version), repr(version)[:80])
     return Subject(name, version, arrays["shape"], arrays["static_offset"])
+
+
+class ReadAvatar(NamedTuple, Generic[Content]):
+    """An avatar's folder, read: its files, head model, subject, and the content of its file."""
+
+    files: list[Path]
+    head: HeadArrays
+    subject: Subject
+    content: Content
+
+
+def read_stored(
+    folder: Path,
+    name: str,
+    read_exact: Callable[[Path, HeadArrays], Content],
+    read_coded: Callable[[Path, HeadArrays], tuple[Subject, Content]],
+) -> ReadAvatar[Content]:
+    """Read the coded file of a folder, or the file ``name`` that a training left and its subject.
+
+    Raises `InputError` for damaged or foreign files.
+    """
+    head, coded = read_shared_head(folder), folder / COMPACT_FILE
+    if coded.exists():
+        return ReadAvatar([coded], head, *read_coded(coded, head))
+    files = [folder / name, folder / SUBJECT_FILE]
+    return ReadAvatar(files, head, read_subject(files[1], head), read_exact(files[0], head))
 
 
 class RefinedTracking:

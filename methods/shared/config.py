@@ -14,6 +14,14 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 
+def check_at_least_one(settings: object, *names: str) -> None:
+    """Raise `ValueError` for the first of some settings that is below 1; None is allowed."""
+    for name in names:
+        value = getattr(settings, name)
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be at least 1, found {value}")
+
+
 @dataclass(frozen=True)
 class DensifiedTraining:
     """Training and density control of splats: 3DGS, section 5, with GaussianAvatars' values.
@@ -94,16 +102,8 @@ class DensifiedTraining:
     checkpoint_every_s: float = 120.0
 
     def __post_init__(self) -> None:
-        for name in (
-            "schedule_length",
-            "densify_every",
-            "reset_every",
-            "min_densify_every",
-            "min_reset_every",
-        ):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, found {value}")
+        check_at_least_one(self, "schedule_length", "densify_every", "reset_every")
+        check_at_least_one(self, "min_densify_every", "min_reset_every")
         if not 0 < self.initial_opacity < 1 or not 0 < self.reset_opacity < 1:
             raise ValueError("initial_opacity and reset_opacity must lie between 0 and 1")
         if not 0 < self.final_rate <= 1:

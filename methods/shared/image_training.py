@@ -44,7 +44,7 @@ class ImageTrainer:
     def __init__(
         self, clip: Clip, settings: TrainingRun, sampler: Sampler, device: str, *, masks: bool = False
     ):
-        self._run_settings, self._sampler = settings, sampler
+        self._run_settings, self._sampler, self._device = settings, sampler, device
         self.keys: Sequence[FrameKey] = clip.splits["train"]
         self._images = TrainingImages(clip, self.keys, sampler, device, masks=masks)
         self.cameras = {key.camera: clip.cameras[key.camera] for key in self.keys}
@@ -52,9 +52,9 @@ class ImageTrainer:
         self._background = torch.tensor(np.asarray(clip.background), dtype=torch.float32, device=device)
 
     def _optimise(self, initial: Initial) -> None:
-        """Set the initial tensors."""
+        """Set the initial tensors, on the device of the training."""
         self.optimiser = Optimiser(
-            {name: nn.Parameter(value) for name, (value, _) in initial.items()},
+            {name: nn.Parameter(value.to(self._device)) for name, (value, _) in initial.items()},
             {name: rate for name, (_, rate) in initial.items()},
         )
         self._rates = {name: rate for name, (_, rate) in initial.items()}
@@ -98,7 +98,12 @@ class ImageTrainer:
         """Train to the end of the budget; see `train`."""
         length, seconds = self._run_settings.schedule_length, self._run_settings.checkpoint_every_s
         try:
-            return train(self, self._sampler, fit, published_length=length, checkpoint_every_s=seconds)
+            return train(
+                *(self, self._sampler, fit),
+                published_length=length,
+                checkpoint_every_s=seconds,
+                cost_growth=self.cost_growth,
+            )
         finally:
             self.close()
 

@@ -103,6 +103,7 @@ def train(
     published_length: int,
     checkpoint_every_s: float,
     began: float | None = None,
+    cost_growth: float = COST_GROWTH,
 ) -> TrainingSummary:
     """Train until the budget is spent; continue from the checkpoint in ``fit.out`` if it is of the same run.
 
@@ -118,6 +119,9 @@ def train(
     began : float | None
         Reading of the clock before ``trainable`` was prepared, so that the preparation counts as
         training time; by default counting begins here.
+    cost_growth : float
+        Estimated cost of a late step relative to an early one, to turn a budget in seconds into iterations; 1 for a
+        constant number of splats.
 
     Raises
     ------
@@ -139,7 +143,7 @@ def train(
             assert budget.seconds is not None
             left = budget.seconds if began is None else budget.seconds - (clock() - began)
             with torch_on_one_thread(compiled):
-                total = _estimate(trainable, sampler, left, published_length, clock, wait)
+                total = _estimate(trainable, sampler, left, published_length, cost_growth, clock, wait)
         trainable.begin(Timeline(total, published_length))
     else:
         with reading(path, "the state of this method", "state", REMEDY):
@@ -199,14 +203,14 @@ def _estimate(
     sampler: Sampler,
     seconds: float,
     published_length: int,
+    cost_growth: float,
     clock: Callable[[], float],
     wait: Callable[[], None],
 ) -> int:
     """Number of iterations in a number of seconds, at least one, estimated from a few steps without effect."""
     trainable.begin(Timeline(published_length, published_length))
-    growth = getattr(trainable, "cost_growth", COST_GROWTH)
-    # With a fixed number of splats, steps late in the run have all parts of the model and cost the same.
-    step_number = 1 if growth > 1 else published_length
+    # With a constant number of splats, steps late in the run have all parts of the model.
+    step_number = 1 if cost_growth > 1 else published_length
     durations = []
     for step in range(1, TIMED_STEPS + 2):
         wait()
@@ -217,7 +221,7 @@ def _estimate(
         durations.append(clock() - before)
     # The first step pays for lazy initialisation; the median of the rest is robust to an outlier.
     typical = sorted(durations[1:])[TIMED_STEPS // 2]
-    return max(1, int(seconds / max(typical * growth, 1e-6)))
+    return max(1, int(seconds / max(typical * cost_growth, 1e-6)))
 
 
 class TrainingImages:

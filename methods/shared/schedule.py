@@ -182,7 +182,7 @@ class GroupedBatches(Batches):
     size : int
         Images of a batch; the last one of an epoch may have fewer.
     together : int
-        Number of images of a group that follow each other, if it has so many.
+        Number of images of a group that follow each other, if it has that many.
     """
 
     def __init__(self, groups: Sequence[int], size: int, together: int, seed: int):

@@ -10,7 +10,7 @@ from torch import Tensor
 from ...bench.contracts import Camera, Clip
 from ..ops.mesh import TriangleFrames
 from ..ops.photometric import photometric_loss
-from ..ops.splats import WorldSplats
+from ..ops.splats import WorldSplats, unturned
 from ..splats import rasterize
 from ..splats.request import Rendering
 from .config import DensifiedTraining, SplatTraining
@@ -253,11 +253,9 @@ def splat_penalties(means: Tensor, log_scales: Tensor, visible: Tensor, settings
 def _initial_geometry(
     start: Start, settings: SplatTraining, extent: float
 ) -> dict[str, tuple[Tensor, float]]:
-    quats = start.means.new_zeros(len(start.means), 4)
-    quats[:, 0] = 1
     return {
         "means": (start.means, settings.position_lr * extent),
         "log_scales": (torch.zeros_like(start.means), settings.scale_lr),
-        "quats": (quats, settings.rotation_lr),
+        "quats": (unturned(len(start.means)).to(start.means), settings.rotation_lr),
         "opacities": (torch.logit(start.opacities), settings.opacity_lr),
     }

@@ -119,9 +119,7 @@ def read_blended(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Sto
     points = decode_points(arrays, head)
     count = len(points.triangles)
     classes = read_classes(arrays, "classes", count)
-    shapes = decode_shapes(arrays, classes, FLOOR)
-    if shapes["quats"].shape[1] != 4:
-        raise InputError(path, "rotations", f"shape (4, {count})", "3 components")
+    shapes = decode_shapes(arrays, classes, FLOOR, turned=True)
     check_sizes(path, torch.from_numpy(shapes["log_scales"]))
     dc, rest = decode_harmonics(arrays, classes)
     means = shapes["means"] + _rest(points, subject, head)

@@ -336,16 +336,19 @@ def encode_shapes(
     }, steps
 
 
-def decode_shapes(arrays: Arrays, classes: IntArray, floor: float = SIZE_FLOOR) -> dict[str, FloatArray]:
-    """``means``, ``log_scales``, ``quats`` and ``logits`` of `encode_shapes`."""
+def decode_shapes(
+    arrays: Arrays, classes: IntArray, floor: float = SIZE_FLOOR, *, turned: bool = False
+) -> dict[str, FloatArray]:
+    """``means``, ``log_scales``, ``quats`` and ``logits`` of `encode_shapes`; ``turned`` requires four components of rotations."""
     count, scale = len(classes), scale_of(classes, COARSEST_SHAPE)
     log_scales = arrays.decoded("log_scales", arrays.step("scales") * scale, 3, count)
     means = arrays.decoded(
         "positions", arrays.step("positions") * scale * splat_size(log_scales, floor), 3, count
     )
     rotations = arrays.decoded("rotations", arrays.step("rotations") * scale, None, count)
-    if len(rotations) not in (3, 4):
-        raise InputError(arrays.path, "rotations", f"shape (3 or 4, {count})", f"shape {rotations.shape}")
+    if len(rotations) not in ((4,) if turned else (3, 4)):
+        expected = f"shape ({'' if turned else '3 or '}4, {count})"
+        raise InputError(arrays.path, "rotations", expected, f"shape {rotations.shape}")
     quats = from_smallest_three(rotations.T) if len(rotations) == 3 else rotations.T
     logits = arrays.decoded("logits", arrays.step("opacities") * scale, count)
     return {"means": means.T, "log_scales": log_scales.T, "quats": quats, "logits": logits}

@@ -149,9 +149,7 @@ def _encode_splats(
 
 def _decode_splats(arrays: Arrays) -> FloatArray:
     classes = read_classes(arrays, "classes", None)
-    shapes = decode_shapes(arrays, classes, FLOOR)
-    if shapes["quats"].shape[1] != 4:
-        raise InputError(arrays.path, "rotations", "4 components", "3 components")
+    shapes = decode_shapes(arrays, classes, FLOOR, turned=True)
     if "exact_features" in arrays:
         features = arrays.floats("exact_features", None, len(classes)).T
     else:

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 
 from ....bench.contracts import FloatArray, HeadAsset
-from ....bench.errors import InputError
 from ...flashavatar.model import SETTINGS_KEY, TrainedSplats, rendering_of_text, rendering_text
 from ...shared.avatar_files import Subject
 from ...shared.networks import layer_names
@@ -71,9 +70,7 @@ def read_offsets(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Tra
     config = rendering_of_text(path, arrays.text.get(SETTINGS_KEY, ""))
     points = decode_points(arrays, head, BARYCENTRIC_STEP)
     classes = read_classes(arrays, "classes", len(points.triangles))
-    shapes = decode_shapes(arrays, classes, FLOOR)
-    if shapes["quats"].shape[1] != 4:
-        raise InputError(path, "rotations", f"shape (4, {len(classes)})", "3 components")
+    shapes = decode_shapes(arrays, classes, FLOOR, turned=True)
     dc, rest = decode_harmonics(arrays, classes)
     tensors = {"log_scales": shapes["log_scales"], "quats": shapes["quats"], "opacities": shapes["logits"]}
     tensors |= {"sh_dc": dc, "sh_rest": rest}

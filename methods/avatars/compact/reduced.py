@@ -100,9 +100,7 @@ def read_reduced(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Sto
     subject, inputs = decode_subject(arrays, head), input_names(path, arrays.text.get(INPUTS_KEY, ""))
     points = decode_points(arrays, head)
     classes = read_classes(arrays, "classes", len(points.triangles))
-    shapes = decode_shapes(arrays, classes, FLOOR)
-    if shapes["quats"].shape[1] != 4:
-        raise InputError(path, "rotations", f"shape (4, {len(classes)})", "3 components")
+    shapes = decode_shapes(arrays, classes, FLOOR, turned=True)
     check_sizes(path, torch.from_numpy(shapes["log_scales"]))
     colors, _ = decode_harmonics(arrays, classes)
     tensors = {name: shapes[name] for name in ("means", "quats", "log_scales")}

@@ -27,36 +27,19 @@ def coded_summary(step: float) -> str:
     return "quantised by visible effect, entropy-coded" + (f", steps times {step:g}" if step != 1 else "")
 
 
-def gbs_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
-    """The coded variants of an avatar of GaussianBlendshapes."""
-    return _variants("gbs.avatar", "GBSAvatar", folder, clip, device)
-
-
-def gha_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
-    """The coded variants of an avatar of Gaussian Head Avatar."""
-    return _variants("gha.avatar", "GHAAvatar", folder, clip, device)
-
-
-def insta_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
-    """The coded variants of an avatar of INSTA."""
-    return _variants("insta.avatar", "InstaAvatar", folder, clip, device)
-
-
-def rgbavatar_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
-    """The coded variants of an avatar of RGBAvatar."""
-    return _variants("rgbavatar.method", "RGBAvatarAvatar", folder, clip, device)
-
-
-def flashavatar_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
-    """The coded variants of an avatar of FlashAvatar."""
-    return _variants("flashavatar.method", "FlashAvatarAvatar", folder, clip, device)
-
-
 def _variants(module: str, name: str, folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
+    """The coded variants of an avatar of the class ``name`` in a module of `methods`, for `MethodSpec.variants`."""
     avatar_class = getattr(import_module(f"...{module}", __package__), name)
     for step in STEPS:
         make = partial(make_coded, avatar_class, folder, clip, device, step)
         yield Variant(coded_name(step), coded_summary(step), make)
+
+
+gbs_variants = partial(_variants, "gbs.avatar", "GBSAvatar")
+gha_variants = partial(_variants, "gha.avatar", "GHAAvatar")
+insta_variants = partial(_variants, "insta.avatar", "InstaAvatar")
+rgbavatar_variants = partial(_variants, "rgbavatar.method", "RGBAvatarAvatar")
+flashavatar_variants = partial(_variants, "flashavatar.method", "FlashAvatarAvatar")
 
 
 def make_coded(avatar_class: Any, folder: Path, clip: Clip, device: str, step: float, out: Path) -> Avatar:

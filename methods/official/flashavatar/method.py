@@ -22,7 +22,7 @@ from ...shared.loop import Fit
 from ..checkout import Checkout, Repository
 from ..config import FlashAvatarOfficialConfig
 from ..ga.export import check_mark_in
-from ..ga.head_files import EXPRESSION_SIZE
+from ..ga.head_files import padding_remarks
 from ..ga.method import copy_file
 from ..ga.windows import around, check_square_pixels, inside
 from ..in_parts import PartsMethod, RenderCall, in_parts, same_intrinsics
@@ -214,9 +214,7 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
             differences.append(
                 "their code assumes the principal point in the middle of the image: images are cropped accordingly"
             )
-        size = clip.head.expression_basis.shape[2]
-        if size < EXPRESSION_SIZE:
-            differences.append(f"an expression basis of {size} directions is padded with zeros")
+        differences += padding_remarks(clip.head)
         return {"leaks": [], "differences": differences}
 
 

@@ -53,6 +53,12 @@ LANDMARKS = 70
 MOST_TEMPLATE = 2**26
 
 
+def padding_remarks(head: HeadAsset) -> list[str]:
+    """A sentence for the record of an avatar if the expression basis of its head is padded."""
+    size = head.expression_basis.shape[2]
+    return [f"an expression basis of {size} directions is padded with zeros"] * (size < EXPRESSION_SIZE)
+
+
 @dataclass(frozen=True, eq=False)
 class OfficialHead:
     """A head model for their code: without teeth, with vertices in their order.

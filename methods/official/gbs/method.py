@@ -26,7 +26,7 @@ from ...shared.schedule import DensifySchedule, Timeline
 from ..checkout import Checkout, Repository
 from ..config import GBSOfficialConfig
 from ..ga.export import check_mark
-from ..ga.head_files import EXPRESSION_SIZE
+from ..ga.head_files import padding_remarks
 from ..ga.method import copy_file, rendered, trained
 from ..method import Listed, OfficialMethod, Patch, Workplace
 from ..spec import GBS_OFFICIAL
@@ -217,9 +217,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
             "frames are renumbered; those at the end, which their code holds out, are placeholders of one pixel",
             "the background is removed from partly covered pixels, and the static offset is part of the template",
         ]
-        if clip.head.expression_basis.shape[2] < EXPRESSION_SIZE:
-            size = clip.head.expression_basis.shape[2]
-            differences.append(f"an expression basis of {size} directions is padded with zeros")
+        differences += padding_remarks(clip.head)
         if self.config.commit and WITHOUT_FIX.startswith(self.config.commit):
             differences.append(
                 "a commit before the authors' fix of June 2025 (5017124), which they say matters for multi-view captures"

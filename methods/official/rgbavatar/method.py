@@ -19,7 +19,7 @@ from ...shared.loop import Fit
 from ...shared.schedule import Timeline
 from ..checkout import Checkout, Repository
 from ..config import RGBAvatarOfficialConfig
-from ..ga.head_files import EXPRESSION_SIZE
+from ..ga.head_files import padding_remarks
 from ..ga.method import copy_file
 from ..in_parts import PartsMethod, RenderCall, in_parts, same_intrinsics
 from ..method import Listed, Patch, Workplace
@@ -175,7 +175,5 @@ class RGBAvatarOfficial(PartsMethod[RGBAvatarOfficialConfig]):
             "colours of renders are limited to 0 to 255 before they are rounded down to 8 bits by their code",
             "their code sets no seed: a run with the same seed is a repetition",
         ]
-        size = clip.head.expression_basis.shape[2]
-        if size < EXPRESSION_SIZE:
-            differences.append(f"an expression basis of {size} directions is padded with zeros")
+        differences += padding_remarks(clip.head)
         return {"leaks": [], "differences": differences}

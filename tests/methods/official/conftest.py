@@ -9,7 +9,7 @@ from headbench.bench.process import ProgramError
 
 from ...datasets.head.toy import toy_head
 from ..toy_clip import toy_clip
-from .repository import lip_numbers, make_repository
+from .repository import export, fit, lip_numbers, make_repository
 
 OFFSETS = {"00": (0.0, 0.0), "01": (3.3, -2.2), "02": (-1.6, 4.1)}
 
@@ -51,6 +51,18 @@ def video_clip():
 def repository(tmp_path, head):
     """Folder and commit of the stand-in, whose lips have numbers that no vertex of the head has."""
     return tmp_path / "repository", make_repository(tmp_path / "repository", *lip_numbers(head))
+
+
+@pytest.fixture
+def exported(method, video_clip, tmp_path):
+    """What a method writes of the tracked video."""
+    return export(method, video_clip, tmp_path / "work")
+
+
+@pytest.fixture
+def avatar(method, video_clip, tmp_path):
+    """An avatar of the tracked video."""
+    return fit(method, video_clip, tmp_path / "a")
 
 
 @pytest.fixture

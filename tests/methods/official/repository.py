@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from headbench.bench.contracts import Budget, no_progress
@@ -19,7 +20,7 @@ from headbench.datasets.tracker_files.metrical import MEMBERS, metrical_frame
 from headbench.methods.official.config import GAOfficialConfig
 from headbench.methods.official.ga.method import GAOfficial
 from headbench.methods.official.gha.method import GHAOfficial
-from headbench.methods.official.method import Workplace
+from headbench.methods.official.method import TRAINING_LOG, Workplace
 from headbench.methods.official.tga.method import TGAOfficial
 
 BUDGET = Budget(iterations=20)
@@ -66,6 +67,18 @@ def kill_at(iteration, clip):
             raise Killed
 
     return progress
+
+
+def check_killed_training(method, clip, behave, folder):
+    """A training that is killed and started again keeps the export; returns the log of the second one."""
+    behave("hang")
+    with pytest.raises(Killed):
+        fit(method, clip, folder, kill_at(5, clip))
+    behave("")
+    calls = []
+    assert fit(method, clip, folder, lambda done, *_: calls.append(done)).files()
+    assert min(calls) > len(clip.splits["train"]), "the export was kept"
+    return (folder / TRAINING_LOG).read_text()
 
 
 def read_tracked(path):

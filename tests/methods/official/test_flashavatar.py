@@ -30,11 +30,9 @@ from headbench.methods.shared.avatar_files import Subject
 from .flashavatar_repository import FlashAvatarStandIn, make_flashavatar_repository
 from .repository import (
     BUDGET,
-    Killed,
+    check_killed_training,
     check_tracked,
-    export,
     fit,
-    kill_at,
     read_tracked,
     renders,
     views,
@@ -52,16 +50,6 @@ def repository(tmp_path, video_clip):
 @pytest.fixture
 def method(repository):
     return FlashAvatarStandIn(FlashAvatarOfficialConfig(str(repository[0]), sys.executable, repository[1]))
-
-
-@pytest.fixture
-def exported(method, video_clip, tmp_path):
-    return export(method, video_clip, tmp_path / "work")
-
-
-@pytest.fixture
-def avatar(method, video_clip, tmp_path):
-    return fit(method, video_clip, tmp_path / "a")
 
 
 def test_frames_are_rendered_under_their_keys(avatar, video_clip, monkeypatch):
@@ -211,15 +199,9 @@ def test_trainings_that_fail_say_so(method, video_clip, faults_are_found, tmp_pa
         faults_are_found({name: expected}, lambda name=name: fit(method, video_clip, tmp_path / name).files())
 
 
-def test_a_killed_training_begins_anew_on_its_export(method, video_clip, behave, tmp_path):
-    behave("hang")
-    with pytest.raises(Killed):
-        fit(method, video_clip, tmp_path / "a", kill_at(5, video_clip))
-    behave("")
-    calls = []
-    assert fit(method, video_clip, tmp_path / "a", lambda done, *_: calls.append(done)).files()
-    assert min(calls) > len(video_clip.splits["train"]), "the export was kept"
-    found = re.findall(r"^finds (.*)", (tmp_path / "a" / TRAINING_LOG).read_text(), re.MULTILINE)
+def test_a_killed_training_starts_again_on_its_export(method, video_clip, behave, tmp_path):
+    log = check_killed_training(method, video_clip, behave, tmp_path / "a")
+    found = re.findall(r"^finds (.*)", log, re.MULTILINE)
     assert found == ["[]", "[]"], "nothing of the killed training is left"
 
 

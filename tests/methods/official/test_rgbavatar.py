@@ -21,11 +21,10 @@ from headbench.methods.official.spec import RGBAVATAR_OFFICIAL
 
 from .repository import (
     BUDGET,
-    Killed,
+    check_killed_training,
     check_tracked,
     export,
     fit,
-    kill_at,
     read_tracked,
     renders,
     views,
@@ -43,16 +42,6 @@ def repository(tmp_path, video_clip):
 @pytest.fixture
 def method(repository):
     return RGBAvatarStandIn(RGBAvatarOfficialConfig(str(repository[0]), sys.executable, repository[1]))
-
-
-@pytest.fixture
-def exported(method, video_clip, tmp_path):
-    return export(method, video_clip, tmp_path / "work")
-
-
-@pytest.fixture
-def avatar(method, video_clip, tmp_path):
-    return fit(method, video_clip, tmp_path / "a")
 
 
 def test_frames_are_rendered_under_their_keys_on_any_ground(avatar, video_clip, monkeypatch):
@@ -159,15 +148,9 @@ def test_a_training_that_fails_says_so(method, video_clip, faults_are_found, tmp
     faults_are_found({behaviour: expected}, lambda: fit(method, video_clip, tmp_path / "a").files())
 
 
-def test_a_killed_training_begins_anew_on_its_export(method, video_clip, behave, tmp_path):
-    behave("hang")
-    with pytest.raises(Killed):
-        fit(method, video_clip, tmp_path / "a", kill_at(5, video_clip))
-    behave("")
-    calls = []
-    assert fit(method, video_clip, tmp_path / "a", lambda done, *_: calls.append(done)).files()
-    assert min(calls) > len(video_clip.splits["train"]), "the export was kept"
-    found = re.findall(r"^finds (\w+)", (tmp_path / "a" / TRAINING_LOG).read_text(), re.MULTILINE)
+def test_a_killed_training_starts_again_on_its_export(method, video_clip, behave, tmp_path):
+    log = check_killed_training(method, video_clip, behave, tmp_path / "a")
+    found = re.findall(r"^finds (\w+)", log, re.MULTILINE)
     assert found == ["False", "False"], "nothing of the killed training is left"
 
 

@@ -32,7 +32,7 @@ def test_samples_are_blue_noise_on_the_triangles_asked_for(ball):
     area = triangle_areas(vertices, faces[upper]).sum()
     nearest = cKDTree(positions).query(positions, k=2)[0][:, 1]
     assert nearest.min() >= RADIUS * np.sqrt(area / COUNT) * 0.999
-    # No hole: every point of the surface has a sample at hand; as candidates are few, a little beyond the disk's radius.
+    # No hole: every point of the surface has a sample nearby; as candidates are few, a little beyond the disk's radius.
     corners = vertices[faces[upper]]
     assert cKDTree(positions).query(corners.mean(1))[0].max() <= 1.3 * RADIUS * np.sqrt(area / COUNT)
 

@@ -132,3 +132,16 @@ def test_arrays_that_are_missing_or_cut_are_refused(trained, tmp_path):
                 continue
             # A table of one part less may be another avatar's, but never an error of another kind.
             assert name not in ("shape", "static_offset", "triangles", "positions", "logits")
+
+
+@pytest.mark.parametrize("trained", ["flashavatar", "gbs", "gha", "rgbavatar"], indirect=True)
+def test_rotations_of_three_components_are_refused(trained, tmp_path):
+    """Differences are added to these quaternions, so that their length counts."""
+    method, folder, avatar = trained
+    head = read_shared_head(folder)
+    write_coded(avatar, head, tmp_path, Precision(), None, None)
+    content = read_content(tmp_path / COMPACT_FILE)
+    arrays = {**content.arrays, "rotations": content.arrays["rotations"][:3]}
+    write_content(tmp_path / COMPACT_FILE, replace(content, arrays=arrays))
+    with pytest.raises(InputError, match=r"rotations: expected shape \(4, "):
+        method.load(tmp_path, device="cpu")
