@@ -75,15 +75,19 @@ def conditions(
 def marks(
     found: Mapping[str, Mapping[str, Conditions]], trivial: Sequence[str]
 ) -> dict[tuple[str, str], str]:
-    """The note for each metric and method whose time is not comparable with the others of its column."""
+    """The note for each metric and method whose time is not comparable with the others of its column.
+
+    The load is the highest of the column, so that its methods share a note.
+    """
     notes = {}
     for metric, by_method in found.items():
         places = [each.places for method, each in by_method.items() if method not in trivial and each.places]
         differ = len(set(places)) > 1
+        most = max((each.others for each in by_method.values()), default=0.0)
         for method, each in by_method.items():
             note = []
             if each.loaded:
-                note.append(f"Measured under load: other processes used up to {each.others:.2f} cores.")
+                note.append(f"Measured under load: other processes used up to {most:.2f} cores.")
             if differ and each.places and method not in trivial:
                 note.append(f"Measured on {each.text}; not comparable with other machines or thread counts.")
             if note:

@@ -255,28 +255,35 @@ def conclusions(runs: RunSet) -> str:
 
 
 def _conclusions(runs: RunSet, pairs: Sequence[PairedComparison]) -> str:
-    """A line for each task, equal conclusions of several metrics together."""
+    """A line for each task, methods and metrics of equal outcome together."""
     specs = {spec.name: spec for spec in runs.metrics}
     lines = []
     for task in dict.fromkeys(pair.task for pair in pairs):
-        found: dict[tuple[str, str], list[str]] = {}
+        metrics: dict[tuple[str, str], list[str]] = {}
         for pair in pairs:
             if pair.task == task:
-                said = (pair.second, _conclusion(pair, specs[pair.metric].unit))
-                found.setdefault(said, []).append(specs[pair.metric].label)
-        said_of = [f"{verdict} by {_listed(metrics)}" for (_, verdict), metrics in found.items()]
-        lines.append(f"- {TASK_TITLES.get(task, task)}: {'; '.join(said_of)}.")
+                spec = specs[pair.metric]
+                metrics.setdefault((_outcome(pair, spec.unit), pair.second), []).append(spec.label)
+        others: dict[tuple[str, str], list[str]] = {}
+        for (outcome, other), labels in metrics.items():
+            others.setdefault((outcome, _listed(labels)), []).append(f"`{other}`")
+        said = [
+            f"{outcome.format(others=_listed(names), are='are' if len(names) > 1 else 'is')} by {labels}"
+            for (outcome, labels), names in others.items()
+        ]
+        lines.append(f"- {TASK_TITLES.get(task, task)}: {'; '.join(said)}.")
     return "\n".join(lines)
 
 
-def _conclusion(pair: PairedComparison, unit: str) -> str:
+def _outcome(pair: PairedComparison, unit: str) -> str:
+    """A sentence on the first method and ``{others}``, with ``{are}`` where the verb follows these."""
     tested = equivalence_text(pair, unit, p=False)
     within = f" ({tested})" if tested else ""
-    if pair.verdict.endswith(" is better"):
-        first, second = f"`{pair.first}`", f"`{pair.second}`"
-        better, worse = (first, second) if pair.verdict.startswith(f"{pair.first} ") else (second, first)
-        return f"{better} is better than {worse}{within}"
-    return f"`{pair.first}` and `{pair.second}`: {pair.verdict}{within}"
+    if pair.verdict == f"{pair.first} is better":
+        return f"`{pair.first}` is better than {{others}}{within}"
+    if pair.verdict == f"{pair.second} is better":
+        return f"{{others}} {{are}} better than `{pair.first}`{within}"
+    return f"`{pair.first}` against {{others}}: {pair.verdict}{within}"
 
 
 def _listed(words: Sequence[str]) -> str:

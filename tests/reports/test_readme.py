@@ -28,46 +28,40 @@ def test_the_run_of_a_suite_is_published_without_folders(write_run, tmp_path, mo
     assert published.configuration.out == ""
 
 
+def pair(second="ga", metric="psnr", difference=1.0, p=0.01, **given):
+    """A comparison of `ours` with another method over ten subjects."""
+    values = tuple((f"s{n}", difference) for n in range(10))
+    settings = {"differences": values, "difference": difference, "p_holm": p, "family": 1, **given}
+    return PairedComparison("novel_view", metric, metric == "psnr", "ours", second, **settings)
+
+
 @pytest.mark.parametrize(
-    ("difference", "p", "said"),
+    ("pairs", "said"),
     [
-        (1.0, 0.01, "`ours` is better than `ga`"),
-        (-1.0, 0.01, "`ga` is better than `ours`"),
-        (1.0, 0.2, "`ours` and `ga`: cannot be told apart"),
+        ([pair()], "`ours` is better than `ga` by PSNR"),
+        ([pair(difference=-1.0)], "`ga` is better than `ours` by PSNR"),
+        ([pair(p=0.2)], "`ours` against `ga`: cannot be told apart by PSNR"),
+        (
+            [pair(difference=0.1, p=0.2, margin=0.3, p_equivalence_holm=0.01)],
+            "`ours` against `ga`: cannot be told apart (equivalent within 0.3) by PSNR",
+        ),
+        (
+            [pair(), pair("gha"), pair(metric="lpips", difference=-1.0), pair("gha", "lpips", -1.0)],
+            "`ours` is better than `ga` and `gha` by PSNR and LPIPS",
+        ),
+        (
+            [pair(difference=-1.0), pair("gbs", difference=-1.0), pair("gha"), pair("gbs", "lpips", p=0.2)],
+            "`ga` and `gbs` are better than `ours` by PSNR; `ours` is better than `gha` by PSNR; "
+            "`ours` against `gbs`: cannot be told apart by LPIPS",
+        ),
     ],
 )
-def test_conclusions_name_the_better_method(difference, p, said):
-    values = tuple((f"s{n}", difference) for n in range(10))
-    pair = PairedComparison(
-        "novel_view",
-        "psnr",
-        True,
-        "ours",
-        "ga",
-        differences=values,
-        difference=difference,
-        p_holm=p,
-        family=1,
-    )
-    assert readme._conclusion(pair, "dB") == said
-
-
-def test_a_conclusion_states_equivalence():
-    pair = PairedComparison(
-        *("novel_view", "psnr", True, "ours", "ga"),
-        differences=tuple((f"s{n}", 0.1) for n in range(10)),
-        difference=0.1,
-        p_holm=0.2,
-        family=1,
-        margin=0.3,
-        p_equivalence_holm=0.01,
-    )
-    assert readme._conclusion(pair, "dB") == (
-        "`ours` and `ga`: cannot be told apart (equivalent within 0.3 dB)"
-    )
+def test_conclusions_name_the_better_methods(pairs, said, write_run):
+    runs = RunSet.read([write_run("run", {"ga": 30.0, "ours": 31.0})])
+    assert readme._conclusions(runs, pairs) == f"- Novel view: {said}."
 
 
 def test_too_few_subjects_allow_no_conclusion(write_run):
     text = readme.conclusions(RunSet.read([write_run("run", {"ga": 30.0, "ours": 31.0})]))
-    assert "- Novel view: `ours` and `ga`: not testable with 4 subjects" in text
+    assert "- Novel view: `ours` against `ga`: not testable with 4 subjects" in text
     assert "is better" not in text
