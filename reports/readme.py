@@ -36,7 +36,7 @@ from .protocols import ProtocolsSettings, protocols_command
 from .runs import RunSet
 from .statistics.command import equivalence_text
 from .statistics.comparisons import PairedComparison, compare
-from .statistics.primary import primary_comparisons
+from .statistics.primary import PAIR, PRIMARY, primary_table
 from .suite.extremes import FOLDER as EXTREMES
 from .suite.extremes import read_extremes
 from .suite.suite import suite_report, suite_runs
@@ -227,14 +227,12 @@ def suite_block(root: Path, name: str = SUITE) -> str:
 
 
 def conclusions(runs: RunSet) -> str:
-    """What the rows allow to conclude about `OURS` and every other ranked method: Markdown lists, a line for each task.
+    """What the rows allow to conclude about `OURS` and every other ranked method: Markdown.
 
-    The primary endpoints come first; the other methods are compared in an exploratory way.
+    A table of the primary endpoints, then the other comparisons, which are exploratory, as a list with a line for each task.
     """
     runs = runs.by_camera
-    primary = primary_comparisons(runs)
-    tested = [pair for pair in primary if pair.p is not None]
-    known = {(pair.second, pair.task, pair.metric) for pair in tested}
+    primary = primary_table(runs)
     pairs = [(OURS, method) for method in runs.ranked if method != OURS]
     specs = [spec for spec in runs.metrics if spec.name in SHOWN]
     others = [
@@ -243,15 +241,17 @@ def conclusions(runs: RunSet) -> str:
         for pair in compare(
             runs.rows, pairs, task=task, metric=spec.name, higher_is_better=spec.higher_is_better
         )
-        if (pair.second, task, spec.name) not in known
+        if not (primary and (pair.first, pair.second) == PAIR and (task, spec.name) in PRIMARY)
     ]
     parts = [
-        (f"Primary endpoints, with Holm's correction over all {len(tested)}:", tested),
-        ("Exploratory, with Holm's correction for the pairs of each metric alone:", others),
+        ("Primary endpoints:", primary),
+        (
+            "Other comparisons, which are exploratory, with Holm's correction for the pairs of each metric alone:",
+            _conclusions(runs, others) if others else "",
+        ),
     ]
-    texts = [f"{title}\n\n{_conclusions(runs, found)}" for title, found in parts if found]
-    how = "Exact sign-flip tests over subjects, level 5%. They hold for these subjects and settings."
-    return "\n\n".join(["What may be concluded:", *texts, how])
+    texts = [f"{title}\n\n{text}" for title, text in parts if text]
+    return "\n\n".join([*texts, "All of this holds for these subjects and settings."])
 
 
 def _conclusions(runs: RunSet, pairs: Sequence[PairedComparison]) -> str:

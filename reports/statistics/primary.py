@@ -36,15 +36,11 @@ def primary_comparisons(runs: RunSet) -> list[PairedComparison]:
     return as_one_family(each for (each,) in found)
 
 
-def primary_section(runs: RunSet) -> str:
-    """The primary endpoints as Markdown, and what the other tests of a page are."""
+def primary_table(runs: RunSet) -> str:
+    """Differences, intervals and verdicts of the primary endpoints as a Markdown table; "" where the runs lack them."""
     found = primary_comparisons(runs)
-    exploratory = (
-        "All other tests on this page are exploratory: they are corrected over the comparisons of one metric and task alone, "
-        "those of the endpoints among them."
-    )
     if not found:
-        return f"## Primary endpoints\n\nNone: they compare `{PAIR[0]}` with `{PAIR[1]}`. {exploratory}"
+        return ""
     specs = {spec.name: spec for spec in runs.metrics}
     confidence = f"{100 * (1 - LEVEL):g} % interval"
     lines = [["endpoint", f"{PAIR[0]} - {PAIR[1]}", confidence, "p", "Holm", "", "equivalence"], ["---"] * 7]
@@ -59,10 +55,19 @@ def primary_section(runs: RunSet) -> str:
         bounds = "-" if c.low is None or c.high is None else f"{c.low:+.{digits}f}, {c.high:+.{digits}f}"
         numbers = [f"{c.difference:+.{digits}f}", bounds, f"{c.p:.4f}", f"{c.p_holm:.4f}"]
         lines.append([head, *numbers, c.verdict, equivalence_text(c, spec.unit)])
-    table = pipe_table(lines)
     how = (
         f"Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in found)} endpoints that can be tested; "
         "equivalence by two one-sided sign-flip tests, which assume that subjects differ symmetrically about the mean, Holm over "
-        f"these; level {LEVEL:.0%}. {exploratory}"
+        f"these; level {LEVEL:.0%}."
     )
-    return f"## Primary endpoints\n\n{table}\n\n{how}"
+    return f"{pipe_table(lines)}\n\n{how}"
+
+
+def primary_section(runs: RunSet) -> str:
+    """The primary endpoints as Markdown, and what the other tests of a page are."""
+    exploratory = (
+        "All other tests on this page are exploratory: they are corrected over the comparisons of one metric and task alone, "
+        "those of the endpoints among them."
+    )
+    table = primary_table(runs) or f"None: they compare `{PAIR[0]}` with `{PAIR[1]}`."
+    return f"## Primary endpoints\n\n{table} {exploratory}"
