@@ -2,7 +2,6 @@
 
 python -m headbench.reports.readme demo demo-output .
 python -m headbench.reports.readme suite suite-output .
-python -m headbench.reports.readme suite-2 suite-output .    # the second edition, until its subjects are measured
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
 from itertools import chain, product
 from pathlib import Path
 from typing import Any
@@ -45,8 +43,8 @@ from .writers import to_markdown
 
 GALLERY = "reports/gallery"
 PROTOCOLS = "protocols"
-SUITE, SECOND = "suite", "suite-2"
-"""Stored results of the suite in `GALLERY`: those of the README, and those of the second edition as far as they are measured."""
+SUITE = "suite"
+"""Stored results of the suite in `GALLERY`."""
 PICTURE = "contact_sheet.jpg"
 RESULTS = "results.md"
 MEASURED = "reports/measured.json"
@@ -54,7 +52,6 @@ MEASURED = "reports/measured.json"
 PAGES = {
     "demo": "docs/explanation/results.md",
     SUITE: "README.md",
-    SECOND: "docs/explanation/suite.md",
     PROTOCOLS: "docs/explanation/protocols.md",
 }
 """The page of each block, in the repository."""
@@ -75,9 +72,9 @@ def publish_demo(out: Path, root: Path) -> None:
     _write(root / PAGES["demo"], "demo", demo_block(target.root))
 
 
-def publish_suite(out: Path, root: Path, name: str = SUITE) -> None:
+def publish_suite(out: Path, root: Path) -> None:
     """Copy manifest and rows of a suite's run to the repository ``root``, and write its tables and block."""
-    target = root / GALLERY / name
+    target = root / GALLERY / SUITE
     for run in chain.from_iterable(suite_runs(out, base) for base in (RUN, SEEDS_RUN, LARGE_RUN)):
         place = target / run.relative_to(out)
         _copy(RunFolder(run), RunFolder(place))
@@ -86,7 +83,7 @@ def publish_suite(out: Path, root: Path, name: str = SUITE) -> None:
     write_text(target / RESULTS, suite_results(target))
     write_json(root / MEASURED, measured(target))
     _write(root / PAGES[PROTOCOLS], PROTOCOLS, protocols_block(target))
-    _write(root / PAGES[name], name, suite_block(root, name))
+    _write(root / PAGES[SUITE], SUITE, suite_block(root))
 
 
 def _copy(source: RunFolder, target: RunFolder) -> None:
@@ -201,10 +198,10 @@ def suite_options(folder: Path) -> tuple[str, ...]:
     return tuple(words)
 
 
-def suite_block(root: Path, name: str = SUITE) -> str:
+def suite_block(root: Path) -> str:
     """Return the block for stored results of the suite in the repository ``root``, with a link to all tables: Markdown."""
-    folder = root / GALLERY / name
-    results = os.path.relpath(folder / RESULTS, (root / PAGES[name]).parent)
+    folder = root / GALLERY / SUITE
+    results = os.path.relpath(folder / RESULTS, (root / PAGES[SUITE]).parent)
     folders = suite_runs(folder)
     runs = RunSet.read(folders)
     options = " ".join(suite_options(folder))
@@ -250,8 +247,7 @@ def conclusions(runs: RunSet) -> str:
             _conclusions(runs, others) if others else "",
         ),
     ]
-    texts = [f"{title}\n\n{text}" for title, text in parts if text]
-    return "\n\n".join([*texts, "All of this holds for these subjects and settings."])
+    return "\n\n".join(f"{title}\n\n{text}" for title, text in parts if text)
 
 
 def _conclusions(runs: RunSet, pairs: Sequence[PairedComparison]) -> str:
@@ -293,7 +289,6 @@ def _listed(words: Sequence[str]) -> str:
 PUBLISH: dict[str, Callable[[Path, Path], None]] = {
     "demo": publish_demo,
     SUITE: publish_suite,
-    SECOND: partial(publish_suite, name=SECOND),
 }
 
 if __name__ == "__main__":

@@ -185,21 +185,13 @@ def test_ci_runs_the_test_command_of_the_readme():
     assert "make test" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
 
 
-def stored_suites():
-    """The suite of the README, and the second edition as soon as it has rows."""
-    from headbench.reports import readme
-
-    folders = (ROOT / readme.GALLERY / name for name in (readme.SUITE, readme.SECOND))
-    return [folder.name for folder in folders if folder.name == readme.SUITE or folder.is_dir()]
-
-
 def test_tables_are_generated_from_the_stored_rows_never_typed():
     from headbench.reports import readme
 
     blocks = {
         "demo": readme.demo_block(ROOT / readme.GALLERY),
-        **{name: readme.suite_block(ROOT, name) for name in stored_suites()},
-        readme.PROTOCOLS: readme.protocols_block(ROOT / readme.GALLERY / stored_suites()[-1]),
+        readme.SUITE: readme.suite_block(ROOT),
+        readme.PROTOCOLS: readme.protocols_block(ROOT / readme.GALLERY / readme.SUITE),
     }
     for name, block in blocks.items():
         begin, end = readme.marks(name)
@@ -219,9 +211,8 @@ def test_measured_figures_are_those_of_the_stored_rows():
 def test_all_tables_of_the_suite_are_generated():
     from headbench.reports import readme
 
-    for name in stored_suites():
-        folder = ROOT / readme.GALLERY / name
-        assert (folder / readme.RESULTS).read_text(encoding="utf-8") == readme.suite_results(folder)
+    folder = ROOT / readme.GALLERY / readme.SUITE
+    assert (folder / readme.RESULTS).read_text(encoding="utf-8") == readme.suite_results(folder)
 
 
 def test_nothing_installs_headbench_by_its_name():

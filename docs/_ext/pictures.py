@@ -1,7 +1,7 @@
 """``make pictures``: screenshots of the pages of a finished demo, the README's picture, and thirty synthetic people.
 
 The report, the page of an avatar, a leaderboard and this site, at three widths in both schemes, as ``docs/pictures/*-after.webp``;
-the report as ``reports/gallery/report.jpg``. These need Chromium. The people are ``docs/pictures/people.webp``.
+a report, for example of a subject of the suite, as ``reports/gallery/report.jpg``. These need Chromium. The people are ``docs/pictures/people.webp``.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ def people() -> Image.Image:
     return Image.fromarray(np.concatenate(rows))
 
 
-def main(demo: Path) -> None:
+def main(demo: Path, report: Path) -> None:
+    """Take the pictures of a demo's folder, and the README's of a file ``report.html``."""
     people().save(ROOT / "docs" / "pictures" / "people.webp", quality=80)
     work = ROOT / "build" / "pictures"
     shutil.rmtree(work, ignore_errors=True)
@@ -97,11 +98,11 @@ def main(demo: Path) -> None:
                         (round(scale * width), round(scale * height)), Image.Resampling.LANCZOS
                     )
                     small.save(ROOT / "docs" / "pictures" / f"{name}-{width}-{scheme}-after.webp", quality=60)
-                    if (name, width, scheme) == ("report", 1440, "light"):
-                        readme = image.crop((0, 0, 1440, 1270)).resize((1152, 1016), Image.Resampling.LANCZOS)
-                        readme.save(ROOT / "reports" / "gallery" / "report.jpg", quality=88)
+        page = browser.new_page(viewport={"width": 1440, "height": 1270}, color_scheme="light")
+        readme = picture(page, report).resize((1152, 1016), Image.Resampling.LANCZOS)
+        readme.save(ROOT / "reports" / "gallery" / "report.jpg", quality=88)
         browser.close()
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(*map(Path, sys.argv[1:]))

@@ -17,7 +17,7 @@ def test_the_run_of_a_suite_is_published_without_folders(write_run, tmp_path, mo
         written.write_text("\n".join(readme.marks(name)))
     write_run("run", {"ga": 30.0, "ours": 31.0})
     monkeypatch.setattr(readme, "suite_results", lambda folder: "tables")
-    monkeypatch.setattr(readme, "suite_block", lambda root, name: "block")
+    monkeypatch.setattr(readme, "suite_block", lambda root: "block")
     readme.publish_suite(tmp_path, page.parent)
     target = page.parent / readme.GALLERY / readme.SUITE
     found = {path.relative_to(target).as_posix() for path in target.rglob("*.json")}
