@@ -29,14 +29,11 @@ def test_links_lead_somewhere(page):
     assert [link for link in links if "://" not in link and not (page.parent / link).exists()] == []
 
 
-def test_every_command_is_listed_and_named_pages_exist(capsys):
+def test_every_command_is_listed(capsys):
     offered = {p.spec.name for p in discover("commands").values() if p.origin.split()[0] == "headbench"}
     assert main(["list", "commands", "--json"]) == 0
     listed = json.dumps(json.loads(capsys.readouterr().out))
     assert {name for name in offered if f'"{name}"' not in listed} == set()
-    line = re.search(r"## Main commands\n\n(.*?)\n`headbench list", README, re.DOTALL)[1]
-    named = {name.removeprefix("headbench ") for name in re.findall(r"`([^`]+)`", line)}
-    assert named <= offered
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -56,7 +56,7 @@ def primary_table(runs: RunSet) -> str:
         numbers = [f"{c.difference:+.{digits}f}", bounds, f"{c.p:.4f}", f"{c.p_holm:.4f}"]
         lines.append([head, *numbers, c.verdict, equivalence_text(c, spec.unit)])
     how = (
-        f"Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in found)} endpoints that can be tested; "
+        f"Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in found)} endpoints with values; "
         "equivalence by two one-sided sign-flip tests, which assume that subjects differ symmetrically about the mean, Holm over "
         f"these; level {LEVEL:.0%}."
     )
