@@ -18,6 +18,7 @@ from ..bench.progress import counted
 from ..bench.rows import ALL, Rows
 from ..bench.specs import CommandResult, MetricSpec
 from .aggregate import subject_means, whole_images
+from .conditions import conditions, titled_note
 from .pareto.points import pareto_front
 from .runs import RunData, RunSet, training_labels
 from .statistics.comparisons import best_set
@@ -29,6 +30,8 @@ COSTS = {
     "milliseconds": ("latency_p50", 1.0),
 }
 """Metric of each cost, and its factor."""
+COST_TITLES = {"seconds": "Training time", "megabytes": "Size", "milliseconds": "Frame time"}
+UNITS = {"seconds": "s of training", "megabytes": "MB", "milliseconds": "ms a frame"}
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,32 @@ class Choice:
 
 
 @dataclass(frozen=True)
+class Choices:
+    """The choices of runs by label, the metric of their quality, what was left out with the reason, and notes on times that are not
+    comparable."""
+
+    by_label: Mapping[str, Choice]
+    metric: MetricSpec
+    without: Sequence[str]
+    notes: Sequence[str]
+
+    @property
+    def subjects(self) -> list[str]:
+        """The subjects, which all choices have."""
+        return sorted(next(iter(self.by_label.values())).quality)
+
+    @property
+    def sign(self) -> float:
+        """1 where a higher quality is better, else -1."""
+        return 1.0 if self.metric.higher_is_better else -1.0
+
+    @property
+    def measured(self) -> list[str]:
+        """The costs that at least one choice has."""
+        return [cost for cost in COSTS if any(cost in each.costs for each in self.by_label.values())]
+
+
+@dataclass(frozen=True)
 class Trial:
     """The recommendation for a subject without its rows: the choice, and its loss against the best one for the subject; None if the
     choice exceeds a limit there."""
@@ -103,23 +132,16 @@ def recommend(settings: RecommendSettings, progress: Progress = no_progress) -> 
     Raises `InputError` for runs that do not belong together, for a task or metric that they lack, and where nothing fits.
     """
     limits = settings.limits
-    choices, metric, without = read_choices(
-        [Path(run) for run in settings.runs], settings.task, settings.metric, limits
-    )
-    subjects = sorted(next(iter(choices.values())).quality)
-    sign = 1.0 if metric.higher_is_better else -1.0
+    read = read_choices([Path(run) for run in settings.runs], settings.task, settings.metric, limits)
+    choices, metric, subjects, sign = read.by_label, read.metric, read.subjects, read.sign
     fitting = {name: choice for name, choice in choices.items() if choice.fits(limits, subjects)}
     if not fitting:
         raise InputError("runs", "limits", f"a method within {_limits(limits)}", _nearest(choices, limits))
     best = best_of(fitting, subjects, sign)
-    means = {name: dict(choice.quality) for name, choice in fitting.items()}
-    alike: frozenset[str] | None = frozenset([best])
-    needed = 0
-    if len(fitting) > 1:
-        found = best_set(means, higher_is_better=metric.higher_is_better)
-        alike, needed = found.methods, found.needed
+    means = {name: choice.quality for name, choice in fitting.items()}
+    found = best_set(means, higher_is_better=metric.higher_is_better)
     trials = held_out(choices, limits, subjects, sign)
-    always = against_always(choices, list(limits) or list(COSTS), subjects, sign)
+    always = against_always(choices, list(limits) or read.measured, subjects, sign)
     data = {
         "recommended": best,
         "metric": metric.name,
@@ -127,33 +149,33 @@ def recommend(settings: RecommendSettings, progress: Progress = no_progress) -> 
         "limits": limits,
         "quality": fmean(fitting[best].quality.values()),
         "costs": {name: max(values.values()) for name, values in fitting[best].costs.items()},
-        "not_told_apart": None if alike is None else sorted(alike - {best}),
-        "subjects_needed": needed,
+        "not_told_apart": None if found.methods is None else sorted(found.methods - {best}),
+        "subjects_needed": found.needed,
         "fitting": {name: fmean(choice.quality.values()) for name, choice in fitting.items()},
         "by_cost": {cost: best_by_cost(choices, cost, subjects, sign) for cost in COSTS},
         "held_out": trials,
         "against_always": always,
-        "without": without,
+        "without": read.without,
+        "notes": read.notes,
     }
     return CommandResult(_text(data, fitting, subjects, metric), data)
 
 
 def read_choices(
     folders: Sequence[Path], task: str, metric_name: str, limits: Collection[str] = ()
-) -> tuple[dict[str, Choice], MetricSpec, list[str]]:
-    """The choices of runs that all subjects have, the metric of quality, and what was left out with the reason.
-
-    ``limits`` are the names of the costs that every choice should have.
+) -> Choices:
+    """The choices of runs that all subjects have; ``limits`` are the names of the costs that every choice should have.
 
     Conditions that change what a method is trained on are no choices. Raises `InputError` as `recommend` does.
     """
     runs = tuple(RunData.read(folder) for folder in folders)
-    RunSet.joined(runs)  # whether they belong together
+    together = RunSet.joined(runs)
+    labels_of_runs = training_labels(runs)
     quality: dict[str, dict[str, float]] = {}
     costs: dict[str, dict[str, dict[str, float]]] = {}
     everybody: set[str] = set()
     spec = None
-    for run, labels in zip(runs, training_labels(runs)):
+    for run, labels in zip(runs, labels_of_runs):
         folder = run.folder.root
         spec = next((each for each in run.metrics if each.name == metric_name and each.per_frame), None)
         if spec is None:
@@ -197,7 +219,8 @@ def read_choices(
     if spec is None or not choices:
         found_instead = "; ".join(without) or "none"
         raise InputError("runs", "methods", "a method with values of every subject", found_instead)
-    return choices, spec, without
+    rows = Rows.joined([run.rows.renamed(own) for run, own in zip(runs, labels_of_runs)])
+    return Choices(choices, spec, without, _time_notes(rows, together.metrics, list(choices)))
 
 
 def best_of(choices: Mapping[str, Choice], subjects: Sequence[str], sign: float) -> str:
@@ -244,7 +267,7 @@ def against_always(
     None with fewer than two subjects or without costs.
     """
     known = {name: each for name, each in choices.items() if set(costs) <= set(each.costs)}
-    if len(subjects) < 2 or not known:
+    if len(subjects) < 2 or not costs or not known:
         return None
     gains: dict[str, float] = {}
     exceeded = 0
@@ -315,7 +338,16 @@ def _recorded_seconds(run: RunData, label: str) -> dict[str, float]:
     return found
 
 
-UNITS = {"seconds": "s of training", "megabytes": "MB", "milliseconds": "ms a frame"}
+def _time_notes(rows: Rows, metrics: Sequence[MetricSpec], labels: Sequence[str]) -> list[str]:
+    """A note for each cost whose values are not comparable, see `titled_note`."""
+    found = conditions(rows, metrics, labels)
+    notes = (titled_note(COST_TITLES[cost], found.get(name, {})) for cost, (name, _) in COSTS.items())
+    return [note for note in notes if note]
+
+
+def cost_text(value: float) -> str:
+    """A cost with three digits."""
+    return f"{float(f'{value:.3g}'):g}"
 
 
 def _limits(limits: Mapping[str, float]) -> str:
@@ -332,7 +364,7 @@ def _nearest(choices: Mapping[str, Choice], limits: Mapping[str, float]) -> str:
     if not known:
         return f"none with measured {' and '.join(limits)}"
     label = min(known, key=lambda label: max(known[label][name] / limit for name, limit in limits.items()))
-    needs = " and ".join(f"{value:.3g} {UNITS[name]}" for name, value in known[label].items())
+    needs = " and ".join(f"{cost_text(value)} {UNITS[name]}" for name, value in known[label].items())
     return f"{label} nearest, with {needs}"
 
 
@@ -346,7 +378,7 @@ def _text(
     sign = 1.0 if metric.higher_is_better else -1.0
     for name in sorted(fitting, key=lambda name: -sign * fmean(fitting[name].quality.values())):
         costs = fitting[name].costs
-        shown = [f"{max(costs[cost].values()):.3g}" if cost in costs else "–" for cost in COSTS]
+        shown = [cost_text(max(costs[cost].values())) if cost in costs else "–" for cost in COSTS]
         lines.append([name, f"{fmean(fitting[name].quality.values()):.{metric.digits}f}", *shown])
     parts = [
         f"Recommended for {_limits(limits)}: {best}. Mean over {counted(len(subjects), 'subject')}, {task}; costs are the largest of a subject.",
@@ -354,7 +386,7 @@ def _text(
     ]
     by_cost = data["by_cost"]
     parts += [
-        f"By {UNITS[cost]} alone, all choices: {', '.join(f'{name} from {at:.3g}' for at, name in steps)}."
+        f"By {UNITS[cost]} alone, all choices: {', '.join(f'{name} from {cost_text(at)}' for at, name in steps)}."
         for cost, steps in by_cost.items()
         if steps
     ]
@@ -368,7 +400,18 @@ def _text(
         parts.append(f"Not told apart from it (sign-flip tests, Holm, 5 %): {', '.join(alike)}.")
     else:
         parts.append("No other method that fits can be the best (sign-flip tests, Holm, 5 %).")
-    trials = data["held_out"]
+    parts += outcome_on_left_out(data["held_out"], data["against_always"], best, metric)
+    parts += data["notes"]
+    without = data["without"]
+    return "\n\n".join([*parts, *(f"Left out: {each}." for each in without)])
+
+
+def outcome_on_left_out(
+    trials: Sequence[Trial], always: Mapping[str, Any] | None, best: str, metric: MetricSpec
+) -> list[str]:
+    """The results of `held_out` and `against_always` in sentences; ``best`` is the recommendation from all subjects."""
+    unit = f" {metric.unit}" if metric.unit else ""
+    parts = []
     if trials:
         same = sum(trial.choice == best for trial in trials)
         losses = [trial.loss for trial in trials if trial.loss is not None]
@@ -381,15 +424,13 @@ def _text(
             f"On each subject from the rows of the others: the same recommendation for {same} of {len(trials)}, {behind} "
             f"the best choice for the subject, beyond a limit for {len(trials) - len(losses)}."
         )
-    always = data["against_always"]
     if always is not None and always["gains"]:
-        gains = list(always["gains"].values())
+        sign = 1.0 if metric.higher_is_better else -1.0
+        gains = [sign * gain for gain in always["gains"].values()]
         spread = f"from {min(gains):+.{metric.digits}f} to {max(gains):+.{metric.digits}f} by subject"
         parts.append(
             f"Over the budgets of the {always['budgets']} choices, recommendations change {metric.label} by "
-            f"{sign * fmean(gains):+.{metric.digits}f}{unit} on subjects that were left out ({spread}), compared with always taking the best on "
-            "average, now "
-            f"{always['always']}, and the most frugal choice where that does not fit."
+            f"{fmean(gains):+.{metric.digits}f}{unit} on subjects that were left out ({spread}), compared with always taking the best on "
+            f"average, now {always['always']}, and the most frugal choice where that does not fit."
         )
-    without = data["without"]
-    return "\n\n".join([*parts, *(f"Left out: {each}." for each in without)])
+    return parts

@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, combinations
 
 import numpy as np
 
-from ...bench.contracts import FloatArray
+from ...bench.contracts import BoolArray, FloatArray
 from ...bench.progress import counted
 from ...bench.rows import Rows
 from ..aggregate import summarise, whole_images
@@ -242,6 +242,58 @@ class BestSet:
     needed: int
 
 
+@dataclass(frozen=True)
+class PairwiseTests:
+    """Sign-flip tests of all pairs of methods over the same subjects, from which the best of any of the methods are found.
+
+    Attributes
+    ----------
+    methods : tuple[str, ...]
+        The n methods.
+    p : FloatArray
+        (n, n) p-values, two-sided and not corrected; 1 on the diagonal.
+    better : BoolArray
+        (n, n), whether the method of the column has a better mean than that of the row.
+    subjects : int
+        Number of subjects.
+    """
+
+    methods: tuple[str, ...]
+    p: FloatArray
+    better: BoolArray
+    subjects: int
+
+    @classmethod
+    def of(cls, means: Mapping[str, Mapping[str, float]], *, higher_is_better: bool) -> PairwiseTests:
+        """Test all pairs. ``means`` has by method (at least one) its mean of each subject; the same subjects for all."""
+        methods = tuple(means)
+        subjects = sorted(means[methods[0]])
+        values = np.array([[means[method][subject] for subject in subjects] for method in methods])
+        values = values if higher_is_better else -values
+        p, better = np.ones((len(methods),) * 2), np.zeros((len(methods),) * 2, dtype=bool)
+        for row, column in combinations(range(len(methods)), 2):
+            differences = values[column] - values[row]
+            p[row, column] = p[column, row] = sign_flip_p(differences)
+            mean = differences.mean()
+            better[row, column], better[column, row] = mean > 0, mean < 0
+        return cls(methods, p, better, len(subjects))
+
+    def best_set(self, among: Sequence[str], level: float = LEVEL) -> BestSet:
+        """The best of the methods ``among`` all, see `best_set`; Holm's correction is over these alone."""
+        chosen = [self.methods.index(method) for method in among]
+        rivals = len(chosen) - 1
+        needed = subjects_needed(level, rivals)
+        if rivals * least_p(self.subjects) > level:
+            return BestSet(None, self.subjects, needed)
+        kept = []
+        for index in chosen:
+            others = [other for other in chosen if other != index]
+            adjusted = holm([float(self.p[index, other]) for other in others])
+            if not any(p <= level and self.better[index, other] for p, other in zip(adjusted, others)):
+                kept.append(self.methods[index])
+        return BestSet(frozenset(kept), self.subjects, needed)
+
+
 def best_set(
     means: Mapping[str, Mapping[str, float]], *, higher_is_better: bool, level: float = LEVEL
 ) -> BestSet:
@@ -250,20 +302,6 @@ def best_set(
     Each method is compared with all others by the sign-flip test, Holm over these comparisons; it is left out if
     one of them is better. Whichever method is truly the best is therefore left out with a probability of at most
     ``level``, however it was chosen: a confidence set of the best (J. Hsu, Multiple Comparisons, 1996, chapter 4).
-    ``means`` has by method (at least two) its mean of each subject; the same subjects for all.
+    ``means`` has by method (at least one) its mean of each subject; the same subjects for all.
     """
-    methods = list(means)
-    subjects = sorted(means[methods[0]])
-    values = np.array([[means[method][subject] for subject in subjects] for method in methods])
-    values = values if higher_is_better else -values
-    count, rivals = len(subjects), len(methods) - 1
-    needed = subjects_needed(level, rivals)
-    if rivals * least_p(count) > level:
-        return BestSet(None, count, needed)
-    kept = []
-    for index, method in enumerate(methods):
-        others = np.delete(values, index, axis=0) - values[index]
-        adjusted = holm([sign_flip_p(difference) for difference in others])
-        if not any(p <= level and difference.mean() > 0 for p, difference in zip(adjusted, others)):
-            kept.append(method)
-    return BestSet(frozenset(kept), count, needed)
+    return PairwiseTests.of(means, higher_is_better=higher_is_better).best_set(list(means), level)

@@ -1,5 +1,6 @@
 """``headbench recommend``: choices within limits, and tests of the answer on subjects left out."""
 
+import itertools
 import re
 
 import numpy as np
@@ -18,6 +19,8 @@ from headbench.reports.recommend import (
     held_out,
     recommend,
 )
+
+from .made_rows import avatar_row, row
 
 METRICS = [
     MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr"),
@@ -222,3 +225,30 @@ def test_training_times_of_a_curve_are_those_of_its_records(tmp_path, write_mani
     write_manifest(folder, METRICS[:1], {"short": None, "long": None}, {"novel_view": "p"})
     assert asked(str(folder.root), seconds=60.0).data["recommended"] == "long"
     assert asked(str(folder.root), seconds=20.0).data["recommended"] == "short"
+
+
+@pytest.mark.parametrize(
+    ("machines", "says"),
+    [
+        (("A", "A"), ""),
+        (
+            ("A", "B"),
+            "Frame time: Measured on A with 2 threads; B with 2 threads; not comparable between these.",
+        ),
+        (("A", ""), ""),
+    ],
+)
+def test_frame_times_of_several_machines_have_a_note(tmp_path, write_manifest, machines, says):
+    """Runs of other subjects, each measured on a machine ("": not recorded)."""
+    folders = [RunFolder(tmp_path / name) for name in ("first", "second")]
+    time = MetricSpec("latency_p50", "p50", "ms", False, 2, "m:p50", kind="avatar", machine_bound=True)
+    for folder, machine, subjects in zip(folders, machines, (SUBJECTS[:3], SUBJECTS[3:])):
+        rows, place = [], {"machine": machine, "threads": 2} if machine else {}
+        for method, subject in itertools.product(("fast", "slow"), subjects):
+            rows.append(row(method, "psnr", 30.0, subject, protocol="p"))
+            rows.append(avatar_row(method, "latency_p50", 5.0, subject, **place))
+        Rows.of(rows).write(folder.rows)
+        write_manifest(folder, [*METRICS[:1], time], {"fast": None, "slow": None}, {"novel_view": "p"})
+    result = recommend(RecommendSettings(tuple(str(f.root) for f in folders), task="novel_view"))
+    assert result.data["notes"] == [says] * bool(says)
+    assert says in result.text
