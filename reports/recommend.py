@@ -21,7 +21,7 @@ from .aggregate import subject_means, whole_images
 from .conditions import conditions, titled_note
 from .pareto.points import pareto_front
 from .runs import RunData, RunSet, training_labels
-from .statistics.comparisons import best_set
+from .statistics.comparisons import BestSet, best_set
 from .writers import pipe_table
 
 COSTS = {
@@ -158,7 +158,7 @@ def recommend(settings: RecommendSettings, progress: Progress = no_progress) -> 
         "without": read.without,
         "notes": read.notes,
     }
-    return CommandResult(_text(data, fitting, subjects, metric), data)
+    return CommandResult(_text(data, fitting, found, metric), data)
 
 
 def read_choices(
@@ -368,9 +368,7 @@ def _nearest(choices: Mapping[str, Choice], limits: Mapping[str, float]) -> str:
     return f"{label} nearest, with {needs}"
 
 
-def _text(
-    data: Mapping[str, Any], fitting: Mapping[str, Choice], subjects: Sequence[str], metric: MetricSpec
-) -> str:
+def _text(data: Mapping[str, Any], fitting: Mapping[str, Choice], found: BestSet, metric: MetricSpec) -> str:
     unit = f" {metric.unit}" if metric.unit else ""
     limits, best = data["limits"], data["recommended"]
     task = str(data["task"]).replace("_", " ")
@@ -381,7 +379,7 @@ def _text(
         shown = [cost_text(max(costs[cost].values())) if cost in costs else "–" for cost in COSTS]
         lines.append([name, f"{fmean(fitting[name].quality.values()):.{metric.digits}f}", *shown])
     parts = [
-        f"Recommended for {_limits(limits)}: {best}. Mean over {counted(len(subjects), 'subject')}, {task}; costs are the largest of a subject.",
+        f"Recommended for {_limits(limits)}: {best}. Mean over {counted(found.subjects, 'subject')}, {task}; costs are the largest of a subject.",
         pipe_table(lines),
     ]
     by_cost = data["by_cost"]
@@ -390,20 +388,23 @@ def _text(
         for cost, steps in by_cost.items()
         if steps
     ]
-    alike = data["not_told_apart"]
-    if alike is None:
-        parts.append(
-            f"It takes {data['subjects_needed']} subjects to tell these methods apart; there {'is' if len(subjects) == 1 else 'are'} "
-            f"{len(subjects)}."
-        )
-    elif alike:
-        parts.append(f"Not told apart from it (sign-flip tests, Holm, 5 %): {', '.join(alike)}.")
-    else:
-        parts.append("No other method that fits can be the best (sign-flip tests, Holm, 5 %).")
+    parts.append(verdict_text(found, [best, *(name for name in fitting if name != best)]))
     parts += outcome_on_left_out(data["held_out"], data["against_always"], best, metric)
     parts += data["notes"]
     without = data["without"]
     return "\n\n".join([*parts, *(f"Left out: {each}." for each in without)])
+
+
+def verdict_text(found: BestSet, fitting: Collection[str]) -> str:
+    """What may be said of the choices that fit, the one with the best mean first, in a sentence."""
+    if len(fitting) == 1:
+        return "It is the only choice that fits."
+    if found.methods is None:
+        there = f"there {'is' if found.subjects == 1 else 'are'} {found.subjects}"
+        return f"It takes {found.needed} subjects to tell these methods apart; {there}."
+    if alike := sorted(found.methods - {next(iter(fitting))}):
+        return f"Not told apart from it (sign-flip tests, Holm, 5 %): {', '.join(alike)}."
+    return "No other method that fits can be the best (sign-flip tests, Holm, 5 %)."
 
 
 def outcome_on_left_out(
