@@ -56,9 +56,8 @@ def budget_of(runs: RunSet, marks: Mapping[str, int]) -> dict[str, Any]:
         return {"reason": f"It takes {error.expected}; found: {error.found}.", "answers": None}
     subjects, spec = read.subjects, read.metric
     means = {label: fmean(choice.quality.values()) for label, choice in read.by_label.items()}
-    names = sorted(
-        means, key=lambda label: -read.sign * means[label]
-    )  # the first of equal ones as in `best_of`
+    # Of equal ones the first, as in `best_of`.
+    names = sorted(means, key=lambda label: -read.sign * means[label])
     costs = {
         cost: [
             max(own[cost].values()) if cost in own else None
@@ -110,10 +109,8 @@ def _left_out(read: Choices, best: str) -> list[str]:
     """How far recommendations hold on subjects that were left out, or why this is not known."""
     choices, subjects, sign = read.by_label, read.subjects, read.sign
     if len(subjects) < 2:
-        return [
-            "The runs have one subject, so it is not known whether a recommendation holds for other people: the test of it leaves out "
-            "one subject at a time."
-        ]
+        unknown = "it is not known whether a recommendation holds for other people"
+        return [f"The runs have one subject, so {unknown}: the test of it leaves out one subject at a time."]
     trials = held_out(choices, {}, subjects, sign)
     always = against_always(choices, read.measured, subjects, sign)
     first, *others = outcome_on_left_out(trials, always, best, read.metric)
