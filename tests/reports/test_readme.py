@@ -51,8 +51,10 @@ def pair(second="ga", metric="psnr", difference=1.0, p=0.01, **given):
         ),
         (
             [pair(difference=-1.0), pair("gbs", difference=-1.0), pair("gha"), pair("gbs", "lpips", p=0.2)],
-            "`ga` and `gbs` are better than `ours` by PSNR; `ours` is better than `gha` by PSNR; "
-            "`ours` against `gbs`: cannot be told apart by LPIPS",
+            (
+                "`ga` and `gbs` are better than `ours` by PSNR; `ours` is better than `gha` by PSNR; "
+                "`ours` against `gbs`: cannot be told apart by LPIPS"
+            ),
         ),
     ],
 )
