@@ -6,6 +6,7 @@ read without that package.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +23,10 @@ CROP = 1.5
 """Side of the crop, relative to the longer side of the landmarks' box."""
 MOST_CHANGE = 0.05
 """Landmarks may move by this part of the face's size when the crop is repeated around them."""
+SAME = 0.5
+"""Faces whose middles are nearer to each other than this part of their size are one."""
 _TRIED, _ROUNDS = 6, 3
+_ACROSS, _FULLY_ACROSS = (0.35, 0.5, 0.65), (0.1, 0.225, 0.35, 0.5, 0.65, 0.775, 0.9)
 
 
 class _Crop(NamedTuple):
@@ -68,20 +72,44 @@ class LandmarkNetwork:
             Landmarks of a similar image of the camera; without them, squares of several sizes are tried.
         """
         if near is not None:
-            found, score = self._run(image, _crop_around(near))
-            return found if score > 0 else self.find(image)
-        scored = sorted((self._run(image, crop) for crop in _candidates(image)), key=lambda one: -one[1])
-        best, least = None, MOST_CHANGE
-        for found, score in scored[:_TRIED]:
-            change = np.inf
-            for _ in range(_ROUNDS):
-                if score > 0:
-                    before, (found, score) = found, self._run(image, _crop_around(found))
-                    change = float(np.abs(found - before).mean() / np.ptp(found, axis=0).max())
-            # Where the network sees a whole face, the landmarks of a crop around them are the same.
-            if score > 0 and change < least:
-                best, least = found, change
-        return best
+            found = self.follow(image, near)
+            return self.find(image) if found is None else found
+        scored = self._scored(image, _ACROSS)[:_TRIED]
+        steady = [self._steady(image, found) for found, score in scored if score > 0]
+        best, change = min(steady, key=lambda one: one[1], default=(None, np.inf))
+        return best if change < MOST_CHANGE else None
+
+    def follow(self, image: ByteArray, near: FloatArray) -> FloatArray | None:
+        """(COUNT, 2) landmarks of the face at ``near``, its landmarks in a similar image; None if it is not there."""
+        found, score = self._run(image, _crop_around(near))
+        return found if score > 0 else None
+
+    def find_all(self, image: ByteArray) -> list[FloatArray]:
+        """(COUNT, 2) landmarks of every face, the largest first; faces much smaller than the picture are not found."""
+        faces: list[FloatArray] = []
+        for found, score in self._scored(image, _FULLY_ACROSS):
+            if score > 0 and not any(same_face(found, face) for face in faces):
+                steady, change = self._steady(image, found)
+                if change < MOST_CHANGE and not any(same_face(steady, face) for face in faces):
+                    faces.append(steady)
+        return sorted(faces, key=face_size, reverse=True)
+
+    def _scored(self, image: ByteArray, across: Sequence[float]) -> list[tuple[FloatArray, float]]:
+        """Landmarks and scores of squares everywhere in an image, the highest score first."""
+        crops = _candidates(image, across)
+        return sorted((self._run(image, crop) for crop in crops), key=lambda one: -one[1])
+
+    def _steady(self, image: ByteArray, found: FloatArray) -> tuple[FloatArray, float]:
+        """Landmarks after repeating the crop around them, and their last change relative to the face's size.
+
+        Where the network sees a whole face, the landmarks of a crop around them are the same.
+        """
+        change, score = np.inf, 1.0
+        for _ in range(_ROUNDS):
+            if score > 0:
+                before, (found, score) = found, self._run(image, _crop_around(found))
+                change = float(np.abs(found - before).mean() / face_size(found))
+        return found, change if score > 0 else np.inf
 
     def _run(self, image: ByteArray, crop: _Crop) -> tuple[FloatArray, float]:
         """Landmarks, and the logit of the probability that the crop shows a face."""
@@ -103,13 +131,28 @@ COUNT = 468
 """Landmarks of the network."""
 
 
-def _candidates(image: ByteArray) -> list[_Crop]:
+def face_size(landmarks: FloatArray) -> float:
+    """The longer side of the box around (COUNT, 2) landmarks."""
+    return float(np.ptp(landmarks, axis=0).max())
+
+
+def face_distance(first: FloatArray, second: FloatArray) -> float:
+    """Distance between the middles of two faces, relative to the size of the second."""
+    return float(np.linalg.norm(first.mean(axis=0) - second.mean(axis=0)) / face_size(second))
+
+
+def same_face(first: FloatArray, second: FloatArray) -> bool:
+    """Whether two sets of landmarks of one image are of the same face."""
+    return face_distance(first, second) < SAME
+
+
+def _candidates(image: ByteArray, across: Sequence[float]) -> list[_Crop]:
     height, width = image.shape[:2]
     shorter = min(height, width)
     return [
         _Crop(np.array([x * width, y * height]), side * shorter, 0.0)
         for side in (0.6, 0.9)
-        for x in (0.35, 0.5, 0.65)
+        for x in across
         for y in (0.35, 0.5, 0.65)
     ]
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 
 from ..errors import InputError
 from .archives import open_archive
-from .files import open_regular, reading
+from .files import atomic_path, open_regular, reading
 
 MOST_BYTES, MOST_PER_BYTE = 2**28, 20
 """All arrays of a file may take 256 MiB, and 20 bytes for each byte of the file: ten times any head model, which
@@ -27,6 +28,8 @@ MAX_MAGNITUDE = 1e4
 MAX_HEADER = 10_000
 """Maximum characters of an array header, which numpy parses as Python literals."""
 
+_MARK = "mark"
+_log = logging.getLogger(__name__)
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _KINDS = "biufU"
 _LARGEST_ITEM = 8
@@ -73,6 +76,49 @@ def read_arrays(
     content = read_npz(path)
     check_arrays(path, content, members, sizes)
     return content
+
+
+def remembered_arrays(
+    path: Path,
+    mark: str,
+    members: Mapping[str, Member],
+    make: Callable[[], Mapping[str, np.ndarray]],
+    sizes: Mapping[str, int] | None = None,
+) -> dict[str, np.ndarray]:
+    """The arrays that an earlier call stored with the same ``mark``, or those that ``make`` returns, which are stored.
+
+    Parameters
+    ----------
+    mark : str
+        Digest of everything that the arrays depend on.
+    members, sizes : Mapping
+        As for `read_arrays`. A file that cannot be read so is made again.
+    """
+    kept = stored_arrays(path, mark, members, sizes)
+    if kept is None:
+        kept = dict(make())
+        store_arrays(path, mark, kept)
+    return kept
+
+
+def stored_arrays(
+    path: Path, mark: str, members: Mapping[str, Member], sizes: Mapping[str, int] | None = None
+) -> dict[str, np.ndarray] | None:
+    """The arrays that `store_arrays` wrote with the same ``mark``; None if there are none that can be read."""
+    if path.exists():
+        try:
+            kept = read_arrays(path, {_MARK: TEXT, **members}, sizes)
+            if str(kept.pop(_MARK)) == mark:
+                return kept
+        except InputError as error:
+            _log.warning("made again: %s", error)
+    return None
+
+
+def store_arrays(path: Path, mark: str, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays and their ``mark`` atomically as an npz."""
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, allow_pickle=False, **{_MARK: np.array(mark)}, **arrays)
 
 
 def check_arrays(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from .track import Tracked
 
 REPORT, PICTURE = "track.json", "overlay.png"
+WORK = ".track"
+"""Folder of what an interrupted call continues from."""
 ROWS, COLUMNS = 3, 4
 """Timesteps and cameras of the picture."""
 
@@ -27,14 +29,15 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     """Track the head model of a capture in its images and write a capture with this tracking.
 
     Writes under ``settings.out`` the capture (images linked), ``track.json`` with every timestep's residuals and
-    ``overlay.png``. Raises `InputError` before the fit for a capture that cannot be tracked or written.
+    ``overlay.png``. What is found meanwhile is stored there, so that a call after an interruption continues. Raises `InputError` before
+    the fit for a capture that cannot be tracked or written.
     """
     from ..clip import check_apart
     from ..head.refit.rewrite import capture_plan, write_capture
     from ..images import write_image
     from ..overlay import draw_overlay
     from ..tracking_errors import tracking_errors
-    from ..video.command import opened_video
+    from ..video.command import video_to_track
     from ..video.decode import is_video
     from .external import track_with_program
     from .network import landmark_source
@@ -43,33 +46,33 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     if settings.program != "light":
         return track_with_program(settings, progress)
     out = Path(settings.out)
-    with ExitStack() as stack:
-        if is_video(Path(settings.capture)):
-            video = stack.enter_context(opened_video(settings, out, progress))
-            clip = video.clip
-        else:
-            video, clip = None, settings.open(settings.capture, progress)
-            check_apart(clip, out)
-            teacher = settings.open(settings.embedding, progress) if settings.embedding else None
-        exact = settings.open(settings.against, progress) if settings.against else None
-        capture_plan(clip, settings.capture)  # Captures that cannot be rewritten are detected before the fit.
-        check_cameras(clip, cameras := [*settings.cameras] or [*clip.cameras])
-        notes = {
-            "landmarks": Path(settings.landmarks).name or "vertices of the tracked mesh",
-            "seed": settings.seed,
-        }
-        source: LandmarkSource
-        if video is not None:
-            source = video.landmarks
-        else:
-            source = landmark_source(
-                clip, cameras, settings.landmarks, teacher, seed=settings.seed, progress=progress
-            )
-        tracked = track(clip, cameras, source, notes=notes, progress=progress)
-        timesteps = evenly_with_ends([residual.timestep for residual in tracked.report.residuals], ROWS)
-        overlay = draw_overlay(tracked.clip, timesteps, evenly_with_ends(cameras, COLUMNS))
-        write_image(out / PICTURE, overlay)
-        union = write_capture(tracked.clip, out, progress)
+    work = out / WORK
+    if is_video(Path(settings.capture)):
+        video = video_to_track(settings, work, progress)
+        clip = video.clip
+    else:
+        video, clip = None, settings.open(settings.capture, progress)
+        check_apart(clip, out)
+        teacher = settings.open(settings.embedding, progress) if settings.embedding else None
+    exact = settings.open(settings.against, progress) if settings.against else None
+    capture_plan(clip, settings.capture)  # Captures that cannot be rewritten are detected before the fit.
+    check_cameras(clip, cameras := [*settings.cameras] or [*clip.cameras])
+    notes = {
+        "landmarks": Path(settings.landmarks).name or "vertices of the tracked mesh",
+        "seed": settings.seed,
+    }
+    source: LandmarkSource
+    if video is not None:
+        source = video.landmarks
+    else:
+        source = landmark_source(
+            clip, cameras, settings.landmarks, teacher, seed=settings.seed, progress=progress
+        )
+    tracked = track(clip, cameras, source, notes=notes, store=work, progress=progress)
+    timesteps = evenly_with_ends([residual.timestep for residual in tracked.report.residuals], ROWS)
+    overlay = draw_overlay(tracked.clip, timesteps, evenly_with_ends(cameras, COLUMNS))
+    write_image(out / PICTURE, overlay)
+    union = write_capture(tracked.clip, out, progress)
     data: dict[str, Any] = {
         "capture": union.as_posix(),
         **notes,
@@ -82,6 +85,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
         data["errors_mm"] = {name: error._asdict() for name, error in errors.items()}
         lines += _table(errors)
     write_json(out / REPORT, data)
+    shutil.rmtree(work)
     return CommandResult("\n".join([*lines, f"Capture: {union}"]), data)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -24,10 +24,22 @@ MOST_MISFIT = 0.04
 
 
 class NetworkLandmarks:
-    """A source of landmarks: the network on the images of some cameras of a clip."""
+    """A source of landmarks: the network on the images of some cameras of a clip, or what it has found before.
+
+    Parameters
+    ----------
+    network : LandmarkNetwork | Callable
+        The network; or a function that gives the (COUNT, 2) landmarks of a timestep in the only camera, pixels.
+    embedding : Embedding
+        Where the network's landmarks are on the head model.
+    """
 
     def __init__(
-        self, network: LandmarkNetwork, embedding: Embedding, clip: CaptureClip, cameras: Sequence[str]
+        self,
+        network: LandmarkNetwork | Callable[[int], FloatArray],
+        embedding: Embedding,
+        clip: CaptureClip,
+        cameras: Sequence[str],
     ):
         self._network, self._embedding, self._clip, self._cameras = network, embedding, clip, [*cameras]
         self._views = Views([clip.cameras[name] for name in cameras])
@@ -39,17 +51,25 @@ class NetworkLandmarks:
         for column, name in enumerate(self._cameras):
             near = None
             for row, timestep in enumerate(timesteps):
-                image = self._clip.image(self._clip.frame_at[timestep, name])
-                trials: list[FloatArray | None] = [None] if near is None else [near, None]
-                for tried in trials:
-                    near = self._network.find(image, tried)
-                    facing = None if near is None else self._facing(near[self._embedding.landmarks], column)
-                    if near is not None and facing is not None:
-                        found = near[self._embedding.landmarks]
-                        pixels[row, column] = np.where(facing[:, None], found, np.nan)
+                trials, near = self._trials(timestep, name, near), None
+                for found in trials:
+                    points = None if found is None else found[self._embedding.landmarks]
+                    facing = None if points is None else self._facing(points, column)
+                    if points is not None and facing is not None:
+                        pixels[row, column] = np.where(facing[:, None], points, np.nan)
+                        near = found
                         break
-                    near = None
         return ImageLandmarks(self._embedding.corners, self._embedding.weights, pixels)
+
+    def _trials(self, timestep: int, camera: str, near: FloatArray | None) -> Iterator[FloatArray | None]:
+        """Landmarks of an image in the order in which they are tried: around those of the image before, then everywhere."""
+        if not isinstance(self._network, LandmarkNetwork):
+            yield self._network(timestep)
+            return
+        image = self._clip.image(self._clip.frame_at[timestep, camera])
+        if near is not None:
+            yield self._network.find(image, near)
+        yield self._network.find(image)
 
     def _facing(self, found: FloatArray, camera: int) -> BoolArray | None:
         """(L,) which landmarks face the camera; None if they do not form a face."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +14,8 @@ from threadpoolctl import threadpool_limits
 
 from ...bench.contracts import FloatArray, Progress, no_progress
 from ...bench.errors import InputError
+from ...bench.io.arrays import Member, remembered_arrays
+from ...bench.io.files import digest
 from ..clip import CaptureClip
 from .fit import Fitter
 from .images import FrameStack
@@ -83,6 +87,7 @@ def track(
     source: LandmarkSource,
     *,
     notes: Mapping[str, Any] | None = None,
+    store: Path | None = None,
     progress: Progress = no_progress,
 ) -> Tracked:
     """Estimate shape and poses from images; recorded as a step. The static offset becomes zero.
@@ -98,6 +103,8 @@ def track(
         Finds landmarks.
     notes : Mapping[str, Any] | None
         Recorded with the step.
+    store : Path | None
+        Folder that keeps the fit of every part, which a later call with the same images and landmarks does not repeat.
 
     Raises
     ------
@@ -126,23 +133,21 @@ def track(
         landmarks = source(part)
         if not np.isfinite(landmarks.pixels).any():
             raise InputError(where, "landmarks", "a face in some image", "none")
-        begin = time.perf_counter()
-        fitter = Fitter(clip.head, views, landmarks)
-        stack = FrameStack(
-            [clip.image(clip.frame_at[timestep, name]) for timestep in part for name in cameras]
-        )
-        keep = shape is not None
-        state = fitter.fit_landmarks(fitter.start(shape), keep_shape=keep)
 
         def report_block(done: int, total: int, note: str = "", block: int = block) -> None:
             progress(block * total + done, blocks * total, f"tracking, {note}")
 
-        fitted = fitter.fit_colours(state, stack, keep_shape=keep, progress=report_block)
-        shape = fitted.state.shape
-        seconds += time.perf_counter() - begin
-        rows = fitted.landmarks.tolist(), fitted.colours.tolist()
+        fit = partial(_fit_block, clip, cameras, views, part, landmarks, shape, report_block)
+        if store is None:
+            fitted = fit()
+        else:
+            mark = digest(_FORMAT, clip.fingerprint, [*cameras], part, *landmarks, shape)
+            fitted = remembered_arrays(store / f"part-{block:05d}.npz", mark, _PART, fit, {"T": len(part)})
+        shape = fitted["shape"]
+        seconds += float(fitted["seconds"])
+        rows = fitted["landmarks"].tolist(), fitted["colours"].tolist()
         residuals += [TimestepResidual(*row) for row in zip(part, *rows)]
-        poses |= dict(zip(part, fitted.state.poses))
+        poses |= dict(zip(part, fitted["poses"]))
     assert shape is not None
     state = HeadState(np.asarray(shape, np.float32), np.stack([poses[timestep] for timestep in timesteps]))
     report = TrackingReport(tuple(cameras), tuple(sorted(residuals)), seconds)
@@ -157,3 +162,37 @@ def track(
         poses=dict(zip(timesteps, tracked)),
     )
     return Tracked(derived, report)
+
+
+_FORMAT = 1  # of the fit of a part; to be raised where the code fits otherwise
+_PART = {
+    "shape": Member("f", ("S",)),
+    "poses": Member("f", ("T", "D")),
+    **dict.fromkeys(("landmarks", "colours"), Member("f", ("T",))),
+    "seconds": Member("f", ()),
+}
+
+
+def _fit_block(
+    clip: CaptureClip,
+    cameras: Sequence[str],
+    views: Views,
+    part: Sequence[int],
+    landmarks: ImageLandmarks,
+    shape: FloatArray | None,
+    progress: Progress,
+) -> dict[str, np.ndarray]:
+    """The arrays of `_PART` of some timesteps, with a given shape or their own."""
+    begin = time.perf_counter()
+    fitter = Fitter(clip.head, views, landmarks)
+    images = [clip.image(clip.frame_at[timestep, name]) for timestep in part for name in cameras]
+    keep = shape is not None
+    state = fitter.fit_landmarks(fitter.start(shape), keep_shape=keep)
+    fitted = fitter.fit_colours(state, FrameStack(images), keep_shape=keep, progress=progress)
+    return {
+        "shape": fitted.state.shape,
+        "poses": fitted.state.poses,
+        "landmarks": fitted.landmarks,
+        "colours": fitted.colours,
+        "seconds": np.array(time.perf_counter() - begin),
+    }

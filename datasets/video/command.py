@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
-from ...bench.io.files import check_output_folder
+from ...bench.io.arrays import Member, remembered_arrays
+from ...bench.io.files import check_output_folder, digest, digest_file
 from ...bench.landmark_network import LandmarkNetwork
+from ...bench.progress import counted
 from ..clip import CaptureClip
 from ..head.refit.command import target_head
+from ..tracking.embedding import Embedding
 from ..tracking.focal import FocalLength, estimate_focal
 from ..tracking.network import NetworkLandmarks, head_embedding
 from .clip import USUAL_FOCAL, VideoClip, open_video
@@ -22,9 +25,13 @@ from .clip import USUAL_FOCAL, VideoClip, open_video
 if TYPE_CHECKING:
     from ..tracking.settings import TrackSettings
 
-FRAMES = ".frames"
-"""Folder of the frames of a video while it is tracked."""
 NEEDED = ("head", "landmarks")
+_EMBEDDING = {
+    "landmarks": Member("i", ("L",)),
+    "corners": Member("iu", ("L", 3)),
+    "weights": Member("f", ("L", 3)),
+}
+_FOCAL = {"pixels": Member("f", ()), "residuals": Member("f", ("N",)), "tried": Member("f", ("N",))}
 
 
 class OpenedVideo(NamedTuple):
@@ -36,11 +43,11 @@ class OpenedVideo(NamedTuple):
     lines: list[str]
 
 
-@contextmanager
-def opened_video(settings: TrackSettings, out: Path, progress: Progress) -> Iterator[OpenedVideo]:
+def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) -> OpenedVideo:
     """The clip of a video with its focal length.
 
-    Its frames are in ``out`` while the context lasts. Raises `InputError` for options that are missing, and as `open_video`.
+    Its frames, and what is learnt of them, are stored in ``folder``, from which a later call continues. Raises `InputError` for options
+    that are missing, and as `open_video`.
     """
     path = Path(settings.capture)
     for name in NEEDED:
@@ -48,45 +55,53 @@ def opened_video(settings: TrackSettings, out: Path, progress: Progress) -> Iter
             raise InputError("command line", f"--{name}", "a value, for the file of a video", "none")
     named = settings.head or ""
     head = target_head(named, "--head")
-    network = LandmarkNetwork(Path(settings.landmarks))
+    network, weights = LandmarkNetwork(Path(settings.landmarks)), digest_file(Path(settings.landmarks))
     own = replace(settings, head=named if Path(named).exists() else None)  # a name of a head is for no reader
     teacher = own.open(settings.embedding, progress) if settings.embedding else None
-    embedding = head_embedding(network, head, teacher, progress)
-    check_output_folder(out)
-    folder = out / FRAMES
-    with _emptied(folder):
-        video = open_video(path, settings, head, network, folder, progress)
-        clip, focal = video.clip, None
-        landmarks = NetworkLandmarks(network, embedding, clip, [*clip.cameras])
-        if settings.focal is None:
-            (camera,) = clip.cameras.values()
-            side = max(video.info.width, video.info.height) * video.scale
-            focal = estimate_focal(clip.head, camera, landmarks(sorted(clip.poses)), side)
-            if focal.clear:
-                clip = video.with_focal(focal.pixels / video.scale)
-                landmarks = NetworkLandmarks(network, embedding, clip, [*clip.cameras])
-        data, lines = _data(video, settings.focal, focal), _lines(video, settings.focal, focal)
-        yield OpenedVideo(clip, landmarks, data, lines)
-
-
-@contextmanager
-def _emptied(folder: Path) -> Iterator[None]:
-    """A new folder, without what a killed run left; removed when the block ends."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    try:
-        yield
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    check_output_folder(folder)
+    mark = digest(weights, head.fingerprint(), teacher.fingerprint if teacher else "")
+    embedding = Embedding(
+        **remembered_arrays(
+            folder / "embedding.npz",
+            mark,
+            _EMBEDDING,
+            lambda: head_embedding(network, head, teacher, progress)._asdict(),
+        )
+    )
+    video = open_video(path, settings, head, network, weights, folder, progress)
+    clip, focal = video.clip, None
+    landmarks = NetworkLandmarks(video.landmarks, embedding, clip, [*clip.cameras])
+    if settings.focal is None:
+        (camera,) = clip.cameras.values()
+        side = max(video.info.width, video.info.height) * video.view.scale
+        found = landmarks(sorted(clip.poses))
+        stored = remembered_arrays(
+            folder / "focal.npz",
+            digest(mark, camera.K, side, found.pixels),
+            _FOCAL,
+            lambda: {
+                name: np.asarray(value)
+                for name, value in estimate_focal(clip.head, camera, found, side)._asdict().items()
+            },
+        )
+        focal = FocalLength(float(stored["pixels"]), stored["residuals"], stored["tried"])
+        if focal.clear:
+            clip = video.with_focal(focal.pixels / video.view.scale)
+            landmarks = NetworkLandmarks(video.landmarks, embedding, clip, [*clip.cameras])
+    return OpenedVideo(
+        clip, landmarks, _data(video, settings.focal, focal), _lines(video, settings.focal, focal)
+    )
 
 
 def _data(video: VideoClip, given: float | None, focal: FocalLength | None) -> dict[str, Any]:
     return {
         "video": {
             **video.info._asdict(),
-            "crop": [*video.crop],
-            "scale": video.scale,
+            "crop": [*video.view.crop],
+            "scale": video.view.scale,
             "without_face": [*video.without_face],
+            "other_faces": video.faces.numbers[video.faces.others > 0].tolist(),
+            **({"unsure": [*video.unsure]} if video.unsure else {}),
             "focal": dict(zip(("pixels", "source"), _focal(video, given, focal))),
         }
     }
@@ -97,7 +112,7 @@ def _focal(video: VideoClip, given: float | None, focal: FocalLength | None) -> 
     if focal is None:
         return given or 0.0, "given"
     if focal.clear:
-        return focal.pixels / video.scale, "estimated from landmarks"
+        return focal.pixels / video.view.scale, "estimated from landmarks"
     usual = USUAL_FOCAL * max(video.info.width, video.info.height)
     return usual, "assumed, since the landmarks do not determine it; give --focal if you know it"
 
@@ -110,7 +125,22 @@ def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> 
         f"  video      {video.info.width}x{video.info.height} pixels, {video.info.rate:.3g} frames a second",
         f"  focal      {pixels:.0f} pixels of the video, {source}",
     ]
+    faces = video.faces
     if video.without_face:
-        shown = ", ".join(map(str, video.without_face[:8])) + (" ..." if len(video.without_face) > 8 else "")
-        lines.append(f"  left out   {len(video.without_face)} frames without a face: {shown}")
+        lines.append(f"  left out   {_listed(video.without_face)} without a face")
+    if faces.others.any():
+        lines.append(
+            f"  others     {_listed(faces.numbers[faces.others > 0].tolist())} with a second face; followed is the face that is largest in "
+            f"frame {faces.numbers[faces.found][0]}"
+        )
+    if video.unsure:
+        half, most = np.quantile(video.unsure, [0.5, 1.0])
+        lines.append(
+            f"  masks      {half:.0%} of the person's pixels are unsure (median of the frames), {most:.0%} in the worst frame"
+        )
     return lines
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    shown = ", ".join(map(str, numbers[:8])) + (" ..." if len(numbers) > 8 else "")
+    return f"{counted(len(numbers), 'frame')} ({shown})"

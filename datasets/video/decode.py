@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,10 +39,11 @@ def is_video(path: Path) -> bool:
 
 def probe_video(path: Path) -> VideoInfo:
     """Size and rate of a video. Raises `InputError` for another file."""
-    _, first = next(_decoded(path))
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    rate, count = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
-    capture.release()
+    with _opened(path) as capture:
+        first = _next(capture)
+        rate, count = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    if first is None:
+        raise _undecoded(path)
     if not 1.0 <= rate <= 1000.0:
         raise InputError(path, "frame rate", "1 to 1000 frames a second", f"{rate:g}")
     return VideoInfo(first.shape[1], first.shape[0], float(rate), max(0, int(count)))
@@ -88,6 +90,23 @@ def video_frames(path: Path, rate: float | None = None) -> Iterator[TimedFrame]:
 
 
 def _decoded(path: Path) -> Iterator[tuple[float, ByteArray]]:
+    with _opened(path) as capture:
+        first, count = None, 0
+        while (frame := _next(capture)) is not None:
+            count += 1
+            now = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            first = now if first is None else first
+            yield max(0.0, now - first), frame
+        if first is None:
+            raise _undecoded(path)
+        stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))  # of some formats an estimate
+        if count < LEAST_SHARE * stated:
+            remedy = "The file is damaged. Convert it again, for example with ffmpeg."
+            raise InputError(path, "", f"{stated} frames, as the file states", f"{count}", remedy)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
     if not path.is_file():
         raise InputError(path, "", "a video", "no such file")
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
@@ -95,20 +114,15 @@ def _decoded(path: Path) -> Iterator[tuple[float, ByteArray]]:
         sides = [int(capture.get(name)) for name in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
         if max(sides) > MOST_SIDE:
             raise InputError(path, "size", f"at most {MOST_SIDE} pixels a side", "x".join(map(str, sides)))
-        first, count = None, 0
-        while True:
-            seen, frame = capture.read()
-            if not seen:
-                break
-            count += 1
-            now = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            first = now if first is None else first
-            yield max(0.0, now - first), np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
-        if first is None:
-            raise InputError(path, "", "a video that OpenCV can decode, such as H.264 in mp4", "no frame")
-        stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))  # of some formats an estimate
-        if count < LEAST_SHARE * stated:
-            remedy = "The file is damaged. Convert it again, for example with ffmpeg."
-            raise InputError(path, "", f"{stated} frames, as the file states", f"{count}", remedy)
+        yield capture
     finally:
         capture.release()
+
+
+def _next(capture: cv2.VideoCapture) -> ByteArray | None:
+    seen, frame = capture.read()
+    return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8) if seen else None
+
+
+def _undecoded(path: Path) -> InputError:
+    return InputError(path, "", "a video that OpenCV can decode, such as H.264 in mp4", "no frame")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,8 +13,8 @@ from threadpoolctl import threadpool_limits
 
 from ....bench.contracts import FloatArray, HeadPose, Progress, no_progress
 from ....bench.errors import InputError
-from ....bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
-from ....bench.io.files import atomic_path, digest
+from ....bench.io.arrays import MAX_MAGNITUDE, Member, remembered_arrays
+from ....bench.io.files import digest
 from ...clip import CaptureClip
 from ..arrays import HeadArrays
 from ..subject import PosedSubject
@@ -143,7 +142,6 @@ PER_TIMESTEP = (
 
 
 _BLOCK = {
-    "mark": TEXT,
     "coefficients": Member("f", ("T", "C"), MAX_MAGNITUDE),
     "angles": Member("f", ("T", 9), MAX_MAGNITUDE),
     **dict.fromkeys(("rotation", "neck", "translation"), Member("f", ("T", 3), MAX_MAGNITUDE)),
@@ -151,7 +149,6 @@ _BLOCK = {
     "evaluations": Member("iu", ("T",)),
     "vertex_sums": Member("f", ("n",)),
 }
-_log = logging.getLogger(__name__)
 
 
 class BlockFitter:
@@ -215,19 +212,9 @@ class BlockFitter:
         inputs = [[pose.expression, pose.rotation, pose.neck, pose.jaw, pose.eyes] for pose in poses]
         places = [[pose.translation, pose.eyelids] for pose in poses]
         mark = digest(self._input, inputs, places)
+        sizes = {"T": len(poses), "C": len(self._problem.bound), "n": len(self.matching.vertices)}
         path = folder / f"refit-{index:05d}.npz"
-        if path.exists():
-            try:
-                sizes = {"T": len(poses), "C": len(self._problem.bound), "n": len(self.matching.vertices)}
-                kept = read_arrays(path, _BLOCK, sizes)
-                if str(kept.pop("mark")) == mark:
-                    return kept
-            except InputError as error:
-                _log.warning("fitted again: %s", error)
-        block = self.fit(poses)
-        with atomic_path(path) as temporary, temporary.open("wb") as stream:
-            np.savez(stream, allow_pickle=False, mark=np.array(mark), **block)
-        return block
+        return remembered_arrays(path, mark, _BLOCK, lambda: self.fit(poses), sizes)
 
     def pose(
         self, pose: HeadPose, timestep: int | None, columns: dict[str, FloatArray], row: int

@@ -18,7 +18,9 @@ from headbench.datasets.ga.writer import CaptureWriter
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.images import write_image
 from headbench.datasets.mesh_pictures import draw_mesh, rasterize_mesh
-from headbench.datasets.tracking.command import track_capture
+from headbench.datasets.tracking import command as tracking_command
+from headbench.datasets.tracking import track
+from headbench.datasets.tracking.command import WORK, track_capture
 from headbench.datasets.tracking.focal import FocalLength, estimate_focal
 from headbench.datasets.tracking.landmarks import ImageLandmarks, spread_vertices
 from headbench.datasets.tracking.settings import TrackSettings
@@ -107,11 +109,17 @@ def settings(filmed, monkeypatch, tmp_path):
         def find(self, image, near=None):
             return known[digest(image)]
 
+        def follow(self, image, near):
+            return self.find(image)
+
+        def find_all(self, image):
+            return [] if self.find(image) is None else [self.find(image)]
+
     monkeypatch.setattr(command, "LandmarkNetwork", Network)
     monkeypatch.setattr(video_clip, "crop_around", lambda faces, width, height: Crop(0, 0, width, height))
     given = {
         "head": "2023",
-        "landmarks": "network.tflite",
+        "landmarks": str(root / "landmarks.npz"),
         "embedding": str(other),
         "focal": float(camera.K[0, 0]),
     }
@@ -129,11 +137,11 @@ def test_a_video_becomes_a_capture_of_its_frames(settings, filmed):
     numbers = [number for number in range(COUNTED) if number != FACELESS]
     assert len(clip.files) == len(numbers)
     assert found.data["video"]["without_face"] == [FACELESS]
-    assert f"without a face: {FACELESS}" in found.text
+    assert f"left out   1 frame ({FACELESS}) without a face" in found.text
     assert clip.splits["self_reenactment"]
     assert found.data["landmarks_px"] < 2.0
     out = Path(settings().out)
-    assert not (out / command.FRAMES).exists()
+    assert not (out / WORK).exists()
     assert json.loads((out / "track.json").read_text())["video"]["focal"]["source"] == "given"
 
 
@@ -168,8 +176,80 @@ def test_a_video_without_faces_is_refused(settings, filmed, monkeypatch):
     monkeypatch.setattr(
         command.LandmarkNetwork, "find", lambda self, image, near=None: (known | frames)[digest(image)]
     )
-    with pytest.raises(InputError, match=r"a face in at least 50% of the frames, found one in 0 of 12"):
+    with pytest.raises(InputError, match=r"in at least 50% of the frames, found no face in any of 12"):
         track_capture(settings())
+
+
+class Stopped(Exception):
+    """In place of a kill."""
+
+
+WORKING = {
+    "follow": lambda: command.LandmarkNetwork,
+    "find_all": lambda: command.LandmarkNetwork,
+    "write_image": lambda: video_clip,
+    "estimate_focal": lambda: command,
+    "fit_colours": lambda: track.Fitter,
+    "write_json": lambda: tracking_command,
+}
+"""What takes long, by its owner."""
+
+
+def finished_calls(monkeypatch, given, stop="", after=0):
+    """How often each function of `WORKING` returned, and the result; one of them is stopped after some calls."""
+    counts = dict.fromkeys(WORKING, 0)
+
+    def counted(name, function):
+        def call(*given, **named):
+            if (name, counts[name]) == (stop, after):
+                raise Stopped
+            result = function(*given, **named)
+            counts[name] += 1
+            return result
+
+        return call
+
+    with monkeypatch.context() as patch:
+        for name, owner in WORKING.items():
+            patch.setattr(owner(), name, counted(name, getattr(owner(), name)))
+        try:
+            result = track_capture(given).data
+        except Stopped:
+            result = None
+    return np.array([*counts.values()]), result
+
+
+STOPS = [("follow", 4), ("write_image", 9), ("estimate_focal", 0), ("fit_colours", 1), ("write_json", 0)]
+
+
+def test_a_call_that_is_interrupted_again_and_again_is_continued(settings, filmed, monkeypatch, tmp_path):
+    monkeypatch.setattr(track, "MOST_TIMESTEPS", 4)  # three parts
+    changes = {"masks": str(filmed[0] / "masks"), "focal": None}
+    wanted, whole = finished_calls(monkeypatch, replace(settings(**changes), out=str(tmp_path / "whole")))
+    counts = np.zeros(len(WORKING), int)
+    for stop in STOPS:
+        done, stopped = finished_calls(monkeypatch, settings(**changes), *stop)
+        assert stopped is None
+        counts += done
+    done, again = finished_calls(monkeypatch, settings(**changes))
+    assert (counts + done).tolist() == wanted.tolist()
+    for result in (whole, again):
+        for key in ("seconds", "seconds_per_timestep", "capture"):
+            del result[key]
+    assert again == whole
+    files = {
+        path.relative_to(tmp_path / "whole") for path in (tmp_path / "whole").rglob("*") if path.is_file()
+    }
+    assert len(files) > 2 * COUNTED
+    for file in files - {Path("track.json")}:
+        assert (tmp_path / "out" / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), file
+
+
+def test_frames_are_searched_again_with_another_option(settings, monkeypatch):
+    finished_calls(monkeypatch, settings(), "write_image", 4)
+    for changes, searched, written in (({"size": 100}, 0, 11), ({"longest": 9}, 7, 8)):
+        done, _ = finished_calls(monkeypatch, settings(**changes), "fit_colours", 0)
+        assert (done[0] > 0, done[2]) == (searched > 0, written)
 
 
 @pytest.mark.parametrize("changes", [{"focal": -1.0}, {"rate": 0.5}, {"size": 8}, {"longest": 0}])

@@ -1,0 +1,130 @@
+"""Where the masks of a video's frames are from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from ...bench.contracts import ByteArray, FloatArray
+from ...bench.errors import InputError
+from ...bench.io.files import digest, digest_file
+from ...bench.io.images import probe_image
+from ..ga.content_digests import content_digests
+from ..images import read_mask
+from .background import SAMPLES, Background, learn_background
+from .decode import TimedFrame, VideoInfo
+from .faces import Crop, FoundFaces
+from .segmentation import SelfieSegmentation
+from .settings import BACKGROUND, MASKLESS, VideoOptions
+
+
+class View(NamedTuple):
+    """The part of a video's frames that a clip shows, and its size in the clip."""
+
+    crop: Crop
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, crop: Crop, size: int) -> View:
+        """The view of a crop whose longer side becomes ``size`` pixels, unless it is shorter."""
+        scale = min(1.0, size / max(crop.width, crop.height))
+        return cls(crop, max(1, round(crop.width * scale)), max(1, round(crop.height * scale)))
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the view by pixels of the frames."""
+        return self.width / self.crop.width
+
+    def image(self, frame: ByteArray) -> ByteArray:
+        """The view of a frame or a mask of its size."""
+        part = self.crop.of(frame)
+        if part.shape[:2] == (self.height, self.width):
+            return part
+        return np.asarray(cv2.resize(part, (self.width, self.height), interpolation=cv2.INTER_AREA), np.uint8)
+
+    def points(self, pixels: FloatArray) -> FloatArray:
+        """(..., 2) pixels of the view from those of a frame."""
+        scale = [self.width / self.crop.width, self.height / self.crop.height]
+        return (pixels - [self.crop.left, self.crop.top]) * scale
+
+
+class MaskSource:
+    """Masks as the options ask for them.
+
+    Raises
+    ------
+    InputError
+        None or several are asked for, or the file is not the network.
+    UnavailableError
+        The package of the network is missing.
+    """
+
+    def __init__(self, options: VideoOptions):
+        if bool(options.segmentation) == bool(options.masks):
+            expected = "one of --segmentation FILE, --masks FOLDER, --masks background and --masks none"
+            remedy = (
+                "selfie_segmentation.tflite is in the wheel of mediapipe 0.10.21 (Apache-2.0), under "
+                "mediapipe/modules/selfie_segmentation: pip download --no-deps mediapipe==0.10.21, and unpack it."
+            )
+            found = "both" if options.masks else "none of them"
+            raise InputError("command line", "masks of a video", expected, found, remedy)
+        self.options = options
+        self.unsure: dict[int, float] = {}
+        """Of masks by the background, `HeadMask.unsure` by the number of the frame."""
+        self._network = SelfieSegmentation(Path(options.segmentation)) if options.segmentation else None
+        self._background: Background | None = None
+
+    def __bool__(self) -> bool:
+        """Whether frames are masked."""
+        return self.options.masks != MASKLESS
+
+    @property
+    def by_background(self) -> bool:
+        """Whether masks are made from what is behind the head."""
+        return self.options.masks == BACKGROUND
+
+    def prepare(self, numbers: Sequence[int], info: VideoInfo) -> str:
+        """Check what masks of frames of some numbers are made from; a digest of it.
+
+        Raises `InputError` unless a folder of masks has one of the video's size for every frame.
+        """
+        if self._network is not None:
+            return digest_file(Path(self.options.segmentation))
+        if not self or self.by_background:
+            return self.options.masks
+        files = [self._file(number) for number in numbers]
+        for file in files:
+            found = probe_image(file)
+            if (found.width, found.height) != (info.width, info.height):
+                expected = f"{info.width}x{info.height} pixels, the size of the video"
+                raise InputError(file, "", expected, f"{found.width}x{found.height}")
+        return digest([*content_digests(files).values()])
+
+    def learn(self, path: Path, frames: Iterable[TimedFrame], faces: FoundFaces, view: View) -> None:
+        """Learn the background from frames of a video, where masks are made from it. Raises `InputError` as `learn_background`."""
+        if not self.by_background:
+            return
+        used = np.flatnonzero(faces.found)
+        used = used[np.unique(np.linspace(0, len(used) - 1, SAMPLES).astype(int))]
+        chosen = dict(zip(faces.numbers[used].tolist(), used))
+        images = {frame.number: view.image(frame.image) for frame in frames if frame.number in chosen}
+        pixels = view.points(faces.pixels[[chosen[number] for number in images]])
+        self._background = learn_background(path, [*images.values()], pixels)
+
+    def mask(self, frame: TimedFrame, view: View, face: FloatArray) -> ByteArray:
+        """(H, W) 8-bit coverage of the person in the view of a frame with landmarks ``face``, (L, 2) pixels of the frame."""
+        if self._network is not None:
+            return view.image(self._network.mask(frame.image))
+        if self._background is not None:
+            found = self._background.mask(view.image(frame.image), view.points(face))
+            self.unsure[frame.number] = found.unsure
+            return found.mask
+        return view.image(read_mask(self._file(frame.number), (frame.image.shape[1], frame.image.shape[0])))
+
+    def _file(self, number: int) -> Path:
+        return Path(self.options.masks) / f"{number:05d}.png"
