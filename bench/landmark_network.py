@@ -25,7 +25,9 @@ MOST_CHANGE = 0.05
 """Landmarks may move by this part of the face's size when the crop is repeated around them."""
 SAME = 0.5
 """Faces whose middles are nearer to each other than this part of their size are one."""
-_TRIED, _ROUNDS = 6, 3
+SETTLED = 0.01
+"""As `MOST_CHANGE`, where several faces are told apart: crops beside a face approach it slowly."""
+_TRIED, _ROUNDS, _MORE_ROUNDS = 6, 3, 15
 _ACROSS, _FULLY_ACROSS = (0.35, 0.5, 0.65), (0.1, 0.225, 0.35, 0.5, 0.65, 0.775, 0.9)
 
 
@@ -76,7 +78,7 @@ class LandmarkNetwork:
             return self.find(image) if found is None else found
         scored = self._scored(image, _ACROSS)[:_TRIED]
         steady = [self._steady(image, found) for found, score in scored if score > 0]
-        best, change = min(steady, key=lambda one: one[1], default=(None, np.inf))
+        best, change, _ = min(steady, key=lambda one: one[1], default=(None, np.inf, 0.0))
         return best if change < MOST_CHANGE else None
 
     def follow(self, image: ByteArray, near: FloatArray) -> FloatArray | None:
@@ -86,12 +88,18 @@ class LandmarkNetwork:
 
     def find_all(self, image: ByteArray) -> list[FloatArray]:
         """(COUNT, 2) landmarks of every face, the largest first; faces much smaller than the picture are not found."""
-        faces: list[FloatArray] = []
+        seen: list[tuple[float, FloatArray]] = []
         for found, score in self._scored(image, _FULLY_ACROSS):
-            if score > 0 and not any(same_face(found, face) for face in faces):
-                steady, change = self._steady(image, found)
-                if change < MOST_CHANGE and not any(same_face(steady, face) for face in faces):
-                    faces.append(steady)
+            if score > 0 and not any(same_face(found, face) for _, face in seen):
+                steady, change, score = self._steady(image, found, _MORE_ROUNDS, SETTLED)
+                if change < SETTLED:
+                    seen.append((score, steady))
+        faces: list[FloatArray] = []
+        for _, face in sorted(
+            seen, key=lambda one: -one[0]
+        ):  # what is found beside a face scores lower than it
+            if all(face_distance(face, other) > 1 for other in faces):
+                faces.append(face)
         return sorted(faces, key=face_size, reverse=True)
 
     def _scored(self, image: ByteArray, across: Sequence[float]) -> list[tuple[FloatArray, float]]:
@@ -99,17 +107,21 @@ class LandmarkNetwork:
         crops = _candidates(image, across)
         return sorted((self._run(image, crop) for crop in crops), key=lambda one: -one[1])
 
-    def _steady(self, image: ByteArray, found: FloatArray) -> tuple[FloatArray, float]:
-        """Landmarks after repeating the crop around them, and their last change relative to the face's size.
+    def _steady(
+        self, image: ByteArray, found: FloatArray, rounds: int = _ROUNDS, settled: float = 0.0
+    ) -> tuple[FloatArray, float, float]:
+        """Landmarks after repeating the crop around them, their last change relative to the face's size, and their score.
+
+        The repetition ends after a number of rounds, or at a change below ``settled``.
 
         Where the network sees a whole face, the landmarks of a crop around them are the same.
         """
         change, score = np.inf, 1.0
-        for _ in range(_ROUNDS):
-            if score > 0:
+        for _ in range(rounds):
+            if score > 0 and change >= settled:
                 before, (found, score) = found, self._run(image, _crop_around(found))
                 change = float(np.abs(found - before).mean() / face_size(found))
-        return found, change if score > 0 else np.inf
+        return found, change if score > 0 else np.inf, score
 
     def _run(self, image: ByteArray, crop: _Crop) -> tuple[FloatArray, float]:
         """Landmarks, and the logit of the probability that the crop shows a face."""

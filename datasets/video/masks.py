@@ -9,13 +9,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ...bench.contracts import ByteArray, FloatArray
+from ...bench.contracts import ByteArray, FloatArray, IntArray
 from ...bench.errors import InputError
 from ...bench.io.files import digest, digest_file
 from ...bench.io.images import probe_image
 from ..ga.content_digests import content_digests
 from ..images import read_mask
-from .background import SAMPLES, Background, learn_background
+from .background import CHECKED, SAMPLES, Background, check_background, learn_background
 from .decode import TimedFrame, VideoInfo
 from .faces import Crop, FoundFaces
 from .segmentation import SelfieSegmentation
@@ -106,15 +106,21 @@ class MaskSource:
         return digest([*content_digests(files).values()])
 
     def learn(self, path: Path, frames: Iterable[TimedFrame], faces: FoundFaces, view: View) -> None:
-        """Learn the background from frames of a video, where masks are made from it. Raises `InputError` as `learn_background`."""
+        """Learn the background from frames of a video, where masks are made from it.
+
+        Raises `InputError` as `learn_background` and `check_background`.
+        """
         if not self.by_background:
             return
-        used = np.flatnonzero(faces.found)
-        used = used[np.unique(np.linspace(0, len(used) - 1, SAMPLES).astype(int))]
-        chosen = dict(zip(faces.numbers[used].tolist(), used))
+        empty, shown = (
+            _spread(np.flatnonzero(faces.found == found), count)
+            for found, count in ((0, SAMPLES), (1, CHECKED))
+        )
+        chosen = {*faces.numbers[[*empty, *shown]].tolist()}
         images = {frame.number: view.image(frame.image) for frame in frames if frame.number in chosen}
-        pixels = view.points(faces.pixels[[chosen[number] for number in images]])
-        self._background = learn_background(path, [*images.values()], pixels)
+        self._background = learn_background(path, [images[number] for number in faces.numbers[empty]])
+        pixels = view.points(faces.pixels[shown])
+        check_background(path, self._background, [images[number] for number in faces.numbers[shown]], pixels)
 
     def mask(self, frame: TimedFrame, view: View, face: FloatArray) -> ByteArray:
         """(H, W) 8-bit coverage of the person in the view of a frame with landmarks ``face``, (L, 2) pixels of the frame."""
@@ -128,3 +134,10 @@ class MaskSource:
 
     def _file(self, number: int) -> Path:
         return Path(self.options.masks) / f"{number:05d}.png"
+
+
+def _spread(values: IntArray, count: int) -> list[int]:
+    """At most ``count`` of the values, evenly."""
+    if not len(values):
+        return []
+    return values[np.unique(np.linspace(0, len(values) - 1, count).astype(int))].tolist()

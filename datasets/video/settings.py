@@ -17,8 +17,8 @@ class VideoOptions:
 
     masks: str = ""
     """Video: folder of masks instead, of the video's size, named by the number of the frame in the file (00000.png is the first frame, also
-    where --rate takes fewer); "background" to take what differs from the room, for a camera that stands still and a head that moves to
-    the sides; or "none" to keep the room behind the person, which then counts in every metric."""
+    where --rate takes fewer); "background" to take what differs from the empty room, which a camera that stands still has to show
+    for some seconds without anyone; or "none" to keep the room behind the person, which then counts in every metric."""
 
     focal: float | None = None
     """Video: focal length in pixels of its upright frames; default: estimated from the landmarks, which is inexact."""

@@ -162,6 +162,7 @@ def test_masks_remove_the_room(settings, filmed):
         ({"head": None}, "--head: expected a value"),
         ({"head": "2020"}, "head_model"),
         ({"masks": "nowhere"}, "nowhere"),
+        ({"masks": "background"}, "frames without a face, for --masks background: at least 10, found 1"),
         ({"longest": 1}, "frames for training"),
     ],
 )
@@ -263,7 +264,7 @@ def test_a_crop_holds_every_face_and_moves_the_camera():
     rng = np.random.default_rng(0)
     for row, middle in ((0, (200, 150)), (2, (230, 160))):
         pixels[row] = middle + 30 * rng.uniform(-1, 1, (COUNT, 2))
-    crop = crop_around(FoundFaces(pixels), 640, 300)
+    crop = crop_around(FoundFaces(np.arange(3), pixels, np.zeros(3, int)), 640, 300)
     low, high = np.nanmin(pixels, axis=(0, 1)), np.nanmax(pixels, axis=(0, 1))
     assert crop.left <= low[0] - 40
     assert crop.top <= low[1] - 50

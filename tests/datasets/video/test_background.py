@@ -1,0 +1,65 @@
+"""Masks by the difference from the empty room, on drawings of the head before a room."""
+
+import cv2
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.datasets.head.procedural.model import procedural_head
+from headbench.datasets.mesh_pictures import draw_mesh, rasterize_mesh
+from headbench.datasets.video.background import check_background, learn_background
+
+from ..tiny_capture import look_at
+
+HEIGHT, WIDTH, SHOWN, EMPTY = 200, 300, 6, 12
+
+
+@pytest.fixture(scope="module")
+def filmed():
+    """Images with noise and changing exposure, true masks and landmarks; and images of the room alone."""
+    rng = np.random.default_rng(0)
+    head = procedural_head("2023")
+    template = np.asarray(head.template)
+    camera = look_at("0", np.array([0.0, 0.1, 1.0]), WIDTH, HEIGHT, WIDTH / 2, HEIGHT / 2)
+    noise = cv2.GaussianBlur(rng.normal(0, 1, (HEIGHT, WIDTH, 3)), (0, 0), 6)
+    room = (120 + 50 * noise / noise.std()).clip(0, 255)
+    room[40:160, 30:90] = (60, 90, 150)
+    colors = np.tile([0.8, 0.6, 0.5], (len(template), 1))
+    images, masks, faces = [], [], []
+    for x in np.linspace(-0.06, 0.06, SHOWN):
+        mesh = template + [x, 0, 0]
+        mask = rasterize_mesh(mesh, head.faces, camera).face >= 0
+        image = draw_mesh(mesh, head.faces, camera, colors)
+        images.append(np.where(mask[..., None], image, room))
+        points = mesh[head.regions["face"]] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        points = points @ camera.K.T
+        faces.append(points[:, :2] / points[:, 2:])
+        masks.append(mask)
+    taken = [
+        (image * rng.uniform(0.97, 1.03) + rng.normal(0, 2, image.shape)).clip(0, 255).astype(np.uint8)
+        for image in [*images, *[room] * EMPTY]
+    ]
+    return taken[:SHOWN], np.stack(masks), np.stack(faces), taken[SHOWN:]
+
+
+def test_masks_overlap_the_true_ones(filmed):
+    images, masks, faces, empty = filmed
+    background = learn_background("me.mp4", empty)
+    check_background("me.mp4", background, images, faces)
+    for image, true, face in zip(images, masks, faces):
+        found = background.mask(image, face)
+        mask = found.mask > 0
+        assert (mask & true).sum() / (mask | true).sum() > 0.93
+        assert found.unsure < 0.3
+
+
+def test_what_shows_no_empty_room_is_refused(filmed):
+    images, _, faces, empty = filmed
+    with pytest.raises(InputError, match=r"at least 10, found 9[\s\S]*leave the picture"):
+        learn_background("me.mp4", empty[:9])
+    moved = [np.roll(image, 9 * number, axis=1) for number, image in enumerate(empty)]
+    with pytest.raises(InputError, match="of the pixels change"):
+        learn_background("me.mp4", moved)
+    background = learn_background("me.mp4", [images[2]] * EMPTY)  # somebody without a face that is found
+    with pytest.raises(InputError, match="pixels unsure, found"):
+        check_background("me.mp4", background, [images[2]], faces[2:3])

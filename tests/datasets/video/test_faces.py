@@ -1,0 +1,114 @@
+"""Whose face is followed where a video shows several people, or nobody for a while."""
+
+import numpy as np
+import pytest
+
+from headbench.bench.errors import InputError
+from headbench.bench.landmark_network import COUNT, face_size, same_face
+from headbench.datasets.video import faces
+from headbench.datasets.video.decode import TimedFrame
+from headbench.datasets.video.faces import find_faces
+
+SHAPE = np.random.default_rng(0).uniform(-0.5, 0.5, (COUNT, 2))
+BLACK = np.zeros((4, 4, 3), np.uint8)
+
+
+def face(x, size=40.0):
+    return np.array([x, 100.0]) + size * SHAPE
+
+
+class Network:
+    """A network that sees the faces of each frame; the number of a frame is in its first pixel."""
+
+    def __init__(self, shown):
+        self.shown, self.searched = shown, []
+
+    def follow(self, image, near):
+        near_by = [one for one in self.shown[image[0, 0, 0]] if same_face(one, near)]
+        return near_by[0] if near_by else None
+
+    def find_all(self, image):
+        self.searched.append(int(image[0, 0, 0]))
+        return sorted(self.shown[image[0, 0, 0]], key=face_size, reverse=True)
+
+
+def frames(count):
+    for number in range(count):
+        yield TimedFrame(2 * number, number / 25, np.full((4, 4, 3), number, np.uint8))
+
+
+def found(tmp_path, shown):
+    return find_faces("me.mp4", frames(len(shown)), Network(shown), tmp_path / "faces.npz", "mark")
+
+
+STILL = [[face(50)] for _ in range(12)]
+CASES = {
+    "one": (STILL, [50] * 12, [0] * 12),
+    "leaves and comes back elsewhere": (
+        [[face(50)]] * 5 + [[]] * 3 + [[face(200)]] * 4,
+        [50] * 5 + [None] * 3 + [200] * 4,
+        [0] * 12,
+    ),
+    "a larger second face": ([[face(50), face(200, 30 + 3 * t)] for t in range(8)], [50] * 8, [1] * 8),
+    "the other one stays": (
+        [[face(50, 44), face(200)]] * 3 + [[face(200)]] * 3 + [[face(60, 44), face(200)]] * 2,
+        [50] * 3 + [None] * 3 + [60] * 2,
+        [1] * 8,
+    ),
+    "the other one moves to the place of the first": (
+        [[face(50), face(122 - 6 * t, 39)] for t in range(8)] + [[face(68 - 6 * t, 39)] for t in range(4)],
+        [50] * 8 + [None] * 4,
+        [1] * 12,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_one_person_is_followed(tmp_path, name):
+    shown, places, others = CASES[name]
+    result = found(tmp_path, shown)
+    assert result.found.tolist() == [place is not None for place in places]
+    middles = result.pixels[result.found].mean(axis=1)[:, 0] - 40 * SHAPE.mean(axis=0)[0]
+    np.testing.assert_allclose(middles, [place for place in places if place is not None], atol=1)
+    assert result.others.tolist() == others
+    assert result.numbers.tolist() == [2 * number for number in range(len(shown))]
+
+
+def test_a_search_that_was_interrupted_is_continued_as_if_it_were_not(tmp_path):
+    shown = CASES["the other one stays"][0]
+    whole = found(tmp_path / "whole", shown)
+
+    def broken():
+        for frame in frames(5):
+            yield frame
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        find_faces("me.mp4", broken(), Network(shown), tmp_path / "faces.npz", "mark")
+    network = Network([None] * 5 + shown[5:])  # which fails at frames that were searched
+    again = find_faces("me.mp4", frames(8), network, tmp_path / "faces.npz", "mark")
+    for one, other in zip(whole, again):
+        np.testing.assert_array_equal(one, other)
+    find_faces("me.mp4", iter([None]), network, tmp_path / "faces.npz", "mark")  # reads no frame
+
+
+def test_landmarks_are_stored_meanwhile_for_a_kill(tmp_path, monkeypatch):
+    monkeypatch.setattr(faces, "STORED_S", 0.0)
+    stored = []
+    monkeypatch.setattr(faces, "store_arrays", lambda path, mark, arrays: stored.append(arrays))
+    found(tmp_path, STILL)
+    assert [len(one["numbers"]) for one in stored] == [*range(1, 13), 12]
+    assert [bool(one["finished"]) for one in stored] == [False] * 12 + [True]
+
+
+@pytest.mark.parametrize(
+    ("shown", "message"),
+    [
+        ([[]] * 4, "in at least 50% of the frames, found no face in any of 4"),
+        ([[face(50)]] + [[]] * 3, "found it in 1 of 4"),
+        ([], "found no face in any of 0"),
+    ],
+)
+def test_too_few_frames_with_the_face_are_refused(tmp_path, shown, message):
+    with pytest.raises(InputError, match=message):
+        found(tmp_path, shown)
