@@ -17,7 +17,7 @@ State = Literal["ready", "partly", "missing"]
 
 @dataclass(frozen=True)
 class DoctorSettings:
-    """Report what is missing on this machine for every method, metric and reader, and how to install it.
+    """Report what is missing on this machine for every method, metric, reader and tracker, and how to install it.
 
     Exit code 0: all default methods, or the named ones, can run here; 3: at least one cannot. Nothing is
     downloaded or written.
@@ -31,7 +31,8 @@ class DoctorSettings:
     """Device that the methods run on: cpu, cuda, cuda:1, ..."""
 
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")] = ()
-    """A setting of a method, as for `headbench run`: `settings.ga-official.checkout=DIR`; repeatable."""
+    """A setting of a method, as for `headbench run`: `settings.ga-official.checkout=DIR`; or checkout and python of a tracker of other
+    authors, such as `settings.vhap.checkout=DIR`; repeatable."""
 
 
 class PluginStatus(NamedTuple):
@@ -73,8 +74,9 @@ def doctor(settings: DoctorSettings, progress: Progress) -> CommandResult:
     RunConfig("", "", device=settings.device)  # refuses what is no device
     named = {get("methods", name).name: name for name in settings.methods}
     known = [*named] if named else [*discover("methods")]
-    if unfit := sorted(set(chosen) - set(known)):
-        raise unknown("command line", "--set settings", unfit[0], known)
+    programs = {} if named else _programs()
+    if unfit := sorted(set(chosen) - {*known, *programs}):
+        raise unknown("command line", "--set settings", unfit[0], [*known, *programs])
     if not all(isinstance(values, Mapping) for values in chosen.values()):
         raise InputError("command line", "--set settings", "settings.METHOD.KEY=VALUE", "another")
     statuses = [PluginStatus("machine", settings.device, True, tuple(_device(settings.device)))]
@@ -88,6 +90,9 @@ def doctor(settings: DoctorSettings, progress: Progress) -> CommandResult:
             elif plugin.spec.needs:
                 needs = tuple(_asked(plugin.spec.needs, None, settings.device))
                 statuses.append(PluginStatus(group, name, False, needs))
+    for name, needs_of in programs.items():
+        found = tuple(_asked(needs_of, chosen.get(name, {}), settings.device))
+        statuses.append(PluginStatus("programs", name, False, found))
     if not named:
         statuses.append(PluginStatus("executors", "slurm", False, tuple(_slurm())))
     unavailable = [status for status in statuses if status.counts and status.state == "missing"]
@@ -128,6 +133,14 @@ def _device(device: str) -> Iterator[Need]:
         yield Need(f"device {device}", "", str(error))
     else:
         yield Need(f"device {device}", "there")
+
+
+def _programs() -> dict[str, str]:
+    """Functions that yield the needs of the programs that commands run, by name of the program."""
+    from .registry import discover
+
+    specs = [plugin.spec for plugin in discover("commands").values()]
+    return {name: needs for spec in specs if spec is not None for name, needs in spec.programs.items()}  # type: ignore[attr-defined]
 
 
 def _slurm() -> Iterator[Need]:

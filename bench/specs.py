@@ -416,6 +416,9 @@ class CommandSpec:
         The setting with the folder that the command writes: no other process works in it meanwhile; "" for none.
     kinds : tuple of str
         The kinds of folder that the command may continue in, see `bench.io.files.check_kind`.
+    programs : mapping of str to str
+        Programs of other authors that the command runs, by name: "package.module:function" of ``(settings, device) -> Iterator[Need]``,
+        where ``settings`` is the mapping that ``headbench doctor --set settings.NAME.KEY=VALUE`` gives.
     """
 
     name: str
@@ -425,6 +428,7 @@ class CommandSpec:
     function: str
     writes: str = ""
     kinds: tuple[str, ...] = ()
+    programs: Mapping[str, str] = field(default_factory=dict)
 
 
 COMMAND_GROUPS = ("compare", "inspect", "data", "export", "validate")

@@ -115,6 +115,10 @@ TRACK = CommandSpec(
     function="headbench.datasets.tracking.command:track_capture",
     writes="out",
     kinds=("captures",),
+    programs={
+        "vhap": "headbench.datasets.tracking.needs:vhap",
+        "pixel3dmm": "headbench.datasets.tracking.needs:pixel3dmm",
+    },
 )
 
 TRACKED = ConditionSpec(

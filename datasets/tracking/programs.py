@@ -184,8 +184,14 @@ def export_of(work: Work) -> Path:
 def check_program(name: str, checkout: Path, python: str) -> tuple[TrackingProgram, Path]:
     """The program of a name, whose checkout and interpreter are complete, and the interpreter's path.
 
-    Raises `InputError` for a script, a file or a module that is missing.
+    Raises `InputError` as `check_checkout` and `check_interpreter`.
     """
+    check_checkout(name, checkout)
+    return PROGRAMS[name], check_interpreter(name, python)
+
+
+def check_checkout(name: str, checkout: Path) -> None:
+    """Raise `InputError` for a script or a file of a program that is missing."""
     program = PROGRAMS[name]
     scripts = [step.arguments(Work(Path("/"), Path("/video.mp4")))[0] for step in program.steps]
     for script in scripts:
@@ -195,6 +201,11 @@ def check_program(name: str, checkout: Path, python: str) -> tuple[TrackingProgr
     for file in program.files:
         if not (checkout / file).exists():
             raise InputError(checkout, file, f"a file that {name} needs", "no such file", program.remedy)
+
+
+def check_interpreter(name: str, python: str) -> Path:
+    """Path of an interpreter with the modules of a program. Raises `InputError` if it or one of these is missing."""
+    program = PROGRAMS[name]
     interpreter = shutil.which(python)
     if interpreter is None:
         raise InputError("command line", "--python", f"the interpreter of the environment of {name}", python)
@@ -218,7 +229,7 @@ def check_program(name: str, checkout: Path, python: str) -> tuple[TrackingProgr
     if found.returncode:
         said = found.stderr.strip().splitlines()[-1:] or [described(found.returncode)]
         raise InputError(path, "", expected, said[0], remedy)
-    return program, path
+    return path
 
 
 def run_steps(

@@ -1,6 +1,7 @@
 """Trackers of other authors: stand-ins for their checkouts that write what the programs write."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -11,6 +12,8 @@ import numpy as np
 import psutil
 import pytest
 
+from headbench.bench.contracts import no_progress
+from headbench.bench.doctor import DoctorSettings, doctor
 from headbench.bench.errors import InputError
 from headbench.bench.io.video import write_video
 from headbench.bench.process import ProgramError
@@ -212,6 +215,28 @@ def test_what_an_installation_lacks_is_said_before_it_runs(settings, missing, me
     with pytest.raises(InputError, match=message):
         track_capture(given)
     assert not Path(given.out).exists()
+
+
+@pytest.mark.parametrize(
+    ("missing", "state", "says"),
+    [
+        ("", "ready", "checkout: {checkout}; environment: {python}"),
+        ("scripts/track.py", "missing", "no checkout. .*git clone"),
+        ("pretrained_weights/uv.ckpt", "missing", "no checkout. .*install_preprocessing"),
+        ("installed/pixel3dmm.py", "missing", "no environment. .*ModuleNotFoundError"),
+    ],
+)
+def test_doctor_reports_what_an_installation_lacks(settings, missing, state, says):
+    given = settings("pixel3dmm")
+    if missing:
+        (Path(given.checkout) / missing).unlink()
+    places = {"checkout": given.checkout, "python": given.python}
+    asked = tuple(f"settings.pixel3dmm.{name}={place}" for name, place in places.items())
+    found = doctor(DoctorSettings(set=asked), no_progress)
+    states = {one["name"]: one["state"] for one in found.data["plugins"] if one["group"] == "programs"}
+    assert states == {"vhap": "missing", "pixel3dmm": state}
+    assert re.search(says.format(**places), found.text)
+    assert "settings.vhap.checkout=DIR" in found.text
 
 
 @pytest.mark.parametrize(

@@ -79,8 +79,7 @@ def test_a_search_that_was_interrupted_is_continued_as_if_it_were_not(tmp_path):
     whole = found(tmp_path / "whole", shown)
 
     def broken():
-        for frame in frames(5):
-            yield frame
+        yield from frames(5)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
