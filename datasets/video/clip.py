@@ -22,7 +22,7 @@ from ..monocular.clip import check_subject, clip_of_track, subject_of
 from ..monocular.track import VIDEO, Track, VideoFrame
 from .decode import TimedFrame, VideoInfo, probe_video, video_frames
 from .faces import FoundFaces, crop_around, find_faces
-from .masks import MaskSource, View
+from .masks import MaskSource, FrameView
 from .settings import VideoOptions
 
 FACES, IMAGES, MASKS = "faces.npz", "images", "masks"
@@ -37,7 +37,7 @@ class VideoClip(NamedTuple):
 
     clip: CaptureClip
     info: VideoInfo
-    view: View
+    view: FrameView
     faces: FoundFaces
     unsure: tuple[float, ...]
     """`HeadMask.unsure` of the frames of the clip, where masks are made from the background."""
@@ -88,7 +88,7 @@ def open_video(
     for other in out.glob(f"{IMAGES}-*"):
         if other != folder:
             shutil.rmtree(other)
-    view = View.of(crop_around(faces, info.width, info.height), options.size)
+    view = FrameView.of(crop_around(faces, info.width, info.height), options.size)
     _write_frames(path, options, faces, masks, view, folder, progress)
     focal = (options.focal or USUAL_FOCAL * max(info.width, info.height)) * view.scale
     middle = view.points(np.array([info.width, info.height]) / 2)
@@ -116,7 +116,7 @@ def _write_frames(
     options: VideoOptions,
     faces: FoundFaces,
     masks: MaskSource,
-    view: View,
+    view: FrameView,
     folder: Path,
     progress: Progress,
 ) -> None:

@@ -22,7 +22,7 @@ from .segmentation import SelfieSegmentation
 from .settings import BACKGROUND, MASKLESS, VideoOptions
 
 
-class View(NamedTuple):
+class FrameView(NamedTuple):
     """The part of a video's frames that a clip shows, and its size in the clip."""
 
     crop: Crop
@@ -30,7 +30,7 @@ class View(NamedTuple):
     height: int
 
     @classmethod
-    def of(cls, crop: Crop, size: int) -> View:
+    def of(cls, crop: Crop, size: int) -> FrameView:
         """The view of a crop whose longer side becomes ``size`` pixels, unless it is shorter."""
         scale = min(1.0, size / max(crop.width, crop.height))
         return cls(crop, max(1, round(crop.width * scale)), max(1, round(crop.height * scale)))
@@ -105,7 +105,7 @@ class MaskSource:
                 raise InputError(file, "", expected, f"{found.width}x{found.height}")
         return digest([*content_digests(files).values()])
 
-    def learn(self, path: Path, frames: Iterable[TimedFrame], faces: FoundFaces, view: View) -> None:
+    def learn(self, path: Path, frames: Iterable[TimedFrame], faces: FoundFaces, view: FrameView) -> None:
         """Learn the background from frames of a video, where masks are made from it.
 
         Raises `InputError` as `learn_background` and `check_background`.
@@ -122,7 +122,7 @@ class MaskSource:
         pixels = view.points(faces.pixels[shown])
         check_background(path, self._background, [images[number] for number in faces.numbers[shown]], pixels)
 
-    def mask(self, frame: TimedFrame, view: View, face: FloatArray) -> ByteArray:
+    def mask(self, frame: TimedFrame, view: FrameView, face: FloatArray) -> ByteArray:
         """(H, W) 8-bit coverage of the person in the view of a frame with landmarks ``face``, (L, 2) pixels of the frame."""
         if self._network is not None:
             return view.image(self._network.mask(frame.image))

@@ -56,7 +56,9 @@ def main(capture: Path) -> None:
         "lost": (image, clip.image(clip.frame_at[first, side])[:, : camera.width // 2 + camera.width // 12]),
         "focal": (
             mesh_over(clip, camera, image),
-            mesh_over(clip, nearer(camera, mesh[np.asarray(clip.head.regions["face"])].mean(axis=0), 0.35), image),
+            mesh_over(
+                clip, nearer(camera, mesh[np.asarray(clip.head.regions["face"])].mean(axis=0), 0.35), image
+            ),
         ),
     }
     for name, (right, wrong) in pairs.items():

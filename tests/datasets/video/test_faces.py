@@ -74,7 +74,7 @@ def test_one_person_is_followed(tmp_path, name):
     assert result.numbers.tolist() == [2 * number for number in range(len(shown))]
 
 
-def test_a_search_that_was_interrupted_is_continued_as_if_it_were_not(tmp_path):
+def test_an_interrupted_search_gives_the_same_landmarks(tmp_path):
     shown = CASES["the other one stays"][0]
     whole = found(tmp_path / "whole", shown)
 

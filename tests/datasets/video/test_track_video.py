@@ -223,7 +223,7 @@ def finished_calls(monkeypatch, given, stop="", after=0):
 STOPS = [("follow", 4), ("write_image", 9), ("estimate_focal", 0), ("fit_colours", 1), ("write_json", 0)]
 
 
-def test_a_call_that_is_interrupted_again_and_again_is_continued(settings, filmed, monkeypatch, tmp_path):
+def test_a_call_that_is_interrupted_repeatedly_is_continued(settings, filmed, monkeypatch, tmp_path):
     monkeypatch.setattr(track, "MOST_TIMESTEPS", 4)  # three parts
     changes = {"masks": str(filmed[0] / "masks"), "focal": None}
     wanted, whole = finished_calls(monkeypatch, replace(settings(**changes), out=str(tmp_path / "whole")))
