@@ -22,7 +22,7 @@ from ..monocular.clip import check_subject, clip_of_track, subject_of
 from ..monocular.track import VIDEO, Track, VideoFrame
 from .decode import TimedFrame, VideoInfo, probe_video, video_frames
 from .faces import FoundFaces, crop_around, find_faces
-from .masks import MaskSource, FrameView
+from .masks import FrameView, MaskSource
 from .settings import VideoOptions
 
 FACES, IMAGES, MASKS = "faces.npz", "images", "masks"
