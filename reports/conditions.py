@@ -128,7 +128,9 @@ def titled_note(title: str, by_method: Mapping[str, Conditions]) -> str:
         texts.append(f"{title} of {note_of(by_method)}")
     if len(places) == 1 and len(*places) > 1:
         text = next(each.text for each in by_method.values() if each.places)
-        texts.append(f"{title}: Measured on {text}; not comparable between these.")
+        texts.append(
+            f"{title}: Measured on {text}; values of different machines or thread counts are not comparable."
+        )
     return " ".join(texts)
 
 

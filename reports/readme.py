@@ -207,6 +207,13 @@ def suite_block(root: Path) -> str:
     options = " ".join(suite_options(folder))
     made = _made(runs.runs[0].manifest)
     minutes = [value for each in folders for _, value in _minutes(each)]
+    seconds = [summarise(runs.rows, label, "training_processor", "").value for label in runs.ranked]
+    known = [value for value in seconds if value is not None]
+    took = (
+        f" (means of a training by method: {min(known):.0f} to {max(known):.0f} processor seconds)"
+        if known
+        else ""
+    )
     hours = sum(value for value in minutes if value is not None) / 60
     interrupted = (
         f", not counting {minutes.count(None)} that were interrupted and continued" if None in minutes else ""
@@ -219,7 +226,7 @@ def suite_block(root: Path) -> str:
         f"{to_markdown(table_of(shown, columns=columns)).strip()}\n\n{conclusions(shown)}\n\n"
         f"[SSIM, tables by region and by part of FREE, paired differences with tests]({results}). "
         f"The captures are of edition {made.get('edition', 1)}, made with seed {made['seed']}, and have the options `headbench run suite {options}`. "
-        f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{interrupted}."
+        f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{took}{interrupted}."
     )
 
 
@@ -264,7 +271,7 @@ def _conclusions(runs: RunSet, pairs: Sequence[PairedComparison]) -> str:
         for (outcome, other), labels in metrics.items():
             others.setdefault((outcome, _listed(labels)), []).append(f"`{other}`")
         said = [
-            f"{outcome.format(others=_listed(names), are='are' if len(names) > 1 else 'is')} by {labels}"
+            outcome.format(others=_listed(names), are="are" if len(names) > 1 else "is", metrics=labels)
             for (outcome, labels), names in others.items()
         ]
         lines.append(f"- {TASK_TITLES.get(task, task)}: {'; '.join(said)}.")
@@ -272,14 +279,14 @@ def _conclusions(runs: RunSet, pairs: Sequence[PairedComparison]) -> str:
 
 
 def _outcome(pair: PairedComparison, unit: str) -> str:
-    """A sentence on the first method and ``{others}``, with ``{are}`` where the verb follows these."""
+    """A sentence on the first method and ``{others}`` by ``{metrics}``, with ``{are}`` where the verb follows the others."""
     tested = equivalence_text(pair, unit, p=False)
     within = f" ({tested})" if tested else ""
     if pair.verdict == f"{pair.first} is better":
-        return f"`{pair.first}` is better than {{others}}{within}"
+        return f"`{pair.first}` is better than {{others}} by {{metrics}}{within}"
     if pair.verdict == f"{pair.second} is better":
-        return f"{{others}} {{are}} better than `{pair.first}`{within}"
-    return f"`{pair.first}` against {{others}}: {pair.verdict}{within}"
+        return f"{{others}} {{are}} better than `{pair.first}` by {{metrics}}{within}"
+    return f"`{pair.first}` against {{others}}, by {{metrics}}: {pair.verdict}{within}"
 
 
 def _listed(words: Sequence[str]) -> str:

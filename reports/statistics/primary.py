@@ -36,12 +36,22 @@ def primary_comparisons(runs: RunSet) -> list[PairedComparison]:
     return as_one_family(each for (each,) in found)
 
 
+def planned_subjects(runs: RunSet) -> int:
+    """Number of subjects that the synthetic captures of the runs were planned for; 0 where none is recorded."""
+    steps = [step["parameters"] for run in runs.runs for clip in run.manifest.clips for step in clip.steps]
+    return max((int(each["synthetic"]["subjects"]) for each in steps if "synthetic" in each), default=0)
+
+
 def primary_table(runs: RunSet) -> str:
-    """Differences, intervals and verdicts of the primary endpoints as a Markdown table; "" where the runs lack them."""
+    """Differences, intervals and verdicts of the primary endpoints as a Markdown table; "" where the runs lack them.
+
+    As long as subjects are missing that the captures were planned for, the results are interim and have no verdict: testing again
+    with each further subject rejects too often.
+    """
     found = primary_comparisons(runs)
     if not found:
         return ""
-    specs = {spec.name: spec for spec in runs.metrics}
+    specs, planned = {spec.name: spec for spec in runs.metrics}, planned_subjects(runs)
     confidence = f"{100 * (1 - LEVEL):g} % interval"
     lines = [["endpoint", f"{PAIR[0]} - {PAIR[1]}", confidence, "p", "Holm", "", "equivalence"], ["---"] * 7]
     for c in found:
@@ -54,9 +64,13 @@ def primary_table(runs: RunSet) -> str:
         digits = spec.digits + 1
         bounds = "-" if c.low is None or c.high is None else f"{c.low:+.{digits}f}, {c.high:+.{digits}f}"
         numbers = [f"{c.difference:+.{digits}f}", bounds, f"{c.p:.4f}", f"{c.p_holm:.4f}"]
+        if c.subjects < planned:
+            lines.append([head, *numbers, f"interim: {c.subjects} of {planned} subjects", ""])
+            continue
         lines.append([head, *numbers, c.verdict, equivalence_text(c, spec.unit)])
     how = (
-        f"Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in found)} endpoints with values; "
+        "Intervals are those of a bootstrap over subjects, each for itself and not corrected; they may exclude 0 where the test of few "
+        f"subjects cannot reject. Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in found)} endpoints with values; "
         "equivalence by two one-sided sign-flip tests, which assume that subjects differ symmetrically about the mean, Holm over "
         f"these; level {LEVEL:.0%}."
     )

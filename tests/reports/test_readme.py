@@ -40,10 +40,10 @@ def pair(second="ga", metric="psnr", difference=1.0, p=0.01, **given):
     [
         ([pair()], "`ours` is better than `ga` by PSNR"),
         ([pair(difference=-1.0)], "`ga` is better than `ours` by PSNR"),
-        ([pair(p=0.2)], "`ours` against `ga`: cannot be told apart by PSNR"),
+        ([pair(p=0.2)], "`ours` against `ga`, by PSNR: cannot be told apart"),
         (
             [pair(difference=0.1, p=0.2, margin=0.3, p_equivalence_holm=0.01)],
-            "`ours` against `ga`: cannot be told apart (equivalent within 0.3) by PSNR",
+            "`ours` against `ga`, by PSNR: cannot be told apart (equivalent within 0.3)",
         ),
         (
             [pair(), pair("gha"), pair(metric="lpips", difference=-1.0), pair("gha", "lpips", -1.0)],
@@ -53,7 +53,7 @@ def pair(second="ga", metric="psnr", difference=1.0, p=0.01, **given):
             [pair(difference=-1.0), pair("gbs", difference=-1.0), pair("gha"), pair("gbs", "lpips", p=0.2)],
             (
                 "`ga` and `gbs` are better than `ours` by PSNR; `ours` is better than `gha` by PSNR; "
-                "`ours` against `gbs`: cannot be told apart by LPIPS"
+                "`ours` against `gbs`, by LPIPS: cannot be told apart"
             ),
         ),
     ],

@@ -233,7 +233,7 @@ def test_training_times_of_a_curve_are_those_of_its_records(tmp_path, write_mani
         (("A", "A"), ""),
         (
             ("A", "B"),
-            "Frame time: Measured on A with 2 threads; B with 2 threads; not comparable between these.",
+            "Frame time: Measured on A with 2 threads; B with 2 threads; values of different machines or thread counts are not comparable.",
         ),
         (("A", ""), ""),
     ],

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from scipy import stats
 from headbench.bench.manifest import MethodRecord
 from headbench.bench.rows import Rows
 from headbench.reports.runs import RunSet
+from headbench.reports.statistics import primary
 from headbench.reports.statistics.primary import MARGINS, PAIR, PRIMARY, primary_comparisons, primary_section
 
 from ..conftest import LPIPS, PSNR
@@ -71,3 +73,18 @@ def test_runs_without_the_pair_have_no_primary_endpoint(runs):
     other = runs.only(["ours", "gbs"])
     assert primary_comparisons(other) == []
     assert "None: they compare `ours` with `ga`" in primary_section(other)
+
+
+@pytest.mark.parametrize(("planned", "interim"), [(0, 0), (10, 0), (12, len(PRIMARY))])
+def test_there_is_no_verdict_before_all_subjects_are_measured(runs, monkeypatch, planned, interim):
+    monkeypatch.setattr(primary, "planned_subjects", lambda runs: planned)
+    text = primary_section(runs)
+    assert text.count("interim: 10 of 12 subjects") == interim
+    assert ("is better" in text or "cannot be told apart" in text) == (not interim)
+
+
+def test_planned_subjects_are_those_of_the_captures():
+    steps = [{"parameters": {"synthetic": {"subjects": 10}}}, {"parameters": {}}]
+    run = SimpleNamespace(manifest=SimpleNamespace(clips=[SimpleNamespace(steps=steps)]))
+    assert primary.planned_subjects(SimpleNamespace(runs=(run, run))) == 10
+    assert primary.planned_subjects(SimpleNamespace(runs=())) == 0
