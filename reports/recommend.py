@@ -132,7 +132,8 @@ def recommend(settings: RecommendSettings, progress: Progress = no_progress) -> 
     Raises `InputError` for runs that do not belong together, for a task or metric that they lack, and where nothing fits.
     """
     limits = settings.limits
-    read = read_choices([Path(run) for run in settings.runs], settings.task, settings.metric, limits)
+    runs = tuple(RunData.read(Path(run)) for run in settings.runs)
+    read = read_choices(runs, settings.task, settings.metric, limits)
     choices, metric, subjects, sign = read.by_label, read.metric, read.subjects, read.sign
     fitting = {name: choice for name, choice in choices.items() if choice.fits(limits, subjects)}
     if not fitting:
@@ -162,13 +163,12 @@ def recommend(settings: RecommendSettings, progress: Progress = no_progress) -> 
 
 
 def read_choices(
-    folders: Sequence[Path], task: str, metric_name: str, limits: Collection[str] = ()
+    runs: tuple[RunData, ...], task: str, metric_name: str, limits: Collection[str] = ()
 ) -> Choices:
     """The choices of runs that all subjects have; ``limits`` are the names of the costs that every choice should have.
 
     Conditions that change what a method is trained on are no choices. Raises `InputError` as `recommend` does.
     """
-    runs = tuple(RunData.read(folder) for folder in folders)
     together = RunSet.joined(runs)
     labels_of_runs = training_labels(runs)
     quality: dict[str, dict[str, float]] = {}

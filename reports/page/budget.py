@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -23,19 +22,18 @@ from ..recommend import (
     read_choices,
     verdict_text,
 )
-from ..runs import RunSet
+from ..runs import RunData, RunSet
 from ..statistics.comparisons import PairwiseTests
 
 MOST_SETS = 4000
 """Sets of choices whose answer is in a page."""
 
 
-def budget_of(runs: RunSet, marks: Mapping[str, int]) -> dict[str, Any]:
-    """Content of the part, or the ``reason`` why it has none; ``answers`` are for the script.
+def budget_of(runs: RunSet, read: tuple[RunData, ...], marks: Mapping[str, int]) -> dict[str, Any]:
+    """Content of the part for runs, which were ``read``, or the ``reason`` why it has none; ``answers`` are for the script.
 
     Task and metric are those of `RecommendSettings`, or the first that the runs have. ``marks`` are numbers of marks by label.
     """
-    settings = RecommendSettings(tuple(str(run.folder.root) for run in runs.runs))
     tasks, metrics = (
         [name for name in known if all(name in own for own in of_runs)]
         for known, of_runs in (
@@ -48,25 +46,26 @@ def budget_of(runs: RunSet, marks: Mapping[str, int]) -> dict[str, Any]:
     )
     if not tasks or not metrics:
         return {"reason": "The runs have no task and metric of frames in common.", "answers": None}
-    task = settings.task if settings.task in tasks else tasks[0]
-    metric = settings.metric if settings.metric in metrics else metrics[0]
+    task = RecommendSettings.task if RecommendSettings.task in tasks else tasks[0]
+    metric = RecommendSettings.metric if RecommendSettings.metric in metrics else metrics[0]
     try:
-        read = read_choices([Path(run) for run in settings.runs], task, metric)
+        found = read_choices(read, task, metric)
     except InputError as error:
         return {"reason": f"It takes {error.expected}; found: {error.found}.", "answers": None}
-    subjects, spec = read.subjects, read.metric
-    means = {label: fmean(choice.quality.values()) for label, choice in read.by_label.items()}
+    subjects, spec = found.subjects, found.metric
+    means = {label: fmean(choice.quality.values()) for label, choice in found.by_label.items()}
     # Of equal ones the first, as in `best_of`.
-    names = sorted(means, key=lambda label: -read.sign * means[label])
+    names = sorted(means, key=lambda label: -found.sign * means[label])
     costs = {
         cost: [
             max(own[cost].values()) if cost in own else None
-            for own in (read.by_label[n].costs for n in names)
+            for own in (found.by_label[n].costs for n in names)
         ]
-        for cost in read.measured
+        for cost in found.measured
     }
     fronts = {
-        cost: {label for _, label in best_by_cost(read.by_label, cost, subjects, read.sign)} for cost in costs
+        cost: {label for _, label in best_by_cost(found.by_label, cost, subjects, found.sign)}
+        for cost in costs
     }
     return {
         "reason": "",
@@ -88,15 +87,15 @@ def budget_of(runs: RunSet, marks: Mapping[str, int]) -> dict[str, Any]:
             }
             for index, label in enumerate(names)
         ],
-        "left_out": _left_out(read, names[0]),
-        "notes": [*read.notes, *(f"Left out: {each}." for each in read.without)],
+        "left_out": _left_out(found, names[0]),
+        "notes": [*found.notes, *(f"Left out: {each}." for each in found.without)],
         "subjects": counted(len(subjects), "subject"),
         "several": len(subjects) > 1,
         "answers": {
             "names": names,
             "costs": costs,
             "units": UNITS,
-            **_answers(read, names, list(costs.values())),
+            **_answers(found, names, list(costs.values())),
         },
     }
 

@@ -11,7 +11,7 @@ from headbench.reports.page import budget
 from headbench.reports.page.report import write_report
 from headbench.reports.page.settings import PageSettings
 from headbench.reports.recommend import COSTS, RecommendSettings, recommend
-from headbench.reports.runs import RunSet
+from headbench.reports.runs import RunData, RunSet
 
 from ..made_rows import avatar_row, row
 
@@ -65,7 +65,7 @@ def made(tmp_path, write_manifest):
 
 
 def content(run):
-    return budget.budget_of(RunSet.read([run]), {"large": 3})
+    return budget.budget_of(RunSet.read([run]), (RunData.read(run),), {"large": 3})
 
 
 def command(run, limits):
