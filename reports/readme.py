@@ -7,6 +7,7 @@ python -m headbench.reports.readme suite suite-output .
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from itertools import chain, product
@@ -225,9 +226,19 @@ def suite_block(root: Path) -> str:
     return (
         f"{to_markdown(table_of(shown, columns=columns)).strip()}\n\n{conclusions(shown)}\n\n"
         f"[SSIM, tables by region and by part of FREE, paired differences with tests]({results}). "
+        f"Measured by other protocols, on other pixels or cameras, the same avatars differ by up to {_spread(root)} dB "
+        f"([table]({PAGES[PROTOCOLS]})). "
         f"The captures are of edition {made.get('edition', 1)}, made with seed {made['seed']}, and have the options `headbench run suite {options}`. "
         f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{took}{interrupted}."
     )
+
+
+def _spread(root: Path) -> float:
+    """The largest difference in dB that the page of protocols states."""
+    begin, end = marks(PROTOCOLS)
+    page = (root / PAGES[PROTOCOLS]).read_text(encoding="utf-8")
+    block = page.split(begin)[1].split(end)[0]
+    return max(float(found) for found in re.findall(r"differ by up to ([\d.]+) dB", block))
 
 
 def conclusions(runs: RunSet) -> str:
