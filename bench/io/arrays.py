@@ -78,7 +78,7 @@ def read_arrays(
     return content
 
 
-def remembered_arrays(
+def cached_arrays(
     path: Path,
     mark: str,
     members: Mapping[str, Member],

@@ -14,9 +14,10 @@ from threadpoolctl import threadpool_limits
 
 from ...bench.contracts import FloatArray, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.io.arrays import Member, remembered_arrays
+from ...bench.io.arrays import Member, cached_arrays
 from ...bench.io.files import digest
 from ..clip import CaptureClip
+from .code import tracking_code
 from .fit import Fitter
 from .images import FrameStack
 from .landmarks import ImageLandmarks
@@ -124,6 +125,9 @@ def track(
     views = Views([clip.cameras[name] for name in cameras])
     most = min(MOST_TIMESTEPS, max(1, int(MOST_PIXELS // views.sizes.prod(axis=1).sum())))
     blocks = -(-len(timesteps) // most)
+    seen = [
+        [camera.id, camera.width, camera.height, camera.K, camera.world_to_camera] for camera in views.cameras
+    ]
     poses: dict[int, FloatArray] = {}
     residuals: list[TimestepResidual] = []
     shape: FloatArray | None = None
@@ -141,8 +145,10 @@ def track(
         if store is None:
             fitted = fit()
         else:
-            mark = digest(_FORMAT, clip.fingerprint, [*cameras], part, *landmarks, shape)
-            fitted = remembered_arrays(store / f"part-{block:05d}.npz", mark, _PART, fit, {"T": len(part)})
+            mark = digest(
+                tracking_code(), clip.fingerprint, clip.head.fingerprint(), seen, part, *landmarks, shape
+            )
+            fitted = cached_arrays(store / f"part-{block:05d}.npz", mark, _PART, fit, {"T": len(part)})
         shape = fitted["shape"]
         seconds += float(fitted["seconds"])
         rows = fitted["landmarks"].tolist(), fitted["colours"].tolist()
@@ -164,7 +170,6 @@ def track(
     return Tracked(derived, report)
 
 
-_FORMAT = 1  # of the fit of a part; to be raised where the code fits otherwise
 _PART = {
     "shape": Member("f", ("S",)),
     "poses": Member("f", ("T", "D")),

@@ -20,13 +20,13 @@ from ..head.subject import resting
 from ..images import write_image
 from ..monocular.clip import check_subject, clip_of_track, subject_of
 from ..monocular.track import VIDEO, Track, VideoFrame
+from ..tracking.code import tracking_code
 from .decode import TimedFrame, VideoInfo, probe_video, video_frames
 from .faces import FoundFaces, crop_around, find_faces
 from .masks import FrameView, MaskSource
 from .settings import VideoOptions
 
 FACES, IMAGES, MASKS = "faces.npz", "images", "masks"
-_FORMAT = 1  # of what is stored for an interrupted run; to be raised where the code makes something else of the same video
 USUAL_FOCAL = 1.0
 """Focal length relative to the longer side of a frame where it is not known: about that of phones' main cameras and of webcams."""
 DISTANCE = 1.0  # of the head before it is tracked, metres
@@ -39,6 +39,8 @@ class VideoClip(NamedTuple):
     info: VideoInfo
     view: FrameView
     faces: FoundFaces
+    pixels: FloatArray
+    """(T, L, 2) landmarks of the frames of the clip, pixels of the clip."""
     unsure: tuple[float, ...]
     """`HeadMask.unsure` of the frames of the clip, where masks are made from the background."""
 
@@ -49,7 +51,7 @@ class VideoClip(NamedTuple):
 
     def landmarks(self, timestep: int) -> FloatArray:
         """(L, 2) landmarks of a frame of the clip, pixels of the clip."""
-        return self.view.points(self.faces.pixels[self.faces.found][timestep])
+        return self.pixels[timestep]
 
     def with_focal(self, focal: float) -> CaptureClip:
         """The clip with a focal length in pixels of the video."""
@@ -80,7 +82,7 @@ def open_video(
     check_subject(subject, "--subject")
     info = probe_video(path)
     masks = MaskSource(options)
-    mark = digest(_FORMAT, digest_file(path), network_digest, options.rate, options.longest)
+    mark = digest(tracking_code(), digest_file(path), network_digest, options.rate, options.longest)
     faces = find_faces(path, _frames(path, options), network, out / FACES, mark, progress)
     shown = faces.numbers[faces.found].tolist()
     mark = digest(mark, options.size, masks.prepare(shown, info))
@@ -108,7 +110,8 @@ def open_video(
         use_cache=False,
         progress=progress,
     )
-    return VideoClip(clip, info, view, faces, tuple(masks.unsure[number] for number in shown if masks.unsure))
+    unsure = tuple(masks.unsure[number] for number in shown if masks.unsure)
+    return VideoClip(clip, info, view, faces, view.points(faces.pixels[faces.found]), unsure)
 
 
 def _write_frames(

@@ -11,12 +11,13 @@ import numpy as np
 
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
-from ...bench.io.arrays import Member, remembered_arrays
+from ...bench.io.arrays import Member, cached_arrays
 from ...bench.io.files import check_output_folder, digest, digest_file
 from ...bench.landmark_network import LandmarkNetwork
 from ...bench.progress import counted
 from ..clip import CaptureClip
 from ..head.refit.command import target_head
+from ..tracking.code import tracking_code
 from ..tracking.embedding import Embedding
 from ..tracking.focal import FocalLength, estimate_focal
 from ..tracking.network import NetworkLandmarks, head_embedding
@@ -59,9 +60,9 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
     own = replace(settings, head=named if Path(named).exists() else None)  # a name of a head is for no reader
     teacher = own.open(settings.embedding, progress) if settings.embedding else None
     check_output_folder(folder)
-    mark = digest(weights, head.fingerprint(), teacher.fingerprint if teacher else "")
+    mark = digest(tracking_code(), weights, head.fingerprint(), teacher.fingerprint if teacher else "")
     embedding = Embedding(
-        **remembered_arrays(
+        **cached_arrays(
             folder / "embedding.npz",
             mark,
             _EMBEDDING,
@@ -75,7 +76,7 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
         (camera,) = clip.cameras.values()
         side = max(video.info.width, video.info.height) * video.view.scale
         found = landmarks(sorted(clip.poses))
-        stored = remembered_arrays(
+        stored = cached_arrays(
             folder / "focal.npz",
             digest(mark, camera.K, side, found.pixels),
             _FOCAL,

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from ....bench.contracts import FloatArray, HeadPose, Progress, no_progress
 from ....bench.errors import InputError
-from ....bench.io.arrays import MAX_MAGNITUDE, Member, remembered_arrays
+from ....bench.io.arrays import MAX_MAGNITUDE, Member, cached_arrays
 from ....bench.io.files import digest
 from ...clip import CaptureClip
 from ..arrays import HeadArrays
@@ -214,7 +214,7 @@ class BlockFitter:
         mark = digest(self._input, inputs, places)
         sizes = {"T": len(poses), "C": len(self._problem.bound), "n": len(self.matching.vertices)}
         path = folder / f"refit-{index:05d}.npz"
-        return remembered_arrays(path, mark, _BLOCK, lambda: self.fit(poses), sizes)
+        return cached_arrays(path, mark, _BLOCK, lambda: self.fit(poses), sizes)
 
     def pose(
         self, pose: HeadPose, timestep: int | None, columns: dict[str, FloatArray], row: int

@@ -253,6 +253,21 @@ def test_frames_are_searched_again_with_another_option(settings, monkeypatch):
         assert (done[0] > 0, done[2]) == (searched > 0, written)
 
 
+@pytest.mark.parametrize("changed", ["focal", "code"])
+def test_another_focal_length_or_code_is_fitted_again(settings, monkeypatch, changed):
+    assert finished_calls(monkeypatch, settings(), "write_json", 0)[1] is None
+    focal = settings().focal * (1.01 if changed == "focal" else 1)
+    if changed == "code":
+        for module in (track, video_clip, command):
+            monkeypatch.setattr(module, "tracking_code", lambda: "another")
+    done, result = finished_calls(monkeypatch, settings(focal=focal))
+    counts = dict(zip(WORKING, done.tolist()))
+    assert counts["fit_colours"] == 1
+    assert (counts["write_image"] > 0) == (counts["follow"] > 0) == (changed == "code")
+    (camera,) = read_capture(result["capture"]).cameras.values()
+    assert camera.K[0, 0] == pytest.approx(focal, rel=1e-5)
+
+
 @pytest.mark.parametrize("changes", [{"focal": -1.0}, {"rate": 0.5}, {"size": 8}, {"longest": 0}])
 def test_settings_out_of_range_are_refused(changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
