@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
+from time import monotonic
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from ...bench.contracts import BoolArray, ByteArray, FloatArray, IntArray, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member, store_arrays, stored_arrays
-from ...bench.landmark_network import COUNT, LandmarkNetwork, face_distance, same_face
+from ...bench.landmark_network import COUNT, SAME, LandmarkNetwork, face_distance, same_face
 from .decode import TimedFrame
 
 LEAST_SEEN = 0.5
@@ -22,8 +23,24 @@ ABOVE, BELOW, BESIDE = 1.0, 0.6, 0.8
 """Room around the landmarks in a crop, relative to their height or width: hair, neck, and turns of the head."""
 SEARCHED = 10
 """In every frame of this number the whole picture is searched for further faces."""
+REACH, SPEED = 1.0, 5.0
+"""A face is taken for the lost one again within this distance of its last place, and this distance a second more, relative to its size."""
 STORED_S = 10.0
 """Seconds after which landmarks are stored again, for a run that is interrupted."""
+
+
+class FoundAgain(NamedTuple):
+    """A frame in which a lost face was found again."""
+
+    number: int
+    """Of the frame in the file."""
+    jump: float
+    """Distance from the place where it was lost, relative to the face's size."""
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether it is so far away that the places alone do not say that it is the same face."""
+        return self.jump >= SAME
 
 
 class FoundFaces(NamedTuple):
@@ -40,6 +57,16 @@ class FoundFaces(NamedTuple):
     def found(self) -> BoolArray:
         """(T,) whether the frame shows the face."""
         return np.asarray(np.isfinite(self.pixels).all(axis=(1, 2)))
+
+    @property
+    def again(self) -> tuple[FoundAgain, ...]:
+        """Where the face was found again after frames without it."""
+        seen = np.flatnonzero(self.found)
+        return tuple(
+            FoundAgain(int(self.numbers[now]), face_distance(self.pixels[now], self.pixels[before]))
+            for before, now in pairwise(seen.tolist())
+            if now > before + 1
+        )
 
 
 class Crop(NamedTuple):
@@ -60,13 +87,18 @@ class FaceFollower:
     """Follows the face of one person, and all others in order not to take one of them for it.
 
     The person is the one with the largest face in the first frame that shows a face. From then on a face is the person's because
-    it is where that was in the frame before. Where the face is lost, the whole picture is searched, and the person is the face that
-    is no other's and nearest to the last place.
+    it is where that was in the frame before. Where the face is lost, the whole picture is searched at once. The person is then the
+    face nearest to the last place that was not seen before and is not farther away than a head can have moved since (`REACH`,
+    `SPEED`); every farther one is another's. That a face found again is the same person's is not known, see `FoundFaces.again`.
+
+    Landmarks are rounded to 32 bits, as they are stored, so that an interruption does not change them.
 
     Attributes
     ----------
     last : FloatArray | None
         (COUNT, 2) landmarks of the person where they were last seen, pixels.
+    last_time : float
+        Time of that frame, seconds.
     lost : bool
         Whether the latest frame does not show them.
     others : list[FloatArray]
@@ -75,15 +107,24 @@ class FaceFollower:
 
     network: LandmarkNetwork
     last: FloatArray | None = None
+    last_time: float = 0.0
     lost: bool = True
     others: list[FloatArray] = field(default_factory=list)
 
-    def follow(self, image: ByteArray, search: bool) -> FloatArray | None:
-        """The person's landmarks in the next frame, (COUNT, 2) pixels, or None; ``search`` looks for further faces."""
-        own = None if self.lost or self.last is None else self.network.follow(image, self.last)
+    def follow(self, image: ByteArray, time: float, search: bool) -> FloatArray | None:
+        """The person's landmarks in the next frame, (COUNT, 2) pixels, or None.
+
+        Parameters
+        ----------
+        time : float
+            Of the frame, seconds.
+        search : bool
+            Whether to look for further faces though the person's is there.
+        """
+        own = None if self.lost or self.last is None else self._near(image, self.last)
         others: list[FloatArray] = []
         for before in self.others:
-            now = self.network.follow(image, before)
+            now = self._near(image, before)
             if now is None or any(same_face(now, other) for other in others):
                 continue
             if own is not None and self.last is not None and same_face(own, now):
@@ -94,20 +135,46 @@ class FaceFollower:
         if own is None or search:
             seen = [] if own is None else [own]
             new = [
-                face
+                np.asarray(face, np.float32)
                 for face in self.network.find_all(image)
                 if not any(same_face(face, known) for known in [*seen, *others])
             ]
             if own is None and new:
-                last = self.last
-                own = new[0] if last is None else min(new, key=lambda face: face_distance(face, last))
+                own = self._own(new, time)
             others += [face for face in new if face is not own]
-        self.last, self.lost, self.others = self.last if own is None else own, own is None, others
+        if own is not None:
+            self.last, self.last_time = own, time
+        self.lost, self.others = own is None, others
         return own
+
+    def _near(self, image: ByteArray, before: FloatArray) -> FloatArray | None:
+        found = self.network.follow(image, before)
+        return None if found is None else np.asarray(found, np.float32)
+
+    def _own(self, new: Sequence[FloatArray], time: float) -> FloatArray | None:
+        """The person's face among those that were not followed, the largest first; None if each is too far away."""
+        last = self.last
+        if last is None:
+            return new[0]
+        nearest = min(new, key=lambda face: face_distance(face, last))
+        farthest = REACH + SPEED * (time - self.last_time)
+        return nearest if face_distance(nearest, last) <= farthest else None
+
+
+class _Searched(NamedTuple):
+    """What was found in a frame."""
+
+    number: int
+    time: float
+    """Seconds."""
+    face: FloatArray | None
+    """(COUNT, 2) landmarks of the person, pixels."""
+    others: int
 
 
 _STORED = {
     "numbers": Member("i", ("T",)),
+    "times": Member("f", ("T",)),
     "found": Member("b", ("T",)),
     "pixels": Member("f", ("T", COUNT, 2)),
     "others": Member("i", ("T",)),
@@ -166,41 +233,49 @@ def _search(
 ) -> dict[str, np.ndarray]:
     """Search the frames after those that are ``kept``; the arrays of `_STORED`, which are also stored."""
     follower = FaceFollower(network)
-    numbers: list[int] = []
-    rows: list[FloatArray | None] = []
-    others: list[int] = []
+    rows: list[_Searched] = []
     if kept is not None:
-        numbers, others = kept["numbers"].tolist(), kept["others"].tolist()
-        rows = [pixels if found else None for pixels, found in zip(kept["pixels"], kept["found"])]
-        last = next((row for row in reversed(rows) if row is not None), None)
-        follower = FaceFollower(network, last, not rows or rows[-1] is None, [*kept["last_others"]])
+        faces = [pixels if found else None for pixels, found in zip(kept["pixels"], kept["found"])]
+        values = zip(kept["numbers"].tolist(), kept["times"].tolist(), faces, kept["others"].tolist())
+        rows = [_Searched(*value) for value in values]
+        for row in rows:
+            if row.face is not None:
+                follower.last, follower.last_time = row.face, row.time
+        follower.lost = not rows or rows[-1].face is None
+        follower.others = [*kept["last_others"]]
+    # Set at once after each frame: an interruption may come between any two statements.
+    latest = len(rows), follower.others
 
     def arrays(finished: bool) -> dict[str, np.ndarray]:
-        empty = np.zeros((COUNT, 2))
+        count, last_others = latest
+        pixels = np.zeros((count, COUNT, 2), np.float32)
+        for place, row in enumerate(rows[:count]):
+            if row.face is not None:
+                pixels[place] = row.face
         return {
-            "numbers": np.array(numbers, np.int64),
-            "found": np.array([row is not None for row in rows], bool),
-            "pixels": np.array([empty if row is None else row for row in rows]).reshape(-1, COUNT, 2),
-            "others": np.array(others, np.int64),
-            "last_others": np.array(follower.others).reshape(-1, COUNT, 2),
+            "numbers": np.array([row.number for row in rows[:count]], np.int64),
+            "times": np.array([row.time for row in rows[:count]], np.float64),
+            "found": np.array([row.face is not None for row in rows[:count]], bool),
+            "pixels": pixels,
+            "others": np.array([row.others for row in rows[:count]], np.int64),
+            "last_others": np.array(last_others, np.float32).reshape(-1, COUNT, 2),
             "finished": np.array(finished),
         }
 
-    finished, since = False, time.monotonic()
+    finished, since = False, monotonic()
     try:
         for index, frame in enumerate(frames):
-            if index >= len(numbers):
-                row = follower.follow(frame.image, index % SEARCHED == 0)
-                numbers.append(frame.number)
-                rows.append(row)
-                others.append(len(follower.others))
-                if time.monotonic() - since > STORED_S:
+            if index >= len(rows):
+                face = follower.follow(frame.image, frame.time, index % SEARCHED == 0)
+                rows.append(_Searched(frame.number, frame.time, face, len(follower.others)))
+                latest = len(rows), follower.others
+                if monotonic() - since > STORED_S:
                     store_arrays(store, mark, arrays(False))
-                    since = time.monotonic()
+                    since = monotonic()
             progress(index + 1, index + 1, "landmarks")
         finished = True
     finally:
-        if numbers:
+        if latest[0]:
             store_arrays(store, mark, arrays(finished))
     return arrays(True)
 

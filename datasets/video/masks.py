@@ -106,16 +106,14 @@ class MaskSource:
         return digest([*content_digests(files).values()])
 
     def learn(self, path: Path, frames: Iterable[TimedFrame], faces: FoundFaces, view: FrameView) -> None:
-        """Learn the background from frames of a video, where masks are made from it.
+        """Learn the background from the frames of a video that show nobody's face, where masks are made from it.
 
         Raises `InputError` as `learn_background` and `check_background`.
         """
         if not self.by_background:
             return
-        empty, shown = (
-            _spread(np.flatnonzero(faces.found == found), count)
-            for found, count in ((0, SAMPLES), (1, CHECKED))
-        )
+        empty = _spread(np.flatnonzero(~faces.found & (faces.others == 0)), SAMPLES)
+        shown = _spread(np.flatnonzero(faces.found), CHECKED)
         chosen = {*faces.numbers[[*empty, *shown]].tolist()}
         images = {frame.number: view.image(frame.image) for frame in frames if frame.number in chosen}
         self._background = learn_background(path, [images[number] for number in faces.numbers[empty]])

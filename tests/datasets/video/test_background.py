@@ -7,7 +7,12 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.mesh_pictures import draw_mesh, rasterize_mesh
+from headbench.datasets.video import masks as video_masks
 from headbench.datasets.video.background import check_background, learn_background
+from headbench.datasets.video.decode import TimedFrame
+from headbench.datasets.video.faces import Crop, FoundFaces
+from headbench.datasets.video.masks import FrameView, MaskSource
+from headbench.datasets.video.settings import VideoOptions
 
 from ..tiny_capture import look_at
 
@@ -63,3 +68,19 @@ def test_what_shows_no_empty_room_is_refused(filmed):
     background = learn_background("me.mp4", [images[2]] * EMPTY)  # somebody without a face that is found
     with pytest.raises(InputError, match="pixels unsure, found"):
         check_background("me.mp4", background, [images[2]], faces[2:3])
+
+
+def test_frames_with_another_person_are_no_empty_room(monkeypatch):
+    learnt = []
+    monkeypatch.setattr(
+        video_masks,
+        "learn_background",
+        lambda path, images: learnt.extend(image[0, 0, 0] for image in images),
+    )
+    monkeypatch.setattr(video_masks, "check_background", lambda *given: None)
+    pixels = np.where(np.arange(9)[:, None, None] < 3, np.ones((9, 5, 2)), np.nan)
+    faces = FoundFaces(np.arange(9), pixels, np.array([0, 1, 0, 0, 1, 1, 0, 2, 0]))
+    frames = [TimedFrame(number, number / 25, np.full((4, 4, 3), number, np.uint8)) for number in range(9)]
+    view = FrameView.of(Crop(0, 0, 4, 4), 64)
+    MaskSource(VideoOptions(masks="background")).learn("me.mp4", frames, faces, view)
+    assert learnt == [3, 6, 8]

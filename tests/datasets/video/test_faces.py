@@ -34,11 +34,11 @@ class Network:
 
 def frames(count):
     for number in range(count):
-        yield TimedFrame(2 * number, number / 25, np.full((4, 4, 3), number, np.uint8))
+        yield TimedFrame(2 * number, number / 5, np.full((4, 4, 3), number, np.uint8))
 
 
-def found(tmp_path, shown):
-    return find_faces("me.mp4", frames(len(shown)), Network(shown), tmp_path / "faces.npz", "mark")
+def found(tmp_path, shown, network=None):
+    return find_faces("me.mp4", frames(len(shown)), network or Network(shown), tmp_path / "faces.npz", "mark")
 
 
 STILL = [[face(50)] for _ in range(12)]
@@ -48,6 +48,21 @@ CASES = {
         [[face(50)]] * 5 + [[]] * 3 + [[face(200)]] * 4,
         [50] * 5 + [None] * 3 + [200] * 4,
         [0] * 12,
+    ),
+    "another one appears elsewhere after it has left": (
+        [[face(50)]] * 7 + [[]] + [[face(200)]] * 4,
+        [50] * 7 + [None] * 5,
+        [0] * 8 + [1] * 4,
+    ),
+    "another one enters between two searches, then it leaves": (
+        [[face(50)]] * 3 + [[face(50), face(200)]] * 4 + [[face(200)]] * 5,
+        [50] * 7 + [None] * 5,
+        [0] * 7 + [1] * 5,
+    ),
+    "another one enters and is seen at the next search": (
+        [[face(50)]] * 3 + [[face(50), face(200)]] * 9,
+        [50] * 12,
+        [0] * 10 + [1] * 2,
     ),
     "a larger second face": ([[face(50), face(200, 30 + 3 * t)] for t in range(8)], [50] * 8, [1] * 8),
     "the other one stays": (
@@ -74,9 +89,27 @@ def test_one_person_is_followed(tmp_path, name):
     assert result.numbers.tolist() == [2 * number for number in range(len(shown))]
 
 
+@pytest.mark.parametrize(
+    ("name", "searched", "again"),
+    [
+        ("one", [0, 10], []),
+        ("leaves and comes back elsewhere", [0, 5, 6, 7, 8, 10], [(16, 150 / 40, True)]),
+        ("the other one stays", [0, 3, 4, 5, 6], [(12, 10 / 44, False)]),
+    ],
+)
+def test_a_lost_face_is_searched_and_its_jump_is_known(tmp_path, name, searched, again):
+    shown = CASES[name][0]
+    network = Network(shown)
+    result = found(tmp_path, shown, network)
+    assert network.searched == searched
+    assert [(one.number, one.elsewhere) for one in result.again] == [(one[0], one[2]) for one in again]
+    assert [one.jump for one in result.again] == pytest.approx([one[1] for one in again], rel=0.02)
+
+
 def test_an_interrupted_search_gives_the_same_landmarks(tmp_path):
     shown = CASES["the other one stays"][0]
     whole = found(tmp_path / "whole", shown)
+    assert whole.pixels.dtype == np.float32
 
     def broken():
         yield from frames(5)
