@@ -48,6 +48,8 @@ class Member:
         any shape.
     most : float | None
         Largest magnitude. Floating-point numbers must be finite in any case.
+    least : float | None
+        Smallest number; without it that is ``-most``.
     dtype : str
         Required type; "" allows any type of ``kinds``.
     optional : bool
@@ -59,6 +61,7 @@ class Member:
     most: float | None = None
     dtype: str = ""
     optional: bool = False
+    least: float | None = None
 
 
 TEXT = Member("U", ())
@@ -139,17 +142,25 @@ def check_arrays(
 
 
 def check_numbers(
-    path: str | PathLike[str], name: str, values: np.ndarray, most: float | None = None
+    path: str | PathLike[str],
+    name: str,
+    values: np.ndarray,
+    most: float | None = None,
+    least: float | None = None,
 ) -> None:
-    """Raise `InputError` for a number that is not finite, or larger than ``most`` in magnitude."""
+    """Raise `InputError` for a number that is not finite, or larger than ``most`` in magnitude, or smaller than ``least``."""
     if values.dtype.kind == "f":
         broken = int(values.size - np.count_nonzero(np.isfinite(values)))
         if broken:
             raise InputError(path, name, "finite numbers", f"{broken} that are NaN or infinite")
     if most is not None and values.size:
-        largest = max(float(values.max()), -float(values.min()))
-        if largest > most:
-            raise InputError(path, name, f"numbers from {-most:g} to {most:g}", f"one of size {largest:g}")
+        lowest, highest = float(values.min()), float(values.max())
+        if least is not None and not least <= lowest <= highest <= most:
+            worst = lowest if lowest < least else highest
+            raise InputError(path, name, f"numbers from {least:g} to {most:g}", f"{worst:g}")
+        if least is None and max(highest, -lowest) > most:
+            found = f"one of size {max(highest, -lowest):g}"
+            raise InputError(path, name, f"numbers from {-most:g} to {most:g}", found)
 
 
 def _check(
@@ -170,7 +181,7 @@ def _check(
             comma = "," * (len(named) == 1)
             raise InputError(path, name, f"shape ({', '.join(named)}{comma})", f"shape {values.shape}")
     if values.dtype.kind in "fiu":
-        check_numbers(path, name, values, member.most)
+        check_numbers(path, name, values, member.most, member.least)
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:

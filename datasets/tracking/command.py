@@ -13,14 +13,13 @@ from ...bench.progress import counted
 from ...bench.protocol import evenly_with_ends
 from ...bench.specs import CommandResult
 from .settings import TrackSettings
+from .work import WORK, check_work_folder, make_work_folder
 
 if TYPE_CHECKING:
     from ..tracking_errors import RegionError
     from .track import Tracked
 
 REPORT, PICTURE = "track.json", "overlay.png"
-WORK = ".track"
-"""Folder of what an interrupted call continues from."""
 ROWS, COLUMNS = 3, 4
 """Timesteps and cameras of the picture."""
 
@@ -47,6 +46,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
         return track_with_program(settings, progress)
     out = Path(settings.out)
     work = out / WORK
+    check_work_folder(work)
     if is_video(Path(settings.capture)):
         video = video_to_track(settings, work, progress)
         clip = video.clip
@@ -68,6 +68,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
         source = landmark_source(
             clip, cameras, settings.landmarks, teacher, seed=settings.seed, progress=progress
         )
+    make_work_folder(work)
     tracked = track(clip, cameras, source, notes=notes, store=work, progress=progress)
     timesteps = evenly_with_ends([residual.timestep for residual in tracked.report.residuals], ROWS)
     overlay = draw_overlay(tracked.clip, timesteps, evenly_with_ends(cameras, COLUMNS))

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ...bench.contracts import Progress
+from ...bench.contracts import HeadAsset, Progress
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member, cached_arrays
-from ...bench.io.files import check_output_folder, digest, digest_file
-from ...bench.landmark_network import LandmarkNetwork
+from ...bench.io.files import digest, digest_file
+from ...bench.landmark_network import COUNT, LandmarkNetwork
 from ...bench.progress import counted
 from ..clip import CaptureClip
 from ..head.refit.command import target_head
@@ -21,17 +21,13 @@ from ..tracking.code import tracking_code
 from ..tracking.embedding import Embedding
 from ..tracking.focal import FocalLength, estimate_focal
 from ..tracking.network import NetworkLandmarks, head_embedding
+from ..tracking.work import make_work_folder
 from .clip import USUAL_FOCAL, VideoClip, open_video
 
 if TYPE_CHECKING:
     from ..tracking.settings import TrackSettings
 
 NEEDED = ("head", "landmarks")
-_EMBEDDING = {
-    "landmarks": Member("i", ("L",)),
-    "corners": Member("iu", ("L", 3)),
-    "weights": Member("f", ("L", 3)),
-}
 _FOCAL = {"pixels": Member("f", ()), "residuals": Member("f", ("N",)), "tried": Member("f", ("N",))}
 
 
@@ -59,13 +55,13 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
     network, weights = LandmarkNetwork(Path(settings.landmarks)), digest_file(Path(settings.landmarks))
     own = replace(settings, head=named if Path(named).exists() else None)  # a name of a head is for no reader
     teacher = own.open(settings.embedding, progress) if settings.embedding else None
-    check_output_folder(folder)
+    make_work_folder(folder)
     mark = digest(tracking_code(), weights, head.fingerprint(), teacher.fingerprint if teacher else "")
     embedding = Embedding(
         **cached_arrays(
             folder / "embedding.npz",
             mark,
-            _EMBEDDING,
+            _embedding_arrays(head),
             lambda: head_embedding(network, head, teacher, progress)._asdict(),
         )
     )
@@ -94,6 +90,14 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
     )
 
 
+def _embedding_arrays(head: HeadAsset) -> dict[str, Member]:
+    return {
+        "landmarks": Member("i", ("L",), most=COUNT - 1, least=0),
+        "corners": Member("iu", ("L", 3), most=len(head.template) - 1, least=0),
+        "weights": Member("f", ("L", 3)),
+    }
+
+
 def _data(video: VideoClip, given: float | None, focal: FocalLength | None) -> dict[str, Any]:
     return {
         "video": {
@@ -101,6 +105,7 @@ def _data(video: VideoClip, given: float | None, focal: FocalLength | None) -> d
             "crop": [*video.view.crop],
             "scale": video.view.scale,
             "without_face": [*video.without_face],
+            "found_again": [one._asdict() for one in video.faces.again],
             "other_faces": video.faces.numbers[video.faces.others > 0].tolist(),
             **({"unsure": [*video.unsure]} if video.unsure else {}),
             "focal": dict(zip(("pixels", "source"), _focal(video, given, focal))),
@@ -128,11 +133,15 @@ def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> 
     ]
     faces = video.faces
     if video.without_face:
-        lines.append(f"  left out   {_listed(video.without_face)} without a face")
+        lines.append(f"  left out   {_listed(video.without_face)}, where the person's face is missing")
+    if elsewhere := [one.number for one in faces.again if one.elsewhere]:
+        lines.append(
+            f"  again      the face was found again at another place in {_listed(elsewhere)}; check that it is the same person"
+        )
     if faces.others.any():
         lines.append(
-            f"  others     {_listed(faces.numbers[faces.others > 0].tolist())} with a second face; followed is the face that is largest in "
-            f"frame {faces.numbers[faces.found][0]}"
+            f"  others     {_listed(faces.numbers[faces.others > 0].tolist())} with a second face. The face that is largest in "
+            f"frame {faces.numbers[faces.found][0]} is followed."
         )
     if video.unsure:
         half, most = np.quantile(video.unsure, [0.5, 1.0])

@@ -133,7 +133,7 @@ def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path, monkeypatch, lie):
 MEMBERS = {
     "points": Member("f", ("V", 3), most=10),
     "weights": Member("f", ("V",), dtype="f4"),
-    "triangles": Member("iu", (None, 3)),
+    "triangles": Member("iu", (None, 3), most=3, least=0),
     "name": TEXT,
     "extra": Member("f", (2,), optional=True),
 }
@@ -164,6 +164,8 @@ def test_arrays_that_are_as_described_are_returned(tmp_path):
         ("weights", np.ones(5, np.float32), "shape (4,)"),
         ("weights", np.full(4, np.inf, np.float32), "finite numbers"),
         ("triangles", np.zeros((7, 3)), "integers"),
+        ("triangles", np.full((7, 3), -1), "numbers from 0 to 3"),
+        ("triangles", np.full((7, 3), 4), "numbers from 0 to 3"),
         ("name", np.array(["x"]), "shape ()"),
         ("name", np.array(1), "text"),
         ("extra", np.zeros(3), "shape (2,)"),

@@ -10,6 +10,7 @@ from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.images import read_image
 from headbench.datasets.tracking.command import track_capture
 from headbench.datasets.tracking.settings import TrackSettings
+from headbench.datasets.tracking.work import WORK
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +37,26 @@ def test_report_and_picture(finished):
     assert f"{stored['errors_mm']['face']['absolute']:.2f}" in result.text
     height, width, _ = read_image(out / "overlay.png", (1, 1, 1)).shape
     assert (height, width) == (3 * 160, 2 * 3 * 120)
+
+
+@pytest.mark.parametrize("kind", ["a link", "a file", "files of something else"])
+def test_what_it_did_not_make_is_never_deleted(patterned_capture, tmp_path, kind):
+    out, other = tmp_path / "out", tmp_path / "other"
+    for folder in (out, other):
+        folder.mkdir()
+    (other / "mine.txt").write_text("mine")
+    place = out / WORK
+    match kind:
+        case "a link":
+            place.symlink_to(other)
+        case "a file":
+            place.write_text("mine")
+        case _:
+            other.rename(place)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError, match=f"that headbench track made, or none, found {kind}"):
+        track_capture(TrackSettings(str(patterned_capture.union), str(out)))
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_an_embedding_needs_a_network(patterned_capture, tmp_path):

@@ -20,12 +20,13 @@ from headbench.datasets.images import write_image
 from headbench.datasets.mesh_pictures import draw_mesh, rasterize_mesh
 from headbench.datasets.tracking import command as tracking_command
 from headbench.datasets.tracking import track
-from headbench.datasets.tracking.command import WORK, track_capture
+from headbench.datasets.tracking.command import track_capture
 from headbench.datasets.tracking.focal import FocalLength, estimate_focal
 from headbench.datasets.tracking.landmarks import ImageLandmarks, spread_vertices
 from headbench.datasets.tracking.settings import TrackSettings
+from headbench.datasets.tracking.work import WORK
 from headbench.datasets.video import clip as video_clip
-from headbench.datasets.video import command
+from headbench.datasets.video import command, faces
 from headbench.datasets.video.decode import video_frames
 from headbench.datasets.video.faces import Crop, FoundFaces, crop_around
 
@@ -131,13 +132,19 @@ def settings(filmed, monkeypatch, tmp_path):
     return make
 
 
-def test_a_video_becomes_a_capture_of_its_frames(settings, filmed):
+def test_a_video_becomes_a_capture_of_its_frames(settings, monkeypatch):
+    monkeypatch.setattr(faces, "SAME", 0.0)  # any movement is another place
     found = track_capture(settings())
     clip = read_capture(found.data["capture"])
     numbers = [number for number in range(COUNTED) if number != FACELESS]
     assert len(clip.files) == len(numbers)
     assert found.data["video"]["without_face"] == [FACELESS]
-    assert f"left out   1 frame ({FACELESS}) without a face" in found.text
+    (again,) = found.data["video"]["found_again"]
+    assert (again["number"], 0 < again["jump"] < 0.5) == (FACELESS + 1, True)
+    assert f"left out   1 frame ({FACELESS}), where the person's face is missing" in found.text
+    assert (
+        f"found again at another place in 1 frame ({FACELESS + 1}); check that it is the same" in found.text
+    )
     assert clip.splits["self_reenactment"]
     assert found.data["landmarks_px"] < 2.0
     out = Path(settings().out)
@@ -253,16 +260,20 @@ def test_frames_are_searched_again_with_another_option(settings, monkeypatch):
         assert (done[0] > 0, done[2]) == (searched > 0, written)
 
 
-@pytest.mark.parametrize("changed", ["focal", "code"])
-def test_another_focal_length_or_code_is_fitted_again(settings, monkeypatch, changed):
+@pytest.mark.parametrize(("changed", "fitted"), [("focal", 1), ("code", 1), ("embedding", 0)])
+def test_what_another_call_left_is_used_where_it_fits(settings, monkeypatch, changed, fitted):
     assert finished_calls(monkeypatch, settings(), "write_json", 0)[1] is None
     focal = settings().focal * (1.01 if changed == "focal" else 1)
     if changed == "code":
         for module in (track, video_clip, command):
             monkeypatch.setattr(module, "tracking_code", lambda: "another")
+    if changed == "embedding":  # of vertices that there are not
+        path = Path(settings().out) / WORK / "embedding.npz"
+        content = dict(np.load(path))
+        np.savez(path, **(content | {"corners": content["corners"] + 10**6}))
     done, result = finished_calls(monkeypatch, settings(focal=focal))
     counts = dict(zip(WORKING, done.tolist()))
-    assert counts["fit_colours"] == 1
+    assert counts["fit_colours"] == fitted
     assert (counts["write_image"] > 0) == (counts["follow"] > 0) == (changed == "code")
     (camera,) = read_capture(result["capture"]).cameras.values()
     assert camera.K[0, 0] == pytest.approx(focal, rel=1e-5)

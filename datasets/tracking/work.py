@@ -1,0 +1,37 @@
+"""The folder of what an interrupted ``headbench track`` continues from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ...bench.errors import InputError
+from ...bench.io.files import check_output_folder, write_text
+
+WORK = ".track"
+"""Its name in the folder of ``--out``."""
+_NOTE = "README.txt"
+_TEXT = """headbench track continues from these files after an interruption and deletes them at the end.
+Those of a video show the person. This folder can be deleted: the next call begins again then.
+"""
+
+
+def check_work_folder(folder: Path) -> None:
+    """Raise `InputError` for anything at the place of the folder that `make_work_folder` did not make: it will be deleted."""
+    if folder.is_symlink():
+        found = "a link"
+    elif folder.is_dir():
+        found = "" if (folder / _NOTE).is_file() or not any(folder.iterdir()) else "files of something else"
+    else:
+        found = "a file" if folder.exists() else ""
+    if found:
+        expected = "a folder that headbench track made, or none"
+        raise InputError(folder, "", expected, found, "Move it away, or choose another --out.")
+
+
+def make_work_folder(folder: Path) -> None:
+    """Make the folder, with a note that says what it is. Raises `InputError` as `check_work_folder`, and if it cannot be made."""
+    check_work_folder(folder)
+    check_output_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / _NOTE).is_file():
+        write_text(folder / _NOTE, _TEXT)
