@@ -58,7 +58,7 @@ class PluginStatus(NamedTuple):
 def doctor(settings: DoctorSettings, progress: Progress) -> CommandResult:
     """Report for every method, metric and reader what is missing on this machine, and how to install it.
 
-    Raises `InputError` for unknown methods and settings, and for an invalid device.
+    Raises `InputError` for unknown methods and settings, also of programs, and for an invalid device.
     """
     from .configuration import parse_assignments
     from .engine.config import RunConfig
@@ -91,7 +91,8 @@ def doctor(settings: DoctorSettings, progress: Progress) -> CommandResult:
                 needs = tuple(_asked(plugin.spec.needs, None, settings.device))
                 statuses.append(PluginStatus(group, name, False, needs))
     for name, needs_of in programs.items():
-        found = tuple(_asked(needs_of, chosen.get(name, {}), settings.device))
+        places = chosen.get(name, {})
+        found = tuple(_asked(needs_of, places, settings.device, given=bool(places)))
         statuses.append(PluginStatus("programs", name, False, found))
     if not named:
         statuses.append(PluginStatus("executors", "slurm", False, tuple(_slurm())))
@@ -182,13 +183,21 @@ def _method(
     return PluginStatus("methods", spec.name, counts, tuple(needs))
 
 
-def _asked(needs: str, config: Any, device: str) -> Iterator[Need]:
+def _asked(needs: str, config: Any, device: str, given: bool = False) -> Iterator[Need]:
     """The requirements that a plug-in declares; an exception of the declaration is reported as a missing
-    one."""
+    one.
+
+    Raises `InputError` of the declaration if its settings were ``given`` on the command line.
+    """
+    from .errors import InputError
     from .registry import resolve
 
     try:
         yield from resolve(needs)(config, device)
+    except InputError as error:
+        if given:
+            raise
+        yield _broken(f"{type(error).__name__}: {error}")
     except Exception as error:  # noqa: BLE001 - a plug-in may fail in any way; the others must still be asked
         yield _broken(f"{type(error).__name__}: {error}")
 

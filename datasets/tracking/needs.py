@@ -35,7 +35,8 @@ def pixel3dmm(settings: Mapping[str, Any], device: str) -> Iterator[Need]:
 
 
 def _needs(name: str, settings: Mapping[str, Any]) -> Iterator[Need]:
-    place = build(ProgramPlace, settings, f"settings of {name}")
+    """Needs of a program. Raises `InputError` for settings that it does not have."""
+    place = build(ProgramPlace, settings, "command line", f"--set settings.{name}.")
     if not place.checkout:
         remedy = (
             f"git clone --recursive {PROGRAMS[name].url}, install it as its page says, and give "
@@ -51,6 +52,8 @@ def _needs(name: str, settings: Mapping[str, Any]) -> Iterator[Need]:
     else:
         yield Need("checkout", str(checkout))
     try:
-        yield Need("environment", str(check_interpreter(name, place.python)))
+        yield Need(
+            "environment", str(check_interpreter(name, place.python, f"--set settings.{name}.python=FILE"))
+        )
     except InputError as error:
         yield Need("environment", "", str(error))

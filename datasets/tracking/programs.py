@@ -203,12 +203,15 @@ def check_checkout(name: str, checkout: Path) -> None:
             raise InputError(checkout, file, f"a file that {name} needs", "no such file", program.remedy)
 
 
-def check_interpreter(name: str, python: str) -> Path:
-    """Path of an interpreter with the modules of a program. Raises `InputError` if it or one of these is missing."""
+def check_interpreter(name: str, python: str, option: str = "--python") -> Path:
+    """Path of an interpreter with the modules of a program. Raises `InputError` if it or one of these is missing.
+
+    ``option`` is the one that names it, for messages.
+    """
     program = PROGRAMS[name]
     interpreter = shutil.which(python)
     if interpreter is None:
-        raise InputError("command line", "--python", f"the interpreter of the environment of {name}", python)
+        raise InputError("command line", option, f"the interpreter of the environment of {name}", python)
     path = Path(interpreter).absolute()
     command = [str(path), "-c", f"import {', '.join(program.modules)}"]
     remedy = f"Give the interpreter of the environment that the page of {name} makes."

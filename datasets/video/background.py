@@ -25,8 +25,10 @@ MOST_UNSURE = 0.5
 """Most `HeadMask.unsure`, median of `CHECKED` frames."""
 CHECKED = 12
 BLUR = 1.0  # pixels
-_ROOM = "a camera that stands still, and frames of the room without anyone in most frames without a face, for --masks background"
-_REMEDY = "Film again and leave the picture for a few seconds; or give --segmentation, or masks of another program by --masks FOLDER."
+_USE = "for --masks background"
+_OTHERWISE = "or give --segmentation, or masks of another program by --masks FOLDER."
+_REMEDY = f"Film again and leave the picture for a few seconds; {_OTHERWISE}"
+_MOVED = f"Film again with a camera that stands still, and leave the picture for a few seconds; {_OTHERWISE}"
 
 
 class HeadMask(NamedTuple):
@@ -95,7 +97,8 @@ def learn_background(path: Path, images: Sequence[ByteArray]) -> Background:
         There are too few, or the room moves in them.
     """
     if len(images) < LEAST_EMPTY:
-        raise InputError(path, "", f"{_ROOM}: at least {LEAST_EMPTY}", f"{len(images)}", _REMEDY)
+        expected = f"at least {LEAST_EMPTY} frames that show nobody's face, {_USE}"
+        raise InputError(path, "", expected, f"{len(images)}", _REMEDY)
     blurred = np.stack([cv2.GaussianBlur(image, (0, 0), BLUR) for image in images])
     colours, noise = np.empty(blurred.shape[1:], np.float32), np.empty(blurred.shape[1:3], np.float32)
     for row in range(len(colours)):  # one at a time, for the memory
@@ -104,7 +107,8 @@ def learn_background(path: Path, images: Sequence[ByteArray]) -> Background:
         noise[row] = 1.4826 * np.median(np.abs(values - colours[row]).max(axis=2), axis=0)
     moved = float((noise > MOST_NOISE).mean())
     if moved > MOST_NOISY:
-        raise InputError(path, "", _ROOM, f"{moved:.0%} of the pixels change in these", _REMEDY)
+        expected = f"the same empty room in most frames that show nobody's face, {_USE}"
+        raise InputError(path, "", expected, f"{moved:.0%} of the pixels change in them", _MOVED)
     return Background(colours, np.maximum(LEAST_LEVELS, NOISES * noise))
 
 
@@ -114,5 +118,5 @@ def check_background(
     """Raise `InputError` if masks of images with landmarks (N, L, 2) are too unsure, as where the person is in the background."""
     unsure = float(np.median([background.mask(image, face).unsure for image, face in zip(images, faces)]))
     if unsure > MOST_UNSURE:
-        expected = f"{_ROOM}, with at most {MOST_UNSURE:.0%} of the person's pixels unsure"
+        expected = f"masks in which at most {MOST_UNSURE:.0%} of the person's pixels are unsure, {_USE}"
         raise InputError(path, "", expected, f"{unsure:.0%}", _REMEDY)

@@ -239,6 +239,17 @@ def test_doctor_reports_what_an_installation_lacks(settings, missing, state, say
     assert "settings.vhap.checkout=DIR" in found.text
 
 
+def test_doctor_names_its_own_options(settings):
+    checkout = settings("vhap").checkout
+    given = (f"settings.vhap.checkout={checkout}", "settings.vhap.python=no-such-python")
+    assert (
+        "--set settings.vhap.python=FILE: expected the interp"
+        in doctor(DoctorSettings(set=given), no_progress).text
+    )
+    with pytest.raises(InputError, match=r"settings\.vhap\.chekout.*Did you mean 'checkout'"):
+        doctor(DoctorSettings(set=(f"settings.vhap.chekout={checkout}",)), no_progress)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -169,7 +169,10 @@ def test_masks_remove_the_room(settings, filmed):
         ({"head": None}, "--head: expected a value"),
         ({"head": "2020"}, "head_model"),
         ({"masks": "nowhere"}, "nowhere"),
-        ({"masks": "background"}, "frames without a face, for --masks background: at least 10, found 1"),
+        (
+            {"masks": "background"},
+            "at least 10 frames that show nobody's face, for --masks background, found 1",
+        ),
         ({"longest": 1}, "frames for training"),
     ],
 )
