@@ -68,8 +68,10 @@ docs: setup
 	HEADBENCH_DOCS_NOTEBOOKS=$(NOTEBOOKS) $(BIN)/python -m sphinx -W --keep-going --quiet -j $(JOBS) -d build/docs-cache docs build/docs
 	@echo "The documentation is in build/docs/index.html."
 
-# Screenshots of the pages of a demo, in docs/pictures, and the picture of the README, of any run's report.
+# Screenshots of the pages of a demo and faults of footage on its capture, in docs/pictures, and the picture of the README, of any
+# run's report.
 pictures: docs
+	$(BIN)/python docs/_ext/footage.py $(firstword $(wildcard $(OUT)/capture/UNION*))
 	$(BIN)/python docs/_ext/pictures.py $(OUT) $(or $(REPORT),$(OUT)/report.html)
 
 # Where writing bytecode is switched off, every process compiles all tests again, two thirds of the time of collecting.

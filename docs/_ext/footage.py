@@ -1,7 +1,7 @@
-"""Pictures of what goes wrong with videos, from a synthetic capture: ``docs/pictures/footage-*.jpg``.
+"""``make pictures``: what goes wrong with videos, from a synthetic capture: ``docs/pictures/footage-*.jpg``.
 
-``python docs/_ext/footage.py CAPTURE`` with a capture of ``headbench synth --cameras 4 --timesteps 12 --performance still``; the first
-picture of each pair is right, the second shows the fault.
+``python docs/_ext/footage.py CAPTURE`` with a capture of ``headbench synth`` or ``headbench demo``. The first picture of each pair is
+right, the second shows the fault.
 """
 
 from __future__ import annotations
@@ -19,8 +19,13 @@ from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.mesh_pictures import draw_mesh
 from headbench.datasets.synthetic.plan import FRONTAL
+from headbench.datasets.video.background import LEAST_EMPTY, learn_background
 
 PICTURES = Path(__file__).parents[1] / "pictures"
+LONGEST = 440
+"""Longest side of a picture, pixels."""
+NOISE = 2.0
+"""Of the camera, levels of 255."""
 
 
 def mesh_over(clip: CaptureClip, camera: Camera, image: ByteArray) -> ByteArray:
@@ -38,21 +43,41 @@ def nearer(camera: Camera, head: np.ndarray, ratio: float) -> Camera:
     return replace(camera, K=K, world_to_camera=pose)
 
 
+def before_wall(clip: CaptureClip, camera: Camera, mesh: np.ndarray) -> ByteArray:
+    """The first frame with the mask that ``--masks background`` makes of it where the wall has the colour of the hair."""
+    key = clip.frame_at[min(clip.poses), camera.id]
+    image, cover = clip.image(key), clip.mask(key)[..., None] / 255
+    seen = mesh @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
+    face = pixels[np.asarray(clip.head.regions["face"])]
+    rows = np.arange(len(image))[:, None, None]
+    hair = (cover > 0.9) & (rows < face[:, 1].min())
+    wall = np.median(image[hair[..., 0]], axis=0)
+    rng = np.random.default_rng(0)
+
+    def filmed(person: np.ndarray | float) -> ByteArray:
+        shown = wall + cover * (person - wall)
+        return (shown + rng.normal(0, NOISE, image.shape)).clip(0, 255).astype(np.uint8)
+
+    background = learn_background(Path("wall"), [filmed(wall) for _ in range(LEAST_EMPTY)])
+    # The person's own colours without the white that the capture has at soft edges.
+    own = np.where(cover > 0.05, 255 + (image - 255.0) / np.maximum(cover, 0.05), 255)
+    mask = background.mask(filmed(own), face).mask
+    return np.where(mask[..., None] > 127, image, 255).astype(np.uint8)
+
+
 def main(capture: Path) -> None:
     clip = read_capture(capture)
     first, camera = min(clip.poses), clip.cameras[FRONTAL]
     key = clip.frame_at[first, camera.id]
-    image, mask = clip.image(key), clip.mask(key)
+    image = clip.image(key)
     ((_, mesh),) = PosedSubject.of(clip).each(clip, [first])
     shifted = np.array(camera.K)
     shifted[:2, 2] += [0.17 * camera.width, 0.06 * camera.height]
-    rows = np.arange(len(mask))[:, None]
-    top = int(np.flatnonzero(mask.max(axis=1))[0])
-    cut = np.where(rows < top + 0.12 * len(mask), 0, mask)
     side = next(name for name in clip.cameras if name != camera.id)
     pairs = {
         "mesh": (mesh_over(clip, camera, image), mesh_over(clip, replace(camera, K=shifted), image)),
-        "mask": (image, np.where(cut[..., None] > 127, image, 255).astype(np.uint8)),
+        "mask": (image, before_wall(clip, camera, mesh)),
         "lost": (image, clip.image(clip.frame_at[first, side])[:, : camera.width // 2 + camera.width // 12]),
         "focal": (
             mesh_over(clip, camera, image),
@@ -64,6 +89,7 @@ def main(capture: Path) -> None:
     for name, (right, wrong) in pairs.items():
         space = np.full((len(right), 12, 3), 255, np.uint8)
         picture = Image.fromarray(np.concatenate([right, space, wrong], axis=1))
+        picture.thumbnail((LONGEST, LONGEST))
         picture.save(PICTURES / f"footage-{name}.jpg", quality=85)
 
 
