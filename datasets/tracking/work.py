@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...bench.errors import InputError
-from ...bench.io.files import check_output_folder, write_text
+from ...bench.io.files import TEMPORARY, check_output_folder, write_text
 
 WORK = ".track"
 """Its name in the folder of ``--out``."""
@@ -20,7 +20,8 @@ def check_work_folder(folder: Path) -> None:
     if folder.is_symlink():
         found = "a link"
     elif folder.is_dir():
-        found = "" if (folder / _NOTE).is_file() or not any(folder.iterdir()) else "files of something else"
+        unfinished = all(path.name.startswith(TEMPORARY) for path in folder.iterdir())  # by a kill at once
+        found = "" if (folder / _NOTE).is_file() or unfinished else "files of something else"
     else:
         found = "a file" if folder.exists() else ""
     if found:

@@ -35,7 +35,7 @@ class FoundAgain(NamedTuple):
     number: int
     """Of the frame in the file."""
     jump: float
-    """Distance from the place where it was lost, relative to the face's size."""
+    """Distance from the place where it was before, relative to the face's size there."""
 
     @property
     def elsewhere(self) -> bool:
@@ -60,13 +60,16 @@ class FoundFaces(NamedTuple):
 
     @property
     def again(self) -> tuple[FoundAgain, ...]:
-        """Where the face was found again after frames without it."""
-        seen = np.flatnonzero(self.found)
-        return tuple(
-            FoundAgain(int(self.numbers[now]), face_distance(self.pixels[now], self.pixels[before]))
-            for before, now in pairwise(seen.tolist())
-            if now > before + 1
-        )
+        """Where the face was found again after frames without it, or is elsewhere than in the frame before."""
+        seen = np.flatnonzero(self.found).tolist()
+        rows = [
+            (
+                now - before,
+                FoundAgain(int(self.numbers[now]), face_distance(self.pixels[now], self.pixels[before])),
+            )
+            for before, now in pairwise(seen)
+        ]
+        return tuple(one for steps, one in rows if steps > 1 or one.elsewhere)
 
 
 class Crop(NamedTuple):

@@ -6,11 +6,12 @@ import os
 import pytest
 
 from headbench.bench.errors import InputError
+from headbench.bench.io.files import TEMPORARY
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.images import read_image
 from headbench.datasets.tracking.command import track_capture
 from headbench.datasets.tracking.settings import TrackSettings
-from headbench.datasets.tracking.work import WORK
+from headbench.datasets.tracking.work import WORK, make_work_folder
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +58,14 @@ def test_what_it_did_not_make_is_never_deleted(patterned_capture, tmp_path, kind
     with pytest.raises(InputError, match=f"that headbench track made, or none, found {kind}"):
         track_capture(TrackSettings(str(patterned_capture.union), str(out)))
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_folder_that_a_kill_left_empty_is_used(tmp_path):
+    (tmp_path / WORK).mkdir()
+    (tmp_path / WORK / f"{TEMPORARY}1.txt").touch()
+    for _ in range(2):
+        make_work_folder(tmp_path / WORK)
+    assert [path.name for path in (tmp_path / WORK).iterdir()] == ["README.txt"]
 
 
 def test_an_embedding_needs_a_network(patterned_capture, tmp_path):

@@ -49,6 +49,7 @@ CASES = {
         [50] * 5 + [None] * 3 + [200] * 4,
         [0] * 12,
     ),
+    "jumps to a place that is near": ([[face(50)]] * 5 + [[face(88)]] * 7, [50] * 5 + [88] * 7, [0] * 12),
     "another one appears elsewhere after it has left": (
         [[face(50)]] * 7 + [[]] + [[face(200)]] * 4,
         [50] * 7 + [None] * 5,
@@ -95,6 +96,7 @@ def test_one_person_is_followed(tmp_path, name):
         ("one", [0, 10], []),
         ("leaves and comes back elsewhere", [0, 5, 6, 7, 8, 10], [(16, 150 / 40, True)]),
         ("the other one stays", [0, 3, 4, 5, 6], [(12, 10 / 44, False)]),
+        ("jumps to a place that is near", [0, 5, 10], [(10, 38 / 40, True)]),
     ],
 )
 def test_a_lost_face_is_searched_and_its_jump_is_known(tmp_path, name, searched, again):
