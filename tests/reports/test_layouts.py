@@ -24,7 +24,9 @@ GALLERY = Path(__file__).parents[2] / "reports" / "gallery"
 
 def test_tables_have_seen_and_unseen_cameras_apart():
     rows = pd.read_parquet(GALLERY / "rows.parquet")
-    rows = rows[(rows.method == "ga") & (rows.metric == "psnr") & (rows.region == "full")]
+    rows = rows[
+        rows.method.eq("ga") & rows.condition.eq("") & rows.metric.eq("psnr") & rows.region.eq("full")
+    ]
     held_out = rows[rows.task == "novel_view"].camera.iloc[0]
     own = rows[rows.task == "self_reenactment"]
     groups = own.camera.where(own.camera == held_out, "seen").map(

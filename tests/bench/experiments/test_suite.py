@@ -94,7 +94,7 @@ def test_the_stored_suite_can_be_made_again_by_its_options(asked):
     recorded = dict(stored.clips[0].steps[0]["parameters"]["synthetic"])
     del recorded["style"]
     assert recorded == planned | {"size": list(planned["size"])}
-    assert not any(condition.clip for condition in config.conditions)
+    assert config.conditions == stored.configuration.conditions
 
 
 ONE = ("--subjects", "1", "--large", "0")

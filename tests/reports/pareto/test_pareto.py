@@ -87,7 +87,7 @@ def test_points_of_several_runs_and_which_are_on_the_front(make_run, tmp_path):
 def test_the_published_result_has_its_points(tmp_path):
     gallery = Path(__file__).parents[3] / "reports" / "gallery"
     points = pareto_runs(ParetoSettings((str(gallery),), str(tmp_path / "out"))).data["points"]
-    assert len(points) == 5  # its rows are of two regions
+    assert len(points) == 12  # six methods and their coded avatars; its rows are of two regions
     assert all(point["megabytes"] and point["milliseconds"] for point in points)
 
 
