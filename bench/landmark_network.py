@@ -95,9 +95,8 @@ class LandmarkNetwork:
                 if change < SETTLED:
                     seen.append((score, steady))
         faces: list[FloatArray] = []
-        for _, face in sorted(
-            seen, key=lambda one: -one[0]
-        ):  # what is found beside a face scores lower than it
+        # What is found beside a face scores lower than it.
+        for _, face in sorted(seen, key=lambda one: -one[0]):
             if all(face_distance(face, other) > 1 for other in faces):
                 faces.append(face)
         return sorted(faces, key=face_size, reverse=True)

@@ -19,7 +19,7 @@ from ..bench.registry import get
 from ..bench.specs import CommandResult, MetricSpec
 from .aggregate import summarise
 from .cameras import unseen_cameras
-from .runs import RunSet
+from .runs import RunSet, synthetic_settings
 from .tables import AVERAGED
 from .writers import pipe_table
 
@@ -114,11 +114,7 @@ def _metrics(runs: RunSet, name: str, protocol: NamedProtocol) -> tuple[list[Met
 def differences(runs: RunSet, protocol: NamedProtocol) -> list[str]:
     """How runs differ from what the published figures of a protocol were obtained with: sentences."""
     found = []
-    synthetic = all(
-        clip.steps and "synthetic" in clip.steps[0].get("parameters", {})
-        for run in runs.runs
-        for clip in run.manifest.clips
-    )
+    synthetic = all(synthetic_settings(clip) for run in runs.runs for clip in run.manifest.clips)
     subjects = len({clip.subject for run in runs.runs for clip in run.manifest.clips})
     if protocol.subjects and synthetic:
         found.append(f"Subjects: {subjects} synthetic, there {protocol.subjects}.")

@@ -26,13 +26,12 @@ from ..bench.experiments.robustness import RECORD_FILE
 from ..bench.experiments.suite_settings import EQUAL, LARGE_RUN, NONE, RUN, SEEDS_RUN, TRACKED
 from ..bench.io.files import write_bytes, write_json, write_text
 from ..bench.io.images import encode_image, read_png
-from ..bench.manifest import Manifest
 from ..bench.progress import counted
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from .aggregate import summarise
 from .protocols import ProtocolsSettings, protocols_command
-from .runs import RunSet
+from .runs import RunSet, synthetic_settings
 from .statistics.command import equivalence_text
 from .statistics.comparisons import PairedComparison, compare
 from .statistics.primary import PAIR, PRIMARY, primary_table
@@ -148,11 +147,6 @@ def suite_results(folder: Path) -> str:
     return suite_report(folder, OURS)
 
 
-def _made(manifest: Manifest) -> dict[str, Any]:
-    """What the settings of the captures of a run were, for all subjects alike."""
-    return dict(manifest.clips[0].steps[0]["parameters"]["synthetic"])
-
-
 def measured(folder: Path) -> dict[str, Any]:
     """Means of the stored runs of the suite, as `method_cards.MeasuredFigures` has them; over all cameras, as papers print them."""
     runs = RunSet.read(suite_runs(folder))
@@ -185,7 +179,7 @@ def suite_options(folder: Path) -> tuple[str, ...]:
     runs, large = (
         [RunFolder(run).read_manifest() for run in suite_runs(folder, base)] for base in (RUN, LARGE_RUN)
     )
-    given = {"tracker": "per-frame", **_made(runs[0])}
+    given = {"tracker": "per-frame", **synthetic_settings(runs[0].clips[0])}
     given["size"] = "x".join(map(str, given["size"]))
     names = ("performance", "tracker", "tracking_error", "cameras", "timesteps", "size", "subjects")
     options = [(f"--{name.replace('_', '-')}", str(given[name])) for name in names]
@@ -206,7 +200,7 @@ def suite_block(root: Path) -> str:
     folders = suite_runs(folder)
     runs = RunSet.read(folders)
     options = " ".join(suite_options(folder))
-    made = _made(runs.runs[0].manifest)
+    made = synthetic_settings(runs.runs[0].manifest.clips[0])
     minutes = [value for each in folders for _, value in _minutes(each)]
     seconds = [summarise(runs.rows, label, "training_processor", "").value for label in runs.ranked]
     known = [value for value in seconds if value is not None]

@@ -16,7 +16,7 @@ from ..bench.engine.config import RunOptions
 from ..bench.engine.scoring import FULL
 from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
-from ..bench.manifest import Manifest, MethodRecord
+from ..bench.manifest import ClipRecord, Manifest, MethodRecord
 from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, joined_protocol, missing_tasks
 from ..bench.rows import ALL, Rows
 from ..bench.source import is_outside
@@ -24,6 +24,12 @@ from ..bench.specs import MetricSpec
 from .cameras import EXPLAINED, SPLIT_TASK, unseen_cameras
 from .coded import check_codecs, with_coded
 from .tables import AVERAGED
+
+
+def synthetic_settings(clip: ClipRecord) -> dict[str, Any]:
+    """Settings of the capture that a clip is from, if it is synthetic; else empty."""
+    first = clip.steps[0] if clip.steps else {}
+    return dict(first.get("parameters", {}).get("synthetic", {}))
 
 
 @dataclass(frozen=True)

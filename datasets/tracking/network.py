@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -23,25 +23,40 @@ MOST_MISFIT = 0.04
 """Largest median distance of landmarks from those of the mean head, relative to the face's size."""
 
 
+Finder = Callable[[int, str, FloatArray | None], Iterable[FloatArray | None]]
+"""From a timestep, a camera's id and the landmarks of the image before, if any: (COUNT, 2) landmarks in pixels, or None where there is no
+face, in the order in which they are tried."""
+
+
+def found_in_images(
+    network: LandmarkNetwork, clip: CaptureClip, timestep: int, camera: str, near: FloatArray | None
+) -> Iterator[FloatArray | None]:
+    """Landmarks around those of the image before, then those of the whole image; a `Finder` for a network and a clip."""
+    image = clip.image(clip.frame_at[timestep, camera])
+    if near is not None:
+        yield network.find(image, near)
+    yield network.find(image)
+
+
 class NetworkLandmarks:
-    """A source of landmarks: the network on the images of some cameras of a clip, or what it has found before.
+    """A source of landmarks: what the network finds in the images of some cameras of a clip.
 
     Parameters
     ----------
-    network : LandmarkNetwork | Callable
-        The network; or a function that gives the (COUNT, 2) landmarks of a timestep in the only camera, pixels.
+    finder : Finder
+        The network's landmarks, `found_in_images` or those that are known.
     embedding : Embedding
         Where the network's landmarks are on the head model.
     """
 
     def __init__(
         self,
-        network: LandmarkNetwork | Callable[[int], FloatArray],
+        finder: Finder,
         embedding: Embedding,
         clip: CaptureClip,
         cameras: Sequence[str],
     ):
-        self._network, self._embedding, self._clip, self._cameras = network, embedding, clip, [*cameras]
+        self._find, self._embedding, self._cameras = finder, embedding, [*cameras]
         self._views = Views([clip.cameras[name] for name in cameras])
         self._rest, self._normals = _rest(clip.head, embedding)
 
@@ -51,7 +66,7 @@ class NetworkLandmarks:
         for column, name in enumerate(self._cameras):
             near = None
             for row, timestep in enumerate(timesteps):
-                trials, near = self._trials(timestep, name, near), None
+                trials, near = self._find(timestep, name, near), None
                 for found in trials:
                     points = None if found is None else found[self._embedding.landmarks]
                     facing = None if points is None else self._facing(points, column)
@@ -60,16 +75,6 @@ class NetworkLandmarks:
                         near = found
                         break
         return ImageLandmarks(self._embedding.corners, self._embedding.weights, pixels)
-
-    def _trials(self, timestep: int, camera: str, near: FloatArray | None) -> Iterator[FloatArray | None]:
-        """Landmarks of an image in the order in which they are tried: around those of the image before, then everywhere."""
-        if not isinstance(self._network, LandmarkNetwork):
-            yield self._network(timestep)
-            return
-        image = self._clip.image(self._clip.frame_at[timestep, camera])
-        if near is not None:
-            yield self._network.find(image, near)
-        yield self._network.find(image)
 
     def _facing(self, found: FloatArray, camera: int) -> BoolArray | None:
         """(L,) which landmarks face the camera; None if they do not form a face."""
@@ -133,4 +138,5 @@ def landmark_source(
             raise InputError("settings of the tracker", "landmarks", "a value beside embedding", "none")
         return partial(known_rig_landmarks, clip, cameras, seed=seed)
     network = LandmarkNetwork(Path(landmarks))
-    return NetworkLandmarks(network, head_embedding(network, clip.head, teacher, progress), clip, cameras)
+    finder = partial(found_in_images, network, clip)
+    return NetworkLandmarks(finder, head_embedding(network, clip.head, teacher, progress), clip, cameras)

@@ -49,9 +49,9 @@ class VideoClip(NamedTuple):
         """Numbers of the frames that were left out because the person's face was not found."""
         return tuple(self.faces.numbers[~self.faces.found].tolist())
 
-    def landmarks(self, timestep: int) -> FloatArray:
-        """(L, 2) landmarks of a frame of the clip, pixels of the clip."""
-        return self.pixels[timestep]
+    def found(self, timestep: int, camera: str, near: FloatArray | None) -> Iterator[FloatArray]:
+        """(L, 2) landmarks of a frame of the clip, pixels of the clip: a `tracking.network.Finder`."""
+        yield self.pixels[timestep]
 
     def with_focal(self, focal: float) -> CaptureClip:
         """The clip with a focal length in pixels of the video."""
@@ -124,9 +124,7 @@ def _write_frames(
     progress: Progress,
 ) -> None:
     """Write the images and masks that are missing in a folder."""
-    seen = {
-        number: face for number, face in zip(faces.numbers.tolist(), faces.pixels) if np.isfinite(face).all()
-    }
+    seen = dict(zip(faces.numbers[faces.found].tolist(), faces.pixels[faces.found]))
     files = {
         number: [folder / f"{number:05d}.png", *([folder / MASKS / f"{number:05d}.png"] if masks else [])]
         for number in seen

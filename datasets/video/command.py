@@ -67,7 +67,7 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
     )
     video = open_video(path, settings, head, network, weights, folder, progress)
     clip, focal = video.clip, None
-    landmarks = NetworkLandmarks(video.landmarks, embedding, clip, [*clip.cameras])
+    landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
     if settings.focal is None:
         (camera,) = clip.cameras.values()
         side = max(video.info.width, video.info.height) * video.view.scale
@@ -84,7 +84,7 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
         focal = FocalLength(float(stored["pixels"]), stored["residuals"], stored["tried"])
         if focal.clear:
             clip = video.with_focal(focal.pixels / video.view.scale)
-            landmarks = NetworkLandmarks(video.landmarks, embedding, clip, [*clip.cameras])
+            landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
     return OpenedVideo(
         clip, landmarks, _data(video, settings.focal, focal), _lines(video, settings.focal, focal)
     )

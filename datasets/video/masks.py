@@ -9,10 +9,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ...bench.contracts import ByteArray, FloatArray, IntArray
+from ...bench.contracts import ByteArray, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.files import digest, digest_file
 from ...bench.io.images import probe_image
+from ...bench.protocol import evenly_with_ends
 from ..ga.content_digests import content_digests
 from ..images import read_mask
 from .background import CHECKED, SAMPLES, Background, check_background, learn_background
@@ -112,8 +113,8 @@ class MaskSource:
         """
         if not self.by_background:
             return
-        empty = _spread(np.flatnonzero(~faces.found & (faces.others == 0)), SAMPLES)
-        shown = _spread(np.flatnonzero(faces.found), CHECKED)
+        empty = evenly_with_ends(np.flatnonzero(~faces.found & (faces.others == 0)).tolist(), SAMPLES)
+        shown = evenly_with_ends(np.flatnonzero(faces.found).tolist(), CHECKED)
         chosen = {*faces.numbers[[*empty, *shown]].tolist()}
         images = {frame.number: view.image(frame.image) for frame in frames if frame.number in chosen}
         self._background = learn_background(path, [images[number] for number in faces.numbers[empty]])
@@ -132,10 +133,3 @@ class MaskSource:
 
     def _file(self, number: int) -> Path:
         return Path(self.options.masks) / f"{number:05d}.png"
-
-
-def _spread(values: IntArray, count: int) -> list[int]:
-    """At most ``count`` of the values, evenly."""
-    if not len(values):
-        return []
-    return values[np.unique(np.linspace(0, len(values) - 1, count).astype(int))].tolist()

@@ -34,16 +34,11 @@ def budget_of(runs: RunSet, read: tuple[RunData, ...], marks: Mapping[str, int])
 
     Task and metric are those of `RecommendSettings`, or the first that the runs have. ``marks`` are numbers of marks by label.
     """
-    tasks, metrics = (
-        [name for name in known if all(name in own for own in of_runs)]
-        for known, of_runs in (
-            (runs.tasks, [run.tasks for run in runs.runs]),
-            (
-                [spec.name for spec in runs.metrics if spec.per_frame],
-                [[spec.name for spec in run.metrics] for run in runs.runs],
-            ),
-        )
-    )
+    tasks = [task for task in runs.tasks if all(task in run.tasks for run in read)]
+    known = [{spec.name for spec in run.metrics} for run in read]
+    metrics = [
+        spec.name for spec in runs.metrics if spec.per_frame and all(spec.name in own for own in known)
+    ]
     if not tasks or not metrics:
         return {"reason": "The runs have no task and metric of frames in common.", "answers": None}
     task = RecommendSettings.task if RecommendSettings.task in tasks else tasks[0]

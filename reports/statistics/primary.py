@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import product
 
 from ...bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
-from ..runs import RunSet
+from ..runs import RunSet, synthetic_settings
 from ..writers import pipe_table
 from .command import equivalence_text
 from .comparisons import LEVEL, PairedComparison, as_one_family, compare
@@ -38,8 +38,8 @@ def primary_comparisons(runs: RunSet) -> list[PairedComparison]:
 
 def planned_subjects(runs: RunSet) -> int:
     """Number of subjects that the synthetic captures of the runs were planned for; 0 where none is recorded."""
-    steps = [step["parameters"] for run in runs.runs for clip in run.manifest.clips for step in clip.steps]
-    return max((int(each["synthetic"]["subjects"]) for each in steps if "synthetic" in each), default=0)
+    settings = [synthetic_settings(clip) for run in runs.runs for clip in run.manifest.clips]
+    return max((int(each.get("subjects", 0)) for each in settings), default=0)
 
 
 def primary_table(runs: RunSet) -> str:
