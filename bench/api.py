@@ -16,10 +16,11 @@ from .engine import run as runner
 from .engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
 from .engine.captures import capture_configuration, open_clips, reader_of
 from .engine.config import ResolvedMethod, build_run_config, default_names, resolve_methods
+from .engine.job import Job
 from .engine.scoring import ScoredFrames, check_regions, score_frames
-from .engine.steps import Job, fit
 from .engine.store import RunFolder
 from .engine.stored import open_avatar
+from .engine.training import fit
 from .errors import InputError
 from .io.files import check_output_folder
 from .io.images import quantise

@@ -89,6 +89,15 @@ def text_of(error: BaseException) -> str:
         return f"{type(error).__name__} without a readable message"
 
 
+def reason_of(error: Exception) -> str:
+    """Reason of a failed cell for its rows; running out of memory is always "out of memory"."""
+    name, text = type(error).__name__, text_of(error)
+    wanted = ("out of memory", "can't allocate memory", "cannot allocate memory")
+    if isinstance(error, MemoryError) or name == "OutOfMemoryError" or any(w in text.lower() for w in wanted):
+        return f"out of memory: {text or name}"
+    return f"{name}: {text}"
+
+
 def is_damage(error: BaseException) -> bool:
     """Whether a reading error is caused by the file's content, and not by the disk, permissions, or lack of
     memory."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from ..contracts import Progress, no_progress
-from ..engine.steps import DIGESTS
+from ..engine.job import DIGESTS
 from ..engine.store import STAGES, RunFolder
 from ..errors import InputError
 from ..io.archives import open_archive

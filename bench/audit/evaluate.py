@@ -12,8 +12,10 @@ from ..condition import PLAIN
 from ..contracts import Avatar, Budget, Camera, Clip, Frame, FrameKey, HeadPose, Progress, no_progress
 from ..engine.captures import capture_configuration, open_clips, open_run_clips
 from ..engine.config import ResolvedMethod, RunConfig, RunOptions, default_names, resolve_metrics
+from ..engine.job import DIGESTS, Job
+from ..engine.measuring import measure
+from ..engine.rendering import render
 from ..engine.run import run_locked
-from ..engine.steps import DIGESTS, Job, measure, render
 from ..engine.store import Cell, RunFolder
 from ..engine.stored import avatar_digest, open_avatar
 from ..errors import HeadbenchError, InputError

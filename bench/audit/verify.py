@@ -19,8 +19,9 @@ from ..condition import Condition
 from ..contracts import Avatar, Clip, FrameKey, Progress, no_progress
 from ..engine.captures import Plugins, open_run_clips, synthesis_arguments
 from ..engine.config import CODED_VARIANT, RunOptions, resolve_cells
+from ..engine.job import DIGESTS, Job, recorded_frames
 from ..engine.jobs import load, make_jobs
-from ..engine.steps import DIGESTS, Job, measure, recorded_frames
+from ..engine.measuring import measure
 from ..engine.store import Cell, RunFolder
 from ..errors import ExitCode, HeadbenchError, InputError
 from ..executors.schedule import Schedule

@@ -11,7 +11,7 @@ from ..manifest import Manifest, MethodRecord
 from ..progress import duration
 from ..specs import CommandResult
 from .disk import shown
-from .steps import Job
+from .job import Job
 from .store import Cell, RunFolder
 
 

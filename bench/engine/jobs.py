@@ -19,9 +19,12 @@ from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
 from .captures import changed, open_run_clips, run_configuration
 from .config import ResolvedMethod, RunConfig, RunOptions, resolve_cells
+from .job import MEASURING_AVATAR, RENDERING, TRAINING, Job
+from .measuring import drive, measure, stored_rows
+from .rendering import render
 from .scoring import check_regions
-from .steps import Job, derive, drive, fit, measure, render, stored_rows
 from .store import Cell, RunFolder
+from .training import derive, fit
 
 
 def make_jobs(
@@ -135,6 +138,23 @@ def _copy_kept(source: Path, folder: Path) -> None:
         if path.is_file() and not path.is_symlink() and not target.exists():
             with atomic_path(target) as temporary:
                 shutil.copyfile(path, temporary)
+
+
+def steps_ahead(job: Job, metrics: Sequence[MetricSpec]) -> dict[str, str]:
+    """The unfinished steps of a cell, each with the kind of cells of similar duration."""
+    trained = job.cell.is_done("fit", job.fit_fingerprint)
+    if trained and job.cell.is_done("measure", job.fit_fingerprint):
+        return {}
+    if job.condition.drive:
+        return {} if stored_rows(job, metrics, retry=True) is not None else {RENDERING: job.label}
+    method = job.label
+    steps = {} if trained or job.source is not None else {TRAINING: method}
+    steps[RENDERING] = method
+    if any(spec.per_frame for spec in metrics):
+        steps |= {f"measuring {task}": "" for task in job.protocols}
+    if not all(spec.per_frame for spec in metrics):
+        steps[MEASURING_AVATAR] = method
+    return steps
 
 
 def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:

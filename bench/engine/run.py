@@ -15,7 +15,15 @@ import numpy as np
 
 from ..condition import Condition, label_of
 from ..contracts import CheckedMethod, Clip
-from ..errors import ChangedInputError, HeadbenchError, InputError, LeftOutError, UnavailableError, is_damage
+from ..errors import (
+    ChangedInputError,
+    HeadbenchError,
+    InputError,
+    LeftOutError,
+    UnavailableError,
+    is_damage,
+    reason_of,
+)
 from ..executors.outcome import outcome_path
 from ..executors.settings import Execution, check_executor
 from ..io.files import check_kind, check_output_folder
@@ -30,9 +38,10 @@ from ..specs import ConditionSpec, DatasetSpec, MetricSpec
 from . import adaptation
 from .captures import open_clips, relative_paths
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
-from .jobs import make_jobs, run_cell
+from .job import Job
+from .jobs import make_jobs, run_cell, steps_ahead
+from .measuring import failed_rows
 from .scoring import compared_over_time, make_metric
-from .steps import Job, failed_rows, reason_of, steps_ahead
 from .store import RunFolder
 from .tasks import execute, machine_of
 

@@ -12,7 +12,7 @@ import pandas as pd
 
 from ..condition import label_of
 from ..contracts import Progress
-from ..errors import InputError
+from ..errors import InputError, reason_of
 from ..executors.settings import is_speed
 from ..io.lock import locked
 from ..machine import check_device, check_device_answers, use_device
@@ -21,9 +21,10 @@ from ..rows import ALL, Rows
 from ..specs import CommandResult, MetricSpec
 from .captures import open_run_clips
 from .config import RunOptions, resolve_cells, resolve_metrics
+from .job import Job
 from .jobs import load, make_jobs
+from .measuring import measure
 from .run import write_reports
-from .steps import Job, measure, reason_of
 from .store import RunFolder
 
 log = logging.getLogger(__name__)

@@ -30,9 +30,11 @@ from ..rows import Rows
 from ..specs import MAX_LABEL, MetricSpec
 from .captures import open_clips
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
-from .jobs import make_jobs, run_cell
-from .steps import Job, failed_rows, log_kept, steps_ahead, stored_rows, trained_files
+from .job import Job, trained_files
+from .jobs import make_jobs, run_cell, steps_ahead
+from .measuring import failed_rows, stored_rows
 from .store import RunFolder
+from .training import log_kept
 
 log = logging.getLogger(__name__)
 REPORT_EVERY_S, LOG_EVERY_S = 2.0, 10.0

@@ -35,7 +35,7 @@ def execute_task(task: Task) -> None:
     OSError
         The disk is full or read-only.
     """
-    from ..engine.steps import reason_of
+    from ..errors import reason_of
     from ..io.files import output_inside
     from ..io.lock import locked
     from ..machine import check_device

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from ..contracts import Avatar, Clip, DepthAvatar, FloatArray, FrameKey, HeadPose, Progress
-from ..engine.steps import Job
+from ..engine.job import Job
 from ..errors import UnavailableError
 from ..io.files import digest
 from ..protocol import Protocol

@@ -13,8 +13,8 @@ import numpy as np
 from ..condition import PLAIN
 from ..contracts import Avatar, Camera, Clip, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
 from ..engine.captures import open_clips
+from ..engine.job import Job
 from ..engine.jobs import make_jobs
-from ..engine.steps import Job
 from ..engine.store import RunFolder
 from ..errors import InputError
 from ..io.files import digest

@@ -27,8 +27,8 @@ from ..contracts import (
     Splats,
 )
 from ..engine.adaptation import MethodNeeds
+from ..engine.job import Job
 from ..engine.scoring import FULL
-from ..engine.steps import Job
 from ..errors import UnavailableError
 from ..io.images import quantise, write_png
 from ..io.provenance import RENDER

@@ -17,8 +17,8 @@ import numpy as np
 from skimage.color import deltaE_ciede2000
 
 from ..contracts import ByteArray, Camera, FloatArray, Frame, GroundTruth, HeadPose, TrueFrame
+from ..engine.job import Job
 from ..engine.scoring import FULL, make_metric
-from ..engine.steps import Job
 from ..errors import InputError, UnavailableError
 from ..io.files import digest
 from ..io.images import quantise, read_png, write_png

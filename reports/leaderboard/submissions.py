@@ -16,9 +16,8 @@ from ...bench.audit.verify import SHOWN, TRAINING, Findings, Renders, lacking_fr
 from ...bench.contracts import Progress
 from ...bench.engine.config import RunOptions
 from ...bench.engine.scoring import FULL
-from ...bench.engine.steps import reason_of
 from ...bench.engine.store import RunFolder
-from ...bench.errors import HeadbenchError, text_of
+from ...bench.errors import HeadbenchError, reason_of, text_of
 from ...bench.executors.settings import Execution
 from ...bench.io.files import digest_file
 from ...bench.manifest import Manifest

@@ -17,8 +17,8 @@ from headbench.bench import cli
 from headbench.bench.benchmarks import take_turns
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.engine.config import RunOptions
+from headbench.bench.engine.job import Job
 from headbench.bench.engine.jobs import load, trained
-from headbench.bench.engine.steps import Job
 from headbench.bench.machine import use_device
 from headbench.bench.registry import discover
 from headbench.bench.rows import ALL, Rows

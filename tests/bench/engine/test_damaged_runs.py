@@ -7,8 +7,8 @@ import cv2
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.engine import rendering
 from headbench.bench.engine import run as runner
-from headbench.bench.engine import steps
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import digest_file, write_json
@@ -134,7 +134,7 @@ def test_frames_without_a_record_are_rendered_again(config, cell, toy, monkeypat
         rendered.append(1)
         return original(self, *arguments)
 
-    monkeypatch.setattr(steps, "RECORD_EVERY_S", -1.0)
+    monkeypatch.setattr(rendering, "RECORD_EVERY_S", -1.0)
     with monkeypatch.context() as patch:
         patch.setattr(toy.ToyAvatar, "render", killed)
         with pytest.raises(KeyboardInterrupt):

@@ -14,8 +14,7 @@ from headbench.bench.engine import run as runner
 from headbench.bench.engine.disk import clean, usage
 from headbench.bench.engine.forecast import forecast
 from headbench.bench.engine.run import planned_jobs
-from headbench.bench.engine.steps import reason_of
-from headbench.bench.errors import InputError
+from headbench.bench.errors import InputError, reason_of
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked

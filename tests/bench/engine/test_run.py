@@ -16,7 +16,7 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.condition import PLAIN, Condition
-from headbench.bench.engine import adaptation, steps
+from headbench.bench.engine import adaptation, job, measuring, training
 from headbench.bench.engine import config as runner_config
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.config import RunConfig
@@ -131,7 +131,7 @@ def test_what_a_method_prepares_is_not_timed_as_training(config, toy, monkeypatc
     monkeypatch.setattr(toy.ToyMethod, "prepare", prepare, raising=False)
     monkeypatch.setattr(toy.ToyMethod, "fit", timed_fit)
     monkeypatch.setattr(
-        steps, "time", types.SimpleNamespace(perf_counter=lambda: now[0], monotonic=time.monotonic)
+        training, "time", types.SimpleNamespace(perf_counter=lambda: now[0], monotonic=time.monotonic)
     )
     runner.run(config)
     assert order[:2] == ["cpu", "fit"]
@@ -397,10 +397,10 @@ def test_changed_code_of_a_metric_is_measured_again(config, edit, toy):
 
 def test_changed_code_of_a_native_method_is_warned_of(config, cell, monkeypatch, caplog):
     """Its version says whether the results are other ones, and whoever edits it may forget that."""
-    for module in (steps, runner_config):
+    for module in (job, measuring, runner_config):
         monkeypatch.setattr(module, "is_outside", lambda reference: False)
     codes = ["first"]
-    for module in (steps, runner_config):
+    for module in (measuring, runner_config):
         monkeypatch.setattr(module, "code_digest", lambda reference: codes[-1])
     rows = rows_of(config)
     assert rows_of(config).equals(rows)

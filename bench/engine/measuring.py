@@ -1,0 +1,366 @@
+"""Measurements of a cell's renders and avatar, as rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from typing import Any
+
+from ..contracts import Avatar, Camera, CodedAvatar, FrameKey, HeadPose, Measurement
+from ..errors import HeadbenchError, UnavailableError
+from ..io.files import digest, digest_file
+from ..io.images import read_png
+from ..isolation.parent import IsolatedAvatar
+from ..machine import ProcessorLoad, machine_name
+from ..protocol import Protocol
+from ..registry import get
+from ..rows import ALL, SUSPECT, Row, Rows
+from ..source import code_digest, is_outside
+from ..specs import ConditionSpec, MetricSpec
+from .adaptation import AdaptedClip
+from .config import resolve_change
+from .job import (
+    DIGESTS,
+    MEASURING_AVATAR,
+    RENDERING,
+    RESULT_FORMAT,
+    Job,
+    avatar_record,
+    recorded_frames,
+    source_now,
+    warn_of_damage,
+)
+from .scoring import FULL, Score, ScoredFrames, make_metric, score_frames
+from .store import Cell
+
+
+def measure(
+    job: Job, avatar: Avatar, metrics: Sequence[MetricSpec], again: Sequence[MetricSpec] = ()
+) -> Rows:
+    """Evaluate the stored frames and the avatar as a whole; existing results are read back.
+
+    Metrics of one implementation are one measurement and are read back or repeated together. A measurement
+    with any value is read back; a failed one is repeated. Damaged rows are measured again, with a warning.
+    Rows of metrics that are not requested stay in the cell's file, with the record of their inputs.
+
+    Parameters
+    ----------
+    again : Sequence[MetricSpec]
+        Metrics to measure again, a subset of ``metrics`` that concern the avatar as a whole; others that
+        were already measured or tried are not. Former values stay in the record of the measurements,
+        under ``earlier``.
+
+    Raises
+    ------
+    UnavailableError
+        A metric in ``again`` has a value but can no longer be measured; nothing is changed then.
+    """
+    known, details, old = _measured_before(job)
+    repeated = {spec.implementation for spec in again}
+    rendered = recorded_frames(job)
+    earlier = {
+        spec.name: old.select(method=ALL, condition=ALL, metric=spec.name, task=ALL, region=ALL, seeds=ALL)
+        for spec in metrics
+    }
+    fingerprints = {spec.name: _measure_fingerprint(job, spec, rendered) for spec in metrics}
+    had = {spec.implementation for spec in metrics if "ok" in set(earlier[spec.name]["status"])}
+    new = {spec.implementation for spec in metrics if known.get(spec.name) != fingerprints[spec.name]}
+    settled = ({spec.implementation for spec in metrics} if again else had) - new - repeated
+    wanted = [spec for spec in metrics if spec.implementation not in settled]
+    per_frame = [spec for spec in wanted if spec.per_frame]
+    scored = [_score(job, per_frame, protocol) for protocol in job.protocols.values() if per_frame]
+    measured: dict[str, Measurement | UnavailableError] = {}
+    of_avatar = [spec for spec in wanted if not spec.per_frame]
+    with job.progress(MEASURING_AVATAR) if of_avatar else nullcontext():
+        for spec in of_avatar:
+            if spec.implementation not in measured:
+                measured[spec.implementation] = outcome = _measure_avatar(job, spec, avatar)
+                if isinstance(outcome, UnavailableError) and spec.implementation in repeated & had:
+                    raise outcome
+                found = outcome.details.items() if isinstance(outcome, Measurement) else ()
+                # JSON has only finite numbers; a metric with another value has its own row.
+                details[spec.name] = {k: v for k, v in found if not isinstance(v, float) or math.isfinite(v)}
+    job.check_unchanged()
+    replaced = [spec.name for spec in metrics if spec.implementation in repeated & had]
+    step = job.cell.step("measure")
+    history = [] if step is None else [*step.get("earlier", [])]
+    if replaced:
+        history.append(_replaced(old.of_metrics(replaced)))
+    record: dict[str, Any] = {"earlier": history} if history else {}
+    parts: list[Rows] = []
+    for spec in metrics:
+        if spec not in wanted:
+            parts.append(Rows(earlier[spec.name]))
+        elif spec.per_frame:
+            parts.append(Rows.of(row for of_protocol in scored for row in of_protocol[spec.name]))
+        else:
+            parts.append(Rows.of([_avatar_row(job, spec, measured[spec.implementation])]))
+    result = Rows.joined(parts)
+    if lost := result.values_lacking(old.of_metrics(replaced)):
+        raise UnavailableError(
+            f"The new measurement has no value of {lost[0]}, and the former has one.", "The former is kept."
+        )
+    others = sorted(old.metrics - fingerprints.keys())
+    job.cell.begin("measure", job.fit_fingerprint, **record)  # interrupted between the rows and their record
+    Rows.joined([result, old.of_metrics(others)] if others else [result]).write(job.cell.rows)
+    job.cell.finish(
+        "measure",
+        job.fit_fingerprint,
+        fingerprints=known | fingerprints,
+        details=details,
+        rows=digest_file(job.cell.rows),
+        codec=avatar.codec if isinstance(avatar, CodedAvatar) else "",
+        **record,
+    )
+    return result
+
+
+def _replaced(rows: Rows) -> dict[str, Any]:
+    """Record of the values of a cell before they are replaced, with the conditions of their measurement."""
+    table = rows.select(method=ALL, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+    table = table[table["status"] == "ok"]
+    first = table.iloc[0]
+    conditions = {name: first[name].item() for name in ("threads", "other_cores")}
+    return {
+        "replaced": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": str(first["machine"]),
+        **{name: value for name, value in conditions.items() if math.isfinite(value)},
+        "values": dict(zip(map(str, table["metric"]), map(float, table["value"]))),
+    }
+
+
+def drive(job: Job, avatar: Avatar) -> Rows:
+    """Render and evaluate the avatar with the condition's change; write the rows and a record to the cell.
+
+    The record has the details of the change, and digests of its files by their place in the run folder.
+    """
+    change = job.condition.drive
+    with job.progress(RENDERING) as report:
+        rows, details, files = resolve_change(change, "drive")(job, avatar, report)
+    job.check_unchanged()
+    rows.write(job.cell.rows)
+    job.cell.finish(
+        "measure",
+        job.fit_fingerprint,
+        fingerprints={change.name: _drive_fingerprint(job)},
+        details={change.name: details},
+        files=Cell(job.run).digests(set(files)),
+        rows=digest_file(job.cell.rows),
+    )
+    return rows  # type: ignore[no-any-return]
+
+
+def _drive_fingerprint(job: Job) -> str:
+    """Digest of everything that the rows of an animated avatar depend on."""
+    change = job.condition.drive
+    spec: ConditionSpec = get("conditions", change.name)
+    code = code_digest(spec.implementation) if is_outside(spec.implementation) else ""
+    state = None if job.source is None else job.source.step("fit")
+    source = None if state is None else (state["fingerprint"], state.get("files"))
+    protocols = sorted(protocol.hash for protocol in job.protocols.values())
+    return digest(
+        RESULT_FORMAT, job.fit_fingerprint, asdict(change), code, source, avatar_record(job), protocols
+    )
+
+
+def _driven_before(job: Job, retry: bool) -> Rows | None:
+    """Stored rows of an animated avatar; None if there are none (``retry``: or no value)."""
+    state = job.cell.step("measure")
+    if state is None or not job.cell.is_done("fit", job.fit_fingerprint):
+        return None
+    known, _, rows = _measured_before(job)
+    if known.get(job.condition.drive.name) != _drive_fingerprint(job):
+        return None
+    damaged = Cell(job.run).damage(state.get("files", {}))
+    if damaged:
+        warn_of_damage(job, damaged, "rendered again")
+    return None if damaged or (retry and not rows.metrics_with_values) else rows
+
+
+def stored_rows(job: Job, metrics: Sequence[MetricSpec], *, retry: bool = False) -> Rows | None:
+    """Stored rows of a finished cell; None if something is missing, damaged or made from other inputs.
+
+    ``retry``: failed measurements count as missing, so that they are repeated.
+    """
+    if job.condition.drive:
+        return _driven_before(job, retry)
+    fitted = job.cell.step("fit")
+    made_of = digest(job.fit_fingerprint, avatar_record(job))
+    if job.source is not None and fitted is not None and fitted.get("derived_from") != source_now(job):
+        return None
+    if fitted is None or not job.cell.is_done("fit", job.fit_fingerprint):
+        return None
+    if not job.cell.is_done(DIGESTS, made_of) or job.cell.damage(fitted.get("files", {})):
+        return None
+    rendered = recorded_frames(job)
+    frames = {name: rendered.get(name, "") for name in map(job.cell.name, job.frame_paths)}
+    if job.cell.damage(frames):
+        return None
+    known, _, old = _measured_before(job)
+    if any(known.get(spec.name) != _measure_fingerprint(job, spec, rendered) for spec in metrics):
+        return None
+    measured = old.metrics_with_values
+    had = {spec.implementation for spec in metrics if spec.name in measured}
+    if retry and any(spec.implementation not in had for spec in metrics):
+        return None
+    return old.of_metrics([spec.name for spec in metrics])
+
+
+def _measured_before(job: Job) -> tuple[dict[str, str], dict[str, Any], Rows]:
+    """Fingerprints and details of the measurements that were taken, by metric, and the rows."""
+    step = job.cell.step("measure")
+    if step is None or step["status"] != "done" or "rows" not in step:
+        return {}, {}, Rows.of([])
+    damaged = job.cell.damage({job.cell.name(job.cell.rows): step["rows"]})
+    if damaged:
+        warn_of_damage(job, damaged, "measured again")
+        return {}, {}, Rows.of([])
+    return step.get("fingerprints", {}), dict(step.get("details", {})), Rows.read(job.cell.rows)
+
+
+def _measure_fingerprint(job: Job, spec: MetricSpec, rendered: Mapping[str, str]) -> str:
+    """Digest of everything a metric's values depend on."""
+    protocols = sorted(protocol.hash for protocol in job.protocols.values())
+    regions = job.regions if spec.kind == "regional" else ()
+    what: Any = avatar_record(job)
+    if spec.per_frame:
+        what = {name: rendered.get(name) for name in map(job.cell.name, job.frame_paths)}
+    metric: tuple[str, ...] = (spec.name, spec.implementation, spec.detail)
+    if is_outside(spec.implementation):
+        metric = (*metric, code_digest(spec.implementation))
+    return digest(RESULT_FORMAT, job.fit_fingerprint, protocols, *metric, regions, what)
+
+
+def failed_rows(job: Job, metrics: Sequence[MetricSpec], reason: str) -> Rows:
+    """Rows that show a failed cell as failed, with its reason."""
+    rows = [
+        _row(job, spec, protocol, status="failed", reason=reason)
+        for spec in metrics
+        for protocol in (job.protocols.values() if spec.per_frame else [None])
+    ]
+    return Rows.of(rows)
+
+
+def workload(
+    form: AdaptedClip, protocols: Mapping[str, Protocol], size: tuple[int, int] | None = None
+) -> list[tuple[Camera, HeadPose]]:
+    """Cameras and poses of the scored frames in pairs, a new camera and pose in every pair.
+
+    ``size`` is the (width, height) that the cameras are brought to, None for their own.
+    """
+    clip = form.clip
+    keys = [form.key(k) for p in protocols.values() for k in p.keys if k.subject == clip.subject]
+    timesteps = sorted({k.timestep for k in keys})
+    cameras = [
+        camera if size is None else camera.resized(*size) for _, camera in sorted(clip.cameras.items())
+    ]
+    steps = max(len(timesteps), len(cameras), 2)
+    pairs = [(cameras[i % len(cameras)], clip.poses[timesteps[i % len(timesteps)]]) for i in range(steps)]
+    first, last = pairs[0], pairs[-1]
+    return pairs[:-1] if len(pairs) > 2 and first[0] is last[0] and first[1] is last[1] else pairs
+
+
+def _score(job: Job, specs: Sequence[MetricSpec], protocol: Protocol) -> dict[str, list[Row]]:
+    """Rows of each metric over a protocol's frames of the job's subject."""
+    keys = [key for key in protocol.keys if key.subject == job.clip.subject]
+    frames = ScoredFrames(lambda key: read_png(job.cell.render(protocol.task, key)), job.clip)
+    by_name = {spec.name: spec for spec in specs}
+    with job.progress(f"measuring {protocol.task}") as report:
+        scored = score_frames(keys, frames, specs, job.regions, report, job.device)
+    return {
+        name: [
+            _row(
+                job,
+                by_name[name],
+                protocol,
+                s.key,
+                s.value,
+                s.status,
+                s.reason or _suspicion(by_name[name], s),
+                s.region,
+            )
+            for s in scores
+        ]
+        for name, scores in scored.items()
+    }
+
+
+def _suspicion(spec: MetricSpec, score: Score) -> str:
+    """Reason of a row whose value is too good to be true, "" for any other."""
+    if spec.suspect_above is None or score.region != FULL or not score.value > spec.suspect_above:
+        return ""
+    return f"{SUSPECT}above {spec.suspect_above:g} {spec.unit}"
+
+
+def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement | UnavailableError:
+    metric = make_metric(spec)
+    try:
+        if spec.kind == "training":
+            return metric(job.cell.step("fit") or {})  # type: ignore[no-any-return]
+        pairs = workload(job.form, job.protocols, job.method.spec.resolution.speed_size)
+        if not spec.machine_bound:
+            return metric(avatar, pairs)  # type: ignore[no-any-return]
+        with ProcessorLoad(job.device, wait=True) as load:
+            if isinstance(avatar, IsolatedAvatar):
+                found = avatar.measured(metric, pairs)
+            else:
+                found = metric(avatar, pairs)
+        return Measurement(found.value, {**found.details, **load.details})
+    except UnavailableError as error:
+        return error
+
+
+def _avatar_row(job: Job, spec: MetricSpec, outcome: Measurement | UnavailableError) -> Row:
+    if isinstance(outcome, UnavailableError):
+        return _row(job, spec, reason=str(outcome))
+    if spec.detail and spec.detail not in outcome.details:
+        return _row(job, spec, reason="The avatar does not report it.")
+    value = float(outcome.details[spec.detail]) if spec.detail else outcome.value
+    return replace(_row(job, spec, value=value, status="ok"), **_conditions(job, spec, outcome.details))
+
+
+def _conditions(job: Job, spec: MetricSpec, details: Mapping[str, float]) -> dict[str, Any]:
+    """Columns of a time: machine, number of threads, load by other processes; empty for other metrics."""
+    if not spec.machine_bound or "threads" not in details:
+        return {}
+    if spec.kind == "training":
+        step = job.cell.step("fit")
+        machine = "" if step is None else str(step.get("load", {}).get("machine", ""))
+    else:
+        machine = machine_name(job.device)
+    others = float(details.get("other_cores", math.nan))
+    return {"machine": machine, "threads": int(details["threads"]), "other_cores": others}
+
+
+def _row(
+    job: Job,
+    spec: MetricSpec,
+    protocol: Protocol | None = None,
+    key: FrameKey | None = None,
+    value: float = math.nan,
+    status: str = "missing",
+    reason: str = "",
+    region: str = FULL,
+) -> Row:
+    if status == "ok" and not math.isfinite(value):
+        raise HeadbenchError(f"{job.name}: {spec.name} of {key} is {value}; a metric must be finite")
+    return Row(
+        method=job.method.spec.name,
+        version=job.method.spec.version,
+        seed=job.seed,
+        task=protocol.task if protocol else "",
+        subject=job.clip.subject,
+        sequence=key.sequence if key else "",
+        timestep=key.timestep if key else -1,
+        camera=key.camera if key else "",
+        region=region,
+        metric=spec.name,
+        value=value,
+        protocol=protocol.hash if protocol else "",
+        status=status,
+        reason=reason,
+        condition=job.condition.name,
+    )
