@@ -365,21 +365,12 @@ class OfficialMethod(ABC, Generic[Config]):
             patches=patches,
             order=self._order(fit, work),
         )
-        ended = run_program(
-            command,
-            work.program,
-            fit.out / TRAINING_LOG,
-            on_line,
-            variables=self.variables,
-            held=held,
-            hours=self.config.time_limit_hours,
-        )
-        if ended.code:
-            raise ended.error(f"The training command of {checkout.folder} {described(ended.code)}")
         shrinking = self.shrink_command(fit, checkout, work)
-        if shrinking is not None:
-            shrunk = run_program(
-                shrinking,
+        commands = [(command, f"The training command of {checkout.folder}")]
+        commands += [] if shrinking is None else [(shrinking, "Leaving the optimiser out of its output")]
+        for each, what in commands:
+            ended = run_program(
+                each,
                 work.program,
                 fit.out / TRAINING_LOG,
                 on_line,
@@ -387,8 +378,8 @@ class OfficialMethod(ABC, Generic[Config]):
                 held=held,
                 hours=self.config.time_limit_hours,
             )
-            if shrunk.code:
-                raise shrunk.error(f"Leaving the optimiser out of its output {described(shrunk.code)}")
+            if ended.code:
+                raise ended.error(f"{what} {described(ended.code)}")
         try:
             kept = self.keep(fit, work)
             write_subject(fit.out / SUBJECT_FILE, Subject.of(fit.clip))
