@@ -25,7 +25,7 @@ from ..bench.errors import InputError
 from ..bench.io.arrays import Member, check_arrays
 from ..bench.io.files import digest
 from ..bench.io.images import quantise
-from .head.arrays import STORED, HeadArrays
+from .head.arrays import OPTIONAL, STORED, HeadArrays
 from .images import ImageStore, read_image, read_mask
 from .region_masks import FOREGROUND, HeadRegions, select
 
@@ -249,7 +249,8 @@ def as_capture(clip: Clip) -> CaptureClip:
         raise InputError(where, "head", "a head model in FLAME's layout", type(clip.head).__name__)
     regions = {name: np.asarray(members) for name, members in clip.head.regions.items()}
     arrays: dict[str, Any] = {name: np.asarray(getattr(clip.head, name)) for name in STORED}
-    head = HeadArrays(clip.head.version, **arrays, eyelid_basis=clip.head.eyelid_basis, regions=regions)
+    arrays |= {name: getattr(clip.head, name, None) for name in OPTIONAL}
+    head = HeadArrays(clip.head.version, **arrays, regions=regions)
     head.validate(where)
     sizes = {"S": head.shape_basis.shape[2], "E": head.expression_basis.shape[2], "V": len(head.template)}
     identity = {"shape": Member("f", ("S",)), "static_offset": Member("f", ("V", 3))}

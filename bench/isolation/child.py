@@ -50,6 +50,7 @@ class StoredHead:
     parents: IntArray
     eyelid_basis: FloatArray | None
     regions: Mapping[str, IntArray]
+    uv: FloatArray | None
 
 
 class RemoteClip:

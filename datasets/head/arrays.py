@@ -45,7 +45,10 @@ _MEMBERS = {
     "skinning_weights": Member("f", ("V", "J"), MAX_MAGNITUDE),
     "parents": Member("iu", ("J",)),
     "eyelid_basis": Member("f", ("V", 3, 2), MAX_MAGNITUDE, optional=True),
+    "uv": Member("f", ("F", 3, 2), MAX_MAGNITUDE, optional=True),
 }
+OPTIONAL = ("eyelid_basis", "uv")
+"""Arrays that a head may lack."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +83,9 @@ class HeadArrays:
         Vertex index by name; may be empty.
     expression_names : tuple[str, ...]
         Names of the expression directions, in order; () if they have none.
+    uv : FloatArray | None
+        (F, 3, 2) texture coordinates of the triangles' corners, in [0, 1] where they have a place in the chart; None if the
+        model has no chart.
     """
 
     version: str
@@ -95,6 +101,7 @@ class HeadArrays:
     regions: Mapping[str, IntArray] = field(default_factory=dict)
     landmarks: Mapping[str, int] = field(default_factory=dict)
     expression_names: tuple[str, ...] = ()
+    uv: FloatArray | None = None
 
     def validate(self, file: str | PathLike[str]) -> HeadArrays:
         """Validate the model and return self.
@@ -111,9 +118,7 @@ class HeadArrays:
             region indices out of range, an invalid joint tree, skinning weights that do not sum
             to 1, or a mesh whose size is not that of a head.
         """
-        arrays = {name: np.asarray(getattr(self, name)) for name in STORED}
-        if self.eyelid_basis is not None:
-            arrays["eyelid_basis"] = self.eyelid_basis
+        arrays = {name: np.asarray(getattr(self, name)) for name in STORED} | self._optional()
         sizes = {"J": len(JOINT_NAMES), "9 (J - 1)": 9 * (len(JOINT_NAMES) - 1)}
         sizes = check_arrays(file, arrays, _MEMBERS, sizes)
         if self.expression_names and len(self.expression_names) != sizes["E"]:
@@ -168,10 +173,14 @@ class HeadArrays:
     def fingerprint(self) -> str:
         """Hex digest of the content: version, all arrays, regions and landmarks."""
         arrays = [np.asarray(getattr(self, name)) for name in STORED]
-        if self.eyelid_basis is not None:
-            arrays.append(self.eyelid_basis)
+        arrays += self._optional().values()
         regions = [part for name in sorted(self.regions) for part in (name, self.regions[name])]
         return digest(self.version, *arrays, *regions, dict(sorted(self.landmarks.items())))
+
+    def _optional(self) -> dict[str, FloatArray]:
+        """Those of the arrays `OPTIONAL` that there are, by name."""
+        given = ((name, getattr(self, name)) for name in OPTIONAL)
+        return {name: values for name, values in given if values is not None}
 
     def _validate_motion(self, file: str | PathLike[str]) -> None:
         joints = float(np.abs(self.joint_regressor.astype(np.float64) @ self.template).max())
@@ -233,14 +242,13 @@ _FILE = {
 def save_head(path: Path, arrays: HeadArrays) -> None:
     """Write a head as one npz file (no pickled objects), whole or not at all.
 
-    Members: ``format``, ``version``, the array fields by name, ``eyelid_basis`` if there is one,
+    Members: ``format``, ``version``, the array fields by name, those of `OPTIONAL` that there are,
     ``region/<name>`` for each region, ``landmark_names`` and ``landmark_vertices``, ``expression_names`` if there are. Equal heads give equal bytes: the
     file is uncompressed because compression depends on the library's version.
     """
     content: dict[str, np.ndarray] = {"format": np.array(FORMAT), "version": np.array(arrays.version)}
     content |= {name: np.asarray(getattr(arrays, name)) for name in STORED}
-    if arrays.eyelid_basis is not None:
-        content["eyelid_basis"] = arrays.eyelid_basis
+    content |= arrays._optional()
     content |= {f"region/{name}": members for name, members in arrays.regions.items()}
     content["landmark_names"] = np.array(list(arrays.landmarks), dtype=np.str_)
     content["landmark_vertices"] = np.array(list(arrays.landmarks.values()), dtype=np.int64)
@@ -270,6 +278,7 @@ def read_head(path: Path) -> HeadArrays:
         version=str(content["version"]),
         **{name: content[name] for name in STORED},
         eyelid_basis=content.get("eyelid_basis"),
+        uv=content.get("uv"),
         regions=regions,
         landmarks={str(name): int(vertex) for name, vertex in zip(names, vertices)},
         expression_names=tuple(map(str, content.get("expression_names", ()))),

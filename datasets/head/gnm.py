@@ -51,6 +51,7 @@ _KEYS = {
     "pose_correctives_regressor": Member("f", (9 * len(JOINTS), None), MAX_MAGNITUDE),
     "vertex_groups": Member("f", ("G", "V"), MAX_MAGNITUDE),
     "vertex_group_names": Member("U", ("G",)),
+    "triangle_uvs": Member("f", ("F", 3, 2), MAX_MAGNITUDE),
 }
 
 
@@ -74,7 +75,8 @@ def gnm_head(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> He
     -------
     HeadArrays
         Head whose vertices are those of GNM at equal coefficients, at any pose with ``rotation``, ``neck`` and ``eyes`` as
-        the rotations of GNM's neck, head and eyes. ``jaw`` moves nothing. It has no landmarks, which GNM has in another file.
+        the rotations of GNM's neck, head and eyes. ``jaw`` moves nothing. It has no landmarks, which GNM has in another file. Skin,
+        eyes, teeth and tongue have charts of their own, which lie on each other.
 
     Raises
     ------
@@ -120,6 +122,7 @@ def gnm_head(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> He
         skinning_weights=weights,
         parents=np.array([-1, 0, 1, 1, 1]),
         regions=_regions(content),
+        uv=content["triangle_uvs"],
     ).validate(file)
 
 

@@ -18,6 +18,7 @@ from ...bench.io.documents import read_json
 from ...bench.io.files import open_regular
 from ...bench.io.unpickle import read_pickle
 from .arrays import RING_REGIONS, HeadArrays, read_head, with_derived_regions
+from .chart import CHART_FILES, read_chart
 from .gnm import gnm_head, is_gnm
 from .ict import ict_head, is_ict
 
@@ -41,12 +42,14 @@ def load_head(
     masks: str | PathLike[str] | None = None,
     regions: str | PathLike[str] | None = None,
     eyelids: str | PathLike[str] | None = None,
+    chart: str | PathLike[str] | None = None,
     version: str | None = None,
 ) -> HeadArrays:
     """Load a head model. The kind of file is recognised by its content.
 
     Files that belong to a FLAME pickle and are not given are searched for in `PLACES` under their usual names,
-    ``FLAME_masks.pkl``, ``l_eyelid.npy`` and ``r_eyelid.npy``, and ``regions.json`` beside the pickle.
+    ``FLAME_masks.pkl``, ``l_eyelid.npy`` and ``r_eyelid.npy``, ``head_template_mesh.obj`` or ``head_template.obj``, and
+    ``regions.json`` beside the pickle.
 
     Parameters
     ----------
@@ -60,6 +63,8 @@ def load_head(
     eyelids : str | PathLike[str] | None
         Folder of ``l_eyelid.npy`` and ``r_eyelid.npy`` (or one of these), (V, 3) metres by which a
         closed lid moves, as Metrical Tracker and SMIRK ship them.
+    chart : str | PathLike[str] | None
+        OBJ file of the mesh with texture coordinates.
     version : str | None
         Name of the expression basis. Required if the file name of a FLAME pickle does not contain it
         ("flame2020", "flame2023"); must agree with the version in an npz of this package.
@@ -93,12 +98,15 @@ def load_head(
         regions = regions or (own if own.is_file() else None)
         lid = next(filter(None, (_beside(path, name) for name in EYELID_FILES)), None)
         eyelids = eyelids or (lid.parent if lid else None)
+        chart = chart or next(filter(None, (_beside(path, name) for name in CHART_FILES)), None)
     if masks is not None:
         head = replace(head, regions={**head.regions, **read_masks(masks)})
     if regions is not None:
         head = replace(head, regions={**head.regions, **read_regions(regions)})
-    if masks is not None or regions is not None:
-        head.validate(regions or masks or path)
+    if chart is not None:
+        head = replace(head, uv=read_chart(Path(chart), head.faces))
+    if masks is not None or regions is not None or chart is not None:
+        head.validate(regions or masks or chart or path)
     if eyelids is not None:
         folder = Path(eyelids)
         head = _with_eyelids(head, folder.parent if folder.is_file() else folder, path)

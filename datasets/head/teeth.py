@@ -37,7 +37,7 @@ def with_teeth(arrays: HeadArrays) -> HeadArrays:
     """Append 8 n teeth vertices and 12 (n - 1) triangles, n being the length of the lip rings.
 
     Upper teeth follow the neck joint, lower ones the jaw. They follow the identity like the lips in front of them
-    (mean of the matching upper and lower lip vertex), and have no expression, pose correctives or influence on joints.
+    (mean of the matching upper and lower lip vertex), and have no expression, pose correctives, influence on joints or place in the chart.
     Adds the regions ``teeth``, ``teeth_upper`` and ``teeth_lower``.
 
     Raises
@@ -70,6 +70,7 @@ def with_teeth(arrays: HeadArrays) -> HeadArrays:
         eyelid_basis=None
         if arrays.eyelid_basis is None
         else _append_zeros(arrays.eyelid_basis, len(weights)),
+        uv=None if arrays.uv is None else _append_zeros(arrays.uv, len(triangles)),
         regions={
             **arrays.regions,
             "teeth": teeth,

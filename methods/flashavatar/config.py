@@ -20,7 +20,10 @@ class FlashAvatarConfig:
     schedule_length : int
         Iterations of the published run; ``sh_every`` below is on its scale.
     samples : int
-        Number of splats, about; they are spread evenly over the surface.
+        Number of splats, about.
+    uv_chart : bool
+        One splat for each texel of the head model's chart of texture coordinates, as published, in a resolution that gives
+        about ``samples``. Without it, and on a head model without a chart, splats are spread evenly over the surface.
     initial_opacity : float
         Opacity of every splat at the start, between 0 and 1.
     frequencies : int
@@ -58,6 +61,7 @@ class FlashAvatarConfig:
 
     schedule_length: int = 150_000
     samples: int = 13_500
+    uv_chart: bool = True
     initial_opacity: float = 0.1
     frequencies: int = 8
     layers: int = 6

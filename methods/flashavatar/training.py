@@ -19,7 +19,7 @@ from ..shared.networks import initial_network, layer_names, tracked_inputs
 from ..shared.optimisation import logit
 from ..shared.schedule import ShuffledEpochs, Timeline
 from ..shared.subject_mesh import BoundedCache, TrainingPoses
-from ..shared.surface_points import poisson_disk, spacing
+from ..shared.surface_points import spacing, spread_points
 from ..splats import rasterize
 from .config import FlashAvatarConfig
 from .model import (
@@ -39,6 +39,9 @@ HUBER = 0.1
 MOUTH = "lips"
 """Region of the head model whose outline is that of the mouth."""
 
+BORDER = "boundary"
+"""Region of the head model where its mesh ends, which has no texel of the chart as in the authors' program."""
+
 
 class FlashAvatarTraining(ImageTrainer):
     """A `Trainable`: splats on the surface, and the network that changes them."""
@@ -49,7 +52,10 @@ class FlashAvatarTraining(ImageTrainer):
         self._config = config
         mesh = clip_mesh(clip, device)
         faces, vertices = np.asarray(clip.head.faces), mesh.canonical.cpu().numpy().astype(np.float64)
-        self.points = poisson_disk(vertices, faces, np.arange(len(faces)), config.samples, seed)
+        border = clip.head.regions.get(BORDER)
+        self.points = spread_points(
+            *(clip.head, vertices, config.samples, seed), chart=config.uv_chart, chart_without=border
+        )
         self._surface = HeadSurface(mesh, self.points)
         self._encoded = positional_encoding(self._surface.rest, config.frequencies)
         self._tracked = TrainingPoses(clip, mesh)

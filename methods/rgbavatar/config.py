@@ -23,7 +23,10 @@ class RGBAvatarConfig:
     schedule_length : int
         Steps of the published run; ``join`` and ``position_settles`` below are on its scale.
     samples : int
-        Number of splats, about; they are spread evenly over the surface.
+        Number of splats, about.
+    uv_chart : bool
+        One splat for each texel of the head model's chart of texture coordinates, as published, in a resolution that gives
+        about ``samples``. Without it, and on a head model without a chart, splats are spread evenly over the surface.
     initial_scale_mm : float
         Size of every splat at the start, for 60,000 splats; fewer splats are larger, so that they cover as much.
     initial_opacity : float
@@ -74,6 +77,7 @@ class RGBAvatarConfig:
 
     schedule_length: int = 5_000
     samples: int = 60_000
+    uv_chart: bool = True
     initial_scale_mm: float = 0.8
     initial_opacity: float = 0.5
     blendshapes: int = 20

@@ -22,7 +22,7 @@ from ..shared.optimisation import logit
 from ..shared.rendering import View
 from ..shared.schedule import Batches, GroupedBatches, log_linear, numpy_generator
 from ..shared.subject_mesh import BoundedCache, TrainingPoses
-from ..shared.surface_points import poisson_disk
+from ..shared.surface_points import spread_points
 from ..splats import rasterize
 from .config import RGBAvatarConfig
 from .model import (
@@ -68,7 +68,7 @@ class RGBAvatarTraining(ImageTrainer):
         self._config, self._batches, self._seed, self._masks = config, batches, seed, masks
         mesh = clip_mesh(clip, device)
         faces, vertices = np.asarray(clip.head.faces), mesh.canonical.cpu().numpy().astype(np.float64)
-        self.points = poisson_disk(vertices, faces, np.arange(len(faces)), config.samples, seed)
+        self.points = spread_points(clip.head, vertices, config.samples, seed, chart=config.uv_chart)
         self._surface = Surface(mesh, self.points)
         self._tracked = TrainingPoses(clip, mesh)
         self._inputs = tracked_inputs(self._tracked.arguments, config.inputs)

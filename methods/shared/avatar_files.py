@@ -55,7 +55,7 @@ def head_arrays(head: HeadAsset) -> HeadArrays:
     if isinstance(head, HeadArrays):
         return head
     names = ("version", *STORED, "eyelid_basis", "regions")
-    return HeadArrays(**{name: getattr(head, name) for name in names})
+    return HeadArrays(**{name: getattr(head, name) for name in names}, uv=getattr(head, "uv", None))
 
 
 def save_shared_head(folder: Path, head: HeadAsset) -> None:

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ...bench.contracts import FloatArray, IntArray
+from ...bench.contracts import FloatArray, HeadAsset, IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...datasets.head.geometry import triangle_areas
@@ -108,6 +108,88 @@ def poisson_disk(
             rows.append(row)
             left[tree.query_ball_point(points[row], radius)] = False
     return SurfacePoints(np.asarray(triangles, np.int64)[chosen[rows]], barycentric[rows])
+
+
+def spread_points(
+    head: HeadAsset,
+    vertices: FloatArray,
+    count: int,
+    seed: int,
+    *,
+    chart: bool = True,
+    chart_without: IntArray | None = None,
+) -> SurfacePoints:
+    """About ``count`` points on a head: one for each texel of its chart, or blue noise if it has none.
+
+    Parameters
+    ----------
+    vertices : FloatArray
+        (V, 3) metres.
+    chart : bool
+        Whether to use the head's chart, if it has one.
+    chart_without : IntArray | None
+        Vertices whose triangles get no texel of the chart.
+    """
+    faces, uv = np.asarray(head.faces), getattr(head, "uv", None)
+    if uv is None or not chart:
+        return poisson_disk(vertices, faces, np.arange(len(faces)), count, seed)
+    left = ~np.isin(faces, [] if chart_without is None else chart_without).any(1)
+    return texel_points(np.asarray(uv, np.float64), np.flatnonzero(left), count)
+
+
+def texel_points(uv: FloatArray, triangles: IntArray, count: int) -> SurfacePoints:
+    """The centres of the texels of a chart, by triangle: a square of R x R texels, with R so that there are about ``count``.
+
+    A triangle without area in the chart has no texel. Charts that lie on each other have texels of their own.
+
+    Parameters
+    ----------
+    uv : FloatArray
+        (F, 3, 2) texture coordinates of the corners.
+    triangles : IntArray
+        Indices of the triangles with texels.
+
+    Raises
+    ------
+    InputError
+        No triangle has an area in the chart, or only slivers have.
+    """
+    a, b, c = np.moveaxis(uv[triangles], 1, 0)
+    doubled = _cross(b - a, c - a)
+    area = 0.5 * float(np.abs(doubled).sum())
+    resolution = round(float(np.sqrt(count / area))) if area > 0 else 0
+    # Texels whose centres lie in the box around a triangle. The offset puts a centre on an edge into one triangle.
+    first = np.ceil(uv[triangles].min(1) * resolution - 0.5 - _OFFSET).astype(np.int64)
+    last = np.floor(uv[triangles].max(1) * resolution - 0.5 - _OFFSET).astype(np.int64)
+    sides = np.where((doubled != 0)[:, None], np.maximum(last - first + 1, 0), 0)
+    candidates = sides.prod(1)
+    if not resolution or not 0 < candidates.sum() <= _MOST_CANDIDATES * count:
+        expected = "triangles that cover a part of the square"
+        raise InputError("head model", "uv", expected, f"an area of {area:.3g} in {len(triangles)} triangles")
+    rows = np.repeat(np.arange(len(triangles)), candidates)
+    within = np.arange(len(rows)) - np.repeat(np.cumsum(candidates) - candidates, candidates)
+    texels = first[rows] + np.column_stack([within % sides[rows, 0], within // sides[rows, 0]])
+
+    def coordinates(points: FloatArray) -> FloatArray:
+        """(n, 2) last two barycentric coordinates."""
+        away = points - a[rows]
+        to_b, to_c = (b - a)[rows], (c - a)[rows]
+        return np.column_stack([_cross(away, to_c), _cross(to_b, away)]) / doubled[rows, None]
+
+    inside = coordinates((texels + 0.5 + _OFFSET) / resolution)
+    kept = (inside >= 0).all(1) & (inside.sum(1) <= 1)
+    exact = coordinates((texels + 0.5) / resolution)[kept].clip(0, 1).astype(np.float32)
+    return SurfacePoints(np.asarray(triangles, np.int64)[rows[kept]], full_barycentric(exact))
+
+
+_OFFSET = np.array([1.0e-7, 1.7e-7])
+"""Texels."""
+_MOST_CANDIDATES = 100
+
+
+def _cross(one: FloatArray, other: FloatArray) -> FloatArray:
+    """(n,) third coordinate of the cross products of (n, 2) vectors."""
+    return one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
 
 
 def point_tensors(points: SurfacePoints) -> dict[str, Tensor]:

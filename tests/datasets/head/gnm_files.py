@@ -63,6 +63,7 @@ def gnm_content(head: HeadArrays | None = None, *, blind: bool = False) -> dict[
         "expression_basis": np.moveaxis(expression, 2, 0).astype(np.float32),
         "joint_parent_indices": np.array([0, 0, 1, 1], np.int32),
         "skinning_weights": weights[:, _ROWS].T.astype(np.float32),
+        "triangle_uvs": np.random.default_rng(1).random((len(head.faces), 3, 2)).astype(np.float32),
         "triangles": head.faces.astype(np.int32),
         "joint_regressor": regressor,
         "pose_correctives_regressor": correctives.reshape(36, -1).astype(np.float32),

@@ -1,0 +1,53 @@
+"""Texture coordinates of a head model's triangles, from an OBJ file of its mesh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ...bench.contracts import FloatArray, IntArray
+from ...bench.errors import InputError
+from ...bench.io.documents import read_text
+from ...bench.io.files import reading
+
+CHART_FILES = ("head_template_mesh.obj", "head_template.obj")
+"""FLAME's mesh with texture coordinates, as VHAP and GaussianAvatars, and DECA, name it."""
+_MOST_BYTES = 2**26
+
+
+def read_chart(path: Path, faces: IntArray) -> FloatArray:
+    """Texture coordinates of the corners of triangles, (F, 3, 2) float32.
+
+    The OBJ file may list the triangles in another order, begin each at another corner, and have more of them.
+
+    Parameters
+    ----------
+    faces : IntArray
+        (F, 3) triangles of the head model.
+
+    Raises
+    ------
+    InputError
+        The file is missing or damaged, has no texture coordinates, or lacks a triangle of the head model.
+    """
+    text = read_text(path, "mesh", _MOST_BYTES)
+    with reading(path, "an OBJ mesh of triangles with texture coordinates"):
+        rows = [line.split() for line in text.splitlines()]
+        coordinates = np.array([row[1:3] for row in rows if row[:1] == ["vt"]], np.float32)
+        corners = [[corner.split("/")[:2] for corner in row[1:]] for row in rows if row[:1] == ["f"]]
+        indices = np.array(corners, np.int64).reshape(-1, 3, 2) - 1
+        if not len(indices) or indices.min() < 0:
+            raise ValueError("no triangles, or indices below 1")
+        given, uv = indices[:, :, 0], coordinates[indices[:, :, 1]]
+    order, wanted = np.argsort(given, axis=1), np.argsort(faces, axis=1)
+    known, known_order = np.unique(np.take_along_axis(given, order, 1), axis=0, return_index=True)
+    places = {tuple(corners): row for corners, row in zip(known.tolist(), known_order.tolist())}
+    found = [places.get(tuple(corners), -1) for corners in np.take_along_axis(faces, wanted, 1).tolist()]
+    if -1 in found:
+        expected = "the triangles of the head model"
+        raise InputError(path, "f", expected, f"{found.count(-1)} of {len(faces)} that are not there")
+    result = np.empty((len(faces), 3, 2), np.float32)
+    by_vertex = np.take_along_axis(uv[found], order[found][:, :, None], 1)
+    np.put_along_axis(result, wanted[:, :, None], by_vertex, 1)
+    return result
