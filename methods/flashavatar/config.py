@@ -34,6 +34,10 @@ class FlashAvatarConfig:
     zero_output : bool
         Start with a last layer of zeros, so that the network changes nothing at first. The authors' program
         starts it at random like the other layers.
+    hyper_gaussians : int
+        Number of latents that the network emits instead of the outputs, which are then conditional means of Gaussians
+        that every splat has over outputs and latents (HyperGaussians, arXiv 2507.02803: 8 in the paper, 32 in the
+        program). They start at zero, whatever ``zero_output``, and have the rate ``network_lr``. 0: none.
     offset_m : float
         Maximum offset of a splat from its point on the surface along each axis of the head, metres.
     scale_variant : Literal['official', 'product']
@@ -67,6 +71,7 @@ class FlashAvatarConfig:
     layers: int = 6
     hidden: int = 256
     zero_output: bool = False
+    hyper_gaussians: int = 0
     offset_m: float = 1.0
     scale_variant: Literal["official", "product"] = "official"
     sh_degree: int = 3
@@ -89,7 +94,8 @@ class FlashAvatarConfig:
         check_at_least_one(self, "hidden", "sh_every", "min_sh_every")
         if not 0 < self.initial_opacity < 1 or not 0 < self.final_rate <= 1:
             raise ValueError("initial_opacity must lie between 0 and 1, and final_rate in (0, 1]")
-        for name, most in (("frequencies", 16), ("layers", 100), ("hidden", 1_024), ("sh_degree", 3)):
+        bounds = {"frequencies": 16, "layers": 100, "hidden": 1_024, "sh_degree": 3, "hyper_gaussians": 128}
+        for name, most in bounds.items():
             if not 0 <= getattr(self, name) <= most:
                 raise ValueError(f"{name} must be 0 to {most}, found {getattr(self, name)}")
         if not 0 < self.offset_m <= 100:

@@ -29,10 +29,11 @@ from ..shared.subject_mesh import SubjectMesh
 from ..shared.surface_points import POINT_MEMBERS, MeshPoints, SurfacePoints, point_tensors, read_points
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
 from .config import FlashAvatarConfig
+from .hyper_gaussians import WIDTHS, check_diagonals, conditional_means, gaussian_shapes
 
 INPUTS = ("expression", "jaw", "eyes", "eyelids")
 """Tracked parameters that the network takes, besides the encoded points."""
-OUTPUTS = (3, 4, 3)
+OUTPUTS = (*WIDTHS.values(),)
 """Columns of the network's outputs: offset, turn, change of size."""
 
 
@@ -49,9 +50,9 @@ def encoding_size(frequencies: int) -> int:
 
 
 def network_sizes(config: FlashAvatarConfig, conditions: int) -> tuple[int, ...]:
-    """Inputs, hidden widths and outputs of the network for a number of tracked inputs."""
+    """Inputs, hidden widths and outputs of the network, or its latents, for a number of tracked inputs."""
     inputs = encoding_size(config.frequencies) + conditions
-    return (inputs, *config.layers * (config.hidden,), sum(OUTPUTS))
+    return (inputs, *config.layers * (config.hidden,), config.hyper_gaussians or sum(OUTPUTS))
 
 
 def layer_of_points(network: Mapping[str, Tensor], encoded: Tensor) -> Tensor:
@@ -66,7 +67,7 @@ def network_outputs(
     """(N, 10) in [-1, 1]: the network's outputs at the points, after tanh.
 
     The inputs of the network are the encoded point and the tracked parameters, one after the other; the first layer is linear, so the
-    parts of both are added.
+    parts of both are added. With ``hyper_gaussians`` the outputs are conditional means of the splats' Gaussians, also in ``network``.
 
     Parameters
     ----------
@@ -78,6 +79,8 @@ def network_outputs(
     values = of_points + of_inputs @ inputs
     for weight, bias in zip(weights[1:], biases[1:]):
         values = linear(values.relu(), network[weight], network[bias])
+    if config.hyper_gaussians:
+        values = conditional_means(network, values)
     return values.tanh()
 
 
@@ -145,6 +148,8 @@ SETTINGS_KEY = "settings"
 """Key of the file's metadata: the settings of rendering, as JSON."""
 RENDERING = ("frequencies", "layers", "hidden", "offset_m", "scale_variant", "sh_degree")
 """Settings that affect rendering."""
+ADDED = "hyper_gaussians"
+"""One more that does, which is stored only if it is not 0."""
 PER_SPLAT = {"log_scales": (3,), "quats": (4,), "opacities": (), "sh_dc": (3,)}
 """Shape of a splat's stored values besides the harmonics above degree 0: logarithms of metres, wxyz, logits."""
 
@@ -155,7 +160,7 @@ class TrainedSplats(NamedTuple):
     Attributes
     ----------
     tensors : dict[str, Tensor]
-        Those of `PER_SPLAT`, ``sh_rest`` (N, 3, K - 1), and weights and biases of the network.
+        Those of `PER_SPLAT`, ``sh_rest`` (N, 3, K - 1), those of `gaussian_shapes`, and weights and biases of the network.
     points : SurfacePoints
         Surface point of each splat.
     config : FlashAvatarConfig
@@ -171,31 +176,36 @@ class TrainedSplats(NamedTuple):
         config = self.config
         shapes: dict[str, tuple[int | str, ...]] = {name: ("N", *shape) for name, shape in PER_SPLAT.items()}
         shapes["sh_rest"] = ("N", 3, coefficient_count(config.sh_degree) - 1)
+        gaussians = gaussian_shapes(config.hyper_gaussians)
+        shapes |= {name: ("N", *shape) for name, shape in gaussians.items()}
         sizes = network_sizes(config, input_count(head, INPUTS))
         for layer, (weight, bias) in enumerate(zip(*layer_names(len(sizes) - 1))):
             shapes |= {weight: (sizes[layer + 1], sizes[layer]), bias: (sizes[layer + 1],)}
         members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in shapes.items()}
         check_tensors(path, self.tensors, members, {"N": len(self.points.triangles)})
+        if gaussians:
+            check_diagonals(path, self.tensors)
         check_sizes(path, math.e * self.tensors["log_scales"])  # the largest that the network makes of them
         return self._replace(tensors={name: self.tensors[name].to(device) for name in shapes})
 
 
 def rendering_text(config: FlashAvatarConfig) -> str:
     """The settings that affect rendering, as JSON."""
-    return json.dumps({name: value for name, value in asdict(config).items() if name in RENDERING})
+    names = (*RENDERING, ADDED) if config.hyper_gaussians else RENDERING
+    return json.dumps({name: value for name, value in asdict(config).items() if name in names})
 
 
 def rendering_of_text(path: Path, text: str) -> FlashAvatarConfig:
     """Settings with those of a `rendering_text`. Raises `InputError`, naming ``path``, for other text."""
     settings = parse_json(text, path, SETTINGS_KEY)
-    if set(settings) != set(RENDERING):
+    if set(settings) - {ADDED} != set(RENDERING):
         raise InputError(path, SETTINGS_KEY, f"the settings {', '.join(RENDERING)}", repr(text)[:80])
     return build(FlashAvatarConfig, settings, str(path))
 
 
 def write_avatar(path: Path, trained: TrainedSplats) -> None:
-    """Write an avatar as safetensors, exact: 56 bytes for each splat, 12 for each of its harmonics above degree 0, and
-    the network."""
+    """Write an avatar as safetensors, exact: 56 bytes for each splat, 12 for each of its harmonics above degree 0, with
+    ``hyper_gaussians`` of L another 128 + 52 L, and the network."""
     tensors = {name: value.detach().to("cpu", torch.float32) for name, value in trained.tensors.items()}
     tensors |= point_tensors(trained.points)
     contiguous = {name: value.contiguous() for name, value in tensors.items()}

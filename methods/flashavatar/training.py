@@ -22,6 +22,7 @@ from ..shared.subject_mesh import BoundedCache, TrainingPoses
 from ..shared.surface_points import spacing, spread_points
 from ..splats import rasterize
 from .config import FlashAvatarConfig
+from .hyper_gaussians import initial_gaussians
 from .model import (
     INPUTS,
     HeadSurface,
@@ -135,9 +136,10 @@ class FlashAvatarTraining(ImageTrainer):
             ),
         }
         network = initial_network(network_sizes(config, self._inputs.shape[1]), seed)
-        if config.zero_output:
+        if config.zero_output and not config.hyper_gaussians:
             for names in layer_names(config.layers + 1):
                 network[names[-1]].zero_()
+        network |= initial_gaussians(count, config.hyper_gaussians)
         initial |= {name: (value, config.network_lr) for name, value in network.items()}
         return initial
 

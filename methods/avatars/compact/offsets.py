@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from ....bench.contracts import FloatArray, HeadAsset
+from ...flashavatar.hyper_gaussians import gaussian_shapes
 from ...flashavatar.model import SETTINGS_KEY, TrainedSplats, rendering_of_text, rendering_text
 from ...shared.avatar_files import Subject
 from ...shared.networks import layer_names
@@ -58,6 +59,9 @@ def encode_offsets(
     for weight, bias in zip(*layer_names(trained.config.layers + 1)):
         arrays |= encode_matrix(weight, tensors[weight], FINER * precision.networks)
         arrays[bias] = tensors[bias].astype(np.float32)
+    for name in gaussian_shapes(trained.config.hyper_gaussians):
+        # By columns, as the splats' numbers of one kind are of a size.
+        arrays |= encode_matrix(name, tensors[name][order].T, FINER * precision.networks)
     person = encode_subject(subject, precision)
     text = {**person.text, SETTINGS_KEY: rendering_text(trained.config)}
     return Content({**arrays, **person.arrays}, text, {**steps, **person.steps})
@@ -76,5 +80,6 @@ def read_offsets(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Tra
     tensors |= {"sh_dc": dc, "sh_rest": rest}
     for weight, bias in zip(*layer_names(config.layers + 1)):
         tensors |= {weight: decode_matrix(arrays, weight), bias: arrays.floats(bias, None)}
+    tensors |= {name: decode_matrix(arrays, name).T for name in gaussian_shapes(config.hyper_gaussians)}
     content = {name: torch.from_numpy(np.array(values, np.float32)) for name, values in tensors.items()}
     return subject, TrainedSplats(content, points, config).checked(path, head, device)
