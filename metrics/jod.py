@@ -34,6 +34,7 @@ class Jod:
     """
 
     package, program = "pyfvvdp", "fvvdp"
+    modules = ("pyfvvdp", "ffmpeg")
     remedy = (
         "If its licence (CC BY-NC 4.0: no commercial use) suits you, install it: pip install pyfvvdp==1.2.2."
     )
@@ -53,6 +54,7 @@ class ColorJod(Jod):
     """The same by ColorVideoVDP, which also sees changes of colour."""
 
     package, program = "pycvvdp", "cvvdp"
+    modules = ("pycvvdp", "torchvision", "ffmpeg")
     remedy = "Install it with the torchvision that belongs to the installed PyTorch (MIT licence): pip install cvvdp==0.5.7."
 
 
@@ -70,17 +72,22 @@ def _program(package: str, name: str, remedy: str) -> Any:
 
 
 def _needs(metric: type[Jod]) -> Iterator[Need]:
-    found = find_spec(metric.package) is not None
-    yield Need(f"{metric.package}, for JOD", "installed" if found else "", metric.remedy, required=False)
+    found = all(find_spec(name) is not None for name in metric.modules)
+    yield Need(
+        f"{' and '.join(metric.modules)}, for JOD",
+        "installed" if found else "",
+        metric.remedy,
+        required=False,
+    )
 
 
 def needs(config: Any, device: str) -> Iterator[Need]:
-    """The package pyfvvdp."""
+    """The package pyfvvdp and what it imports."""
     return _needs(Jod)
 
 
 def color_needs(config: Any, device: str) -> Iterator[Need]:
-    """The package pycvvdp."""
+    """The package pycvvdp and what it imports."""
     return _needs(ColorJod)
 
 

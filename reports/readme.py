@@ -2,6 +2,8 @@
 
 python -m headbench.reports.readme demo demo-output .
 python -m headbench.reports.readme suite suite-output .
+python -m headbench.reports.readme profiles run-of-one-subject .
+python -m headbench.reports.readme faces run-of-one-subject .
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import chain, product
 from pathlib import Path
 from typing import Any
@@ -45,6 +48,8 @@ GALLERY = "reports/gallery"
 PROTOCOLS = "protocols"
 SUITE = "suite"
 """Stored results of the suite in `GALLERY`."""
+PROFILES, FACES = "profiles", "faces"
+"""Stored results of one of its subjects: by the definitions of all protocols, and by metrics of faces."""
 PICTURE = "contact_sheet.jpg"
 RESULTS = "results.md"
 MEASURED = "reports/measured.json"
@@ -53,6 +58,8 @@ PAGES = {
     "demo": "docs/explanation/results.md",
     SUITE: "README.md",
     PROTOCOLS: "docs/explanation/protocols.md",
+    PROFILES: "docs/explanation/protocols.md",
+    FACES: "docs/explanation/metrics.md",
 }
 """The page of each block, in the repository."""
 OURS = "ours"
@@ -84,6 +91,13 @@ def publish_suite(out: Path, root: Path) -> None:
     write_json(root / MEASURED, measured(target))
     _write(root / PAGES[PROTOCOLS], PROTOCOLS, protocols_block(target))
     _write(root / PAGES[SUITE], SUITE, suite_block(root))
+
+
+def publish_subject(name: str, out: Path, root: Path) -> None:
+    """Copy manifest and rows of a run of one subject of the suite to the repository ``root``, and write the block ``name``."""
+    target = root / GALLERY / name
+    _copy(RunFolder(out), RunFolder(target))
+    _write(root / PAGES[name], name, SUBJECT_BLOCKS[name](target))
 
 
 def _copy(source: RunFolder, target: RunFolder) -> None:
@@ -168,10 +182,20 @@ def measured(folder: Path) -> dict[str, Any]:
 
 def protocols_block(folder: Path) -> str:
     """What the choices of an evaluation are worth on stored runs of the suite, for two methods: Markdown."""
-    runs = tuple(map(str, suite_runs(folder)))
-    subjects = counted(len(RunSet.read(suite_runs(folder)).rows.subjects), "subject")
-    found = protocols_command(ProtocolsSettings(runs, COMPARED), no_progress)
-    return f"`{'` and `'.join(COMPARED)}`, {subjects} of {folder.name}:\n\n{found.text}"
+    return _worth_of_choices(suite_runs(folder))
+
+
+def _worth_of_choices(runs: Sequence[Path]) -> str:
+    subjects = counted(len(RunSet.read(runs).rows.subjects), "subject")
+    found = protocols_command(ProtocolsSettings(tuple(map(str, runs)), COMPARED), no_progress)
+    return f"`{'` and `'.join(COMPARED)}`, {subjects} of the suite:\n\n{found.text}"
+
+
+SUBJECT_BLOCKS: dict[str, Callable[[Path], str]] = {
+    PROFILES: lambda folder: _worth_of_choices([folder]),
+    FACES: lambda folder: table_text([folder], "md").strip(),
+}
+"""Markdown of the stored rows of a folder."""
 
 
 def suite_options(folder: Path) -> tuple[str, ...]:
@@ -301,6 +325,7 @@ def _listed(words: Sequence[str]) -> str:
 PUBLISH: dict[str, Callable[[Path, Path], None]] = {
     "demo": publish_demo,
     SUITE: publish_suite,
+    **{name: partial(publish_subject, name) for name in SUBJECT_BLOCKS},
 }
 
 if __name__ == "__main__":
