@@ -5,26 +5,30 @@ Papers compute it with three kinds of landmarks at least (98 by PIPNet, 478 by M
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..bench.contracts import FloatArray
-from ..bench.errors import HeadbenchError, UnavailableError
 from ..bench.specs import MetricSpec, Need
-from .faces import DlibLandmarks, FaceMetric
+from .faces import AtLandmarks, DlibLandmarks, FaceMetric, dlib_needs, named_file, network_need
 
 if TYPE_CHECKING:
     from ..bench.landmark_network import LandmarkNetwork
+    from .pipnet import PipNet
 
 VARIABLE = "HEADBENCH_FACE_LANDMARKS"
 REMEDY = (
     f"Set {VARIABLE} to the file mediapipe/modules/face_landmark/face_landmark.tflite of the package mediapipe 0.10.21 "
     "(Apache-2.0): pip download --no-deps mediapipe==0.10.21, and unpack the wheel. It is read by ai-edge-litert: "
     "pip install ai-edge-litert."
+)
+PIPNET_VARIABLE = "HEADBENCH_PIPNET"
+PIPNET_REMEDY = (
+    f"Set {PIPNET_VARIABLE} to the authors' weights of WFLW with ResNet-18, epoch59.pth of the experiment "
+    "pip_32_16_60_r18_l2_l1_10_1_nb10, to which the page of the project PIPNet (jhb86253817 on GitHub, MIT licence) links, and put "
+    "the project's file data/WFLW/meanface.txt beside it."
 )
 
 
@@ -52,23 +56,35 @@ class AkdDlib(_Akd):
         return DlibLandmarks()
 
 
+class AkdPipNet(_Akd):
+    """AKD of 98 landmarks by PIPNet, each image searched by itself."""
+
+    def network(self) -> AtLandmarks:
+        """The network of the file that the variable names, at dlib's landmarks."""
+        return AtLandmarks(_pipnet())
+
+
 def _mediapipe() -> LandmarkNetwork:
     from ..bench.landmark_network import LandmarkNetwork
 
-    path = os.environ.get(VARIABLE, "")
-    if not path:
-        raise UnavailableError("AKD needs a landmark network, whose file is not named.", REMEDY)
-    return LandmarkNetwork(Path(path))
+    return LandmarkNetwork(named_file("AKD", VARIABLE, REMEDY))
 
 
 def mediapipe_needs(config: object, device: str) -> Iterator[Need]:
     """The file of the network, and what reads it."""
-    try:
-        _mediapipe()
-    except HeadbenchError:
-        yield Need("landmark network, for AKD", "", REMEDY, required=False)
-    else:
-        yield Need("landmark network, for AKD", os.environ[VARIABLE], REMEDY, required=False)
+    yield network_need("landmark network, for AKD", VARIABLE, REMEDY, _mediapipe)
+
+
+def _pipnet() -> PipNet:
+    from .pipnet import PipNet
+
+    return PipNet(named_file("AKD", PIPNET_VARIABLE, PIPNET_REMEDY))
+
+
+def pipnet_needs(config: object, device: str) -> Iterator[Need]:
+    """The files of the network, and dlib, which finds faces for it."""
+    yield network_need("PIPNet's weights and mean face, for AKD", PIPNET_VARIABLE, PIPNET_REMEDY, _pipnet)
+    yield from dlib_needs(config, device)
 
 
 def _spec(name: str, landmarks: str, implementation: str, needs: str) -> MetricSpec:
@@ -86,3 +102,4 @@ def _spec(name: str, landmarks: str, implementation: str, needs: str) -> MetricS
 
 AKD_MEDIAPIPE = _spec("akd-mediapipe", "468 MediaPipe", "AkdMediaPipe", "akd:mediapipe_needs")
 AKD_DLIB = _spec("akd-dlib", "68 dlib", "AkdDlib", "faces:dlib_needs")
+AKD_PIPNET = _spec("akd-pipnet", "98 PIPNet", "AkdPipNet", "akd:pipnet_needs")

@@ -1,35 +1,78 @@
 """CSIM: cosine similarity of the identity that a network recognises in a render and in the ground truth.
 
-Papers compute it by other networks, ArcFace above all, whose weights are not free to use, so that the name says which.
+Papers compute it by several networks, most by ArcFace, whose weights may only be used for research that is not commercial, so that
+the name says which.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..bench.contracts import FloatArray
-from ..bench.specs import MetricSpec
-from .faces import DlibIdentity, FaceMetric
+from ..bench.specs import MetricSpec, Need
+from .faces import AtLandmarks, DlibIdentity, FaceMetric, dlib_needs, named_file, network_need
 
-CSIM_DLIB = MetricSpec(
-    name="csim-dlib",
-    label="CSIM",
-    unit="",
-    higher_is_better=True,
-    digits=3,
-    implementation="headbench.metrics.csim:CsimDlib",
-    summary="Cosine similarity of dlib's face descriptors, at most 1; frames in which no face is found are left out and counted.",
-    needs="headbench.metrics.faces:dlib_needs",
+if TYPE_CHECKING:
+    from .arcface import ArcFace
+
+VARIABLE = "HEADBENCH_ARCFACE"
+REMEDY = (
+    f"Set {VARIABLE} to the file w600k_r50.onnx of the archive buffalo_l.zip, which the project insightface (deepinsight on GitHub) "
+    "publishes with its releases; its weights are for research that is not commercial."
 )
 
 
-class CsimDlib(FaceMetric):
+class _Csim(FaceMetric):
+    """Cosine similarity of descriptors."""
+
+    def score(self, found: FloatArray, truth: FloatArray) -> float:
+        """Cosine of the angle between two (N,) descriptors."""
+        return float(found @ truth / (np.linalg.norm(found) * np.linalg.norm(truth)))
+
+
+class CsimDlib(_Csim):
     """Cosine similarity of the 128 numbers by which dlib recognises people."""
 
     def network(self) -> DlibIdentity:
         """dlib's network."""
         return DlibIdentity()
 
-    def score(self, found: FloatArray, truth: FloatArray) -> float:
-        """Cosine of the angle between two (N,) descriptors."""
-        return float(found @ truth / (np.linalg.norm(found) * np.linalg.norm(truth)))
+
+class CsimArcFace(_Csim):
+    """Cosine similarity of the 512 numbers by which ArcFace recognises people."""
+
+    def network(self) -> AtLandmarks:
+        """The network of the file that the variable names, at dlib's landmarks."""
+        return AtLandmarks(_arcface())
+
+
+def _arcface() -> ArcFace:
+    from .arcface import ArcFace
+
+    return ArcFace(named_file("CSIM", VARIABLE, REMEDY))
+
+
+def arcface_needs(config: object, device: str) -> Iterator[Need]:
+    """The file of the network, and dlib, which finds faces for it."""
+    yield network_need("ArcFace's network, for CSIM", VARIABLE, REMEDY, _arcface)
+    yield from dlib_needs(config, device)
+
+
+def _spec(name: str, descriptors: str, implementation: str, needs: str) -> MetricSpec:
+    return MetricSpec(
+        name=name,
+        label="CSIM",
+        unit="",
+        higher_is_better=True,
+        digits=3,
+        implementation=f"headbench.metrics.csim:{implementation}",
+        summary=f"Cosine similarity of {descriptors}, at most 1; frames in which no face is found are left out and counted.",
+        needs=f"headbench.metrics.{needs}",
+    )
+
+
+CSIM_DLIB = _spec("csim-dlib", "dlib's face descriptors", "CsimDlib", "faces:dlib_needs")
+CSIM_ARCFACE = _spec("csim-arcface", "ArcFace's face descriptors", "CsimArcFace", "csim:arcface_needs")

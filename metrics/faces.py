@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray
-from ..bench.errors import LeftOutError, UnavailableError, install_extra
+from ..bench.errors import HeadbenchError, InputError, LeftOutError, UnavailableError, install_extra
 from ..bench.specs import Need
 from .pairs import check_pair
 
@@ -104,6 +105,41 @@ class DlibIdentity(_Dlib):
         if shape is None:
             return None
         return np.array(self._network.compute_face_descriptor(np.ascontiguousarray(image), shape))
+
+
+class AtLandmarks:
+    """A network that is shown where a face is by `DlibLandmarks`: a function of an image and these, as `FaceNetwork.find` returns."""
+
+    def __init__(self, network: Callable[[ByteArray, FloatArray], FloatArray | None]) -> None:
+        self._landmarks = DlibLandmarks()
+        self._network = network
+
+    def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:
+        """What the network finds in the most certain face."""
+        landmarks = self._landmarks.find(image)
+        return None if landmarks is None else self._network(image, landmarks)
+
+
+def named_file(metric: str, variable: str, remedy: str) -> Path:
+    """The file of a metric's network that an environment variable names.
+
+    Raises `UnavailableError` if it is not set, and `InputError` if there is no such file.
+    """
+    path = os.environ.get(variable, "")
+    if not path:
+        raise UnavailableError(f"{metric} needs a network, whose file is not named.", remedy)
+    if not Path(path).is_file():
+        raise InputError(f"environment variable {variable}", "", "a file", f"{path}, not there", remedy)
+    return Path(path)
+
+
+def network_need(what: str, variable: str, remedy: str, network: Callable[[], object]) -> Need:
+    """The file of a metric's network, which is found if the function ``network``, which reads it, raises no `HeadbenchError`."""
+    try:
+        network()
+    except HeadbenchError:
+        return Need(what, "", remedy, required=False)
+    return Need(what, os.environ[variable], remedy, required=False)
 
 
 def _dlib() -> tuple[Any, Path]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.engine.scoring import score_frames
-from headbench.bench.errors import LeftOutError, UnavailableError
+from headbench.bench.errors import LeftOutError
 from headbench.bench.landmark_network import COUNT
 from headbench.bench.rows import LEFT_OUT, Rows
 from headbench.metrics import akd
@@ -46,14 +46,6 @@ def test_the_distance_is_that_of_the_landmarks(network):
 def test_a_picture_without_a_face_is_left_out(network, image, truth, name):
     with pytest.raises(LeftOutError, match=f"no face is found in the {name}"):
         akd.AkdMediaPipe()(level(image), level(truth))
-
-
-def test_without_the_file_the_remedy_says_where_it_is(monkeypatch):
-    monkeypatch.delenv(akd.VARIABLE, raising=False)
-    with pytest.raises(UnavailableError, match=r"face_landmark\.tflite of the package mediapipe 0\.10\.21"):
-        akd.AkdMediaPipe()(level(1), level(1))
-    (need,) = akd.mediapipe_needs(None, "cpu")
-    assert (need.found, need.required) == ("", False)
 
 
 def test_frames_left_out_have_a_reason(network, monkeypatch):

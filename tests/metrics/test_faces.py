@@ -1,4 +1,5 @@
-"""Landmarks and descriptors by dlib, which is not a dependency: what it is called with, and what its absence gives."""
+"""Landmarks and descriptors by dlib, which is not a dependency: what it is called with, and what its absence gives; networks
+in files of the user."""
 
 import sys
 import types
@@ -6,10 +7,10 @@ import types
 import numpy as np
 import pytest
 
-from headbench.bench.errors import LeftOutError, UnavailableError
-from headbench.metrics import faces
-from headbench.metrics.akd import AkdDlib
-from headbench.metrics.csim import CsimDlib
+from headbench.bench.errors import InputError, LeftOutError, UnavailableError
+from headbench.metrics import akd, csim, faces
+from headbench.metrics.akd import AkdDlib, AkdPipNet
+from headbench.metrics.csim import CsimArcFace, CsimDlib
 
 
 class Shape:
@@ -75,9 +76,25 @@ def test_csim_is_the_cosine_between_descriptors(dlib):
     assert metric(level(10), level(10)) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("metric", [AkdDlib, CsimDlib])
+@pytest.fixture
+def networks(monkeypatch):
+    """Stand-ins of networks at dlib's 68 landmarks, which return them, and the angle of the first."""
+    monkeypatch.setattr(akd, "_pipnet", lambda: lambda image, landmarks: landmarks)
+    monkeypatch.setattr(
+        csim,
+        "_arcface",
+        lambda: lambda image, landmarks: np.array([1.0, np.tan(np.radians(landmarks[0, 0]))]),
+    )
+
+
+def test_networks_of_files_are_shown_the_landmarks_of_the_best_face(dlib, networks):
+    assert AkdPipNet()(level(13), level(10)) == pytest.approx(np.hypot(3, 6))
+    assert CsimArcFace()(level(70), level(10)) == pytest.approx(np.cos(np.radians(60)))
+
+
+@pytest.mark.parametrize("metric", [AkdDlib, CsimDlib, AkdPipNet, CsimArcFace])
 @pytest.mark.parametrize(("image", "truth", "name"), [(0, 9, "render"), (9, 0, "ground truth")])
-def test_a_picture_without_a_face_is_left_out(dlib, metric, image, truth, name):
+def test_a_picture_without_a_face_is_left_out(dlib, networks, metric, image, truth, name):
     with pytest.raises(LeftOutError, match=f"no face is found in the {name}"):
         metric()(level(image), level(truth))
 
@@ -92,3 +109,31 @@ def test_without_a_package_the_remedy_says_what_to_install(monkeypatch, missing)
         AkdDlib()(level(1), level(1))
     (need,) = faces.dlib_needs(None, "cpu")
     assert (need.found, need.required) == ("", False)
+
+
+@pytest.mark.parametrize(
+    ("metric", "variable", "needs", "remedy"),
+    [
+        (akd.AkdMediaPipe, akd.VARIABLE, akd.mediapipe_needs, "mediapipe 0.10.21"),
+        (AkdPipNet, akd.PIPNET_VARIABLE, akd.pipnet_needs, "epoch59.pth.*meanface.txt"),
+        (CsimArcFace, csim.VARIABLE, csim.arcface_needs, "w600k_r50.onnx.*not commercial"),
+    ],
+)
+def test_without_the_file_of_a_network_the_remedy_says_where_it_is(
+    dlib, monkeypatch, tmp_path, metric, variable, needs, remedy
+):
+    monkeypatch.delenv(variable, raising=False)
+    with pytest.raises(UnavailableError, match=f"is not named. Set {variable} to .*{remedy}"):
+        metric()(level(1), level(1))
+    need, *others = needs(None, "cpu")
+    assert (need.found, need.required) == ("", False)
+    assert all(other.found == "installed" for other in others)
+    monkeypatch.setenv(variable, str(tmp_path / "none"))
+    with pytest.raises(InputError, match=f"{variable}: expected a file, found .*none, not there. .*{remedy}"):
+        metric()(level(1), level(1))
+    assert next(iter(needs(None, "cpu"))).found == ""
+
+
+def test_the_file_of_a_network_that_can_be_read_is_found(monkeypatch):
+    monkeypatch.setenv("HEADBENCH_X", "there")
+    assert faces.network_need("x", "HEADBENCH_X", "remedy", lambda: None).found == "there"

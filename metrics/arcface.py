@@ -1,0 +1,67 @@
+"""ArcFace's description of a face, by a network in a file of ONNX.
+
+Deng, Guo, Xue, Zafeiriou, "ArcFace: Additive Angular Margin Loss for Deep Face Recognition", CVPR 2019. Crop and colours are
+those of the project insightface.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..bench.contracts import ByteArray, FloatArray
+from ..bench.errors import InputError
+from ..bench.io.files import read_bytes, reading
+
+SIDE = 112
+"""Pixels across the network's input."""
+PLACES = np.array(
+    [[38.2946, 51.6963], [73.5318, 51.5014], [56.0252, 71.7366], [41.5493, 92.3655], [70.7299, 92.2041]]
+)
+"""Of the eyes, the tip of the nose and the corners of the mouth in the crop, pixels."""
+LENGTH = 512
+MAX_BYTES = 2**30
+"""Of a file; that of ResNet-50 has 0.17 GB."""
+
+
+class ArcFace:
+    """The network of a file.
+
+    Raises `InputError` if the file is missing, is not a network, or is one of another input or output.
+    """
+
+    def __init__(self, path: Path):
+        expected = f"a network of ONNX that maps a picture of {SIDE}x{SIDE} pixels to {LENGTH} numbers"
+        content = read_bytes(path, expected, MAX_BYTES)
+        with reading(path, expected):
+            self._network = cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8))
+            shape = self._run(np.zeros((SIDE, SIDE, 3), np.uint8)).shape
+        if shape != (1, LENGTH):
+            raise InputError(path, "", expected, f"an output of shape {shape}")
+
+    def __call__(self, image: ByteArray, landmarks: FloatArray) -> FloatArray:
+        """(512,) numbers of the face with these (68, 2) landmarks of 300-W, pixels, in an (H, W, 3) 8-bit RGB image."""
+        turn = alignment(five_points(landmarks), PLACES)
+        return self._run(np.asarray(cv2.warpAffine(image, turn, (SIDE, SIDE)), np.uint8))[0]
+
+    def _run(self, crop: ByteArray) -> FloatArray:
+        pixels = (crop.astype(np.float32) - 127.5) / 127.5
+        self._network.setInput(np.ascontiguousarray(pixels.transpose(2, 0, 1)[None]))
+        return np.array(self._network.forward())
+
+
+def five_points(landmarks: FloatArray) -> FloatArray:
+    """(5, 2) middles of the eyes, tip of the nose and corners of the mouth, of (68, 2) landmarks of 300-W."""
+    eyes = landmarks[36:42].mean(axis=0), landmarks[42:48].mean(axis=0)
+    return np.stack([*eyes, landmarks[30], landmarks[48], landmarks[54]])
+
+
+def alignment(points: FloatArray, places: FloatArray) -> FloatArray:
+    """(2, 3) turn, scale and shift that bring (N, 2) points to their places with the least sum of squared distances."""
+    start, end = points @ (1, 1j), places @ (1, 1j)  # as complex numbers, a turn and a scale are one factor
+    away = start - start.mean()
+    factor = np.vdot(away, end) / np.vdot(away, away)
+    shift = end.mean() - factor * start.mean()
+    return np.array([[factor.real, -factor.imag, shift.real], [factor.imag, factor.real, shift.imag]])
