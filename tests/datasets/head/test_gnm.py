@@ -36,7 +36,7 @@ def test_vertices_are_those_of_the_definition(tmp_path, blind):
         assert np.abs(head(pose, identity) - expected).max() < 1e-7  # 0.1 micrometres
 
 
-def test_regressor_of_the_file_is_kept_where_expressions_do_not_move_it():
+def test_regressor_is_kept_if_expressions_do_not_move_joints():
     content = gnm_content(blind=True)
     head = gnm_head("gnm.npz", content)
     np.testing.assert_array_equal(head.joint_regressor[[0, 1, 3, 4]], content["joint_regressor"])

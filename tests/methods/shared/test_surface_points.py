@@ -85,7 +85,7 @@ def test_each_texel_of_a_chart_has_one_point(n, size):
 
 
 @pytest.mark.parametrize("count", [4_000, 16_000, 64_000])
-def test_number_of_texels_is_the_charts_area_times_the_resolutions_square(ball, count):
+def test_number_of_texels_is_area_times_squared_resolution(ball, count):
     vertices, faces = ball
     # Each half is nearly a disk of radius 0.3.
     flat = 0.5 + 0.3 * vertices[:, :2] / np.linalg.norm(vertices, axis=1, keepdims=True)
