@@ -49,7 +49,7 @@ class ArcFace:
     def _run(self, crop: ByteArray) -> FloatArray:
         pixels = (crop.astype(np.float32) - 127.5) / 127.5
         self._network.setInput(np.ascontiguousarray(pixels.transpose(2, 0, 1)[None]))
-        return np.array(self._network.forward())
+        return np.array(self._network.forward(), float)
 
 
 def five_points(landmarks: FloatArray) -> FloatArray:

@@ -80,6 +80,7 @@ def test_numbers_are_of_the_colours_of_the_aligned_face(path):
     image[50:274, 120:344] = colours  # the crop, at half its scale
     found = ArcFace(path)(image, marks(2 * PLACES + (120, 50)))
     np.testing.assert_allclose(found, (colours / 127.5 - 1) @ WEIGHTS + BIAS, atol=1e-3)  # of the crop's edge
+    assert found.dtype == np.float64  # the cosine between equal numbers is at most 1
 
 
 @pytest.mark.parametrize(

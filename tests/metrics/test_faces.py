@@ -87,7 +87,7 @@ def networks(monkeypatch):
     )
 
 
-def test_networks_of_files_are_shown_the_landmarks_of_the_best_face(dlib, networks):
+def test_networks_of_files_are_shown_the_best_face(dlib, networks):
     assert AkdPipNet()(level(13), level(10)) == pytest.approx(np.hypot(3, 6))
     assert CsimArcFace()(level(70), level(10)) == pytest.approx(np.cos(np.radians(60)))
 
@@ -119,7 +119,7 @@ def test_without_a_package_the_remedy_says_what_to_install(monkeypatch, missing)
         (CsimArcFace, csim.VARIABLE, csim.arcface_needs, "w600k_r50.onnx.*not commercial"),
     ],
 )
-def test_without_the_file_of_a_network_the_remedy_says_where_it_is(
+def test_without_its_file_the_remedy_says_where_it_is(
     dlib, monkeypatch, tmp_path, metric, variable, needs, remedy
 ):
     monkeypatch.delenv(variable, raising=False)

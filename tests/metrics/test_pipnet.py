@@ -105,7 +105,7 @@ def test_a_box_beside_the_picture_has_no_face(finder):
     assert finder.find_in(np.zeros((50, 50, 3), np.uint8), np.array([70, 10, 20, 20])) is None
 
 
-def test_the_box_is_that_in_whose_crop_the_face_lies_as_the_mean_face_does(finder):
+def test_the_face_lies_in_the_crop_as_the_mean_face_does(finder):
     landmarks = FACE * (120, 130) + (90, 60)  # in a crop of 120 x 130 pixels at (90, 60)
     box = pipnet.face_box(landmarks, FACE)
     np.testing.assert_array_equal(box, [90 + 10, 60 - 13, 120 / 1.2, 130])
