@@ -87,19 +87,19 @@ def pipnet_needs(config: object, device: str) -> Iterator[Need]:
     yield from dlib_needs(config, device)
 
 
-def _spec(name: str, landmarks: str, implementation: str, needs: str) -> MetricSpec:
+def _spec(name: str, count: int, network: str, implementation: str, needs: str) -> MetricSpec:
     return MetricSpec(
         name=name,
-        label="AKD",
+        label=f"AKD ({network})",
         unit="px",
         higher_is_better=False,
         digits=2,
         implementation=f"headbench.metrics.akd:{implementation}",
-        summary=f"Mean distance of {landmarks} landmarks in pixels; frames in which no face is found are left out and counted.",
+        summary=f"Mean distance of {count} {network} landmarks in pixels; frames in which no face is found are left out and counted.",
         needs=f"headbench.metrics.{needs}",
     )
 
 
-AKD_MEDIAPIPE = _spec("akd-mediapipe", "468 MediaPipe", "AkdMediaPipe", "akd:mediapipe_needs")
-AKD_DLIB = _spec("akd-dlib", "68 dlib", "AkdDlib", "faces:dlib_needs")
-AKD_PIPNET = _spec("akd-pipnet", "98 PIPNet", "AkdPipNet", "akd:pipnet_needs")
+AKD_MEDIAPIPE = _spec("akd-mediapipe", 468, "MediaPipe", "AkdMediaPipe", "akd:mediapipe_needs")
+AKD_DLIB = _spec("akd-dlib", 68, "dlib", "AkdDlib", "faces:dlib_needs")
+AKD_PIPNET = _spec("akd-pipnet", 98, "PIPNet", "AkdPipNet", "akd:pipnet_needs")

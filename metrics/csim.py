@@ -61,18 +61,18 @@ def arcface_needs(config: object, device: str) -> Iterator[Need]:
     yield from dlib_needs(config, device)
 
 
-def _spec(name: str, descriptors: str, implementation: str, needs: str) -> MetricSpec:
+def _spec(name: str, network: str, implementation: str, needs: str) -> MetricSpec:
     return MetricSpec(
         name=name,
-        label="CSIM",
+        label=f"CSIM ({network})",
         unit="",
         higher_is_better=True,
         digits=3,
         implementation=f"headbench.metrics.csim:{implementation}",
-        summary=f"Cosine similarity of {descriptors}, at most 1; frames in which no face is found are left out and counted.",
+        summary=f"Cosine similarity of the face descriptors of {network}, at most 1; frames in which no face is found are left out and counted.",
         needs=f"headbench.metrics.{needs}",
     )
 
 
-CSIM_DLIB = _spec("csim-dlib", "dlib's face descriptors", "CsimDlib", "faces:dlib_needs")
-CSIM_ARCFACE = _spec("csim-arcface", "ArcFace's face descriptors", "CsimArcFace", "csim:arcface_needs")
+CSIM_DLIB = _spec("csim-dlib", "dlib", "CsimDlib", "faces:dlib_needs")
+CSIM_ARCFACE = _spec("csim-arcface", "ArcFace", "CsimArcFace", "csim:arcface_needs")
