@@ -26,7 +26,9 @@ PAGES = [
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page):
     links = re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8"))
-    assert [link for link in links if "://" not in link and not (page.parent / link).exists()] == []
+    # Sphinx writes the generated pages, and checks the links to them (`make docs`).
+    places = [link for link in links if "://" not in link and "generated/" not in link]
+    assert [link for link in places if not (page.parent / link).exists()] == []
 
 
 def test_every_command_is_listed(capsys):
