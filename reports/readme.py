@@ -9,7 +9,6 @@ python -m headbench.reports.readme faces run-of-one-subject .
 from __future__ import annotations
 
 import os
-import re
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -33,16 +32,14 @@ from ..bench.progress import counted
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from .aggregate import summarise
-from .protocols import ProtocolsSettings, protocols_command
+from .protocols import USUAL, ProtocolsSettings, protocols_command
 from .runs import RunSet, synthetic_settings
-from .statistics.command import equivalence_text
-from .statistics.comparisons import PairedComparison, compare
-from .statistics.primary import PAIR, PRIMARY, primary_table
+from .statistics.primary import primary_table
 from .suite.extremes import FOLDER as EXTREMES
 from .suite.extremes import read_extremes
 from .suite.suite import suite_report, suite_runs
 from .table_report import Columns, table_of, table_text
-from .writers import to_markdown
+from .writers import pipe_table, to_markdown
 
 GALLERY = "reports/gallery"
 PROTOCOLS = "protocols"
@@ -64,7 +61,9 @@ PAGES = {
 """The page of each block, in the repository."""
 OURS = "ours"
 COMPARED = (OURS, "ga")
-"""Methods of the table of protocols."""
+"""Methods of the tables of protocols."""
+CHOICES = ("pixels: face", "pixels: mouth", "pixels: hair", "pooled: 16 frames", "cameras: unseen")
+"""Those of the README; the page of protocols has all."""
 SHOWN = ("psnr", "lpips")
 """Metrics of frames in the README, whose table would not fit a page with all; those of the suite's tables are in `RESULTS`."""
 
@@ -198,6 +197,25 @@ SUBJECT_BLOCKS: dict[str, Callable[[Path], str]] = {
 """Markdown of the stored rows of a folder."""
 
 
+def choices_table(runs: Sequence[Path]) -> str:
+    """PSNR of `COMPARED` by the usual protocol, and its change by each of `CHOICES` alone: Markdown."""
+    found = protocols_command(ProtocolsSettings(tuple(map(str, runs)), COMPARED), no_progress).data["values"]
+    columns = list(product(("novel_view", "self_reenactment"), reversed(COMPARED)))
+    lines = [["dB", *(f"{TASK_TITLES[task].lower()}, {method}" for task, method in columns)]]
+    lines.append([":--", *("--:" for _ in columns)])
+    for choice in (USUAL, *CHOICES):
+        own, changes = found[choice], choice != USUAL
+        values = {key: own[key] - changes * found[USUAL][key] for key in own}
+        keys = [f"{method} {task} psnr" for task, method in columns]
+        lines.append(
+            [
+                choice,
+                *(f"{values[key]:{'+' if changes else ''}.2f}" if key in values else "–" for key in keys),
+            ]
+        )
+    return pipe_table(lines)
+
+
 def suite_options(folder: Path) -> tuple[str, ...]:
     """Options of ``headbench run suite`` that make the captures of stored runs, as these record them."""
     runs, large = (
@@ -242,84 +260,13 @@ def suite_block(root: Path) -> str:
     measured = {spec.name for spec in runs.metrics if "comparison" in spec.tables}
     columns = Columns((*SHOWN, *(name for name in of_avatars if name in measured)))
     return (
-        f"{to_markdown(table_of(shown, columns=columns)).strip()}\n\n{conclusions(shown)}\n\n"
-        f"[SSIM, tables by region and by part of FREE, paired differences with tests]({results}). "
-        f"Measured by other protocols, on other pixels or cameras, the same avatars differ by up to {_spread(root)} dB "
-        f"([table]({PAGES[PROTOCOLS]})). "
+        f"{to_markdown(table_of(shown, columns=columns)).strip()}\n\n"
+        f"Primary endpoints:\n\n{primary_table(shown)}\n\n"
+        f"[SSIM, tables by region and by part of FREE, all other comparisons with tests]({results}). "
+        f"The mean PSNR of the same avatars by other choices of an evaluation ([all]({PAGES[PROTOCOLS]})):\n\n{choices_table(folders)}\n\n"
         f"The captures are of edition {made.get('edition', 1)}, made with seed {made['seed']}, and have the options `headbench run suite {options}`. "
         f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{took}{interrupted}."
     )
-
-
-def _spread(root: Path) -> float:
-    """The largest difference in dB that the page of protocols states."""
-    begin, end = marks(PROTOCOLS)
-    page = (root / PAGES[PROTOCOLS]).read_text(encoding="utf-8")
-    block = page.split(begin)[1].split(end)[0]
-    return max(float(found) for found in re.findall(r"differ by up to ([\d.]+) dB", block))
-
-
-def conclusions(runs: RunSet) -> str:
-    """What the rows allow to conclude about `OURS` and every other ranked method: Markdown.
-
-    A table of the primary endpoints, then the other comparisons, which are exploratory, as a list with a line for each task.
-    """
-    runs = runs.by_camera
-    primary = primary_table(runs)
-    pairs = [(OURS, method) for method in runs.ranked if method != OURS]
-    specs = [spec for spec in runs.metrics if spec.name in SHOWN]
-    others = [
-        pair
-        for task, spec in product(runs.tasks if pairs else (), specs)
-        for pair in compare(
-            runs.rows, pairs, task=task, metric=spec.name, higher_is_better=spec.higher_is_better
-        )
-        if not (primary and (pair.first, pair.second) == PAIR and (task, spec.name) in PRIMARY)
-    ]
-    parts = [
-        ("Primary endpoints:", primary),
-        (
-            "Other comparisons, which are exploratory, with Holm's correction for the pairs of each metric alone:",
-            _conclusions(runs, others) if others else "",
-        ),
-    ]
-    return "\n\n".join(f"{title}\n\n{text}" for title, text in parts if text)
-
-
-def _conclusions(runs: RunSet, pairs: Sequence[PairedComparison]) -> str:
-    """A line for each task, methods and metrics of equal outcome together."""
-    specs = {spec.name: spec for spec in runs.metrics}
-    lines = []
-    for task in dict.fromkeys(pair.task for pair in pairs):
-        metrics: dict[tuple[str, str], list[str]] = {}
-        for pair in pairs:
-            if pair.task == task:
-                spec = specs[pair.metric]
-                metrics.setdefault((_outcome(pair, spec.unit), pair.second), []).append(spec.label)
-        others: dict[tuple[str, str], list[str]] = {}
-        for (outcome, other), labels in metrics.items():
-            others.setdefault((outcome, _listed(labels)), []).append(f"`{other}`")
-        said = [
-            outcome.format(others=_listed(names), are="are" if len(names) > 1 else "is", metrics=labels)
-            for (outcome, labels), names in others.items()
-        ]
-        lines.append(f"- {TASK_TITLES.get(task, task)}: {'; '.join(said)}.")
-    return "\n".join(lines)
-
-
-def _outcome(pair: PairedComparison, unit: str) -> str:
-    """A sentence on the first method and ``{others}`` by ``{metrics}``, with ``{are}`` where the verb follows the others."""
-    tested = equivalence_text(pair, unit, p=False)
-    within = f" ({tested})" if tested else ""
-    if pair.verdict == f"{pair.first} is better":
-        return f"`{pair.first}` is better than {{others}} by {{metrics}}{within}"
-    if pair.verdict == f"{pair.second} is better":
-        return f"{{others}} {{are}} better than `{pair.first}` by {{metrics}}{within}"
-    return f"`{pair.first}` against {{others}}, by {{metrics}}: {pair.verdict}{within}"
-
-
-def _listed(words: Sequence[str]) -> str:
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 PUBLISH: dict[str, Callable[[Path, Path], None]] = {

@@ -189,7 +189,7 @@ def _plain(comparison: PairedComparison) -> dict[str, Any]:
     }
 
 
-def equivalence_text(comparison: PairedComparison, unit: str, *, p: bool = True) -> str:
+def equivalence_text(comparison: PairedComparison, unit: str) -> str:
     """Outcome of the test of equivalence in words, with its p-value; "" without one."""
     if comparison.margin is None or comparison.p_equivalence_holm is None:
         return ""
@@ -197,7 +197,7 @@ def equivalence_text(comparison: PairedComparison, unit: str, *, p: bool = True)
     text = (
         f"equivalent within {within}" if comparison.equivalent else f"equivalence within {within} not shown"
     )
-    return f"{text} (Holm {comparison.p_equivalence_holm:.4f})" if p else text
+    return f"{text} (Holm {comparison.p_equivalence_holm:.4f})"
 
 
 def _csv(comparisons: Sequence[dict[str, Any]]) -> str:
