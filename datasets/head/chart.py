@@ -8,12 +8,14 @@ import numpy as np
 
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
+from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers
 from ...bench.io.documents import read_text
 from ...bench.io.files import reading
 
 CHART_FILES = ("head_template_mesh.obj", "head_template.obj")
 """FLAME's mesh with texture coordinates, as VHAP and GaussianAvatars, and DECA, name it."""
-_MOST_BYTES = 2**26
+_MOST_BYTES = 2**24
+"""FLAME's have 1 MB. Lists of words take up to 60 times their text."""
 
 
 def read_chart(path: Path, faces: IntArray) -> FloatArray:
@@ -29,16 +31,18 @@ def read_chart(path: Path, faces: IntArray) -> FloatArray:
     Raises
     ------
     InputError
-        The file is missing or damaged, has no texture coordinates, or lacks a triangle of the head model.
+        The file is missing or damaged, has no texture coordinates or such that are not finite, a face that is no triangle, or
+        lacks a triangle of the head model.
     """
     text = read_text(path, "mesh", _MOST_BYTES)
     with reading(path, "an OBJ mesh of triangles with texture coordinates"):
-        rows = [line.split() for line in text.splitlines()]
-        coordinates = np.array([row[1:3] for row in rows if row[:1] == ["vt"]], np.float32)
-        corners = [[corner.split("/")[:2] for corner in row[1:]] for row in rows if row[:1] == ["f"]]
-        indices = np.array(corners, np.int64).reshape(-1, 3, 2) - 1
-        if not len(indices) or indices.min() < 0:
+        rows = [row for row in map(str.split, text.splitlines()) if row[:1] in (["vt"], ["f"])]
+        coordinates = np.array([row[1:3] for row in rows if row[0] == "vt"], np.float64)
+        corners = [[corner.split("/")[:2] for corner in row[1:]] for row in rows if row[0] == "f"]
+        indices = np.array(corners, np.int64) - 1
+        if indices.shape[1:] != (3, 2) or indices.min() < 0:
             raise ValueError("no triangles, or indices below 1")
+        check_numbers(path, "vt", coordinates, MAX_MAGNITUDE)
         given, uv = indices[:, :, 0], coordinates[indices[:, :, 1]]
     order, wanted = np.argsort(given, axis=1), np.argsort(faces, axis=1)
     known, known_order = np.unique(np.take_along_axis(given, order, 1), axis=0, return_index=True)

@@ -105,8 +105,8 @@ def load_head(
         head = replace(head, regions={**head.regions, **read_regions(regions)})
     if chart is not None:
         head = replace(head, uv=read_chart(Path(chart), head.faces))
-    if masks is not None or regions is not None or chart is not None:
-        head.validate(regions or masks or chart or path)
+    if masks is not None or regions is not None:
+        head.validate(regions or masks or path)
     if eyelids is not None:
         folder = Path(eyelids)
         head = _with_eyelids(head, folder.parent if folder.is_file() else folder, path)

@@ -33,7 +33,7 @@ def obj_text(faces, uv, seed=0):
 
 def test_triangles_are_found_in_any_order(tmp_path):
     path = tmp_path / "chart.obj"
-    path.write_text(obj_text(HEAD.faces, UV) + EXTRA)
+    path.write_text(obj_text(HEAD.faces, UV).replace("\nvt ", "\n vt\t") + EXTRA)
     np.testing.assert_array_equal(read_chart(path, HEAD.faces), UV)
 
 
@@ -59,6 +59,11 @@ def test_the_file_beside_a_flame_pickle_is_the_chart(tmp_path, name):
         ("v 0 0 0\nf 1 2 3\n", "texture coordinates"),
         ("vt 0 0\nf 1/1 2/2 3/3\n", "texture coordinates"),
         ("vt 0 0\nf 1/1 2/1 3/1 4/1\n", "texture coordinates"),
+        ("vt 0 0\n" + 3 * "f 1/1 2/1 3/1 4/1\n", "no triangles"),
+        ("vt 0 0\nf 1//1 2//1 3//1\n", "texture coordinates"),
+        ("vt nan 0\nf 1/1 2/1 3/1\n", "vt: expected finite numbers"),
+        ("vt 1e39 0\nf 1/1 2/1 3/1\n", "vt: expected numbers from -10000 to 10000"),
+        ("\n" * 2**24 + "vt", "at most 16777216 bytes"),
         ("vt 0 0\nf 1/-1 2/1 3/1\n", "texture coordinates"),
         ("vt 0 0\nf 1/1 2/1 3/1\n", "that are not there"),
     ],
