@@ -152,20 +152,22 @@ def texel_points(uv: FloatArray, triangles: IntArray, count: int) -> SurfacePoin
     Raises
     ------
     InputError
-        No triangle has an area in the chart, or only slivers have.
+        No triangle has an area in the chart, only slivers have, or the area is too large or too small for ``count`` texels.
     """
     a, b, c = np.moveaxis(uv[triangles], 1, 0)
     doubled = _cross(b - a, c - a)
     area = 0.5 * float(np.abs(doubled).sum())
-    resolution = round(float(np.sqrt(count / area))) if area > 0 else 0
+    resolution = round(np.sqrt(count / area)) if area * _MOST_ACROSS**2 > count else 0
+    expected = f"triangles that cover a part of the square, for {count} texels"
+    found = f"an area of {area:.3g} in {len(triangles)} triangles"
+    refused = InputError("head model", "uv", expected, found)
     # Texels whose centres lie in the box around a triangle. The offset puts a centre on an edge into one triangle.
     first = np.ceil(uv[triangles].min(1) * resolution - 0.5 - _OFFSET).astype(np.int64)
     last = np.floor(uv[triangles].max(1) * resolution - 0.5 - _OFFSET).astype(np.int64)
     sides = np.where((doubled != 0)[:, None], np.maximum(last - first + 1, 0), 0)
     candidates = sides.prod(1)
-    if not resolution or not 0 < candidates.sum() <= _MOST_CANDIDATES * count:
-        expected = "triangles that cover a part of the square"
-        raise InputError("head model", "uv", expected, f"an area of {area:.3g} in {len(triangles)} triangles")
+    if not resolution or not 0 < candidates.sum(dtype=float) <= _MOST_CANDIDATES * count:
+        raise refused
     rows = np.repeat(np.arange(len(triangles)), candidates)
     within = np.arange(len(rows)) - np.repeat(np.cumsum(candidates) - candidates, candidates)
     texels = first[rows] + np.column_stack([within % sides[rows, 0], within // sides[rows, 0]])
@@ -178,6 +180,8 @@ def texel_points(uv: FloatArray, triangles: IntArray, count: int) -> SurfacePoin
 
     inside = coordinates((texels + 0.5 + _OFFSET) / resolution)
     kept = (inside >= 0).all(1) & (inside.sum(1) <= 1)
+    if not kept.any():
+        raise refused
     exact = coordinates((texels + 0.5) / resolution)[kept].clip(0, 1).astype(np.float32)
     return SurfacePoints(np.asarray(triangles, np.int64)[rows[kept]], full_barycentric(exact))
 
@@ -185,6 +189,8 @@ def texel_points(uv: FloatArray, triangles: IntArray, count: int) -> SurfacePoin
 _OFFSET = np.array([1.0e-7, 1.7e-7])
 """Texels."""
 _MOST_CANDIDATES = 100
+_MOST_ACROSS = 2**16
+"""Texels; the candidates of a triangle are then counted in an int64, at coordinates up to 10,000."""
 
 
 def _cross(one: FloatArray, other: FloatArray) -> FloatArray:

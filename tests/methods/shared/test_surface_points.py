@@ -112,6 +112,22 @@ def test_triangles_without_a_place_in_the_chart_have_no_point():
             texel_points(nowhere, np.arange(len(faces)), 400)
 
 
+@pytest.mark.parametrize(
+    ("corners", "count"),
+    [
+        ([[0, 0], [1e-30, 0], [0, 1e-30]], 400),  # finer texels than there are numbers
+        ([[0, 0], [1, 1], [1, 1 + 1e-6]], 400),
+        ([[0, 0], [1e4, 0], [0, 1e4]], 400),  # several charts for each texel
+        ([[0, 0], [0.95, 0], [0, 0.95]], 1),  # no centre lies inside
+    ],
+    ids=["tiny", "sliver", "large", "few"],
+)
+def test_charts_that_have_no_texels_are_refused(corners, count):
+    uv = np.array([corners, [[0, 0], [0, 0], [1e4, 1e4]]])
+    with pytest.raises(InputError, match=f"cover a part of the square, for {count} texels"):
+        texel_points(uv, np.arange(2), count)
+
+
 def test_a_head_without_a_chart_has_blue_noise():
     head = toy_head()
     vertices, everything = head.template, np.arange(len(head.faces))
