@@ -35,6 +35,8 @@ JOINT_TOLERANCE = 1e-8
 """Metres by which a joint may be off per unit of a coefficient: a hundredth of a micrometre."""
 
 _RIDGE, _REFINEMENTS = 1e-10, 4
+_MOST_DIRECTIONS = 2000
+"""Identity and expression directions together; GNM's are 636. Memory grows with their square, to 0.3 GB."""
 _KEYS = {
     "version": TEXT,
     "variant": TEXT,
@@ -91,7 +93,12 @@ def gnm_head(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> He
     if tuple(names) != JOINTS or parents[1:] != [0, 1, 1]:
         expected = f"{', '.join(JOINTS)} with parents 0, 1 and 1 of the last three"
         raise InputError(file, "joint_names", expected, f"{', '.join(map(str, names))[:200]} with {parents}")
-    vertices = sizes["V"]
+    vertices, directions = sizes["V"], sizes["I"] + sizes["E"]
+    if not vertices:
+        raise InputError(file, "template_vertex_positions", "at least one vertex", "none")
+    if directions > _MOST_DIRECTIONS:
+        expected = f"at most {_MOST_DIRECTIONS} directions with those of expression_basis"
+        raise InputError(file, "vertex_identity_basis", expected, f"{directions}")
     correctives = content["pose_correctives_regressor"]
     if correctives.shape[1] != 3 * vertices:
         raise InputError(

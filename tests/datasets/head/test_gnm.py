@@ -90,6 +90,26 @@ def test_other_arrays_are_refused(change, key):
     assert caught.value.key == key
 
 
+@pytest.mark.parametrize(
+    ("vertices", "directions", "key"),
+    [(0, 3, "template_vertex_positions"), (2, 1999, "vertex_identity_basis")],
+)
+def test_numbers_of_vertices_and_directions_have_bounds(vertices, directions, key):
+    content = gnm_content() | {
+        "template_vertex_positions": np.zeros((vertices, 3)),
+        "vertex_identity_basis": np.zeros((directions, vertices, 3)),
+        "joint_identity_basis": np.zeros((directions, 4, 3)),
+        "expression_basis": np.zeros((2, vertices, 3)),
+        "skinning_weights": np.zeros((4, vertices)),
+        "joint_regressor": np.zeros((4, vertices)),
+        "pose_correctives_regressor": np.zeros((36, 3 * vertices)),
+        "vertex_groups": np.zeros((6, vertices)),
+    }
+    with pytest.raises(InputError) as caught:
+        gnm_head("gnm.npz", content)
+    assert caught.value.key == key
+
+
 def test_correctives_of_the_root_are_refused():
     content = gnm_content()
     content["pose_correctives_regressor"][4, 0] = 1e-3
