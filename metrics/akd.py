@@ -61,7 +61,7 @@ class AkdPipNet(_Akd):
 
     def network(self) -> AtLandmarks:
         """The network of the file that the variable names, at dlib's landmarks."""
-        return AtLandmarks(_pipnet())
+        return AtLandmarks(_pipnet)
 
 
 def _mediapipe() -> LandmarkNetwork:

@@ -29,7 +29,8 @@ MAX_BYTES = 2**30
 class ArcFace:
     """The network of a file.
 
-    Raises `InputError` if the file is missing, is not a network, or is one of another input or output.
+    Raises `InputError` if the file is missing, is not a network, or is one of another input or output, or of numbers that are
+    not finite.
     """
 
     def __init__(self, path: Path):
@@ -37,9 +38,11 @@ class ArcFace:
         content = read_bytes(path, expected, MAX_BYTES)
         with reading(path, expected):
             self._network = cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8))
-            shape = self._run(np.zeros((SIDE, SIDE, 3), np.uint8)).shape
-        if shape != (1, LENGTH):
-            raise InputError(path, "", expected, f"an output of shape {shape}")
+            found = self._run(np.zeros((SIDE, SIDE, 3), np.uint8))
+        if found.shape != (1, LENGTH):
+            raise InputError(path, "", expected, f"an output of shape {found.shape}")
+        if not np.isfinite(found).all():
+            raise InputError(path, "", expected, "numbers that are not finite")
 
     def __call__(self, image: ByteArray, landmarks: FloatArray) -> FloatArray:
         """(512,) numbers of the face with these (68, 2) landmarks of 300-W, pixels, in an (H, W, 3) 8-bit RGB image."""

@@ -46,7 +46,7 @@ class CsimArcFace(_Csim):
 
     def network(self) -> AtLandmarks:
         """The network of the file that the variable names, at dlib's landmarks."""
-        return AtLandmarks(_arcface())
+        return AtLandmarks(_arcface)
 
 
 def _arcface() -> ArcFace:

@@ -108,11 +108,15 @@ class DlibIdentity(_Dlib):
 
 
 class AtLandmarks:
-    """A network that is shown where a face is by `DlibLandmarks`: a function of an image and these, as `FaceNetwork.find` returns."""
+    """A network that is shown where a face is by `DlibLandmarks`: a function of an image and these, as `FaceNetwork.find` returns.
 
-    def __init__(self, network: Callable[[ByteArray, FloatArray], FloatArray | None]) -> None:
+    It is what the function ``network`` returns. Raises as `DlibLandmarks` before that reads a file, which it would for each frame.
+    """
+
+    def __init__(self, network: Callable[[], Callable[[ByteArray, FloatArray], FloatArray | None]]) -> None:
+        _dlib()
+        self._network = network()
         self._landmarks = DlibLandmarks()
-        self._network = network
 
     def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:
         """What the network finds in the most certain face."""
@@ -128,17 +132,23 @@ def named_file(metric: str, variable: str, remedy: str) -> Path:
     path = os.environ.get(variable, "")
     if not path:
         raise UnavailableError(f"{metric} needs a network, whose file is not named.", remedy)
-    if not Path(path).is_file():
-        raise InputError(f"environment variable {variable}", "", "a file", f"{path}, not there", remedy)
+    if not os.path.isfile(path):  # which also answers for paths that cannot be looked up
+        found = f"{path}, {'a folder' if os.path.isdir(path) else 'not there'}"
+        raise InputError(f"environment variable {variable}", "", "a file", found, remedy)
     return Path(path)
 
 
 def network_need(what: str, variable: str, remedy: str, network: Callable[[], object]) -> Need:
-    """The file of a metric's network, which is found if the function ``network``, which reads it, raises no `HeadbenchError`."""
+    """The file of a metric's network, which is found if the function ``network``, which reads it, raises no `HeadbenchError`.
+
+    Of a file that is named and cannot be read, the fault is the remedy.
+    """
     try:
         network()
-    except HeadbenchError:
+    except UnavailableError:
         return Need(what, "", remedy, required=False)
+    except HeadbenchError as error:
+        return Need(what, "", str(error), required=False)
     return Need(what, os.environ[variable], remedy, required=False)
 
 

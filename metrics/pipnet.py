@@ -180,6 +180,8 @@ def read_mean_face(path: Path) -> FloatArray:
         raise InputError(path, "", expected, f"{numbers.size}")
     check_numbers(path, "", numbers, 1, 0)
     places = numbers.reshape(COUNT, 2)
+    if not np.ptp(places, axis=0).all():
+        raise InputError(path, "", expected, "landmarks on a line")
     if len(np.unique(_neighbours(places))) < COUNT:
         raise InputError(path, "", expected, "a landmark that is the neighbour of none")
     return places

@@ -32,7 +32,7 @@ def _picture(number, name, shape):
     return _field(number, _field(1, name) + _field(2, _field(1, _field(1, 1) + _field(2, sizes))))
 
 
-def onnx(length=512, channels=3):
+def onnx(length=512, channels=3, bias=BIAS):
     """A file of ONNX: the mean colour of a picture, times weights, plus a bias."""
     nodes = (
         ("GlobalAveragePool", ("x",), "mean"),
@@ -44,7 +44,7 @@ def onnx(length=512, channels=3):
         for kind, inputs, output in nodes
     )
     weights = np.resize(WEIGHTS, (channels, WEIGHTS.shape[1]))[:, :length]
-    graph += _field(2, "g") + _tensor("w", weights) + _tensor("b", BIAS[:length])
+    graph += _field(2, "g") + _tensor("w", weights) + _tensor("b", bias[:length])
     graph += _picture(11, "x", (1, channels, 112, 112)) + _picture(12, "y", (1, length))
     return _field(1, 8) + _field(7, graph) + _field(8, _field(2, 13))
 
@@ -91,8 +91,9 @@ def test_numbers_are_of_the_colours_of_the_aligned_face(path):
         (onnx()[:-400], ""),
         (onnx(511), r"an output of shape \(1, 511\)"),
         (onnx(channels=1), ""),
+        (onnx(bias=np.nan * BIAS), "not finite"),
     ],
-    ids=["empty", "text", "cut", "length", "input"],
+    ids=["empty", "text", "cut", "length", "input", "numbers"],
 )
 def test_other_files_are_refused(path, content, found):
     path.write_bytes(content)

@@ -132,7 +132,9 @@ def test_weights_are_those_of_the_file_and_no_other_network_s(finder, network, t
         ("0.5 " * 195 + "x", "could not convert"),
         ("0.5 " * 195 + "nan", "1 that are NaN"),
         ("0.5 " * 195 + "47", "47"),
-        ("0.5 " * 196, "neighbour of none"),
+        ("0.5 " * 196, "on a line"),
+        (" ".join(f"{x:.3f} 0.5" for x in FACE[:, 0]), "on a line"),
+        ("0 0 1 1 " + "0.5 " * 192, "neighbour of none"),
     ],
 )
 def test_another_mean_face_is_refused(tmp_path, text, found):
