@@ -368,6 +368,7 @@ class OfficialMethod(ABC, Generic[Config]):
         shrinking = self.shrink_command(fit, checkout, work)
         commands = [(command, f"The training command of {checkout.folder}")]
         commands += [] if shrinking is None else [(shrinking, "Leaving the optimiser out of its output")]
+        ends = []
         for each, what in commands:
             ended = run_program(
                 each,
@@ -380,12 +381,13 @@ class OfficialMethod(ABC, Generic[Config]):
             )
             if ended.code:
                 raise ended.error(f"{what} {described(ended.code)}")
+            ends.append(ended)
         try:
             kept = self.keep(fit, work)
             write_subject(fit.out / SUBJECT_FILE, Subject.of(fit.clip))
             save_shared_head(fit.out, fit.clip.head)
         except (InputError, OSError) as error:
-            raise ended.error(
+            raise ends[0].error(
                 f"The training command of {checkout.folder} left no whole avatar: {error}"
             ) from error
         fit.progress(frames + iterations, frames + iterations)

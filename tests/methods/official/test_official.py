@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import sys
 import time
 from pathlib import Path
 
@@ -179,6 +180,16 @@ def test_a_renderer_that_fails_says_so(avatar, official_clip, faults_are_found):
 )
 def test_a_training_that_fails_says_so(method, official_clip, faults_are_found, tmp_path, fault):
     faults_are_found(fault, lambda: fit(method, official_clip, tmp_path / "avatar").files())
+
+
+def test_a_training_without_an_avatar_is_quoted_itself(method, official_clip, behave, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        type(method), "shrink_command", lambda *given: [sys.executable, "-c", "print('smaller')"]
+    )
+    behave("no ply")
+    with pytest.raises(ProgramError, match="left no whole avatar") as caught:
+        fit(method, official_clip, tmp_path / "avatar")
+    assert "smaller" not in str(caught.value)
 
 
 def test_an_interrupted_training_ends_its_processes(method, repository, official_clip, behave, tmp_path):
