@@ -20,7 +20,9 @@ GALLERY = Path(__file__).parents[2] / "reports" / "gallery" / "run.json"
 @pytest.fixture
 def published(tmp_path):
     """A copy of the published run, with its protocols in its own folder."""
-    shutil.copytree(GALLERY.parent, tmp_path / "run", ignore=shutil.ignore_patterns("suite", "faces", "profiles", "*.jpg"))
+    shutil.copytree(
+        GALLERY.parent, tmp_path / "run", ignore=shutil.ignore_patterns("suite", "faces", "profiles", "*.jpg")
+    )
     return tmp_path / "run" / "run.json"
 
 
