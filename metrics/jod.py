@@ -34,7 +34,7 @@ class Jod:
     """
 
     package, program = "pyfvvdp", "fvvdp"
-    modules = ("pyfvvdp", "ffmpeg")
+    modules: tuple[str, ...] = ("pyfvvdp", "ffmpeg")
     remedy = (
         "If its licence (CC BY-NC 4.0: no commercial use) suits you, install it: pip install pyfvvdp==1.2.2."
     )
