@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from itertools import chain, product
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from ..bench.io.images import encode_image, read_png
 from ..bench.progress import counted
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
+from ..bench.specs import CommandResult
 from .aggregate import summarise
 from .protocols import USUAL, ProtocolsSettings, protocols_command
 from .runs import RunSet, synthetic_settings
@@ -184,9 +185,15 @@ def protocols_block(folder: Path) -> str:
     return _worth_of_choices(suite_runs(folder))
 
 
+@cache
+def _choices(runs: tuple[Path, ...]) -> CommandResult:
+    """What the choices of an evaluation are worth for `COMPARED`; both tables of the suite's runs are made of it."""
+    return protocols_command(ProtocolsSettings(tuple(map(str, runs)), COMPARED), no_progress)
+
+
 def _worth_of_choices(runs: Sequence[Path]) -> str:
     subjects = counted(len(RunSet.read(runs).rows.subjects), "subject")
-    found = protocols_command(ProtocolsSettings(tuple(map(str, runs)), COMPARED), no_progress)
+    found = _choices(tuple(runs))
     return f"`{'` and `'.join(COMPARED)}`, {subjects} of the suite:\n\n{found.text}"
 
 
@@ -199,7 +206,7 @@ SUBJECT_BLOCKS: dict[str, Callable[[Path], str]] = {
 
 def choices_table(runs: Sequence[Path]) -> str:
     """PSNR of `COMPARED` by the usual protocol, and its change by each of `CHOICES` alone: Markdown."""
-    found = protocols_command(ProtocolsSettings(tuple(map(str, runs)), COMPARED), no_progress).data["values"]
+    found = _choices(tuple(runs)).data["values"]
     columns = list(product(("novel_view", "self_reenactment"), reversed(COMPARED)))
     lines = [["dB", *(f"{TASK_TITLES[task].lower()}, {method}" for task, method in columns)]]
     lines.append([":--", *("--:" for _ in columns)])

@@ -15,6 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..errors import reason_of
 from .task import TASK_LOG, Task
 
 if TYPE_CHECKING:
@@ -35,7 +36,6 @@ def execute_task(task: Task) -> None:
     OSError
         The disk is full or read-only.
     """
-    from ..errors import reason_of
     from ..io.files import output_inside
     from ..io.lock import locked
     from ..machine import check_device
