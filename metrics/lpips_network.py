@@ -8,7 +8,8 @@ The linear layers (version 0.1 of Zhang et al. 2018) come with the installed tor
 are read without importing it. The backbone is looked for, in this order:
 
 1. an explicit path, a file or a folder;
-2. the environment variable ``HEADBENCH_LPIPS_WEIGHTS``, a file or a folder;
+2. the environment variable ``HEADBENCH_LPIPS_WEIGHTS``, a folder, or a file, which is passed over if it has the name of
+   another network's weights;
 3. the user's caches: headbench's own, then torch hub's;
 4. PyTorch's publication, fetched once into headbench's cache and checked against the hash in its name.
 
@@ -269,7 +270,8 @@ def present_backbone(spec: NetworkSpec, path: Path | None = None) -> Path | None
     """The file with the weights of ``spec`` on this machine, or None; errors as for `find_backbone`."""
     if path is not None:
         return _named(spec, path, "weights")
-    if value := os.environ.get(VARIABLE):
+    value = os.environ.get(VARIABLE)
+    if value and Path(value).name not in _names_of_others(spec):
         return _named(spec, Path(value), f"environment variable {VARIABLE}")
     folders = (cache_folder(), Path(torch.hub.get_dir()) / "checkpoints")
     return next(filter(None, (_in_folder(spec, folder) for folder in folders)), None)
@@ -339,6 +341,12 @@ def _named(spec: NetworkSpec, path: Path, option: str) -> Path:
         )
     expected = f"a file, or a folder with {spec.file} or {spec.features_file}"
     raise InputError(option, "", expected, f"{path}, not there")
+
+
+def _names_of_others(spec: NetworkSpec) -> set[str]:
+    return {
+        name for other in NETWORKS.values() if other != spec for name in (other.file, other.features_file)
+    }
 
 
 def _in_folder(spec: NetworkSpec, folder: Path) -> Path | None:

@@ -7,7 +7,7 @@ import torch
 
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.metrics import lpips_network as weights
-from headbench.metrics.lpips_network import SQUEEZE
+from headbench.metrics.lpips_network import ALEX, SQUEEZE
 
 
 @pytest.fixture
@@ -32,6 +32,17 @@ def test_places_are_searched_in_order(bare_machine, tmp_path, monkeypatch):
     assert weights.find_backbone(SQUEEZE) == variable
     explicit.touch()
     assert weights.find_backbone(SQUEEZE, explicit.parent) == explicit
+    assert bare_machine == []
+
+
+def test_a_variable_with_another_network_s_file_is_passed_over(bare_machine, tmp_path, monkeypatch):
+    alex = tmp_path / ALEX.features_file
+    own = weights.cache_folder() / SQUEEZE.file
+    own.parent.mkdir(parents=True, exist_ok=True)
+    for path in (alex, own):
+        path.touch()
+    monkeypatch.setenv(weights.VARIABLE, str(alex))
+    assert (weights.find_backbone(ALEX), weights.find_backbone(SQUEEZE)) == (alex, own)
     assert bare_machine == []
 
 
