@@ -94,7 +94,7 @@ class BenchSettings(StressSettings):
     """
 
     tradeoffs: bool = False
-    """Instead of speed alone, what settings that give up accuracy for speed buy."""
+    """Measure the speed and accuracy of approximate settings instead of speed alone."""
 
 
 def bench(settings: BenchSettings, progress: Progress) -> CommandResult:

@@ -63,7 +63,7 @@ class DemoSettings:
     out: str = "demo-output"
     """Folder for everything the demo makes."""
     preset: Preset = "demo"
-    """How much effort: smoke takes seconds and proves nothing about quality; demo takes minutes."""
+    """Preset: smoke takes seconds and gives no meaningful quality; demo takes minutes."""
     seed: int = 0
     """Seeds the training."""
     set: Assignments = ()
@@ -106,10 +106,11 @@ class RunSettings:
     data: str | None = None
     """Capture, such as one in the GaussianAvatars/VHAP layout: a UNION folder, a sequence folder, or a folder of them."""
     out: str | None = None
-    """Folder for everything the run makes. A run in it is continued and grows: methods, seeds, metrics, conditions, tasks and
-    frames are added to those that it has, and every method is trained with every seed. What it has keeps its settings."""
+    """Output folder. An existing run in it is continued: methods, seeds, metrics, conditions, tasks and
+    frames are added, and every method is trained with every seed. Settings of existing results cannot be
+    changed."""
     methods: str | None = None
-    """Names, separated by commas; see `headbench list methods`. Default: all that compare fairly here:
+    """Names, separated by commas; see `headbench list methods`. Default:
     mean-image,nearest-camera,ga,ours."""
     preset: str | None = None
     """How much training: smoke (seconds), demo (minutes), fast, paper (the published schedule), or another that each
@@ -117,7 +118,7 @@ class RunSettings:
     config: str | None = None
     """YAML file with any settings of a run."""
     head: str | None = None
-    """Head model for captures that bring none: FLAME pickle or npz."""
+    """Head model of captures that do not contain one: FLAME pickle or npz."""
     protocol: tuple[str, ...] = ()
     """Published protocols whose metrics and regions are measured, too, and whose tasks are: names of `headbench list protocols`.
     `headbench table --protocol NAME` prints the table of one."""
@@ -127,9 +128,9 @@ class RunSettings:
     """Where cells (a subject, a method, a seed) run: inline, one after another; processes, several at once on this machine;
     slurm, a job for each. Default: inline."""
     workers: int | None = None
-    """How many processes, with `--executor processes`. Default: one for each core."""
+    """Number of processes, with `--executor processes`. Default: one for each core."""
     unchecked: bool = False
-    """Train although `headbench lint` names an error of a capture that makes its results meaningless."""
+    """Train even if `headbench lint` finds an error that makes the results of a capture meaningless."""
     dry_run: bool = False
     """Check everything and list the cells with the time, disk and memory that each will probably take; train nothing."""
     estimates: str | None = None

@@ -23,7 +23,7 @@ class CaptureOptions:
     it."""
 
     head: str | None = None
-    """Head model for captures that bring none: FLAME pickle or npz."""
+    """Head model of captures that do not contain one: FLAME pickle or npz."""
 
     cy: Literal["auto", "top", "bottom", "centre"] = "auto"
     """Principal-point convention of the reader ga; auto takes the declared one, else compares with the images."""

@@ -94,7 +94,7 @@ TABLE_COMMAND = CommandSpec(
 PROTOCOLS = CommandSpec(
     name="protocols",
     group="compare",
-    summary="Table what each choice of an evaluation is worth for stored rows: pixels, metrics, cameras, means, whole protocols.",
+    summary="Show how each choice of an evaluation changes the results: pixels, metrics, cameras, means.",
     settings="headbench.reports.protocols:ProtocolsSettings",
     function="headbench.reports.protocols:protocols_command",
 )

@@ -132,7 +132,7 @@ class EvaluateSettings(ExecutionOptions):
     """What to score. Not with --like, whose run decides it."""
 
     metrics: tuple[str, ...] = ()
-    """By which metrics of frames; default: those of `headbench run`. Not with --like."""
+    """Metrics of frames to compute; default: those of `headbench run`. Not with --like."""
 
     protocol: tuple[str, ...] = ()
     """Published protocols, as for `headbench run`. Not with --like."""
@@ -141,7 +141,7 @@ class EvaluateSettings(ExecutionOptions):
     """Which dataset reader opens the capture; default: the one that finds it. Not with --like."""
 
     head: str | None = None
-    """Head model for captures that bring none: FLAME pickle or npz."""
+    """Head model of captures that do not contain one: FLAME pickle or npz."""
 
     trust: bool = False
     """With --like, import the modules that the run folder names for metrics and readers which are not registered; they

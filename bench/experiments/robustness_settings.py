@@ -61,7 +61,8 @@ class ExtremesSettings(RunOptions, ExecutionOptions):
 
 @dataclass(frozen=True)
 class ReenactSettings(RunOptions, ExecutionOptions):
-    """Drive a run's avatars with another subject's expressions (cross-reenactment); 1 where a limit is broken."""
+    """Drive a run's avatars with another subject's expressions (cross-reenactment); exit code 1 if a limit
+    is exceeded."""
 
     run: tyro.conf.Positional[str]
     """Folder of a finished run."""

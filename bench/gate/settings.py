@@ -16,14 +16,15 @@ class BaselineOptions:
 
     baseline: str | None = None
     """Compare one run, or what `headbench evaluate` wrote, with this baseline file (JSON), which is kept under version
-    control. Exit code 0: nothing got worse; 1: something did; 3: results or baseline missing or invalid."""
+    control. Exit code 0: no value is worse; 1: a value is worse; 3: results or baseline missing or invalid.
+    """
 
     update: bool = False
     """With --baseline: write the results into the file instead of judging them; tolerances that it has are kept."""
 
     captures: Captures | None = None
-    """With --update: `same` (default) demands the very same captures, by fingerprint, ever after; `remade` is for ones
-    synthesised again for every run, whose pictures differ in last bits between processors: all else must be the same."""
+    """With --update: `same` (default) requires captures with the same fingerprint; `remade` is for captures
+    that are synthesised again for every run: everything except the fingerprint must be the same."""
 
     judge_speed: bool = False
     """With --baseline: also judge metrics that depend on the machine and its load (frames per second, milliseconds, training time, memory),

@@ -54,8 +54,9 @@ class SynthSettings(ExecutionOptions):
     """Level of simulated tracking errors: shrunk and mixed expressions, drift; 1 is 0.5 to 1 mm on the face, 2 to 3 mm
     on lips and lids. 0 to 4."""
     tracker: Literal["video", "per-frame"] = "video"
-    """Kind of tracker that errs so. A tracker of videos has an error that lasts for a sequence, slow drift, jitter, and 1.2 mm
-    on lips and lids; one of single frames drifts from each timestep to the next."""
+    """Tracker whose errors are simulated. A video tracker has a constant error for each sequence, slow
+    drift, jitter, and 1.2 mm on lips and lids; the error of a per-frame tracker drifts from each timestep
+    to the next."""
     hair_lag: float = 0.0
     """Lag of hair and of the skin of the neck behind the head, which the tracked mesh does not have; 1 is as a rod of the
     hair's length swings. 0 to 4."""

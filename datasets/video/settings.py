@@ -24,7 +24,7 @@ class VideoOptions:
     """Video: focal length in pixels of its upright frames; default: estimated from the landmarks, which is inexact."""
 
     rate: float = 25.0
-    """Video: maximum frame rate; of a faster one frames are left out."""
+    """Video: maximum frame rate; frames of a faster video are skipped."""
 
     longest: int | None = None
     """Video: maximum number of frames that are used, from its beginning; default: all."""

@@ -49,8 +49,8 @@ class ViewSettings(RunOptions):
     """Rendering device; by default that of the training."""
 
     host: str = "127.0.0.1"
-    """Address to listen at. Any other than the machine's own lets everybody look and draw who reaches it and has the
-    printed address, which then holds a random token."""
+    """Address to listen at. With another address than the default, everybody who can connect and has the
+    printed address, which contains a random token, can use the viewer."""
 
     allowed_hosts: tuple[str, ...] = ()
     """Names of this machine in browsers, such as that of a proxy, besides localhost and ``host``; others are refused."""

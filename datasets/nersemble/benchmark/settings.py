@@ -60,7 +60,7 @@ class SubmissionWriteSettings:
 class SubmissionCheckSettings:
     """Say what the NeRSemble benchmark's server would refuse of a submission.
 
-    Exit code 0: nothing; 1: something; 2: it is no zip that can be looked at.
+    Exit code 0: no fault; 1: a fault; 2: not a readable zip.
     """
 
     zip: tyro.conf.Positional[str]

@@ -35,7 +35,7 @@ class ParitySettings(ExecutionOptions):
     --cameras and --timesteps."""
 
     head: str | None = None
-    """Head model for captures that bring none: FLAME pickle or npz."""
+    """Head model of captures that do not contain one: FLAME pickle or npz."""
 
     iterations: int = 1_000
     """Length of each training."""
