@@ -132,12 +132,9 @@ def inspect_interpreter(
 
 
 def inspect_program(method: str, config: INSTAOfficialConfig, repository: Repository) -> Environment:
-    """Command and version of the program built in the checkout; also checks for a GPU; see `look`."""
+    """Command and version of the program built in the checkout; also checks for a GPU; see `inspect_checkout`."""
     source = f"settings.{method}.program"
-    try:
-        words = shlex.split(config.program)
-    except ValueError:
-        words = []
+    words = _words(config.program)
     if not words:
         raise InputError(source, "", "the program that was built", repr(config.program)[:80])
     if not config.checkout:
@@ -150,37 +147,51 @@ def inspect_program(method: str, config: INSTAOfficialConfig, repository: Reposi
             inside if len(words) == 1 else words[0], source, "a program that can be run", "none", built
         )
     command = (str(Path.cwd() / program), *words[1:])
-    said = _answer([*command, "--version"], source)
+    kind = "a program of this machine"
+    said, _ = _answer([*command, "--version"], source, kind)
     match = re.search(r"neural graphics primitives version (\S{1,40})", said)
     if match is None:
         found = " ".join(said.split())[-200:] or "no answer"
         raise InputError(program, source, "the answer of the authors' program to --version", found, built)
-    devices = re.search(r"headbench-devices (\d+)", _answer([sys.executable, "-c", _DEVICES], source))
+    counted, _ = _answer([sys.executable, "-c", _DEVICES], source, kind)
+    devices = re.search(r"headbench-devices (\d+)", counted)
     if devices is None or devices[1] == "0":
         remedy = "Run it on a machine with an NVIDIA GPU."
         raise InputError(program, source, "a CUDA device, by NVIDIA's driver", "none", remedy)
     return command, {"program": f"instant-ngp {match[1]}"}
 
 
-def _answer(command: Sequence[str], source: str) -> str:
-    """Output of a command, both streams, within `PROBE_S`."""
+def _words(command: str) -> list[str]:
+    """Words of a command; none if a quotation mark is not closed."""
+    try:
+        return shlex.split(command)
+    except ValueError:
+        return []
+
+
+def _answer(
+    command: Sequence[str], source: str, kind: str, errors: int = subprocess.STDOUT, remedy: str = ""
+) -> tuple[str, str]:
+    """Output of a command within `PROBE_S`, and that to ``errors`` if they are apart.
+
+    Raises `InputError` if it does not end, or cannot be started; then ``kind`` says what was expected.
+    """
     try:
         done = subprocess.run(
             command,
             check=False,
             stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
+            stderr=errors,
             stdin=subprocess.DEVNULL,
             timeout=PROBE_S,
             env=environment(),
             start_new_session=True,
         )
     except subprocess.TimeoutExpired as error:
-        raise InputError(command[0], source, f"an answer within {PROBE_S:g} s", "none") from error
+        raise InputError(command[0], source, f"an answer within {PROBE_S:g} s", "none", remedy) from error
     except OSError as error:
-        expected = "a program of this machine"
-        raise InputError(command[0], source, expected, error.strerror or str(error)) from error
-    return done.stdout.decode(errors="replace")
+        raise InputError(command[0], source, kind, error.strerror or str(error)) from error
+    return done.stdout.decode(errors="replace"), (done.stderr or b"").decode(errors="replace")
 
 
 def inspect_checkout(
@@ -202,17 +213,12 @@ def inspect_checkout(
 def inspect_folder(
     method: str, config: OfficialConfig, repository: Repository
 ) -> tuple[Path, dict[str, Any]]:
-    """The checkout with its commit and changes; see `look`."""
+    """The checkout with its commit and changes; see `inspect_checkout`."""
     source, commit = f"settings.{method}", config.commit
+    made = f" and --set {source}.python=PYTHON of an environment made" if repository.modules else ", built"
     remedy = (
         f"git clone --recursive {repository.url} DIR && git -C DIR checkout {repository.commit[:12]}; then --set "
-        f"settings.{method}.checkout=DIR"
-        + (
-            f" and --set settings.{method}.python=PYTHON of an environment made"
-            if repository.modules
-            else ", built"
-        )
-        + " as its installation page says (methods/official/README.md)."
+        f"settings.{method}.checkout=DIR{made} as its installation page says (methods/official/README.md)."
     )
     if not config.checkout:
         raise InputError(source, "checkout", f"the folder of a checkout of {repository.url}", "none", remedy)
@@ -246,12 +252,11 @@ def _commit(folder: Path) -> tuple[str, dict[str, Any]]:
     if not top or Path(top).resolve() != folder:
         return "", {}
     commit = _git(folder, "rev-parse", "HEAD").strip()
-    difference = _git(folder, "diff", "--no-ext-diff", "--no-textconv", "--ignore-submodules", "HEAD")
+    compare = ("diff", "--no-ext-diff", "--no-textconv", "--ignore-submodules")
+    difference = _git(folder, *compare, "HEAD")
     if not difference:
         return commit, {"changed": []}
-    names = _git(
-        folder, "diff", "--no-ext-diff", "--no-textconv", "--ignore-submodules", "--name-only", "HEAD"
-    ).split("\n")
+    names = _git(folder, *compare, "--name-only", "HEAD").split("\n")
     changed = [name for name in names if name][:40]
     return commit, {"changed": changed, "difference": hashlib.sha256(difference.encode()).hexdigest()}
 
@@ -278,10 +283,7 @@ def _interpreter(method: str, config: OfficialConfig) -> tuple[str, ...]:
     if config.device != "cuda" and not config.python:
         return (sys.executable,)
     remedy = f"--set settings.{method}.python=/path/to/environment/bin/python, or a command that starts one."
-    try:
-        words = shlex.split(config.python)
-    except ValueError:
-        words = []
+    words = _words(config.python)
     if not words:
         found = repr(config.python)[:80] if config.python else "none"
         raise InputError(source, "python", "the interpreter that the checkout's code runs in", found, remedy)
@@ -301,28 +303,13 @@ def _probed(
     method: str, python: Sequence[str], repository: Repository, *, cuda: bool, shim: bool
 ) -> dict[str, Any]:
     """Versions of the interpreter, if it can import what the code needs."""
-    source = f"settings.{method}.python"
-    program = _PROBE.replace("TRIAL", repository.trial or "pass")
-    try:
-        done = subprocess.run(
-            [*python, "-c", program, *repository.modules],
-            check=False,
-            capture_output=True,
-            stdin=subprocess.DEVNULL,
-            timeout=PROBE_S,
-            env=environment(),
-            start_new_session=True,
-        )
-    except subprocess.TimeoutExpired as error:
-        expected = f"an answer within {PROBE_S:g} s"
-        raise InputError(python[0], source, expected, "none", "Try it by hand: import torch.") from error
-    except OSError as error:
-        raise InputError(python[0], source, "a Python interpreter", error.strerror or str(error)) from error
-    lines = done.stdout.decode(errors="replace").split("\n")
-    answer = next((line.partition(" ")[2] for line in lines if line.startswith("headbench-probe ")), None)
+    source, kind = f"settings.{method}.python", "a Python interpreter"
+    command = [*python, "-c", _PROBE.replace("TRIAL", repository.trial or "pass"), *repository.modules]
+    said, failed = _answer(command, source, kind, subprocess.PIPE, "Try it by hand: import torch.")
+    lines = (line for line in said.split("\n") if line.startswith("headbench-probe "))
+    answer = next((line.partition(" ")[2] for line in lines), None)
     if answer is None:
-        said = done.stderr.decode(errors="replace").strip()[-200:]
-        raise InputError(python[0], source, "a Python interpreter", said or "no answer")
+        raise InputError(python[0], source, kind, failed.strip()[-200:] or "no answer")
     found = checked(parse_json(answer, python[0], source), _Probed, python[0])
     if found.missing:
         name, why = next(iter(found.missing.items()))
