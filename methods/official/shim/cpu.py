@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import builtins
 import importlib.util
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
@@ -36,7 +37,7 @@ def install(threads: int, code: str) -> None:
     _module("simple_knn")
     _module("simple_knn._C", {"distCUDA2": mean_square_distances, **blendshapes.NEIGHBOURS})
     # Imported by scripts, but not used: no mesh is drawn, no external OBJ file read and no LPIPS measured.
-    context = {"RasterizeCudaContext": _Nothing, "RasterizeGLContext": _Nothing}
+    context = dict.fromkeys(("RasterizeCudaContext", "RasterizeGLContext"), blendshapes.Ignoring)
     unused: dict[str, dict[str, Any]] = {
         "nvdiffrast": {},
         "nvdiffrast.torch": context,
@@ -80,13 +81,7 @@ class LocalPaths:
 
     def exists(self, path: Any) -> bool:
         """Whether there is such a file."""
-        import os
-
         return os.path.exists(path)
-
-
-class _Nothing:
-    """A class that can only be constructed."""
 
 
 def _module(name: str, content: Mapping[str, Any] | None = None) -> None:
@@ -120,17 +115,8 @@ def _on_cpu(value: Any) -> Any:
     return "cpu" if isinstance(value, str | torch.device) and str(value).startswith("cuda") else value
 
 
-class _Event:
+class _Event(blendshapes.Ignoring):
     """A CUDA event that measures nothing."""
-
-    def __init__(self, *arguments: Any, **options: Any):
-        pass
-
-    def record(self, *arguments: Any) -> None:
-        pass
-
-    def synchronize(self) -> None:
-        pass
 
     def elapsed_time(self, other: Any) -> float:
         return 0.0
