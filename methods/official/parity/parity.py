@@ -126,9 +126,8 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
         "iterations": settings.iterations,
         "settings": {name: config.settings[name] for name in config.methods},
         "differences": [
-            {**asdict(each), "equivalence_p": each.equivalence_p(settings.tolerance)}
-            if each.metric == "psnr"
-            else asdict(each)
+            asdict(each)
+            | ({"equivalence_p": each.equivalence_p(settings.tolerance)} if each.metric == "psnr" else {})
             for each in differences
         ],
         "avatars": cells,
@@ -204,9 +203,9 @@ def differences_of(rows: Rows, native: str, official: str, orders: Sequence[int]
             if not both:
                 continue
             apart = [of_official[pair] - of_native[pair] for pair in both]
-            values = [tuple(of[pair] for pair in both) for of in (of_native, of_official)]
+            ours, theirs = (tuple(of[pair] for pair in both) for of in (of_native, of_official))
             found.append(
-                Difference(task, metric, tuple(both), values[0], values[1], fmean(apart), _half_width(apart))
+                Difference(task, metric, tuple(both), ours, theirs, fmean(apart), _half_width(apart))
             )
     return found
 
@@ -294,17 +293,9 @@ def _text(
         _table(differences, native, official, markdown=markdown),
         *_equivalence(differences, settings.tolerance),
     ]
-    splats = [
-        f"{name}: " + ", ".join(str(cell["splats"] or "?") for cell in cells[name])
-        for name in (native, official)
-    ]
-    lines += [
-        "",
-        "Splats by subject and order: " + "; ".join(splats) + ".",
-        "",
-        "Known causes of differences:",
-        "",
-    ]
+    counts = {name: ", ".join(str(cell["splats"] or "?") for cell in of) for name, of in cells.items()}
+    splats = "; ".join(f"{name}: {count}" for name, count in counts.items())
+    lines += ["", f"Splats by subject and order: {splats}.", "", "Known causes of differences:", ""]
     lines += [f"- {cause}" for cause in causes]
     if rows.failed:
         lines += ["", f"Failed: {', '.join(rows.failed)}; see run/tables/comparison.md for the reasons."]
