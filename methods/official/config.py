@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
+
+
+def option_words(options: Mapping[str, Any]) -> list[str]:
+    """Options and their values as words of a command."""
+    return [str(word) for pair in options.items() for word in pair]
 
 
 @dataclass(frozen=True)

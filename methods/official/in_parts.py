@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from ...bench.io.files import read_bytes, write_bytes, write_json
-from .checkout import Checkout
+from ...bench.contracts import Frame
 from .config import OfficialConfig
-from .method import Listed, OfficialMethod, Workplace
+from .method import OfficialMethod
+from .video import read_covered
+from .workplace import Listed, Workplace, write_launcher
 
-PLAN, LAUNCHER = "parts.json", Path(__file__).with_name("parts.py")
-RENDERS = "renders"
-MOST_LAUNCHER = 1 << 16
-_DRAWN = re.compile(r"^headbench: drawn (\d+)")
+LAUNCHER = Path(__file__).with_name("parts.py")
 
 Config = TypeVar("Config", bound=OfficialConfig)
 
@@ -42,36 +39,27 @@ class RenderCall:
     command: list[str]
     numbers: list[int]
     renders: str
-    cameras: list[str]
+    cameras: list[str] = field(default_factory=list)
 
 
 class PartsMethod(OfficialMethod[Config]):
     """Renders a list by the launcher `parts`, which gives each render the number of its frame."""
 
-    def write_calls(self, folder: Path, calls: Sequence[RenderCall], drawn: str, work: Workplace) -> None:
-        """Write the launcher and its plan; ``drawn`` is a regular expression for the frames done in their output."""
-        renders = self.render_folder(folder, work)
+    frame_line = r"^headbench: drawn (\d+)"
+
+    def command_of(self, calls: Sequence[RenderCall], drawn: str, work: Workplace) -> list[str]:
+        """Write the launcher and its plan; return its command, for headbench's interpreter.
+
+        ``drawn`` is a regular expression for the frames done in the output of the calls.
+        """
+        renders = work.model / self.render_folder
         renders.mkdir(parents=True)
         plan = {"drawn": drawn, "renders": str(renders), "parts": [asdict(call) for call in calls]}
-        write_json(work.root / PLAN, plan)
-        write_bytes(work.root / LAUNCHER.name, read_bytes(LAUNCHER, "the launcher", MOST_LAUNCHER))
+        return [sys.executable, *write_launcher(LAUNCHER, plan, work)]
 
-    def render_command(self, folder: Path, checkout: Checkout, work: Workplace) -> list[str]:
-        """The launcher with the plan of the list, run by headbench's interpreter."""
-        return [sys.executable, str(work.root / LAUNCHER.name), str(work.root / PLAN)]
-
-    def drawn(self, line: str) -> int | None:
-        """From the launcher."""
-        match = _DRAWN.search(line)
-        return None if match is None else int(match[1])
-
-    def render_folder(self, folder: Path, work: Workplace) -> Path:
-        """Output folder of the launcher."""
-        return work.model / RENDERS
-
-    def render_name(self, number: int) -> str:
-        """Render by the number of the frame in the list."""
-        return f"{number:06d}.png"
+    def read_back(self, frame: Listed, path: Path, background: Sequence[float], work: Workplace) -> Frame:
+        """A render on black, composited on the background by its coverage."""
+        return read_covered(frame, path, background)
 
 
 def same_intrinsics(frame: Listed) -> Hashable:

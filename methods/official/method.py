@@ -3,42 +3,25 @@ key."""
 
 from __future__ import annotations
 
-import fcntl
-import os
-import shutil
+import re
 import time
 from abc import ABC, abstractmethod
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, ClassVar, Generic, Literal, TypeVar
 
-import numpy as np
-
-from ...bench.contracts import (
-    Budget,
-    Camera,
-    Clip,
-    FloatArray,
-    Frame,
-    FrameKey,
-    HeadAsset,
-    HeadPose,
-    Progress,
-)
+from ...bench.contracts import Budget, Camera, Clip, Frame, FrameKey, HeadAsset, HeadPose, Progress
 from ...bench.errors import InputError, UnavailableError
 from ...bench.io.documents import read_json
-from ...bench.io.files import check_output_folder, digest_file, write_json
-from ...bench.io.images import probe_image
+from ...bench.io.files import digest_file, write_json
 from ...bench.process import ProgramEnd, described, run_program
-from ...datasets.images import write_image
 from ..shared.avatar_files import (
     HEAD_FILE,
     SUBJECT_FILE,
     Subject,
     is_finished,
+    read_shared_head,
+    read_subject,
     run_digest,
     save_shared_head,
     write_record,
@@ -49,66 +32,26 @@ from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import threads
 from .checkout import Checkout, Environment, Repository, inspect_checkout, inspect_interpreter
 from .config import OfficialConfig
+from .workplace import (
+    LOCK,
+    Listed,
+    Patch,
+    Workplace,
+    alone,
+    as_recorded,
+    check_export,
+    exported_files,
+    remove,
+    write_launcher,
+)
 
 TRAINING, RENDERING = "training", "rendering"
 """Temporary folders inside the avatar's, for training and for rendering."""
 TRAINING_LOG, RENDERING_LOG = "training.log", "rendering.log"
-EXPORTED = "exported.json"
-PLAN, LAUNCHER = "plan.json", Path(__file__).parent / "shim" / "launch.py"
-
-Patch = tuple[str, str, str]
-"""A source file of theirs, a text in it, and its replacement when the file is run."""
-
-INDEX = "index.json"
+EXPORTED, INDEX = "exported.json", "index.json"
+LAUNCHER = Path(__file__).parent / "shim" / "launch.py"
 
 Config = TypeVar("Config", bound=OfficialConfig)
-
-
-@dataclass(frozen=True)
-class Workplace:
-    """Folders of one call of the authors' program.
-
-    Attributes
-    ----------
-    input : Path
-        The capture in the repository's own format.
-    program : Path
-        The program's working directory, with the files that it expects; the checkout is not modified.
-    """
-
-    root: Path
-
-    @classmethod
-    def at(cls, root: Path) -> Workplace:
-        """The input folder as an absolute path, since the program has another working directory."""
-        return cls(root.absolute())
-
-    @property
-    def input(self) -> Path:
-        return self.root / "input"
-
-    @property
-    def program(self) -> Path:
-        return self.root / "program"
-
-    @property
-    def model(self) -> Path:
-        return self.root / "model"
-
-    def make(self) -> None:
-        """Make the folders."""
-        for folder in (self.input, self.program, self.model):
-            folder.mkdir(parents=True, exist_ok=True)
-
-
-@dataclass(frozen=True)
-class Listed:
-    """A frame to render: its number in the program's list, its key, camera and pose."""
-
-    number: int
-    key: FrameKey
-    camera: Camera
-    pose: HeadPose
 
 
 class OfficialMethod(ABC, Generic[Config]):
@@ -126,6 +69,24 @@ class OfficialMethod(ABC, Generic[Config]):
     """Kind of code for `shim`; "" if it does not support the repository."""
     variables: ClassVar[Mapping[str, str]] = {}
     """Environment variables of the authors' programs besides `process.environment`."""
+    changes: ClassVar[tuple[Patch, ...]] = ()
+    """Texts in their sources that every training replaces in memory, for what no option of theirs allows."""
+    order_changes: ClassVar[tuple[Patch, ...]] = ()
+    """Texts replaced for a given order of the images, in code that draws images without a loader."""
+    iteration_line: ClassVar[str]
+    """Regular expression of a line of their training: iterations done and, if it has them, the loss."""
+    frame_line: ClassVar[str]
+    """Regular expression of a line of their renderer: frames drawn."""
+    avatar_files: ClassVar[tuple[str, ...]]
+    """The subject's files that rendering needs."""
+    render_folder: ClassVar[str] = "renders"
+    """Folder of the renders inside the one of the model."""
+    render_name: ClassVar[str] = "{:06d}.png"
+    """File name of a render by its number in the list, according to the repository."""
+    render_files: ClassVar[str] = "*"
+    """Pattern of the names of renders, since the program may write other files into their folder."""
+    excused: ClassVar[str] = ""
+    """Regular expression of a line of a renderer that failed after all frames were rendered; "" for none."""
 
     def __init__(self, config: Config | None = None):
         self.config: Config = config or self.config_class()
@@ -140,83 +101,38 @@ class OfficialMethod(ABC, Generic[Config]):
         """Raise `InputError` for a length of the run that the repository's code does not support."""
 
     @abstractmethod
-    def export(
-        self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
-    ) -> dict[str, FrameKey]:
+    def export(self, clip: Clip, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
         """Write the training frames in the repository's format; return the key of every image, by path in the input."""
 
     @abstractmethod
-    def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
+    def train_command(self, fit: Fit, work: Workplace) -> list[str]:
         """The training command."""
 
-    def shrink_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str] | None:
+    def shrink_command(self, fit: Fit, work: Workplace) -> list[str] | None:
         """A command, run after training, that removes data from its output that rendering never reads."""
         return None
 
-    @abstractmethod
     def done(self, line: str) -> tuple[int, str] | None:
         """Iterations done and a short status, if a line of the training's output has them."""
+        match = re.search(self.iteration_line, line)
+        return None if match is None else (int(match[1]), f"loss {match[2]}" if match.lastindex == 2 else "")
 
     @abstractmethod
-    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
-        """Move the output needed for rendering into the avatar's folder; return entries for the record.
-
-        Subject and head model are written beside it.
-        """
+    def keep(self, fit: Fit, work: Workplace) -> None:
+        """Move the output needed for rendering into the avatar's folder; subject and head model are written beside it."""
 
     @abstractmethod
-    def files(self, folder: Path) -> list[Path]:
-        """The subject's files that rendering needs."""
-
-    def shared_files(self, folder: Path) -> list[Path]:
-        """The head model."""
-        return [folder / HEAD_FILE]
+    def render_command(
+        self, folder: Path, frames: Sequence[Listed], background: Sequence[float], work: Workplace
+    ) -> list[str]:
+        """Write the frames to render, in order, in the repository's format; return the command that renders them."""
 
     @abstractmethod
-    def write_list(
-        self,
-        folder: Path,
-        frames: Sequence[Listed],
-        background: Sequence[float],
-        checkout: Checkout,
-        work: Workplace,
-    ) -> None:
-        """Write the frames to render, in order, in the repository's format."""
-
-    @abstractmethod
-    def render_command(self, folder: Path, checkout: Checkout, work: Workplace) -> list[str]:
-        """The render command."""
-
-    @abstractmethod
-    def drawn(self, line: str) -> int | None:
-        """Frames drawn, if a line of the renderer's output has their number."""
-
-    @abstractmethod
-    def render_folder(self, folder: Path, work: Workplace) -> Path:
-        """Folder of the renders."""
-
-    @abstractmethod
-    def render_name(self, number: int) -> str:
-        """File name of a render by its number in the list, according to the repository."""
-
-    def is_render(self, name: str) -> bool:
-        """Whether a file in the folder of the renders is one of them, since the program may write other files there."""
-        return True
-
-    @abstractmethod
-    def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
+    def read_back(self, frame: Listed, path: Path, background: Sequence[float], work: Workplace) -> Frame:
         """A render for its camera. Raises `InputError` for a render of another size or frame."""
 
-    def excused(self, ended: ProgramEnd) -> bool:
-        """Whether a failed renderer failed after all frames were rendered."""
-        return False
-
-    def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """For the record: ``leaks`` of held-out data, and ``differences`` from the published code."""
-        return {"leaks": [], "differences": []}
-
-    def changes(self) -> list[Patch]:
-        """Texts in their sources that every training replaces in memory, for what no option of theirs allows."""
+    def differences(self, clip: Clip, seed: int) -> list[str]:
+        """Differences from the published code, for the record."""
         return []
 
     def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
@@ -225,10 +141,6 @@ class OfficialMethod(ABC, Generic[Config]):
 
     def patches_to_render(self, folder: Path, checkout: Checkout) -> list[Patch]:
         """The same for rendering an avatar."""
-        return []
-
-    def patches_for_order(self) -> list[Patch]:
-        """Texts replaced for a given order of the images, in code that draws images without a loader."""
         return []
 
     def image_name(self, path: str) -> str:
@@ -245,14 +157,8 @@ class OfficialMethod(ABC, Generic[Config]):
                 expected = f"{only}; the shim does not support this code"
                 raise InputError(f"settings.{self.name}", name, expected, value)
 
-    def _launched(
-        self,
-        command: Sequence[str],
-        checkout: Checkout,
-        work: Workplace,
-        *,
-        patches: Sequence[Patch],
-        order: Sequence[str] = (),
+    def launched(
+        self, command: Sequence[str], work: Workplace, patches: Sequence[Patch], order: Sequence[str] = ()
     ) -> list[str]:
         """A command of theirs, run by the launcher if its sources have to be changed."""
         shim = self.config.device != "cuda"
@@ -264,10 +170,8 @@ class OfficialMethod(ABC, Generic[Config]):
             "patches": list(patches),
             "order": list(order),
         }
-        write_json(work.root / PLAN, plan)
-        shutil.copyfile(LAUNCHER, work.root / LAUNCHER.name)
-        python, script = command[: len(checkout.python)], command[len(checkout.python) :]
-        return [*python, str(work.root / LAUNCHER.name), str(work.root / PLAN), *script]
+        count = len(work.checkout.python)
+        return [*command[:count], *write_launcher(LAUNCHER, plan, work), *command[count:]]
 
     def _order(self, fit: Fit, work: Workplace) -> list[str]:
         """Names of the images in the order of the native method with this seed, one for each iteration; empty for their order."""
@@ -289,6 +193,12 @@ class OfficialMethod(ABC, Generic[Config]):
         if self.config.order == "native":
             differences.append("images in the order in which the native method draws them with this seed")
         return differences + [f"{file}: {old!r} read as {new!r}" for file, old, new in patches]
+
+    def repeated(self, seed: int) -> list[str]:
+        """A sentence for the record of code that fixes its seed."""
+        if not seed or self.config.order != "published":
+            return []
+        return [f"their code fixes the seed at 0; seed {seed} is a repetition, not another start"]
 
     def inspect(self) -> Checkout:
         """Check the settings; see `checkout.inspect_checkout`."""
@@ -328,10 +238,10 @@ class OfficialMethod(ABC, Generic[Config]):
         """
         run = run_digest(self.name, self.version, self.config, clip, budget, seed)
         if not is_finished(out, run):
-            checkout = self._checked(clip, budget)
-            with _alone(out / TRAINING) as held:
-                self._train(Fit(clip, out, budget, self.config.device, seed, progress, run), checkout, held)
-        _remove(out / TRAINING)
+            work = Workplace.at(out / TRAINING, self._checked(clip, budget))
+            with alone(out / TRAINING) as held:
+                self._train(Fit(clip, out, budget, self.config.device, seed, progress, run), work, held)
+        remove(out / TRAINING)
         return self.load(out, device=device)
 
     def load(self, path: Path, *, device: str) -> OfficialAvatar:
@@ -342,12 +252,31 @@ class OfficialMethod(ABC, Generic[Config]):
                 raise InputError(file, "", f"a file of an avatar of {self.name}", "no such file")
         return avatar
 
-    def _train(self, fit: Fit, checkout: Checkout, held: IO[str]) -> None:
-        work, start = Workplace.at(fit.out / TRAINING), time.monotonic()
+    def run(
+        self,
+        command: Sequence[str],
+        work: Workplace,
+        log: Path,
+        on_line: Callable[[str], None],
+        held: IO[str],
+    ) -> ProgramEnd:
+        """Run a command of theirs in the program's folder; see `process.run_program`."""
+        return run_program(
+            command,
+            work.program,
+            log,
+            on_line,
+            variables=self.variables,
+            held=held,
+            hours=self.config.time_limit_hours,
+        )
+
+    def _train(self, fit: Fit, work: Workplace, held: IO[str]) -> None:
+        start, checkout = time.monotonic(), work.checkout
         frames, iterations = len(fit.clip.splits["train"]), fit.budget.iterations or 0
-        self._export(fit, checkout, work)
-        command = self.train_command(fit, checkout, work)
-        _remove(work.model)
+        self._export(fit, work)
+        command = self.train_command(fit, work)
+        remove(work.model)
         work.make()
 
         def on_line(line: str) -> None:
@@ -356,34 +285,20 @@ class OfficialMethod(ABC, Generic[Config]):
                 fit.progress(frames + min(found[0], iterations), frames + iterations, found[1])
 
         shim = self.config.device != "cuda"
-        patches = self.changes() + (self.patches(fit.clip.head, iterations, checkout) if shim else [])
-        patches += self.patches_for_order() if self.config.order == "native" else []
-        command = self._launched(
-            [*command, *self.config.arguments],
-            checkout,
-            work,
-            patches=patches,
-            order=self._order(fit, work),
-        )
-        shrinking = self.shrink_command(fit, checkout, work)
+        patches = [*self.changes, *(self.patches(fit.clip.head, iterations, checkout) if shim else ())]
+        patches += self.order_changes if self.config.order == "native" else ()
+        command = self.launched([*command, *self.config.arguments], work, patches, self._order(fit, work))
+        shrinking = self.shrink_command(fit, work)
         commands = [(command, f"The training command of {checkout.folder}")]
         commands += [] if shrinking is None else [(shrinking, "Leaving the optimiser out of its output")]
         ends = []
         for each, what in commands:
-            ended = run_program(
-                each,
-                work.program,
-                fit.out / TRAINING_LOG,
-                on_line,
-                variables=self.variables,
-                held=held,
-                hours=self.config.time_limit_hours,
-            )
+            ended = self.run(each, work, fit.out / TRAINING_LOG, on_line, held)
             if ended.code:
                 raise ended.error(f"{what} {described(ended.code)}")
             ends.append(ended)
         try:
-            kept = self.keep(fit, work)
+            self.keep(fit, work)
             write_subject(fit.out / SUBJECT_FILE, Subject.of(fit.clip))
             save_shared_head(fit.out, fit.clip.head)
         except (InputError, OSError) as error:
@@ -396,12 +311,11 @@ class OfficialMethod(ABC, Generic[Config]):
             "device": self.config.device,
             "arguments": list(self.config.arguments),
         }
-        remarks = self.remarks(fit.clip, fit.seed)
-        remarks["differences"] += self._of_launch(patches)
-        recorded = {**remarks, "official": official, **kept}
-        write_record(fit, TrainingSummary(iterations, iterations, time.monotonic() - start), **recorded)
+        differences = self.differences(fit.clip, fit.seed) + self._of_launch(patches)
+        summary = TrainingSummary(iterations, iterations, time.monotonic() - start)
+        write_record(fit, summary, leaks=[], differences=differences, official=official)
 
-    def _export(self, fit: Fit, checkout: Checkout, work: Workplace) -> None:
+    def _export(self, fit: Fit, work: Workplace) -> None:
         """Write the program's input, or reuse that of an earlier call if it is complete; then compare it with the
         training split."""
         record = work.root / EXPORTED
@@ -410,13 +324,13 @@ class OfficialMethod(ABC, Generic[Config]):
         def exporting(done: int, total: int, note: str = "") -> None:
             fit.progress(done, steps, note or "exporting")
 
-        if not (record.exists() and read_json(record).get("run") == fit.run and _as_recorded(record, work)):
+        if not (record.exists() and read_json(record).get("run") == fit.run and as_recorded(record, work)):
             for folder in (work.input, work.program, work.model):
-                _remove(folder)
+                remove(folder)
             record.unlink(missing_ok=True)
             work.make()
-            images = self.export(fit.clip, checkout, work, exporting)
-            digests = {path: digest_file(work.root / path) for path in _files(work)}
+            images = self.export(fit.clip, work, exporting)
+            digests = {path: digest_file(work.root / path) for path in exported_files(work)}
             named = {path: list(key) for path, key in images.items()}
             write_json(record, {"run": fit.run, "images": named, "files": digests})
         check_export(work, {p: FrameKey(*key) for p, key in read_json(record)["images"].items()}, fit.clip)
@@ -430,11 +344,11 @@ class OfficialAvatar:
 
     def files(self) -> Sequence[Path]:
         """Files of the subject that the authors' program needs for rendering, without the driving signal."""
-        return self._method.files(self._folder)
+        return [self._folder / name for name in self._method.avatar_files]
 
     def shared_files(self) -> Sequence[Path]:
-        """Further files, the same for every subject, without the checkout."""
-        return self._method.shared_files(self._folder)
+        """The head model: the same for every subject, without the checkout."""
+        return [self._folder / HEAD_FILE]
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """Single frames are not supported: raises `UnavailableError`, see `ListedFrames`."""
@@ -451,49 +365,41 @@ class OfficialAvatar:
     ) -> Iterator[tuple[FrameKey, Frame]]:
         """Render frames by the authors' program; yield each with its key. See `ListedFrames`."""
         method, folder = self._method, self._folder
-        checkout = method.inspect()
         frames = [Listed(number, key, *view) for number, (key, view) in enumerate(views.items())]
-        work = Workplace.at(folder / RENDERING)
-        with _alone(work.root) as held:
-            _remove(work.root, but=_LOCK)
+        work = Workplace.at(folder / RENDERING, method.inspect())
+        with alone(work.root) as held:
+            remove(work.root, but=LOCK)
             work.make()
-            write_json(work.root / INDEX, {method.render_name(f.number): list(f.key) for f in frames})
-            method.write_list(folder, frames, background, checkout, work)
+            write_json(work.root / INDEX, {method.render_name.format(f.number): list(f.key) for f in frames})
+            command = method.render_command(folder, frames, background, work)
 
             def on_line(line: str) -> None:
-                drawn = method.drawn(line)
+                drawn = re.search(method.frame_line, line)
                 if drawn is not None:
-                    progress(min(drawn, len(frames)), len(frames))
+                    progress(min(int(drawn[1]), len(frames)), len(frames))
 
-            command = method._launched(
-                method.render_command(folder, checkout, work),
-                checkout,
-                work,
-                patches=method.patches_to_render(folder, checkout) if method.config.device != "cuda" else [],
-            )
-            ended = run_program(
-                command,
-                work.program,
-                folder / RENDERING_LOG,
-                on_line,
-                variables=method.variables,
-                held=held,
-                hours=method.config.time_limit_hours,
-            )
-            if ended.code and not method.excused(ended):
-                raise ended.error(f"The render command of {checkout.folder} {described(ended.code)}")
-            yield from _read_back(method, folder, frames, work, ended)
-        _remove(work.root)
+            shim = method.config.device != "cuda"
+            patches = method.patches_to_render(folder, work.checkout) if shim else []
+            command = method.launched(command, work, patches)
+            ended = method.run(command, work, folder / RENDERING_LOG, on_line, held)
+            excused = method.excused and any(re.search(method.excused, line) for line in ended.lines)
+            if ended.code and not excused:
+                raise ended.error(f"The render command of {work.checkout.folder} {described(ended.code)}")
+            yield from _read_back(method, frames, background, work, ended)
+        remove(work.root)
 
 
 def _read_back(
-    method: OfficialMethod[Any], folder: Path, frames: Sequence[Listed], work: Workplace, ended: ProgramEnd
+    method: OfficialMethod[Any],
+    frames: Sequence[Listed],
+    background: Sequence[float],
+    work: Workplace,
+    ended: ProgramEnd,
 ) -> Iterator[tuple[FrameKey, Frame]]:
     """Renders by the names of the index. Raises `InputError` unless these and no others exist."""
-    renders = method.render_folder(folder, work)
+    renders = work.model / method.render_folder
     index = {name: FrameKey(*key) for name, key in read_json(work.root / INDEX).items()}
-    found = {path.name for path in renders.iterdir()} if renders.is_dir() else set()
-    found = {name for name in found if method.is_render(name)}
+    found = {path.name for path in renders.glob(method.render_files)}
     for what, names in (("lacks", index.keys() - found), ("has besides", found - index.keys())):
         if names:
             first = min(names)
@@ -502,109 +408,13 @@ def _read_back(
     by_key = {frame.key: frame for frame in frames}
     for name, key in index.items():
         try:
-            frame = method.read_back(by_key[key], renders / name, work)
+            frame = method.read_back(by_key[key], renders / name, background, work)
         except InputError as error:
             raise ended.error(str(error)) from error
         yield key, frame
 
 
-def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) -> None:
-    """Verify that the program gets only training frames.
-
-    Every image in the program's folders is one that was exported for a training key, each equally often, or a
-    placeholder, which has a single pixel and shows no frame. `clip` gives no pixels of other frames
-    (`headbench.bench.engine.guard.TrainingView`), so that none can have such a name.
-
-    Raises `InputError` for an image of another frame, one that was not exported, and a missing one.
-    """
-    allowed = frozenset(clip.splits["train"])
-    for path, key in images.items():
-        if key not in allowed:
-            raise InputError(work.root / path, str(key), "a training frame", "a held-out one")
-    if len(set(Counter(images.values()).values())) > 1:
-        expected, found = "as many images of each training frame", "different numbers"
-        raise InputError(work.root, "images", expected, found)
-    there = {path for path in _files(work) if Path(path).suffix.lower() in _IMAGES}
-    there -= {path for path in there - images.keys() if _is_placeholder(work.root / path)}
-    for what, names in (
-        ("an exported image", images.keys() - there),
-        ("exported images alone", there - images.keys()),
-    ):
-        if names:
-            raise InputError(
-                work.root / min(names), "", what, "none" if what.startswith("an ") else "another image"
-            )
-
-
-def write_placeholder(path: Path) -> None:
-    """Write a placeholder for an image that a loader requires: one pixel, black and transparent."""
-    write_image(path, np.zeros((1, 1, 4), np.uint8))
-
-
-def _is_placeholder(path: Path) -> bool:
-    if path.suffix != ".png" or path.is_symlink():
-        return False
-    info = probe_image(path)
-    return (info.width, info.height) == (1, 1)
-
-
-_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".mp4", ".avi", ".mkv")
-_LOCK = "program.lock"
-
-
-def _files(work: Workplace) -> list[str]:
-    """Files of the program's input and working directory, by path."""
-    folders = (work.input, work.program)
-    found = (path for folder in folders for path in folder.rglob("*") if path.is_file() or path.is_symlink())
-    return sorted(path.relative_to(work.root).as_posix() for path in found)
-
-
-def _as_recorded(record: Path, work: Workplace) -> bool:
-    """Whether all exported files exist unchanged."""
-    files = read_json(record).get("files", {})
-    return files.keys() <= set(_files(work)) and all(
-        digest_file(work.root / path) == known for path, known in files.items()
-    )
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[IO[str]]:
-    """Make a folder and hold its lock; a program that inherits the lock keeps it if this process is killed.
-
-    Raises `InputError` if a program of an earlier call still runs.
-    """
-    check_output_folder(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / _LOCK).open("a+") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            stream.seek(0)
-            started = stream.read(200).strip()
-            remedy = "Wait until it ends, or terminate it."
-            found = f"one of an earlier call ({started})"
-            raise InputError(folder, "", "no running program", found, remedy) from None
-        stream.truncate(0)
-        stream.write(f"started by process {os.getpid()}")
-        stream.flush()
-        yield stream
-
-
-def _remove(folder: Path, but: str = "") -> None:
-    """Remove a folder, or everything in it except one name."""
-    if not but:
-        shutil.rmtree(folder, ignore_errors=True)
-        return
-    for path in folder.iterdir():
-        if path.name != but:
-            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
-
-
-def opaque(rgb: np.ndarray) -> Frame:
-    """A frame of an 8-bit image (H, W, 3) with unknown coverage."""
-    return opaque_colours(rgb.astype(np.float32) / 255)
-
-
-def opaque_colours(rgb: FloatArray) -> Frame:
-    """A frame of colours (H, W, 3) in [0, 1] with unknown coverage."""
-    return Frame(rgb, np.ones(rgb.shape[:2], np.float32))
+def read_identity(folder: Path) -> tuple[Subject, HeadAsset]:
+    """Subject and head model of an avatar."""
+    head = read_shared_head(folder)
+    return read_subject(folder / SUBJECT_FILE, head), head

@@ -18,43 +18,18 @@ from .method import OfficialMethod
 from .rgbavatar.method import RGBAvatarOfficial
 from .tga.method import TGAOfficial
 
-
-def ga(config: OfficialConfig, device: str) -> Iterator[Need]:
-    """Checkout and environment of GaussianAvatars."""
-    return _needs(GAOfficial, config)
-
-
-def tga(config: OfficialConfig, device: str) -> Iterator[Need]:
-    """Checkout and environment of the method of `ours`."""
-    return _needs(TGAOfficial, config)
+METHODS: dict[type[OfficialConfig], type[OfficialMethod[Any]]] = {
+    method.config_class: method
+    for method in (
+        *(FlashAvatarOfficial, GAOfficial, GBSOfficial, GHAOfficial),
+        *(INSTAOfficial, RGBAvatarOfficial, TGAOfficial),
+    )
+}
 
 
-def gbs(config: OfficialConfig, device: str) -> Iterator[Need]:
-    """Checkout and environment of GaussianBlendshapes."""
-    return _needs(GBSOfficial, config)
-
-
-def gha(config: OfficialConfig, device: str) -> Iterator[Need]:
-    """Checkout, its downloads, and environment of Gaussian Head Avatar."""
-    return _needs(GHAOfficial, config)
-
-
-def insta(config: OfficialConfig, device: str) -> Iterator[Need]:
-    """Checkout of INSTA, the program built in it, and a GPU."""
-    return _needs(INSTAOfficial, config)
-
-
-def rgbavatar(config: OfficialConfig, device: str) -> Iterator[Need]:
-    """Checkout and environment of RGBAvatar."""
-    return _needs(RGBAvatarOfficial, config)
-
-
-def flashavatar(config: OfficialConfig, device: str) -> Iterator[Need]:
-    """Checkout of FlashAvatar, and its environment with the weights of its perceptual loss."""
-    return _needs(FlashAvatarOfficial, config)
-
-
-def _needs(method: type[OfficialMethod[Any]], config: OfficialConfig) -> Iterator[Need]:
+def official(config: OfficialConfig, device: str) -> Iterator[Need]:
+    """Checkout of the authors' code with its downloads, and the environment or the program that runs it."""
+    method = METHODS[type(config)](config)
     try:
         folder, record = inspect_folder(method.name, config, method.repository)
     except InputError as error:
@@ -63,11 +38,10 @@ def _needs(method: type[OfficialMethod[Any]], config: OfficialConfig) -> Iterato
         changed = f", {len(record['changed'])} files changed" if record.get("changed") else ""
         yield Need("checkout", f"{folder}, {record['commit'][:12] or 'no commit'}{changed}")
     try:
-        _, versions = method(config).inspect_environment()
+        _, versions = method.inspect_environment()
     except InputError as error:
         yield Need("environment", "", str(error))
     else:
         known = {"python": "Python ", "torch": "torch "}
-        yield Need(
-            "environment", ", ".join(f"{known.get(name, '')}{value}" for name, value in versions.items())
-        )
+        found = (f"{known.get(name, '')}{value}" for name, value in versions.items())
+        yield Need("environment", ", ".join(found))

@@ -16,18 +16,39 @@ from ..insta.spec import INSTA
 from ..ours.spec import OURS
 from ..rgbavatar.spec import RGBAVATAR
 from ..shared.config import PAPER_ITERATIONS, SHORT_SPLATS
+from .config import option_words
 
 
-def _short_run() -> tuple[str, ...]:
-    """Learning rates of the native methods' short presets, as options of the authors' training script."""
-    rates: Mapping[str, Any] = {
-        "--position_lr_init": SHORT_SPLATS["position_lr"],
-        "--position_lr_final": SHORT_SPLATS["position_lr_final"],
-        "--scaling_lr": SHORT_SPLATS["scale_lr"],
-        "--rotation_lr": SHORT_SPLATS["rotation_lr"],
-        "--feature_lr": SHORT["sh_dc_lr"],
+def _short_rates(splats: Mapping[str, Any], colours: Mapping[str, Any]) -> tuple[str, ...]:
+    """Learning rates of a native method's short presets, as options of the authors' training script."""
+    rates = {
+        "--position_lr_init": splats["position_lr"],
+        "--position_lr_final": splats["position_lr_final"],
+        "--scaling_lr": splats["scale_lr"],
+        "--rotation_lr": splats["rotation_lr"],
+        "--feature_lr": colours["sh_dc_lr"],
     }
-    return tuple(str(word) for pair in rates.items() for word in pair)
+    return tuple(option_words(rates))
+
+
+def _lengths(**presets: int) -> dict[str, dict[str, Any]]:
+    """Presets with these numbers of iterations alone."""
+    return {name: {"budget": {"iterations": iterations}} for name, iterations in presets.items()}
+
+
+def _lengths_of(native: MethodSpec) -> dict[str, dict[str, Any]]:
+    """Presets with the budgets of the native method alone."""
+    return {name: {"budget": native.presets[name]["budget"]} for name in ("smoke", "demo", "fast", "paper")}
+
+
+def _paper_of(native: MethodSpec) -> dict[str, Any]:
+    """What the spec of the native method says of their paper, and what all official methods have in common."""
+    return {
+        "needs": "headbench.methods.official.needs:official",
+        "native": False,
+        "source": native.source,
+        "bibtex": native.bibtex,
+    }
 
 
 GA_OFFICIAL = MethodSpec(
@@ -35,17 +56,13 @@ GA_OFFICIAL = MethodSpec(
     summary="GaussianAvatars by its authors' code, in your checkout and environment; needs CUDA.",
     implementation="headbench.methods.official.ga.method:GAOfficial",
     config="headbench.methods.official.config:GAOfficialConfig",
-    needs="headbench.methods.official.needs:ga",
     renders="headbench.methods.official.renders:gaussian_avatars",
     presets={
-        "smoke": {"budget": {"iterations": 60}, "arguments": _short_run()},
-        "demo": {"budget": {"iterations": 2_000}, "arguments": _short_run()},
-        "fast": {"budget": {"iterations": 4_000}, "arguments": _short_run()},
-        "paper": {"budget": {"iterations": PAPER_ITERATIONS}},
-    },
-    native=False,
-    source="GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians, CVPR 2024, arXiv 2312.02069",
-    bibtex=GA.bibtex,
+        name: preset | {"arguments": _short_rates(SHORT_SPLATS, SHORT)}
+        for name, preset in _lengths(smoke=60, demo=2_000, fast=4_000).items()
+    }
+    | _lengths(paper=PAPER_ITERATIONS),
+    **_paper_of(GA),
 )
 
 TGA_OFFICIAL = MethodSpec(
@@ -53,50 +70,35 @@ TGA_OFFICIAL = MethodSpec(
     summary="The method ours by its authors' code, in your checkout and environment; needs CUDA.",
     implementation="headbench.methods.official.tga.method:TGAOfficial",
     config="headbench.methods.official.config:TGAOfficialConfig",
-    needs="headbench.methods.official.needs:tga",
     renders="headbench.methods.official.renders:gaussian_avatars",
     # Their feature lines start at a fixed iteration, so shorter runs do not train the method.
-    presets={"paper": {"budget": {"iterations": PAPER_ITERATIONS}}},
-    native=False,
-    source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
-    "CVPR 2025, arXiv 2504.14967",
-    bibtex=OURS.bibtex,
+    presets=_lengths(paper=PAPER_ITERATIONS),
+    **_paper_of(OURS),
 )
 
-
-def _short_blendshapes(samples: int) -> tuple[str, ...]:
-    """The same for GaussianBlendshapes, whose script has fewer options, and the initial number of splats."""
-    options: Mapping[str, Any] = {
-        "--position_lr_init": GBS_SHORT_SPLATS["position_lr"],
-        "--position_lr_final": GBS_SHORT_SPLATS["position_lr_final"],
-        "--scaling_lr": GBS_SHORT_SPLATS["scale_lr"],
-        "--rotation_lr": GBS_SHORT_SPLATS["rotation_lr"],
-        "--feature_lr": GBS_SHORT["sh_dc_lr"],
-        "--init_face_point_number": samples,
-    }
-    return tuple(str(word) for pair in options.items() for word in pair)
-
+_SAMPLES = "--init_face_point_number"
+"""Option of GaussianBlendshapes for the initial number of splats; its script has fewer options for learning rates."""
 
 GBS_OFFICIAL = MethodSpec(
     name="gbs-official",
     summary="GaussianBlendshapes by its authors' code, in your checkout and environment; needs CUDA.",
     implementation="headbench.methods.official.gbs.method:GBSOfficial",
     config="headbench.methods.official.config:GBSOfficialConfig",
-    needs="headbench.methods.official.needs:gbs",
     renders="headbench.methods.official.renders:gaussian_blendshapes",
-    presets={
+    presets=_lengths_of(GBS)
+    | {
         name: {
             "budget": GBS.presets[name]["budget"],
-            "arguments": _short_blendshapes(GBS.presets[name]["samples"]),
+            "arguments": (
+                *_short_rates(GBS_SHORT_SPLATS, GBS_SHORT),
+                *(_SAMPLES, str(GBS.presets[name]["samples"])),
+            ),
         }
         for name in ("smoke", "demo", "fast")
-    }
-    | {"paper": {"budget": GBS.presets["paper"]["budget"]}},
+    },
     head_models=GBS.head_models,
     monocular=True,
-    native=False,
-    source=GBS.source,
-    bibtex=GBS.bibtex,
+    **_paper_of(GBS),
 )
 
 GHA_OFFICIAL = MethodSpec(
@@ -104,15 +106,9 @@ GHA_OFFICIAL = MethodSpec(
     summary="Gaussian Head Avatar by its authors' code, in your checkout and environment; needs CUDA.",
     implementation="headbench.methods.official.gha.method:GHAOfficial",
     config="headbench.methods.official.config:GHAOfficialConfig",
-    needs="headbench.methods.official.needs:gha",
-    presets={
-        "smoke": {"budget": {"iterations": 60}},
-        "paper": {"budget": {"iterations": PAPER_ITERATIONS}},
-    },
+    presets=_lengths(smoke=60, paper=PAPER_ITERATIONS),
     preset_resolutions=GHA.preset_resolutions,
-    native=False,
-    source=GHA.source,
-    bibtex=GHA.bibtex,
+    **_paper_of(GHA),
 )
 
 INSTA_OFFICIAL = MethodSpec(
@@ -120,14 +116,11 @@ INSTA_OFFICIAL = MethodSpec(
     summary="INSTA by its authors' code, built in your checkout; needs CUDA.",
     implementation="headbench.methods.official.insta.method:INSTAOfficial",
     config="headbench.methods.official.config:INSTAOfficialConfig",
-    needs="headbench.methods.official.needs:insta",
     renders="headbench.methods.official.renders:insta",
     # Their settings have no schedule to shorten.
-    presets={name: {"budget": INSTA.presets[name]["budget"]} for name in ("smoke", "demo", "fast", "paper")},
+    presets=_lengths_of(INSTA),
     monocular=True,
-    native=False,
-    source=INSTA.source,
-    bibtex=INSTA.bibtex,
+    **_paper_of(INSTA),
 )
 
 RGBAVATAR_OFFICIAL = MethodSpec(
@@ -135,16 +128,11 @@ RGBAVATAR_OFFICIAL = MethodSpec(
     summary="RGBAvatar by its authors' code, in your checkout and environment; needs CUDA.",
     implementation="headbench.methods.official.rgbavatar.method:RGBAvatarOfficial",
     config="headbench.methods.official.config:RGBAvatarOfficialConfig",
-    needs="headbench.methods.official.needs:rgbavatar",
     # The published schedule, shortened; one iteration is a batch of ten images.
-    presets={
-        name: {"budget": RGBAVATAR.presets[name]["budget"]} for name in ("smoke", "demo", "fast", "paper")
-    },
+    presets=_lengths_of(RGBAVATAR),
     head_models=("flame2020",),
     monocular=True,
-    native=False,
-    source=RGBAVATAR.source,
-    bibtex=RGBAVATAR.bibtex,
+    **_paper_of(RGBAVATAR),
 )
 
 FLASHAVATAR_OFFICIAL = MethodSpec(
@@ -152,17 +140,10 @@ FLASHAVATAR_OFFICIAL = MethodSpec(
     summary="FlashAvatar by its authors' code, in your checkout and environment; needs CUDA.",
     implementation="headbench.methods.official.flashavatar.method:FlashAvatarOfficial",
     config="headbench.methods.official.config:FlashAvatarOfficialConfig",
-    needs="headbench.methods.official.needs:flashavatar",
     # The paper's number of iterations is not stated; "paper" is the default of their script.
-    presets={
-        "smoke": {"budget": {"iterations": 60}},
-        "demo": {"budget": {"iterations": 2_000}},
-        "fast": {"budget": {"iterations": 4_000}},
-        "paper": {"budget": FLASHAVATAR.presets["paper"]["budget"]},
-    },
+    presets=_lengths(smoke=60, demo=2_000, fast=4_000)
+    | {"paper": {"budget": FLASHAVATAR.presets["paper"]["budget"]}},
     head_models=("flame2020",),
     monocular=True,
-    native=False,
-    source=FLASHAVATAR.source,
-    bibtex=FLASHAVATAR.bibtex,
+    **_paper_of(FLASHAVATAR),
 )

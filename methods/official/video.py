@@ -4,7 +4,7 @@ Metrical Tracker."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,22 +25,18 @@ from ...bench.contracts import (
     Progress,
 )
 from ...bench.errors import InputError
-from ...bench.io.documents import read_json
-from ...bench.io.files import atomic_path, grouped_writes, write_json
+from ...bench.io.files import atomic_path, grouped_writes
 from ...bench.io.images import read_pixels
 from ...datasets.head.loaders import FLAME_IDENTITY_SIZE
-from ...datasets.head.subject import PosedSubject, camera_in_head_frame
+from ...datasets.head.subject import BATCH, PosedSubject, camera_in_head_frame
 from ...datasets.images import write_image
 from ...datasets.steps.masks import recomposite
 from ..shared.avatar_files import Subject
 from .ga.head_files import EXPRESSION_SIZE, ArrayPickler, OfficialHead, padded
-from .method import Listed, Workplace
+from .workplace import Listed
 
-BACKGROUND_FILE = "background.json"
 SAME_INTRINSICS = 0.05
 """Tolerance of focal lengths and principal points of one video, pixels."""
-
-Views = Sequence[tuple[Camera, HeadPose]]
 
 
 def check_masks(clip: Clip) -> None:
@@ -78,16 +74,21 @@ def six_numbers(turns: FloatArray) -> FloatArray:
     return np.asarray(matrices[:, :2].ravel(), np.float64)
 
 
-def cameras_at_rest(
-    subject: PosedSubject, views: Sequence[tuple[Camera, HeadPose]], size: int = 64
-) -> list[Camera]:
-    """The camera of each view relative to a head that does not move, and poses without rigid motion."""
-    cameras = []
-    for start in range(0, len(views), size):
-        part = views[start : start + size]
-        motions = subject.motions([pose for _, pose in part])
-        cameras += [camera_in_head_frame(camera, motion) for (camera, _), motion in zip(part, motions)]
-    return cameras
+def at_rest(posed: PosedSubject, frames: Sequence[Listed]) -> list[Listed]:
+    """Frames whose cameras are relative to a head that does not move; poses are as they were."""
+    found = []
+    for start in range(0, len(frames), BATCH):
+        part = frames[start : start + BATCH]
+        motions = posed.motions([frame.pose for frame in part])
+        found += [replace(f, camera=camera_in_head_frame(f.camera, m)) for f, m in zip(part, motions)]
+    return found
+
+
+def training_frames(clip: Clip, posed: PosedSubject) -> list[Listed]:
+    """Training frames in the order of the video, by timestep and camera, `at_rest`."""
+    keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
+    listed = [Listed(i, k, clip.cameras[k.camera], clip.poses[k.timestep]) for i, k in enumerate(keys)]
+    return at_rest(posed, listed)
 
 
 # ------------------------------------------------------------------ cameras
@@ -155,16 +156,6 @@ def frame_parts(**parts: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.nda
     }
 
 
-def sized_frame(subject: Subject, camera: Camera, pose: HeadPose) -> dict[str, Any]:
-    """A frame of RGBAvatar's and FlashAvatar's loaders, its camera in the head's frame.
-
-    Both read ``img_size`` as width and height. The tracker writes height and width, which is the same for the square
-    images that their authors use.
-    """
-    parts = frame_parts(flame=flame_values(subject, pose), opencv=opencv_values(camera))
-    return {**parts, "img_size": np.array([camera.width, camera.height])}
-
-
 @dataclass(frozen=True, eq=False)
 class FlameSubject:
     """A head model with FLAME's vertices and one identity, for loaders of tracked videos.
@@ -183,8 +174,13 @@ class FlameSubject:
 
     @classmethod
     def of(cls, head: HeadAsset, subject: Subject, vertices: int, file: Path) -> FlameSubject:
-        """See `OfficialHead.of_flame`."""
-        official = OfficialHead.of_flame(head, vertices, file)
+        """Raises `InputError` unless the head has as many vertices as ``file`` of the checkout, which is ``vertices``."""
+        official = OfficialHead.numbered(head)
+        if len(official.order) != vertices:
+            expected = f"{vertices} vertices, as {file} has, since their code needs FLAME's texture chart"
+            remedy = "Refit the capture to FLAME 2020 (headbench prepare refit)."
+            where = f"head model {head.version!r}"
+            raise InputError(where, "template", expected, str(len(official.order)), remedy)
         return cls(official, subject, PosedSubject(head, subject.shape, subject.static_offset))
 
     def model(self) -> dict[str, np.ndarray]:
@@ -192,8 +188,13 @@ class FlameSubject:
         return self.official.model(self.identity.static_offset)
 
     def frame(self, camera: Camera, pose: HeadPose) -> dict[str, Any]:
-        """Content of the file of a frame; see `sized_frame`."""
-        return sized_frame(self.identity, camera, pose)
+        """Content of the file of a frame, its camera in the head's frame.
+
+        RGBAvatar and FlashAvatar read ``img_size`` as width and height. The tracker writes height and width, which is
+        the same for the square images that their authors use.
+        """
+        parts = frame_parts(flame=flame_values(self.identity, pose), opencv=opencv_values(camera))
+        return {**parts, "img_size": np.array([camera.width, camera.height])}
 
 
 def write_torch(path: Path, content: Mapping[str, Any]) -> None:
@@ -208,50 +209,38 @@ class _ArrayPickles:
     Pickler = ArrayPickler
 
 
-def training_views(clip: Clip) -> tuple[list[FrameKey], Views]:
-    """Training frames in the order of the video, by timestep and camera, and their cameras and poses."""
-    keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
-    return keys, [(clip.cameras[key.camera], clip.poses[key.timestep]) for key in keys]
-
-
 def write_video(
     clip: Clip,
     posed: PosedSubject,
     folder: Path,
     frame: Callable[[Camera, HeadPose], Mapping[str, Any]],
     progress: Progress,
-) -> tuple[list[FrameKey], Mapping[str, Any]]:
+) -> tuple[dict[str, FrameKey], Mapping[str, Any]]:
     """Write images with straight alpha and parameters of the training frames, numbered from 0 without gaps.
 
-    ``frame`` makes the content of a file of a camera in the head's frame. Returns the frames in order and the content
-    of the first file.
+    ``frame`` makes the content of a file of a camera in the head's frame. Returns the key of every image, by path in
+    the folder, and the content of the first file.
     """
-    keys, views = training_views(clip)
-    cameras = cameras_at_rest(posed, views)
+    frames = training_frames(clip, posed)
     with grouped_writes():
-        for number, (key, camera, (_, pose)) in enumerate(zip(keys, cameras, views)):
-            write_image(folder / image_name(number), straight_rgba(clip, key))
-            write_torch(folder / frame_name(number), frame(camera, pose))
-            progress(number + 1, len(keys), "exporting")
-    return keys, frame(cameras[0], views[0][1])
+        for each in frames:
+            write_image(folder / image_name(each.number), straight_rgba(clip, each.key))
+            write_torch(folder / frame_name(each.number), frame(each.camera, each.pose))
+            progress(each.number + 1, len(frames), "exporting")
+    return {image_name(each.number): each.key for each in frames}, frame(frames[0].camera, frames[0].pose)
 
 
 # ------------------------------------------------------------------ renders with coverage
 
 
-def write_background(work: Workplace, background: Sequence[float]) -> None:
-    """Write the background of a list of frames, for `on_background`."""
-    write_json(work.root / BACKGROUND_FILE, {"background": [float(level) for level in background]})
-
-
-def on_background(rgb: FloatArray, alpha: FloatArray, work: Workplace) -> Frame:
-    """A frame of colours on black (H, W, 3) and coverage (H, W), on the background of the list."""
-    ground = np.array(read_json(work.root / BACKGROUND_FILE)["background"], np.float32)
+def on_background(rgb: FloatArray, alpha: FloatArray, background: Sequence[float]) -> Frame:
+    """A frame of colours on black (H, W, 3) and coverage (H, W), on a background."""
+    ground = np.array([float(level) for level in background], np.float32)
     return Frame(np.clip(rgb + (1 - alpha[..., None]) * ground, 0, 1), np.ascontiguousarray(alpha))
 
 
-def read_covered(frame: Listed, path: Path, work: Workplace) -> Frame:
-    """A render (RGBA) on black, on the background of the list.
+def read_covered(frame: Listed, path: Path, background: Sequence[float]) -> Frame:
+    """A render (RGBA) on black, on a background.
 
     Raises `InputError` for a file of another size or without coverage.
     """
@@ -259,4 +248,4 @@ def read_covered(frame: Listed, path: Path, work: Workplace) -> Frame:
     if pixels.ndim != 3 or pixels.shape[2] != 4:
         raise InputError(path, str(frame.key), "colours and coverage (RGBA)", f"shape {pixels.shape}")
     rgba = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA).astype(np.float32) / 255
-    return on_background(rgba[..., :3], rgba[..., 3], work)
+    return on_background(rgba[..., :3], rgba[..., 3], background)

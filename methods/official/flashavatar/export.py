@@ -8,7 +8,6 @@ takes identity, image size and focal lengths from frame 0, and the principal poi
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,18 +22,11 @@ from ...insta.warp import mouth_triangles, touching
 from ...shared.avatar_files import Subject
 from ..checkout import Checkout
 from ..ga.export import mark
-from ..ga.head_files import MOST_TEMPLATE, pickled
+from ..ga.head_files import MOST_TEMPLATE, pickled, read_obj
 from ..ga.windows import around, inside
-from ..method import Listed, Workplace
 from ..surface import VisibleMesh
-from ..video import (
-    FlameSubject,
-    cameras_at_rest,
-    frame_name,
-    straight_rgba,
-    training_views,
-    write_torch,
-)
+from ..video import FlameSubject, at_rest, frame_name, straight_rgba, training_frames, write_torch
+from ..workplace import Listed, Workplace
 
 SOURCES = (
     "*.py",
@@ -57,24 +49,27 @@ FULL = 255
 
 def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout) -> FlameSubject:
     """The head model and one identity. Raises `InputError` for another topology than FLAME's, and without regions."""
-    text = read_bytes(checkout.folder / MESH_FILE, "an OBJ file", MOST_TEMPLATE).decode(errors="replace")
-    vertices = len(re.findall(r"^v\s", text, re.MULTILINE))
+    vertices, _ = read_obj(checkout.folder / MESH_FILE)
     for name in (BOUNDARY, "lips"):
         region(head, name)
     return FlameSubject.of(head, subject, vertices, MESH_FILE)
 
 
-def write_program(subject: FlameSubject, checkout: Checkout, folder: Path) -> None:
-    """Write their program and the files that it opens relative to its working directory or beside itself."""
+def write_program(identity: Subject, head: HeadAsset, work: Workplace) -> FlameSubject:
+    """Write their program and the files that it opens relative to its working directory or beside itself.
+
+    Returns the identity on the head model; raises the errors of `flame_subject`.
+    """
+    checkout, folder = work.checkout, work.program
+    subject = flame_subject(identity, head, checkout)
     paths = [path for pattern in SOURCES for path in sorted(checkout.folder.glob(pattern))]
     for path in (*paths, *(checkout.folder / name for name in UNCHANGED)):
         content = read_bytes(path, "a file of the program", MOST_TEMPLATE)
         write_bytes(folder / path.relative_to(checkout.folder), content)
     write_bytes(folder / MODEL_FILE, pickled(subject.model()))
-    order = subject.official.order
-    boundary = np.flatnonzero(np.isin(order, subject.official.head.regions[BOUNDARY])).astype(np.int64)
-    write_bytes(folder / MASKS_FILE, pickled({BOUNDARY: boundary}))
+    write_bytes(folder / MASKS_FILE, pickled({BOUNDARY: subject.official.region(BOUNDARY)}))
     subject.official.write_eyelids(*(folder / name for name in EYELID_FILES))
+    return subject
 
 
 class ParsingMasks:
@@ -116,21 +111,22 @@ def write_training(
 
     Returns the key of every image by its path.
     """
-    keys, views = training_views(clip)
-    cameras = cameras_at_rest(subject.posed, views)
+    frames = training_frames(clip, subject.posed)
     masks = ParsingMasks(clip.head, subject)
     images: dict[str, FrameKey] = {}
     with grouped_writes():
-        for number, (key, camera, (_, pose)) in enumerate(zip(keys, cameras, views)):
-            window = inside(camera)
-            pixels = straight_rgba(clip, key)
-            head, mouth = masks.of(pose, camera, pixels[..., 3])
+        for frame in frames:
+            window = inside(frame.camera)
+            pixels = straight_rgba(clip, frame.key)
+            head, mouth = masks.of(frame.pose, frame.camera, pixels[..., 3])
             parts = (np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3]), head, mouth)
-            for place, image in zip(image_names(name, number), parts):
+            for place, image in zip(image_names(name, frame.number), parts):
                 write_png(work.program / place, window.cut(image))
-                images[f"program/{place}"] = key
-            write_torch(work.program / tracked_name(name, number), subject.frame(window.camera, pose))
-            progress(number + 1, len(keys), "exporting")
+                images[f"program/{place}"] = frame.key
+            write_torch(
+                work.program / tracked_name(name, frame.number), subject.frame(window.camera, frame.pose)
+            )
+            progress(frame.number + 1, len(frames), "exporting")
     return images
 
 
@@ -139,11 +135,10 @@ def write_list(frames: Sequence[Listed], subject: FlameSubject, name: str, work:
 
     Images are marks, see `..ga.export.mark`; the renderer writes each beside the render. Masks have one pixel.
     """
-    cameras = cameras_at_rest(subject.posed, [(frame.camera, frame.pose) for frame in frames])
     white, black = np.full((1, 1), FULL, np.uint8), np.zeros((1, 1), np.uint8)
     with grouped_writes():
-        for index, (frame, camera) in enumerate(zip(frames, cameras)):
-            window = around(camera).camera
+        for index, frame in enumerate(at_rest(subject.posed, frames)):
+            window = around(frame.camera).camera
             image = np.full((window.height, window.width, 3), mark(frame.number), np.uint8)
             for place, pixels in zip(image_names(name, index), (image, white, white, black)):
                 write_png(work.program / place, pixels)

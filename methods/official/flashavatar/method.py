@@ -5,30 +5,27 @@ Xiang et al., "FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Em
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
-import numpy as np
-
-from ....bench.contracts import Clip, FloatArray, Frame, FrameKey, Progress
+from ....bench.contracts import Clip, Frame, FrameKey, Progress
 from ....bench.errors import InputError
 from ....bench.io.documents import read_json
 from ....bench.io.files import write_json
-from ....bench.io.images import read_png
-from ...shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head, read_subject
+from ...shared.avatar_files import SUBJECT_FILE, Subject
 from ...shared.loop import Fit
 from ..checkout import Checkout, Repository
 from ..config import FlashAvatarOfficialConfig
-from ..ga.export import check_mark_in
+from ..ga.export import check_mark
 from ..ga.head_files import padding_remarks
-from ..ga.method import copy_file
-from ..ga.windows import around, check_square_pixels, inside
+from ..ga.windows import around, cameras_of, check_square_pixels, inside
 from ..in_parts import PartsMethod, RenderCall, in_parts, same_intrinsics
-from ..method import Listed, Patch, Workplace, opaque
+from ..method import read_identity
 from ..spec import FLASHAVATAR_OFFICIAL
 from ..video import check_masks, check_one_camera
+from ..workplace import Listed, Patch, Workplace, copy_file, is_white, opaque, read_sized
 from .export import EYELID_FILES, MESH_FILE, flame_subject, write_list, write_program, write_training
 
 NAME, LOG = "head", "log"
@@ -36,7 +33,6 @@ CHECKPOINT_FILE, OPTIONS_FILE = "chkpnt.pth", "options.json"
 LOADER = "scene/__init__.py"
 PART = 500
 """Maximum number of frames in one call, whose images are in the GPU's memory; as many as their test split has."""
-GREEN = (0.0, 1.0, 0.0)
 PICTURES: Patch = (
     "train.py",
     "np.zeros((args.image_res, args.image_res*2, 3))",
@@ -68,8 +64,8 @@ def lean(part):
 torch.save((tuple(map(lean, network)), tuple(map(lean, splats)), iteration), path)
 """
 """Removes the state of both optimisers, two thirds of the file, from a checkpoint, since rendering takes no step."""
-_DONE = re.compile(r"^step: (\d+), huber: ([\d.]+|nan|inf)")
 _DRAWN = r"drawn (\d+)"
+_white = partial(is_white, other=(0.0, 1.0, 0.0), known="white, or green (0, 1, 0)")
 
 FLASHAVATAR_REPOSITORY = Repository(
     "https://github.com/USTC3DV/FlashAvatar-code",
@@ -94,6 +90,9 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
 
     name, version = FLASHAVATAR_OFFICIAL.name, FLASHAVATAR_OFFICIAL.version
     config_class, repository = FlashAvatarOfficialConfig, FLASHAVATAR_REPOSITORY
+    changes = CHANGES
+    iteration_line = r"^step: (\d+), huber: ([\d.]+|nan|inf)"
+    avatar_files = (CHECKPOINT_FILE, OPTIONS_FILE, SUBJECT_FILE)
     # Frames and checkpoints contain more than tensors, which newer versions of torch read only if requested.
     variables: ClassVar[Mapping[str, str]] = {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}
 
@@ -104,27 +103,19 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
         check_masks(clip)
         _white(clip.background, where)
         check_one_camera(clip)
-        for name in sorted({key.camera for keys in clip.splits.values() for key in keys}):
-            check_square_pixels(clip.cameras[name], where)
+        for camera in cameras_of(clip).values():
+            check_square_pixels(camera, where)
         most = int(checkout.constant(LOADER, r"max_train_num = (\d+)", "max_train_num"))
         if len(clip.splits["train"]) > most:
             expected = f"at most {most} training frames, as many as their loader reads"
             raise InputError(where, "train", expected, f"{len(clip.splits['train'])}")
         flame_subject(Subject.of(clip), clip.head, checkout)
 
-    def export(
-        self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
-    ) -> dict[str, FrameKey]:
+    def export(self, clip: Clip, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
         """Write the training frames as an identity, and their program with the files that it opens."""
-        subject = flame_subject(Subject.of(clip), clip.head, checkout)
-        write_program(subject, checkout, work.program)
-        return write_training(clip, subject, NAME, work, progress)
+        return write_training(clip, write_program(Subject.of(clip), clip.head, work), NAME, work, progress)
 
-    def changes(self) -> list[Patch]:
-        """Their loader and their training, for images and runs of any size."""
-        return list(CHANGES)
-
-    def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
+    def train_command(self, fit: Fit, work: Workplace) -> list[str]:
         """Their script; its output folder inside the identity's is a link to ``model``."""
         link = work.program / "dataset" / NAME / LOG
         link.unlink(missing_ok=True)
@@ -133,36 +124,21 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
         options = ["--idname", NAME, "--image_res", str(camera.width), "--seed", str(fit.seed)]
         options += ["--iterations", str(fit.budget.iterations)]
         ground = _flags(_white(fit.clip.background, f"clip {fit.clip.subject}"))
-        return [*checkout.python, str(work.program / "train.py"), *options, *ground]
+        return [*work.checkout.python, str(work.program / "train.py"), *options, *ground]
 
-    def shrink_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str] | None:
+    def shrink_command(self, fit: Fit, work: Workplace) -> list[str] | None:
         """Run in their interpreter, on the device to which tensors are loaded."""
-        return [*checkout.python, "-c", SHRINK, str(_checkpoint(fit, work))]
+        return [*work.checkout.python, "-c", SHRINK, str(_checkpoint(fit, work))]
 
-    def done(self, line: str) -> tuple[int, str] | None:
-        """Parse the line that their training writes every 500 iterations."""
-        match = _DONE.search(line)
-        return None if match is None else (int(match[1]), f"loss {match[2]}")
-
-    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
+    def keep(self, fit: Fit, work: Workplace) -> None:
         """The checkpoint, and the background of the training, which their renderer needs as an option."""
         copy_file(_checkpoint(fit, work), fit.out / CHECKPOINT_FILE)
         white = _white(fit.clip.background, f"clip {fit.clip.subject}")
         write_json(fit.out / OPTIONS_FILE, {"white_background": white})
-        return {}
 
-    def files(self, folder: Path) -> list[Path]:
-        """Splats and network, background, and the subject."""
-        return [folder / name for name in (CHECKPOINT_FILE, OPTIONS_FILE, SUBJECT_FILE)]
-
-    def write_list(
-        self,
-        folder: Path,
-        frames: Sequence[Listed],
-        background: Sequence[float],
-        checkout: Checkout,
-        work: Workplace,
-    ) -> None:
+    def render_command(
+        self, folder: Path, frames: Sequence[Listed], background: Sequence[float], work: Workplace
+    ) -> list[str]:
         """Write the frames of each camera's intrinsics as an identity."""
         white = _white(background, "render")
         if white != bool(read_json(folder / OPTIONS_FILE).get("white_background")):
@@ -170,11 +146,9 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
             raise InputError(folder, "background", expected, str(tuple(background)))
         for frame in frames:
             check_square_pixels(frame.camera, "render")
-        head = read_shared_head(folder)
-        subject = flame_subject(read_subject(folder / SUBJECT_FILE, head), head, checkout)
-        write_program(subject, checkout, work.program)
-        script = [*checkout.python, str(work.program / "test.py")]
-        command = self._launched(script, checkout, work, patches=RENDERING_CHANGES)
+        subject = write_program(*read_identity(folder), work)
+        script = [*work.checkout.python, str(work.program / "test.py")]
+        command = self.launched(script, work, RENDERING_CHANGES)
         calls = []
         for index, part in enumerate(in_parts(frames, same_intrinsics, PART)):
             name = f"part_{index:04d}"
@@ -184,21 +158,19 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
             width = around(part[0].camera).camera.width
             options = ["--idname", name, "--image_res", str(width), *_flags(white)]
             options += ["--checkpoint", str((folder / CHECKPOINT_FILE).absolute())]
-            calls.append(RenderCall([*command, *options], [f.number for f in part], str(renders), []))
-        self.write_calls(folder, calls, _DRAWN, work)
+            calls.append(RenderCall([*command, *options], [f.number for f in part], str(renders)))
+        return self.command_of(calls, _DRAWN, work)
 
-    def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
+    def read_back(self, frame: Listed, path: Path, background: Sequence[float], work: Workplace) -> Frame:
         """A render, after its frame is verified by the image on its left."""
         window = around(frame.camera)
-        image, width, height = read_png(path), window.camera.width, window.camera.height
-        if image.shape[:2] != (height, 2 * width):
-            found = f"{image.shape[1]}x{image.shape[0]}"
-            raise InputError(path, str(frame.key), f"{2 * width}x{height} pixels", found)
-        check_mark_in(image[:, :width], path, frame.number)
+        width = window.camera.width
+        image = read_sized(path, frame, 2 * width, window.camera.height)
+        check_mark(image[:, :width], path, frame.number)
         return opaque(window.uncut(image[:, width:], frame.camera))
 
-    def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """Leaks and differences, for readers of results."""
+    def differences(self, clip: Clip, seed: int) -> list[str]:
+        """Of the export, the images, the head model and the schedule."""
         camera = check_one_camera(clip)
         window = inside(camera).camera
         differences = [
@@ -214,8 +186,7 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
             differences.append(
                 "their code assumes the principal point in the middle of the image: images are cropped accordingly"
             )
-        differences += padding_remarks(clip.head)
-        return {"leaks": [], "differences": differences}
+        return differences + padding_remarks(clip.head)
 
 
 def _checkpoint(fit: Fit, work: Workplace) -> Path:
@@ -224,12 +195,3 @@ def _checkpoint(fit: Fit, work: Workplace) -> Path:
 
 def _flags(white: bool) -> list[str]:
     return ["--white_background"] if white else []
-
-
-def _white(background: Sequence[float] | FloatArray, where: str) -> bool:
-    """Whether a background is white. Raises `InputError` for one that is neither white nor green."""
-    levels = tuple(float(value) for value in background)
-    if not any(np.array_equal(levels, known) for known in ((1.0, 1.0, 1.0), GREEN)):
-        expected = "white, or green (0, 1, 0), which the code supports"
-        raise InputError(where, "background", expected, str(levels))
-    return levels[0] == 1.0

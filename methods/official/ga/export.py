@@ -11,12 +11,12 @@ import numpy as np
 from ....bench.contracts import ByteArray, Camera, Clip, FrameKey, HeadPose, Progress
 from ....bench.errors import InputError
 from ....bench.io.files import grouped_writes, write_json
-from ....bench.io.images import read_png, write_png
+from ....bench.io.images import write_png
 from ....datasets.ga import layout
 from ....datasets.ga.writer import CANONICAL_JAW, camera_record, save_npz, transforms_document
-from ..method import Listed, Workplace
+from ..workplace import Listed, Workplace, read_sized
 from .head_files import OfficialTracking
-from .windows import Window, around, inside
+from .windows import Window, around, cameras_of, inside
 
 TRAIN, VALIDATION, TEST = layout.SPLIT_FILES.values()
 MARK_LEVELS, MARK_STEP = 16, 16
@@ -33,8 +33,8 @@ def write_training(
     """
     timesteps = sorted({key.timestep for key in clip.splits["train"]})
     number = {timestep: index for index, timestep in enumerate(timesteps)}
-    names = sorted({key.camera for key in clip.splits["train"]})
-    windows = {name: inside(clip.cameras[name]) for name in names}
+    windows = {name: inside(camera) for name, camera in cameras_of(clip, "train").items()}
+    names = list(windows)
     keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
     records, images = [], {}
     with grouped_writes():
@@ -83,13 +83,8 @@ def mark(number: int) -> ByteArray:
     return np.array([MARK_STEP * digit + MARK_STEP // 2 for digit in digits], np.uint8)
 
 
-def check_mark(path: Path, number: int) -> None:
-    """Raise `InputError` if a file is not the mark of a frame, so that another frame was rendered."""
-    check_mark_in(read_png(path), path, number)
-
-
-def check_mark_in(image: ByteArray, path: Path, number: int) -> None:
-    """Raise `InputError` if the pixels of a part of a file are not the mark of a frame; see `check_mark`."""
+def check_mark(image: ByteArray, path: Path, number: int) -> None:
+    """Raise `InputError` if pixels of a file are not the mark of a frame, so that another frame was rendered."""
     pixels = image.reshape(-1, 3).astype(int)
     off = int(np.abs(pixels - mark(number).astype(int)).max())
     if off >= MARK_STEP // 2:
@@ -99,12 +94,7 @@ def check_mark_in(image: ByteArray, path: Path, number: int) -> None:
 def read_window(frame: Listed, path: Path) -> ByteArray:
     """A render at the size of its camera. Raises `InputError` for a render of another size than its window."""
     window = around(frame.camera)
-    image = read_png(path)
-    wanted = (window.camera.height, window.camera.width)
-    if image.shape[:2] != wanted:
-        found = f"{image.shape[1]}x{image.shape[0]}"
-        raise InputError(path, str(frame.key), f"{wanted[1]}x{wanted[0]} pixels", found)
-    return window.uncut(image, frame.camera)
+    return window.uncut(read_sized(path, frame, window.camera.width, window.camera.height), frame.camera)
 
 
 def _parameters(timestep: int) -> str:

@@ -22,7 +22,7 @@ from ....bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
 from ....bench.errors import InputError
 from ....bench.io.files import atomic_path, read_bytes, write_bytes, write_text
 from ....datasets.ga.writer import pose_to_parameters, save_npz
-from ....datasets.head.arrays import JOINT_NAMES, RING_REGIONS, HeadArrays
+from ....datasets.head.arrays import JOINT_NAMES, RING_REGIONS
 from ....datasets.head.loaders import FLAME_IDENTITY_SIZE
 from ....datasets.head.teeth import lip_rings
 from ...shared.avatar_files import head_arrays
@@ -35,18 +35,8 @@ SOURCE = "flame_model/flame.py"
 EXPRESSION_SIZE = 100
 """Expression coefficients that their code reads."""
 MASKS = (
-    *(
-        "face",
-        "neck",
-        "scalp",
-        "boundary",
-        "right_eyeball",
-        "left_eyeball",
-        "right_ear",
-        "left_ear",
-        "forehead",
-    ),
-    *("eye_region", "nose", "lips", "right_eye_region", "left_eye_region"),
+    *("face", "neck", "scalp", "boundary", "right_eyeball", "left_eyeball", "right_ear"),
+    *("left_ear", "forehead", "eye_region", "nose", "lips", "right_eye_region", "left_eye_region"),
 )
 """Regions of FLAME's masks; those that a head lacks are empty."""
 LANDMARKS = 70
@@ -57,6 +47,14 @@ def padding_remarks(head: HeadAsset) -> list[str]:
     """A sentence for the record of an avatar if the expression basis of its head is padded."""
     size = head.expression_basis.shape[2]
     return [f"an expression basis of {size} directions is padded with zeros"] * (size < EXPRESSION_SIZE)
+
+
+def without_teeth(head: HeadAsset) -> tuple[IntArray, IntArray]:
+    """(V',) vertices of a head without its teeth, and its triangles (F', 3) in their numbering."""
+    kept = np.setdiff1d(np.arange(len(head.template)), head.regions.get("teeth", []))
+    number = np.full(len(head.template), -1)
+    number[kept] = np.arange(len(kept))
+    return kept, number[head.faces[np.isin(head.faces, kept).all(axis=1)]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,35 +88,12 @@ class OfficialHead:
             ("expression", head.expression_basis.shape[2], EXPRESSION_SIZE),
         ):
             if size > most:
-                raise InputError(
-                    where,
-                    f"{name} basis",
-                    f"at most {most} directions, as many as their code reads",
-                    f"{size}",
-                )
+                expected = f"at most {most} directions, as many as their code reads"
+                raise InputError(where, f"{name} basis", expected, f"{size}")
         if list(head.parents) != [-1, 0, 1, 1, 1]:
-            raise InputError(
-                where, "parents", f"FLAME's joints, {', '.join(JOINT_NAMES)}", f"{list(head.parents)}"
-            )
-        kept = np.setdiff1d(np.arange(len(head.template)), head.regions.get("teeth", []))
-        faces = head.faces[np.isin(head.faces, kept).all(axis=1)]
-        number = np.full(len(head.template), -1)
-        number[kept] = np.arange(len(kept))
-        return cls(head, kept, number[faces])
-
-    @classmethod
-    def of_flame(cls, head: HeadAsset, vertices: int, file: Path) -> OfficialHead:
-        """A head whose vertices and triangles are FLAME's, for code with a texture chart of FLAME.
-
-        ``vertices`` is the number in ``file`` of the checkout. Raises `InputError` for another topology.
-        """
-        own = cls.numbered(head)
-        if len(own.order) != vertices:
-            expected = f"{vertices} vertices, as {file} has, since their code needs FLAME's texture chart"
-            remedy = "Refit the capture to FLAME 2020 (headbench prepare refit)."
-            where = f"head model {head.version!r}"
-            raise InputError(where, "template", expected, str(len(own.order)), remedy)
-        return own
+            expected = f"FLAME's joints, {', '.join(JOINT_NAMES)}"
+            raise InputError(where, "parents", expected, f"{list(head.parents)}")
+        return cls(head, *without_teeth(head))
 
     def _with_lips(self, wanted: tuple[IntArray, IntArray], where: str) -> OfficialHead:
         """Renumber the vertices so that the given indices are the rings of the lips."""
@@ -148,7 +123,7 @@ class OfficialHead:
         """Write the four files below the program's working directory."""
         model = self.model()
         write_bytes(folder / MODEL_FILE, pickled(model))
-        write_bytes(folder / MASKS_FILE, pickled({name: self._region(name) for name in MASKS}))
+        write_bytes(folder / MASKS_FILE, pickled({name: self.region(name) for name in MASKS}))
         write_text(folder / TEMPLATE_FILE, obj_text(model["v_template"], self.faces))
         write_landmarks(folder / LANDMARKS_FILE, {"full_lmk": (1, LANDMARKS)})
 
@@ -179,10 +154,10 @@ class OfficialHead:
         basis = head_arrays(self.head).eyelid_basis
         for side, path in enumerate((left, right)):
             values = np.zeros((len(self.head.template), 3)) if basis is None else basis[:, :, side]
-            with atomic_path(path) as temporary, temporary.open("wb") as stream:
-                np.save(stream, self.vertices(values).astype(np.float64), allow_pickle=False)
+            write_npy(path, self.vertices(values).astype(np.float64))
 
-    def _region(self, name: str) -> IntArray:
+    def region(self, name: str) -> IntArray:
+        """Vertices of a region in their order; none for one that the head lacks."""
         return np.flatnonzero(np.isin(self.order, self.head.regions.get(name, []))).astype(np.int64)
 
 
@@ -231,8 +206,13 @@ def write_landmarks(path: Path, sizes: Mapping[str, tuple[int, ...]]) -> None:
     landmarks = np.zeros((), dtype=fields)
     for name in sizes:
         landmarks[f"{name}_bary_coords"] = 1 / 3
+    write_npy(path, landmarks)
+
+
+def write_npy(path: Path, array: np.ndarray) -> None:
+    """Write an array as npy, whole or not at all."""
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
-        np.save(stream, landmarks, allow_pickle=False)
+        np.save(stream, array, allow_pickle=False)
 
 
 def pickled(arrays: Mapping[str, np.ndarray | SparseMatrix]) -> bytes:
@@ -300,11 +280,11 @@ def _same_faces(faces: IntArray, template: Path) -> bool:
     """Whether the triangles are those of the template in the checkout; False if there is none."""
     if not template.is_file():
         return False
-    text = read_bytes(template, "an OBJ file", MOST_TEMPLATE).decode(errors="replace")
+    return bool(np.array_equal(read_obj(template)[1], faces))
+
+
+def read_obj(path: Path) -> tuple[int, IntArray]:
+    """Number of vertices of an OBJ file, and its triangles (F, 3), numbered from 0; other faces are left out."""
+    text = read_bytes(path, "an OBJ file", MOST_TEMPLATE).decode(errors="replace")
     corners = re.findall(r"^f\s+(\d+)\S*\s+(\d+)\S*\s+(\d+)\S*\s*$", text, re.MULTILINE)
-    return len(corners) == len(faces) and bool(np.array_equal(np.array(corners, np.int64) - 1, faces))
-
-
-def eyelids_are_lost(head: HeadAsset) -> bool:
-    """Whether a head moves its eyelids by bases that their code does not have."""
-    return isinstance(head, HeadArrays) and head.eyelid_basis is not None
+    return len(re.findall(r"^v\s", text, re.MULTILINE)), np.array(corners, np.int64).reshape(-1, 3) - 1

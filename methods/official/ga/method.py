@@ -5,46 +5,42 @@ Qian et al., "GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussi
 
 from __future__ import annotations
 
-import re
-import shutil
 import socket
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from ....bench.contracts import Clip, FloatArray, Frame, FrameKey, Progress
+from ....bench.contracts import Clip, FloatArray, Frame, FrameKey, HeadAsset, Progress
 from ....bench.errors import InputError
 from ....bench.io.arrays import MAX_MAGNITUDE, Member, read_arrays
 from ....bench.io.files import atomic_path
+from ....bench.io.images import read_png
+from ....datasets.head.arrays import HeadArrays
 from ....datasets.head.teeth import RING_LENGTH, ROWS
-from ...shared.avatar_files import (
-    SUBJECT_FILE,
-    TRACKED,
-    RefinedTracking,
-    Subject,
-    read_shared_head,
-    read_subject,
-)
+from ...shared.avatar_files import SUBJECT_FILE, TRACKED, RefinedTracking, Subject
 from ...shared.config import PAPER_ITERATIONS, SplatTraining
 from ...shared.loop import Fit
 from ...shared.schedule import DensifySchedule, Timeline
 from ..checkout import Checkout, Repository
-from ..config import GAOfficialConfig, OfficialConfig
-from ..method import Listed, OfficialMethod, Workplace, opaque
+from ..config import GAOfficialConfig, OfficialConfig, option_words
+from ..method import OfficialMethod, read_identity
 from ..spec import GA_OFFICIAL
+from ..workplace import Listed, Workplace, copy_file, is_white, opaque
 from .export import check_mark, read_window, write_list, write_training
-from .head_files import OfficialHead, OfficialTracking, eyelids_are_lost
-from .windows import check_square_pixels
+from .head_files import OfficialHead, OfficialTracking
+from .windows import cameras_of, check_square_pixels
 
 PLY_FILE, TRACKING_FILE, ARGUMENTS_FILE = "point_cloud.ply", "driving.npz", "cfg_args"
 PARAMETERS_FILE = "flame_param.npz"
 TEETH_VERTICES = len(ROWS) * RING_LENGTH
 """Number of vertices that their head model adds to FLAME's."""
-RENDERS, TRUTHS = "renders", "gt"
-_PROGRESS, _LOSS = re.compile(r"Training progress:.*?(\d+)/\d+ \["), re.compile(r"Loss=([\d.]+)")
-_DRAWN = re.compile(r"Rendering progress:.*?(\d+)/\d+ ")
+TRAINED = r"Training progress:.*?(\d+)/\d+ \[(?:.*?Loss=([\d.]+))?"
+RENDERED = r"Rendering progress:.*?(\d+)/\d+ "
+"""Progress bars of scripts derived from those of 3D Gaussian Splatting."""
+_white = partial(is_white, other=(0.0, 0.0, 0.0), known="white or black")
 
 LOADER_MODULES = ("tqdm", "numpy", "PIL.Image")
 LOADER_TRIAL = "import numpy, PIL.Image; PIL.Image.fromarray(numpy.zeros((1, 1, 3), dtype=numpy.byte), 'RGB')"
@@ -83,27 +79,24 @@ class GALayoutMethod(OfficialMethod[Config]):
     """Common code for the repositories with GaussianAvatars' loader and head model."""
 
     shimmed = "bound splats"
+    iteration_line, frame_line = TRAINED, RENDERED
+    render_folder, render_name = "test/ours_1/renders", "{:05d}.png"
+    model_files: ClassVar[tuple[str, ...]] = (PLY_FILE,)
+    """The files of the splats."""
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
         """Check that the background is white or black, pixels are square and the head is supported by their code."""
         where = f"clip {clip.subject}"
         _white(clip.background, where)
-        for name in sorted({key.camera for keys in clip.splits.values() for key in keys}):
-            check_square_pixels(clip.cameras[name], where)
+        for camera in cameras_of(clip).values():
+            check_square_pixels(camera, where)
         OfficialHead.of(clip.head, checkout.folder)
 
-    def export(
-        self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
-    ) -> dict[str, FrameKey]:
+    def export(self, clip: Clip, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
         """Write the training frames in GaussianAvatars' layout, and the head model as FLAME's files."""
-        head = OfficialHead.of(clip.head, checkout.folder)
-        head.write(work.program)
-        subject = Subject.of(clip)
-        return write_training(
-            clip, OfficialTracking(head, subject.shape, subject.static_offset), work, progress
-        )
+        return write_training(clip, _write_head(Subject.of(clip), clip.head, work), work, progress)
 
-    def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
+    def train_command(self, fit: Fit, work: Workplace) -> list[str]:
         """Their script, with densification and learning rates scaled to the length of the run."""
         iterations = fit.budget.iterations or 0
         white = _white(fit.clip.background, f"clip {fit.clip.subject}")
@@ -124,47 +117,31 @@ class GALayoutMethod(OfficialMethod[Config]):
             "--checkpoint_iterations": -1,
         }
         flags = ["--eval", "--bind_to_mesh", *(["--white_background"] if white else [])]
-        words = [str(word) for pair in options.items() for word in pair]
-        return [*checkout.python, str(checkout.folder / "train.py"), *words, *flags]
+        script = str(work.checkout.folder / "train.py")
+        return [*work.checkout.python, script, *option_words(options), *flags]
 
-    def done(self, line: str) -> tuple[int, str] | None:
-        """Parse the progress bar of their training."""
-        return trained(line)
-
-    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
+    def keep(self, fit: Fit, work: Workplace) -> None:
         """Keep their splats and arguments; the subject is stored without the zeros of their file."""
         made = self._made(work, fit.budget.iterations or 0)
-        for name in self._model_files():
+        for name in self.model_files:
             copy_file(made / name, fit.out / name)
         copy_file(work.model / ARGUMENTS_FILE, fit.out / ARGUMENTS_FILE)
-        return {}
 
-    def files(self, folder: Path) -> list[Path]:
-        """Splats, subject, and the arguments that their renderer reads."""
-        return [folder / name for name in (*self._model_files(), SUBJECT_FILE, ARGUMENTS_FILE)]
-
-    def write_list(
-        self,
-        folder: Path,
-        frames: Sequence[Listed],
-        background: Sequence[float],
-        checkout: Checkout,
-        work: Workplace,
-    ) -> None:
-        """Write the frames as a test split, and a model folder with the parameters of the frames."""
+    def render_command(
+        self, folder: Path, frames: Sequence[Listed], background: Sequence[float], work: Workplace
+    ) -> list[str]:
+        """Their script for a test split of the frames, with a model folder that has the parameters of the frames."""
         trained_on = (folder / ARGUMENTS_FILE).read_text(errors="replace")
         if _white(background, "render") != ("white_background=True" in trained_on):
             expected = "the background that it was trained on; their renders have no coverage"
             raise InputError(folder, "background", expected, str(tuple(background)))
-        head, subject = self._head(folder, checkout)
-        head.write(work.program)
-        tracking = OfficialTracking(head, subject.shape, subject.static_offset)
+        tracking = _write_head(*read_identity(folder), work)
         poses = write_list(frames, tracking, work)
         refined = folder / TRACKING_FILE
         if refined.exists():
             poses = [RefinedTracking.read(refined)(pose) for pose in poses]
         made = self._made(work, 1)
-        for name in self._model_files():
+        for name in self.model_files:
             copy_file(folder / name, made / name)
         copy_file(folder / ARGUMENTS_FILE, work.model / ARGUMENTS_FILE)
         values = [tracking.parameters(pose) for pose in poses]
@@ -175,32 +152,18 @@ class GALayoutMethod(OfficialMethod[Config]):
         arrays = {**moving, **still, **self._more_parameters(len(poses), still["static_offset"])}
         with atomic_path(made / PARAMETERS_FILE) as temporary:
             np.savez_compressed(temporary, allow_pickle=False, **arrays)
+        options = {"--source_path": work.input, "--model_path": work.model, "--iteration": 1}
+        script = str(work.checkout.folder / "render.py")
+        return [*work.checkout.python, script, *option_words(options), "--skip_train", "--skip_val"]
 
-    def render_command(self, folder: Path, checkout: Checkout, work: Workplace) -> list[str]:
-        """Their script, for the test split alone."""
-        options: dict[str, Any] = {"--source_path": work.input, "--model_path": work.model, "--iteration": 1}
-        words = [str(word) for pair in options.items() for word in pair]
-        return [*checkout.python, str(checkout.folder / "render.py"), *words, "--skip_train", "--skip_val"]
-
-    def drawn(self, line: str) -> int | None:
-        """Parse the progress bar of their renderer."""
-        return rendered(line)
-
-    def render_folder(self, folder: Path, work: Workplace) -> Path:
-        """Renders of the test split."""
-        return work.model / "test" / "ours_1" / RENDERS
-
-    def render_name(self, number: int) -> str:
-        """Render by the frame's position in the JSON of the split."""
-        return f"{number:05d}.png"
-
-    def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
+    def read_back(self, frame: Listed, path: Path, background: Sequence[float], work: Workplace) -> Frame:
         """A render, after its frame is verified by the ground truth written beside it."""
-        check_mark(path.parent.parent / TRUTHS / path.name, frame.number)
+        truth = path.parent.parent / "gt" / path.name
+        check_mark(read_png(truth), truth, frame.number)
         return opaque(read_window(frame, path))
 
-    def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """Leaks and differences, for readers of results."""
+    def differences(self, clip: Clip, seed: int) -> list[str]:
+        """Of the export, cameras, eyelids and seed."""
         differences = ["the capture has no held-out frames; cameras and timesteps are renumbered"]
         moved = [
             c
@@ -212,20 +175,9 @@ class GALayoutMethod(OfficialMethod[Config]):
                 "their code assumes the principal point in the middle of the image: images are cropped accordingly "
                 f"({len(moved)} of {len(clip.cameras)} cameras)"
             )
-        if eyelids_are_lost(clip.head):
+        if isinstance(clip.head, HeadArrays) and clip.head.eyelid_basis is not None:
             differences.append("their head model has no eyelid bases: eyelids follow the expression alone")
-        if seed and self.config.order == "published":
-            differences.append(
-                f"their code fixes the seed at 0; seed {seed} is a repetition, not another start"
-            )
-        return {"leaks": [], "differences": differences}
-
-    def _head(self, folder: Path, checkout: Checkout) -> tuple[OfficialHead, Subject]:
-        head = read_shared_head(folder)
-        return OfficialHead.of(head, checkout.folder), read_subject(folder / SUBJECT_FILE, head)
-
-    def _model_files(self) -> tuple[str, ...]:
-        return (PLY_FILE,)
+        return differences + self.repeated(seed)
 
     def _more_parameters(self, count: int, offset: FloatArray) -> Mapping[str, FloatArray]:
         """Further arrays of their parameter file, for a number of timesteps."""
@@ -241,22 +193,28 @@ class GAOfficial(GALayoutMethod[GAOfficialConfig]):
 
     name, version = GA_OFFICIAL.name, GA_OFFICIAL.version
     config_class, repository = GAOfficialConfig, GA_REPOSITORY
+    avatar_files = (PLY_FILE, SUBJECT_FILE, ARGUMENTS_FILE)
 
-    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
+    def keep(self, fit: Fit, work: Workplace) -> None:
         """Also keep the tracking refined by their training."""
-        kept = super().keep(fit, work)
-        timesteps = np.array(sorted({key.timestep for key in fit.clip.splits["train"]}))
-        _refined(fit.clip, timesteps, self._made(work, fit.budget.iterations or 0)).save(
-            fit.out / TRACKING_FILE
-        )
-        return kept
+        super().keep(fit, work)
+        refined = _refined(fit.clip, self._made(work, fit.budget.iterations or 0))
+        refined.save(fit.out / TRACKING_FILE)
 
     def _more_parameters(self, count: int, offset: FloatArray) -> Mapping[str, FloatArray]:
         return {"dynamic_offset": np.zeros((count, *offset.shape[1:]), np.float32)}
 
 
-def _refined(clip: Clip, timesteps: np.ndarray, made: Path) -> RefinedTracking:
+def _write_head(subject: Subject, head: HeadAsset, work: Workplace) -> OfficialTracking:
+    """Write a head model as FLAME's files; return the tracking of a subject on it."""
+    official = OfficialHead.of(head, work.checkout.folder)
+    official.write(work.program)
+    return OfficialTracking(official, subject.shape, subject.static_offset)
+
+
+def _refined(clip: Clip, made: Path) -> RefinedTracking:
     """Their tracking after training, which numbers the training timesteps from 0."""
+    timesteps = np.array(sorted({key.timestep for key in clip.splits["train"]}))
     tracked = {
         name: np.stack([np.asarray(getattr(clip.poses[t], name), np.float32) for t in timesteps.tolist()])
         for name in TRACKED
@@ -268,18 +226,6 @@ def _refined(clip: Clip, timesteps: np.ndarray, made: Path) -> RefinedTracking:
         for name, theirs in THEIR_NAMES.items()
     }
     return RefinedTracking(clip.subject, timesteps, tracked, refined)
-
-
-def trained(line: str) -> tuple[int, str] | None:
-    """Iterations and loss in the progress bar of training scripts derived from 3DGS."""
-    match, loss = _PROGRESS.search(line), _LOSS.search(line)
-    return None if match is None else (int(match[1]), f"loss {loss[1]}" if loss else "")
-
-
-def rendered(line: str) -> int | None:
-    """Frames in the progress bar of render scripts derived from 3DGS."""
-    match = _DRAWN.search(line)
-    return None if match is None else int(match[1])
 
 
 def free_port() -> int:
@@ -304,19 +250,3 @@ def _first_round(schedule: DensifySchedule) -> int:
     if schedule.first_reset is None and schedule.start < schedule.every:
         return 0
     return schedule.start
-
-
-def _white(background: Sequence[float] | FloatArray, where: str) -> bool:
-    """Whether a background is white. Raises `InputError` for one that is neither white nor black."""
-    levels = [float(value) for value in background]
-    if levels not in ([1.0] * 3, [0.0] * 3):
-        raise InputError(where, "background", "white or black, which the code supports", str(tuple(levels)))
-    return levels[0] == 1.0
-
-
-def copy_file(source: Path, target: Path) -> None:
-    """Copy a file atomically. Raises `InputError` if it is missing."""
-    if not source.is_file() or not source.stat().st_size:
-        raise InputError(source, "", "a file that the program writes", "none")
-    with atomic_path(target) as temporary:
-        shutil.copyfile(source, temporary)

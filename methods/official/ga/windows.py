@@ -11,7 +11,7 @@ from typing import TypeVar, cast
 import cv2
 import numpy as np
 
-from ....bench.contracts import ByteArray, Camera, FloatArray
+from ....bench.contracts import ByteArray, Camera, Clip, FloatArray
 from ....bench.errors import InputError
 
 Image = TypeVar("Image", ByteArray, FloatArray)
@@ -63,6 +63,12 @@ def inside(camera: Camera) -> Window:
 def around(camera: Camera) -> Window:
     """The smallest window around the image, for rendering; the image is cropped from it."""
     return _window(camera, grow=True)
+
+
+def cameras_of(clip: Clip, *splits: str) -> dict[str, Camera]:
+    """Cameras of the frames of some splits, of all by default, by name and in the order of the names."""
+    names = {key.camera for split in splits or clip.splits for key in clip.splits[split]}
+    return {name: clip.cameras[name] for name in sorted(names)}
 
 
 def check_square_pixels(camera: Camera, where: str) -> None:

@@ -31,9 +31,8 @@ from ..ga.head_files import (
     pickled,
     write_landmarks,
 )
-from ..method import Listed, Workplace, write_placeholder
 from ..video import (
-    cameras_at_rest,
+    at_rest,
     flame_values,
     frame_name,
     frame_parts,
@@ -42,6 +41,7 @@ from ..video import (
     write_torch,
     write_video,
 )
+from ..workplace import Listed, Workplace, write_placeholder
 
 SOURCES = ("*.py", "config/*.py", "FLAME/*.py", "utils/*.py")
 """Their program, which is run from a copy because it opens the eyelid bases beside its own file."""
@@ -133,8 +133,7 @@ class VideoHead:
                 content = read_bytes(self._checkout / name, "a list of numbers", MOST_TEMPLATE)
                 write_bytes(folder / name, content)
             return
-        neck = np.flatnonzero(np.isin(self.official.order, self.official.head.regions.get("neck", [])))
-        for name, numbers in ((BACK_FILE, self._back), (NECK_FILE, neck)):
+        for name, numbers in ((BACK_FILE, self._back), (NECK_FILE, self.official.region("neck"))):
             write_text(folder / name, "".join(f"{number}\n" for number in numbers))
 
     def _triangles(self, region: str) -> np.ndarray:
@@ -177,12 +176,12 @@ def write_training(
     other image by its path.
     """
     head.write_identity(work.input)
-    keys, first = write_video(clip, head.posed, work.input, head.frame, progress)
+    images, first = write_video(clip, head.posed, work.input, head.frame, progress)
     with grouped_writes():
-        for number in range(len(keys), len(keys) + placeholders):
+        for number in range(len(images), len(images) + placeholders):
             write_placeholder(work.input / image_name(number))
             write_torch(work.input / frame_name(number), first)
-    return {f"input/{image_name(number)}": key for number, key in enumerate(keys)}
+    return {f"input/{name}": key for name, key in images.items()}
 
 
 def write_list(frames: Sequence[Listed], head: VideoHead, work: Workplace) -> None:
@@ -192,13 +191,12 @@ def write_list(frames: Sequence[Listed], head: VideoHead, work: Workplace) -> No
     values from the checkpoint. Grids of one node in its cache files avoid that.
     """
     head.write_identity(work.input)
-    cameras = cameras_at_rest(head.posed, [(frame.camera, frame.pose) for frame in frames])
     with grouped_writes():
-        for frame, camera in zip(frames, cameras):
-            image = np.full((camera.height, camera.width, 4), 255, np.uint8)
+        for frame in at_rest(head.posed, frames):
+            image = np.full((frame.camera.height, frame.camera.width, 4), 255, np.uint8)
             image[..., :3] = mark(frame.number)
             write_image(work.input / image_name(frame.number), image)
-            write_torch(work.input / frame_name(frame.number), head.frame(camera, frame.pose))
+            write_torch(work.input / frame_name(frame.number), head.frame(frame.camera, frame.pose))
     for file, name in GRIDS.items():
         box = {"bbox_min": torch.zeros(3), "bbox_max": torch.ones(3), "grid_size": [1, 1, 1]}
         write_torch(work.input / file, {**box, name: torch.zeros(1, 1, 1, 1)})

@@ -13,15 +13,16 @@ import torch
 
 from ....bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
 from ....bench.errors import InputError
-from ....bench.io.files import atomic_path, grouped_writes
-from ....bench.io.images import read_png, write_png
+from ....bench.io.files import grouped_writes
+from ....bench.io.images import write_png
 from ....datasets.ga.writer import save_npz
 from ...gha.config import GHAConfig
 from ...gha.driving import Driver, landmark_vertices
 from ...shared.avatar_files import Subject, head_arrays
 from ..ga.export import mark
-from ..ga.windows import Window, square, square_side
-from ..method import Listed, Workplace
+from ..ga.head_files import write_npy
+from ..ga.windows import Window, cameras_of, square, square_side
+from ..workplace import Listed, Workplace, read_sized
 
 MOUTH_ROWS = slice(48, 66)
 """Landmarks of the mouth in their code, around which it adds points; other landmarks have no special role."""
@@ -92,8 +93,8 @@ def write_training(
     beyond the image's border is ``visible``, so there is no loss.
     """
     side, frames = training_side(clip), whole_timesteps(clip)
-    names = sorted({key.camera for key in clip.splits["train"]})
-    windows = {name: square(clip.cameras[name], side) for name in names}
+    windows = {name: square(camera, side) for name, camera in cameras_of(clip, "train").items()}
+    names = list(windows)
     images: dict[str, FrameKey] = {}
     total = len(frames) * len(names)
     with grouped_writes():
@@ -108,9 +109,9 @@ def write_training(
                 progress(number * len(names) + index + 1, total, "exporting")
             folder = work.input / PARAMETERS / frame
             save_npz(folder / "params.npz", tracking.parameters(clip.poses[timestep]))
-            _save_array(folder / "lmk_3d.npy", tracking.landmarks(clip.poses[timestep]))
+            write_npy(folder / "lmk_3d.npy", np.ascontiguousarray(tracking.landmarks(clip.poses[timestep])))
             # All points are landmarks; their loader would add every hundredth of these vertices.
-            _save_array(folder / "vertices.npy", np.zeros((0, 3), np.float32))
+            write_npy(folder / "vertices.npy", np.zeros((0, 3), np.float32))
     return images
 
 
@@ -169,12 +170,12 @@ def write_camera(path: Path, camera: Camera) -> None:
 
 def training_side(clip: Clip) -> int:
     """Side of the square images of all training cameras."""
-    return square_side(clip.cameras[name] for name in {key.camera for key in clip.splits["train"]})
+    return square_side(cameras_of(clip, "train").values())
 
 
 def whole_timesteps(clip: Clip) -> dict[int, dict[str, FrameKey]]:
     """Training frames by timestep and camera. Raises `InputError` for a timestep that some camera lacks."""
-    names = sorted({key.camera for key in clip.splits["train"]})
+    names = list(cameras_of(clip, "train"))
     frames: dict[int, dict[str, FrameKey]] = {}
     for key in sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera)):
         frames.setdefault(key.timestep, {})[key.camera] = key
@@ -227,14 +228,6 @@ def read_render(path: Path, frame: Listed, side: int, rendered: int) -> tuple[By
 
     Raises `InputError` for a file that is not two squares of ``rendered`` pixels.
     """
-    image = read_png(path)
-    if image.shape[:2] != (rendered, 2 * rendered):
-        found = f"{image.shape[1]}x{image.shape[0]}"
-        raise InputError(path, str(frame.key), f"{2 * rendered}x{rendered} pixels", found)
+    image = read_sized(path, frame, 2 * rendered, rendered)
     render = _resized(image[:, rendered:].astype(np.float32) / 255, side)
     return image[:, :rendered], square(frame.camera, side).uncut(render, frame.camera)
-
-
-def _save_array(path: Path, array: FloatArray) -> None:
-    with atomic_path(path) as temporary, temporary.open("wb") as stream:
-        np.save(stream, np.ascontiguousarray(array), allow_pickle=False)

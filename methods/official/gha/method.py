@@ -6,31 +6,26 @@ Xu et al., "Gaussian Head Avatar: Ultra High-fidelity Head Avatar via Dynamic Ga
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ....bench.contracts import Clip, Frame, FrameKey, Progress
 from ....bench.errors import InputError
 from ....bench.io.documents import read_json
-from ....bench.io.files import read_bytes, write_bytes, write_json
+from ....bench.io.files import write_json
 from ...gha.config import GHAConfig
 from ...gha.driving import code_size
-from ...shared.avatar_files import (
-    SUBJECT_FILE,
-    Subject,
-    read_shared_head,
-    read_subject,
-)
+from ...shared.avatar_files import SUBJECT_FILE, Subject
 from ...shared.loop import Fit
 from ..checkout import Checkout, Repository
 from ..config import GHAOfficialConfig
-from ..ga.export import check_mark_in
-from ..ga.method import copy_file
-from ..ga.windows import square_side
-from ..method import Listed, OfficialMethod, Workplace, opaque_colours
+from ..ga.export import check_mark
+from ..ga.windows import cameras_of, square_side
+from ..method import OfficialMethod, read_identity
 from ..spec import GHA_OFFICIAL
+from ..workplace import Listed, Workplace, copy_file, is_white, opaque_colours, write_launcher
 from .export import (
     IMAGES,
     PARAMETERS,
@@ -45,15 +40,13 @@ from .export import (
 MESH, GAUSSIANS = "train_meshhead.py", "train_gaussianhead.py"
 REENACTMENT = "reenactment.py"
 LAUNCHER = Path(__file__).with_name("stages.py")
-PLAN = "stages.json"
 NETWORKS = ("gaussianhead_latest", "supres_latest")
 SIDE_FILE = "square.json"
 TETRAHEDRA = "assets/tets_data.npz"
 RENDERED = 2048
 """Side of their renders: four times 512 splatted pixels, a constant of their renderer."""
-MOST_SIDE, MOST_LAUNCHER, SHORTEST = 1 << 15, 1 << 16, 2
-_DONE = re.compile(r"^headbench: iteration (\d+) loss ([\d.]+|nan|inf)")
-_DRAWN = re.compile(r"^headbench: drawn (\d+)")
+MOST_SIDE, SHORTEST = 1 << 15, 2
+_check_white = partial(is_white, other=(1.0, 1.0, 1.0), known="white")
 
 GHA_REPOSITORY = Repository(
     "https://github.com/YuelangX/Gaussian-Head-Avatar",
@@ -73,14 +66,17 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
 
     name, version = GHA_OFFICIAL.name, GHA_OFFICIAL.version
     config_class, repository = GHAOfficialConfig, GHA_REPOSITORY
+    iteration_line = r"^headbench: iteration (\d+) loss ([\d.]+|nan|inf)"
+    frame_line = r"^headbench: drawn (\d+)"
+    avatar_files = (*NETWORKS, SUBJECT_FILE, SIDE_FILE)
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
         """Check that the background is white, pixels are not skewed, timesteps have all cameras and the head has a face."""
         where = f"clip {clip.subject}"
         _check_white(clip.background, where)
-        for name in sorted({key.camera for keys in clip.splits.values() for key in keys}):
-            skew = abs(float(clip.cameras[name].K[0, 1]))
-            if skew > 1e-3 * float(clip.cameras[name].K[0, 0]):
+        for name, camera in cameras_of(clip).items():
+            skew = abs(float(camera.K[0, 1]))
+            if skew > 1e-3 * float(camera.K[0, 0]):
                 raise InputError(
                     where, f"camera {name}", "no skew, which the code does not support", f"{skew:.2f}"
                 )
@@ -93,20 +89,18 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
             expected = f"{SHORTEST} or more, one for each stage"
             raise InputError(f"settings.{self.name}", "budget.iterations", expected, f"{iterations}")
 
-    def export(
-        self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
-    ) -> dict[str, FrameKey]:
+    def export(self, clip: Clip, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
         """Write the training frames in their layout, and the tetrahedra file."""
         target = work.program / TETRAHEDRA
         target.parent.mkdir(parents=True)
-        os.symlink(checkout.folder / TETRAHEDRA, target)
+        os.symlink(work.checkout.folder / TETRAHEDRA, target)
         return write_training(clip, GHATracking.of(clip.head, Subject.of(clip)), work, progress)
 
-    def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
+    def train_command(self, fit: Fit, work: Workplace) -> list[str]:
         """Both of their scripts, run one after the other by the launcher."""
         mesh, gaussians = self._lengths(fit.budget.iterations or 0)
         clip = fit.clip
-        cameras = len({key.camera for key in clip.splits["train"]})
+        cameras = len(cameras_of(clip, "train"))
         shared = {
             "gpu_id": 0,
             "batch_size": 1,
@@ -146,38 +140,23 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
             path = work.root / f"{Path(script).stem}.yaml"
             write_json(path, config)  # JSON is YAML
             parts.append({"script": script, "config": str(path), "iterations": length, "before": before})
-        return self._staged(checkout, work, parts, fit.seed)
+        return self._staged(work, parts, fit.seed)
 
-    def done(self, line: str) -> tuple[int, str] | None:
-        """Parse the output of the launcher, which counts both stages."""
-        match = _DONE.search(line)
-        return None if match is None else (int(match[1]), f"loss {match[2]}")
-
-    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
+    def keep(self, fit: Fit, work: Workplace) -> None:
         """Keep their Gaussians with the networks that drive them, and super-resolution."""
         for name in NETWORKS:
             copy_file(_checkpoints(work, "gaussianhead") / name, fit.out / name)
         write_json(fit.out / SIDE_FILE, {"side": training_side(fit.clip)})
-        return {}
 
-    def files(self, folder: Path) -> list[Path]:
-        """Gaussians, networks, subject, and the side of the training images."""
-        return [folder / name for name in (*NETWORKS, SUBJECT_FILE, SIDE_FILE)]
-
-    def write_list(
-        self,
-        folder: Path,
-        frames: Sequence[Listed],
-        background: Sequence[float],
-        checkout: Checkout,
-        work: Workplace,
-    ) -> None:
+    def render_command(
+        self, folder: Path, frames: Sequence[Listed], background: Sequence[float], work: Workplace
+    ) -> list[str]:
         """Write the frames of each camera as a separate application, all run by the launcher."""
         _check_white(background, "render")
-        head = read_shared_head(folder)
-        tracking = GHATracking.of(head, read_subject(folder / SUBJECT_FILE, head))
+        subject, head = read_identity(folder)
+        tracking = GHATracking.of(head, subject)
         side = max(_side(folder), square_side(frame.camera for frame in frames))
-        renders = self.render_folder(folder, work)
+        renders = work.model / self.render_folder
         renders.mkdir(parents=True)
         parts = []
         for place, numbers in write_list(frames, tracking, side, work):
@@ -204,36 +183,19 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
             part = {"script": REENACTMENT, "config": str(path), "numbers": numbers, "renders": str(renders)}
             parts.append(part)
         write_json(work.root / SIDE_FILE, {"side": side})
-        self._staged(checkout, work, parts, 0)
+        return self._staged(work, parts, 0)
 
-    def render_command(self, folder: Path, checkout: Checkout, work: Workplace) -> list[str]:
-        """The launcher, with the plan that was written with the list."""
-        return [*checkout.python, str(work.root / LAUNCHER.name), str(work.root / PLAN)]
-
-    def drawn(self, line: str) -> int | None:
-        """From the launcher."""
-        match = _DRAWN.search(line)
-        return None if match is None else int(match[1])
-
-    def render_folder(self, folder: Path, work: Workplace) -> Path:
-        """Output folder of the launcher."""
-        return work.model / "renders"
-
-    def render_name(self, number: int) -> str:
-        """Render by the number that the plan gives to each frame of a camera."""
-        return f"{number:06d}.png"
-
-    def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
+    def read_back(self, frame: Listed, path: Path, background: Sequence[float], work: Workplace) -> Frame:
         """A render, after its frame is verified by the image beside it."""
         beside, render = read_render(path, frame, _side(work.root), RENDERED)
-        check_mark_in(beside, path, frame.number)
+        check_mark(beside, path, frame.number)
         return opaque_colours(render)
 
-    def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """Leaks and differences, for readers of results."""
+    def differences(self, clip: Clip, seed: int) -> list[str]:
+        """Of the export, the networks, the length of the training, and the renders."""
         side = training_side(clip)
         codes = code_size(clip.head)
-        differences = [
+        return [
             "the capture has no held-out frames; cameras and timesteps are renumbered",
             f"the head model's {codes} values of expression, jaw, eyes and eyelids replace the 64 expression coefficients "
             + "of the Basel Face Model; the first layers of the networks have the width that this requires",
@@ -246,19 +208,16 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
             "training ends after a number of iterations, unlike the authors'",
             "renders show listed poses; the authors' smooths them over time",
         ]
-        return {"leaks": [], "differences": differences}
 
     def _lengths(self, iterations: int) -> tuple[int, int]:
         mesh = min(iterations - 1, max(1, round(iterations * self.config.mesh_fraction)))
         return mesh, iterations - mesh
 
     @staticmethod
-    def _staged(checkout: Checkout, work: Workplace, parts: Sequence[dict[str, Any]], seed: int) -> list[str]:
+    def _staged(work: Workplace, parts: Sequence[dict[str, Any]], seed: int) -> list[str]:
         """Write launcher and plan; return the command."""
-        launcher = work.root / LAUNCHER.name
-        write_bytes(launcher, read_bytes(LAUNCHER, "the launcher", MOST_LAUNCHER))
-        write_json(work.root / PLAN, {"checkout": str(checkout.folder), "seed": seed, "parts": list(parts)})
-        return [*checkout.python, str(launcher), str(work.root / PLAN)]
+        plan = {"checkout": str(work.checkout.folder), "seed": seed, "parts": list(parts)}
+        return [*work.checkout.python, *write_launcher(LAUNCHER, plan, work)]
 
 
 _SHARPENER = {
@@ -322,9 +281,3 @@ def _side(folder: Path) -> int:
     if not isinstance(side, int) or not 1 <= side <= MOST_SIDE:
         raise InputError(path, "side", f"1 to {MOST_SIDE} pixels", repr(side)[:60])
     return side
-
-
-def _check_white(background: Sequence[float] | Any, where: str) -> None:
-    levels = [float(value) for value in background]
-    if levels != [1.0] * 3:
-        raise InputError(where, "background", "white, which the code supports", str(tuple(levels)))

@@ -7,7 +7,6 @@ alpha, ``meshes``, ``flame/exp``, ``depth`` (16 bits, millimetres), ``seg_mask``
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,11 +34,11 @@ from ...insta.warp import bare_triangles, mouth_triangles
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import pose_key
 from ..checkout import Checkout
-from ..ga.head_files import MOST_TEMPLATE
+from ..ga.head_files import MOST_TEMPLATE, read_obj, without_teeth
 from ..in_parts import in_parts
-from ..method import Listed, Workplace, write_placeholder
 from ..surface import VisibleMesh
-from ..video import cameras_at_rest, check_no_skew, straight_rgba, training_views
+from ..video import at_rest, check_no_skew, straight_rgba, training_frames
+from ..workplace import Listed, Workplace, write_placeholder
 
 MASKS: Mapping[str, tuple[str, ...]] = {
     "lips": ("lips", "mouth_socket"),
@@ -95,7 +94,7 @@ class VideoMesh:
     def of(cls, subject: Subject, head: HeadAsset, checkout: Checkout) -> VideoMesh:
         """Raises `InputError` for a head outside their scene."""
         posed = PosedSubject(head, subject.shape, subject.static_offset)
-        kept = np.setdiff1d(np.arange(len(head.template)), head.regions.get("teeth", []))
+        kept, faces = without_teeth(head)
         farthest = float(np.abs(posed.neutral[kept]).max())
         if farthest > REACH:
             expected = f"vertices within {REACH} m of the origin along each axis, as FLAME's are"
@@ -104,15 +103,9 @@ class VideoMesh:
             name: read_bytes(checkout.folder / MASK_FOLDER / f"{name}.obj", "an OBJ file", MOST_TEMPLATE)
             for name in MASKS
         }
-        text = files["lips"].decode(errors="replace")
-        if len(re.findall(r"^v\s", text, re.MULTILINE)) == len(kept):
-            corners = re.findall(r"^f\s+(\d+)\S*\s+(\d+)\S*\s+(\d+)\S*\s*$", text, re.MULTILINE)
-            theirs = np.array(corners, np.int64).reshape(-1, 3) - 1
-            if len(theirs) and 0 <= theirs.min() and theirs.max() < len(kept):
-                return cls(head, posed, kept, theirs, files, True)
-        number = np.full(len(head.template), -1)
-        number[kept] = np.arange(len(kept))
-        faces = number[head.faces[np.isin(head.faces, kept).all(axis=1)]]
+        vertices, theirs = read_obj(checkout.folder / MASK_FOLDER / "lips.obj")
+        if vertices == len(kept) and len(theirs) and 0 <= theirs.min() and theirs.max() < len(kept):
+            return cls(head, posed, kept, theirs, files, True)
         return cls(head, posed, kept, faces, _masks(head, kept, faces, posed.neutral), False)
 
     def write_masks(self, folder: Path) -> None:
@@ -198,27 +191,26 @@ def write_training(clip: Clip, head: VideoMesh, work: Workplace, progress: Progr
     pixels are those of the mesh instead of those of a tracker and a face parsing network. Returns the key of every
     other image by its path.
     """
-    keys, views = training_views(clip)
-    cameras = cameras_at_rest(head.posed, views)
+    frames = training_frames(clip, head.posed)
     surfaces = _Surfaces(head)
     images: dict[str, FrameKey] = {}
     records = []
     head.write_canonical(work.input)
     with grouped_writes():
-        head.write_poses(work.input, {frame_name(i): pose for i, (_, pose) in enumerate(views)})
-        for number, (key, camera, (_, pose)) in enumerate(zip(keys, cameras, views)):
-            name, pixels = frame_name(number), straight_rgba(clip, key)
-            classes, depth = surfaces.seen(pose, camera, pixels[..., 3])
+        head.write_poses(work.input, {frame_name(frame.number): frame.pose for frame in frames})
+        for frame in frames:
+            name, pixels = frame_name(frame.number), straight_rgba(clip, frame.key)
+            classes, depth = surfaces.seen(frame.pose, frame.camera, pixels[..., 3])
             for part, image in (("images", pixels), ("seg_mask", classes), ("depth", depth)):
                 write_image(work.input / f"{part}/{name}.png", image)
-                images[f"input/{part}/{name}.png"] = key
+                images[f"input/{part}/{name}.png"] = frame.key
             parts = {"depth_path": f"depth/{name}.png", "seg_mask_path": f"seg_mask/{name}.png"}
-            records.append({**record(name, camera, f"images/{name}.png"), **parts})
-            progress(number + 1, len(keys), "exporting")
+            records.append({**record(name, frame.camera, f"images/{name}.png"), **parts})
+            progress(frame.number + 1, len(frames), "exporting")
         write_placeholder(work.input / PLACEHOLDER)
-        shared = {**intrinsics(cameras[0]), "integer_depth_scale": 1 / MILLIMETRES}
+        shared = {**intrinsics(frames[0].camera), "integer_depth_scale": 1 / MILLIMETRES}
         write_json(work.input / TRAIN, {**shared, "frames": records})
-        last = record(frame_name(0), cameras[0], PLACEHOLDER)
+        last = record(frame_name(0), frames[0].camera, PLACEHOLDER)
         write_json(work.input / TEST, {**shared, "frames": [last]})
     return images
 
@@ -287,7 +279,7 @@ def write_list(frames: Sequence[Listed], head: VideoMesh, work: Workplace) -> li
     parts: list[dict[str, Any]] = []
     for part in in_parts(frames, lambda frame: (frame.camera.width, frame.camera.height), PART):
         folder = f"part_{len(parts):04d}"
-        cameras = cameras_at_rest(head.posed, [(frame.camera, frame.pose) for frame in part])
+        cameras = [frame.camera for frame in at_rest(head.posed, part)]
         names = [frame_name(index) for index in range(len(part))]
         with grouped_writes():
             head.write_canonical(work.input / folder)

@@ -6,27 +6,22 @@ instant-ngp. It takes a scene and a configuration, trains, records the frames of
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ....bench.contracts import Clip, Frame, FrameKey, Progress
+from ....bench.contracts import Clip, FrameKey, HeadAsset, Progress
 from ....bench.io.files import read_bytes, write_bytes, write_json
-from ...shared.avatar_files import (
-    SUBJECT_FILE,
-    Subject,
-    read_shared_head,
-    read_subject,
-)
+from ...shared.avatar_files import SUBJECT_FILE, Subject
 from ...shared.loop import Fit
 from ..checkout import Checkout, Environment, Repository, inspect_program
 from ..config import INSTAOfficialConfig
-from ..ga.method import copy_file
+from ..ga.windows import cameras_of
 from ..in_parts import PartsMethod, RenderCall
-from ..method import Listed, Workplace
+from ..method import read_identity
 from ..spec import INSTA_OFFICIAL
-from ..video import check_masks, check_no_skew, read_covered, write_background
+from ..video import check_masks, check_no_skew
+from ..workplace import Listed, Workplace, copy_file
 from .export import (
     CONDITIONS,
     MASK_FOLDER,
@@ -48,7 +43,6 @@ SNAPSHOT = "snapshot.msgpack"
 LAST_SIZE = 16
 """Side of the unused final render of a training."""
 MOST_CONFIG = 1 << 16
-_ITERATION = re.compile(r"iteration=(\d+) loss=([-+.\de]+|-?nan|inf)")
 _RECORDED = r"Recording frame \[(\d+)/\d+\]"
 
 INSTA_REPOSITORY = Repository(
@@ -64,6 +58,8 @@ class INSTAOfficial(PartsMethod[INSTAOfficialConfig]):
 
     name, version = INSTA_OFFICIAL.name, INSTA_OFFICIAL.version
     config_class, repository = INSTAOfficialConfig, INSTA_REPOSITORY
+    iteration_line = r"iteration=(\d+) loss=([-+.\de]+|-?nan|inf)"
+    avatar_files = (SNAPSHOT, SUBJECT_FILE)
 
     def inspect_environment(self) -> Environment:
         """Check their program and the GPU."""
@@ -72,54 +68,32 @@ class INSTAOfficial(PartsMethod[INSTAOfficialConfig]):
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
         """Refuse a clip without masks, a skewed camera, and a head outside their scene."""
         check_masks(clip)
-        for name in sorted({key.camera for key in clip.splits["train"]}):
-            check_no_skew(clip.cameras[name])
+        for camera in cameras_of(clip, "train").values():
+            check_no_skew(camera)
         VideoMesh.of(Subject.of(clip), clip.head, checkout)
 
-    def export(
-        self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
-    ) -> dict[str, FrameKey]:
+    def export(self, clip: Clip, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
         """Write the training frames as a tracked video, and the files that the program opens in its working directory."""
-        head = VideoMesh.of(Subject.of(clip), clip.head, checkout)
-        head.write_masks(work.program)
-        _copy_main(checkout, work)
+        head = _write_program(Subject.of(clip), clip.head, work)
         return write_training(clip, head, work, progress)
 
-    def train_command(self, fit: Fit, checkout: Checkout, work: Workplace) -> list[str]:
+    def train_command(self, fit: Fit, work: Workplace) -> list[str]:
         """Their program without a window; its output folder ``input/experiments`` is a link to ``model``."""
         _write_config(work, max_steps=fit.budget.iterations, max_images_gpu=self.config.images_on_gpu)
         link = work.input / EXPERIMENTS
         link.unlink(missing_ok=True)
         link.symlink_to(Path("..") / work.model.name)
-        return [*_program(checkout), "--scene", INPUT, *_size(LAST_SIZE, LAST_SIZE)]
+        return [*_program(work.checkout), "--scene", INPUT, *_size(LAST_SIZE, LAST_SIZE)]
 
-    def done(self, line: str) -> tuple[int, str] | None:
-        """Parse the line that it writes after each iteration."""
-        match = _ITERATION.search(line)
-        return None if match is None else (int(match[1]), f"loss {match[2]}")
-
-    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
+    def keep(self, fit: Fit, work: Workplace) -> None:
         """The snapshot."""
         copy_file(work.model / RECORDED / SNAPSHOT, fit.out / SNAPSHOT)
-        return {}
 
-    def files(self, folder: Path) -> list[Path]:
-        """Field with its occupancy grid and settings, and the subject."""
-        return [folder / name for name in (SNAPSHOT, SUBJECT_FILE)]
-
-    def write_list(
-        self,
-        folder: Path,
-        frames: Sequence[Listed],
-        background: Sequence[float],
-        checkout: Checkout,
-        work: Workplace,
-    ) -> None:
+    def render_command(
+        self, folder: Path, frames: Sequence[Listed], background: Sequence[float], work: Workplace
+    ) -> list[str]:
         """Write the frames as test splits, each rendered in a separate call."""
-        model = read_shared_head(folder)
-        head = VideoMesh.of(read_subject(folder / SUBJECT_FILE, model), model, checkout)
-        head.write_masks(work.program)
-        _copy_main(checkout, work)
+        head = _write_program(*read_identity(folder), work)
         _write_config(work, max_images_gpu=PART, max_cached_bvh=PART, render_from_snapshot=True)
         (work.program / SNAPSHOT).symlink_to((folder / SNAPSHOT).absolute())
         calls = []
@@ -127,18 +101,13 @@ class INSTAOfficial(PartsMethod[INSTAOfficialConfig]):
             listed = Path(INPUT) / part["folder"] / TEST
             recorded = listed.parent / EXPERIMENTS / RECORDED
             size = _size(part["width"], part["height"])
-            call = [*_program(checkout), "--snapshot", SNAPSHOT, "--scene", str(listed), *size]
+            call = [*_program(work.checkout), "--snapshot", SNAPSHOT, "--scene", str(listed), *size]
             shown = [str(listed), str(recorded / "transforms_overlay.json")]
             calls.append(RenderCall(call, part["numbers"], str(recorded / "overlay"), shown))
-        self.write_calls(folder, calls, _RECORDED, work)
-        write_background(work, background)
+        return self.command_of(calls, _RECORDED, work)
 
-    def read_back(self, frame: Listed, path: Path, work: Workplace) -> Frame:
-        """A render on black, composited on the background by its coverage."""
-        return read_covered(frame, path, work)
-
-    def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
-        """Leaks and differences, for readers of results."""
+    def differences(self, clip: Clip, seed: int) -> list[str]:
+        """Of the export, the images in memory, the seed, and the renders."""
         differences = [
             "frames are renumbered; the test split that their program renders at the end is a placeholder of one pixel",
             "depths and classes of pixels (mouth, skin, hair) are those of the head model's mesh, not of a depth map of the "
@@ -158,7 +127,7 @@ class INSTAOfficial(PartsMethod[INSTAOfficialConfig]):
             )
         if seed:
             differences.append(f"their code fixes the seeds; seed {seed} is a repetition, not another start")
-        return {"leaks": [], "differences": differences}
+        return differences
 
 
 def _program(checkout: Checkout) -> list[str]:
@@ -169,9 +138,13 @@ def _size(width: int, height: int) -> list[str]:
     return ["--width", str(width), "--height", str(height)]
 
 
-def _copy_main(checkout: Checkout, work: Workplace) -> None:
-    content = read_bytes(checkout.folder / CONFIGS / MAIN, "a configuration", MOST_CONFIG)
+def _write_program(subject: Subject, model: HeadAsset, work: Workplace) -> VideoMesh:
+    """Write the files that the program opens in its working directory; return the subject's mesh."""
+    head = VideoMesh.of(subject, model, work.checkout)
+    head.write_masks(work.program)
+    content = read_bytes(work.checkout.folder / CONFIGS / MAIN, "a configuration", MOST_CONFIG)
     write_bytes(work.program / CONFIGS / MAIN, content)
+    return head
 
 
 def _write_config(work: Workplace, **changes: Any) -> None:

@@ -21,8 +21,8 @@ from ....bench.io.files import grouped_writes, read_bytes, write_bytes, write_te
 from ...shared.avatar_files import Subject
 from ..checkout import Checkout
 from ..ga.head_files import MOST_TEMPLATE, SparseMatrix, pickled
-from ..method import Listed, write_placeholder
-from ..video import FlameSubject, cameras_at_rest, frame_name, image_name, write_torch
+from ..video import FlameSubject, at_rest, frame_name, image_name, write_torch
+from ..workplace import Listed, Workplace, write_placeholder
 
 DATA = Path("data/FLAME2020")
 MODEL_FILE, CHART_FILE = DATA / "generic_model.pkl", DATA / "flame_uv.npz"
@@ -44,14 +44,19 @@ def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout) -> Flam
     return found
 
 
-def write_program(subject: FlameSubject, checkout: Checkout, folder: Path) -> None:
-    """Write the files that the program opens relative to its working directory: head model, chart and eyelids."""
+def write_program(identity: Subject, head: HeadAsset, work: Workplace) -> FlameSubject:
+    """Write the files that the program opens relative to its working directory: head model, chart and eyelids.
+
+    Returns the identity on the head model; raises the errors of `flame_subject`.
+    """
+    subject, folder = flame_subject(identity, head, work.checkout), work.program
     model = subject.model()
     sparse = SparseMatrix(model["J_regressor"])
     write_bytes(folder / MODEL_FILE, pickled({**model, "J_regressor": sparse}))
     subject.official.write_eyelids(*(folder / name for name in EYELID_FILES))
-    chart = read_bytes(checkout.folder / CHART_FILE, "a texture chart", MOST_TEMPLATE)
+    chart = read_bytes(work.checkout.folder / CHART_FILE, "a texture chart", MOST_TEMPLATE)
     write_bytes(folder / CHART_FILE, chart)
+    return subject
 
 
 def write_config(path: Path, checkout: Checkout, changes: Mapping[str, Any]) -> None:
@@ -74,8 +79,7 @@ def write_list(frames: Sequence[Listed], subject: FlameSubject, folder: Path) ->
 
     Images have one pixel: their renderer loads them and uses none, and takes the size from the first frame's file.
     """
-    cameras = cameras_at_rest(subject.posed, [(frame.camera, frame.pose) for frame in frames])
     with grouped_writes():
-        for index, (frame, camera) in enumerate(zip(frames, cameras)):
+        for index, frame in enumerate(at_rest(subject.posed, frames)):
             write_placeholder(folder / image_name(index))
-            write_torch(folder / frame_name(index), subject.frame(camera, frame.pose))
+            write_torch(folder / frame_name(index), subject.frame(frame.camera, frame.pose))

@@ -6,21 +6,18 @@ CVPR 2025. Their loader, head model and files are GaussianAvatars', see `..ga.me
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ....bench.contracts import Clip, FloatArray, FrameKey, HeadAsset, Progress
 from ....bench.errors import InputError
-from ....bench.process import ProgramEnd
 from ....datasets.ga.writer import save_npz
 from ....datasets.head.teeth import RING_LENGTH
 from ....datasets.steps.clusters import cluster_expressions
 from ....datasets.steps.jaw_bases import DEFAULT_COUNT, jaw_bases
-from ...shared.avatar_files import read_shared_head
+from ...shared.avatar_files import SUBJECT_FILE, read_shared_head
 from ...shared.config import PAPER_ITERATIONS
 from ...shared.loop import Fit
 from ...shared.schedule import Timeline
@@ -28,16 +25,16 @@ from ..checkout import Checkout, Repository
 from ..config import TGAOfficialConfig
 from ..ga.head_files import OfficialHead
 from ..ga.method import (
+    ARGUMENTS_FILE,
     LOADER_MODULES,
     LOADER_REMEDY,
     LOADER_TRIAL,
     PLY_FILE,
     TEETH_VERTICES,
     GALayoutMethod,
-    copy_file,
 )
-from ..method import Listed, Patch, Workplace
 from ..spec import TGA_OFFICIAL
+from ..workplace import Listed, Patch, Workplace, copy_file
 
 JAW_FILE, CLUSTER_FILE = "sorted_jaw_poses.npz", "train_cluster_16.npz"
 NETWORKS = ("triplane.pth", "feat_line.pth")
@@ -61,6 +58,10 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
         LOADER_TRIAL,
         LOADER_REMEDY,
     )
+    model_files = (PLY_FILE, *NETWORKS)
+    avatar_files = (*model_files, SUBJECT_FILE, ARGUMENTS_FILE, JAW_FILE)
+    # Their renderer appends its speed to a file of its author after all images of a split are written.
+    excused = r"FileNotFoundError.*fps\.txt"
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
         """Also refuse a mesh of another size than the fixed one of their code, and a head without a face."""
@@ -78,11 +79,9 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
         if "face" not in clip.head.regions:
             raise InputError(where, "regions", "a region face", "none", "Load the head model with its masks.")
 
-    def export(
-        self, clip: Clip, checkout: Checkout, work: Workplace, progress: Progress
-    ) -> dict[str, FrameKey]:
+    def export(self, clip: Clip, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
         """Also write jaw bases and expression clusters of the training timesteps."""
-        images = super().export(clip, checkout, work, progress)
+        images = super().export(clip, work, progress)
         bases = jaw_bases(clip, DEFAULT_COUNT)
         # Their code has 16 lines: a duplicate base shares the weight with its copy.
         filled = bases[np.arange(DEFAULT_COUNT) % len(bases)]
@@ -119,43 +118,25 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
             if theirs != ours
         ]
 
-    def keep(self, fit: Fit, work: Workplace) -> dict[str, Any]:
+    def keep(self, fit: Fit, work: Workplace) -> None:
         """Also keep the jaw bases, which their renderer reads."""
-        kept = super().keep(fit, work)
+        super().keep(fit, work)
         copy_file(work.input / JAW_FILE, fit.out / JAW_FILE)
-        return kept
 
-    def files(self, folder: Path) -> list[Path]:
-        """Besides, the jaw bases."""
-        return [*super().files(folder), folder / JAW_FILE]
-
-    def write_list(
-        self,
-        folder: Path,
-        frames: Sequence[Listed],
-        background: Sequence[float],
-        checkout: Checkout,
-        work: Workplace,
-    ) -> None:
-        """Besides, the jaw bases."""
-        super().write_list(folder, frames, background, checkout, work)
+    def render_command(
+        self, folder: Path, frames: Sequence[Listed], background: Sequence[float], work: Workplace
+    ) -> list[str]:
+        """Besides, the jaw bases are written."""
+        command = super().render_command(folder, frames, background, work)
         copy_file(folder / JAW_FILE, work.input / JAW_FILE)
+        return command
 
-    def excused(self, ended: ProgramEnd) -> bool:
-        """Their renderer appends its speed to a file of its author after all images of a split are written."""
-        return any(re.search(r"FileNotFoundError.*fps\.txt", line) for line in ended.lines)
-
-    def remarks(self, clip: Clip, seed: int) -> dict[str, list[str]]:
+    def differences(self, clip: Clip, seed: int) -> list[str]:
         """Also the replacement of their preprocessing."""
-        remarks = super().remarks(clip, seed)
-        remarks["differences"] += [
+        return super().differences(clip, seed) + [
             "jaw bases from training poses, first the identity; published: validation and test poses, first a half turn",
             "expression clusters without random starts",
         ]
-        return remarks
-
-    def _model_files(self) -> tuple[str, ...]:
-        return (PLY_FILE, *NETWORKS)
 
     def _more_parameters(self, count: int, offset: FloatArray) -> Mapping[str, FloatArray]:
         return {"jaw_quat_weight": np.zeros((count, DEFAULT_COUNT), np.float32)}

@@ -136,6 +136,6 @@ class BlendshapesStandIn(GBSOfficial):
 
     repository = replace(GBSOfficial.repository, modules=("json",), trial="")
 
-    def shrink_command(self, fit, checkout, work):
+    def shrink_command(self, fit, work):
         """Nothing: its checkpoints are no torch files."""
         return

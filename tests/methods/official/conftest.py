@@ -1,15 +1,32 @@
-"""The stand-in repository, and a clip whose principal points are not in the middle."""
+"""Stand-ins of all adapters, and clips whose principal points are not in the middle."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from headbench.bench.process import ProgramError
+from headbench.methods.official import checkout
+from headbench.methods.official.gha import method as gha
+from headbench.methods.official.insta.method import INSTAOfficial
 
 from ...datasets.head.toy import toy_head
 from ..toy_clip import toy_clip
-from .repository import export, fit, lip_numbers, make_repository
+from .blendshapes_repository import BlendshapesStandIn, make_blendshapes_repository
+from .flashavatar_repository import FlashAvatarStandIn, make_flashavatar_repository
+from .insta_repository import make_insta_repository
+from .repository import (
+    HeadAvatarStandIn,
+    StandIn,
+    TensorialStandIn,
+    export,
+    fit,
+    lip_numbers,
+    make_head_avatar_repository,
+    make_repository,
+)
+from .rgbavatar_repository import RGBAvatarStandIn, make_rgbavatar_repository
 
 OFFSETS = {"00": (0.0, 0.0), "01": (3.3, -2.2), "02": (-1.6, 4.1)}
 
@@ -47,48 +64,77 @@ def video_clip():
     return replace(clip, cameras=cameras, poses=lids)
 
 
-@pytest.fixture
-def repository(tmp_path, head):
-    """Folder and commit of the stand-in, whose lips have numbers that no vertex of the head has."""
-    return tmp_path / "repository", make_repository(tmp_path / "repository", *lip_numbers(head))
+@pytest.fixture(autouse=True)
+def small_renders_and_a_gpu(monkeypatch):
+    """Renders of Gaussian Head Avatar of 64 pixels instead of 2048, and a device for INSTA's program."""
+    monkeypatch.setattr(gha, "RENDERED", 64)
+    monkeypatch.setattr(checkout, "_DEVICES", "print('headbench-devices', 1)")
+
+
+ADAPTERS = {
+    "ga": (StandIn, lambda folder, head: make_repository(folder, *lip_numbers(head))),
+    "tga": (TensorialStandIn, lambda folder, head: make_repository(folder, *lip_numbers(head))),
+    "gbs": (BlendshapesStandIn, lambda folder, head: make_blendshapes_repository(folder, 1)),
+    "gha": (HeadAvatarStandIn, lambda folder, head: make_head_avatar_repository(folder)),
+    "insta": (INSTAOfficial, lambda folder, head: make_insta_repository(folder)),
+    "rgbavatar": (
+        RGBAvatarStandIn,
+        lambda folder, head: make_rgbavatar_repository(folder, len(head.template), len(head.faces)),
+    ),
+    "flashavatar": (
+        FlashAvatarStandIn,
+        lambda folder, head: make_flashavatar_repository(folder, len(head.template)),
+    ),
+}
+"""Methods by name, and what writes their repository for a head and returns its commit."""
+OF_VIDEO = ("rgbavatar", "flashavatar")
+"""Adapters that are tested with the clip of equal cameras."""
+MORE_SETTINGS = {"gha": {"mesh_fraction": 0.25}, "insta": {"python": ""}}
 
 
 @pytest.fixture
-def exported(method, video_clip, tmp_path):
-    """What a method writes of the tracked video."""
-    return export(method, video_clip, tmp_path / "work")
+def name(request):
+    """The adapter that a module tests."""
+    return request.module.NAME
 
 
 @pytest.fixture
-def avatar(method, video_clip, tmp_path):
-    """An avatar of the tracked video."""
-    return fit(method, video_clip, tmp_path / "a")
+def clip(name, official_clip, video_clip):
+    return video_clip if name in OF_VIDEO else official_clip
+
+
+@pytest.fixture
+def method(name, clip, tmp_path):
+    """A method around a stand-in for its repository, at a place with words in it that INSTA's program looks for in paths."""
+    folder = tmp_path / "train and test $(false)"
+    implementation, make = ADAPTERS[name]
+    commit = make(folder, clip.head)
+    settings = {"checkout": str(folder), "python": sys.executable, "commit": commit}
+    return implementation(implementation.config_class(**{**settings, **MORE_SETTINGS.get(name, {})}))
+
+
+@pytest.fixture
+def repository(method):
+    """Folder and commit of the stand-in."""
+    return Path(method.config.checkout), method.config.commit
 
 
 @pytest.fixture
 def behave(repository):
     """Make the stand-in behave in another way."""
-
-    def set_behaviour(what):
-        (repository[0] / "behaviour.txt").write_text(what)
-
-    yield set_behaviour
-    set_behaviour("")
+    yield (repository[0] / "behaviour.txt").write_text
+    (repository[0] / "behaviour.txt").write_text("")
 
 
 @pytest.fixture
-def faults_are_found(behave):
-    """Each behaviour of the stand-in ends ``work`` with the error that is named for it, after which the work can be done."""
+def exported(method, clip, tmp_path):
+    """What a method writes of the training frames."""
+    return export(method, clip, tmp_path / "work")
 
-    def check(faults, work):
-        for behaviour, expected in faults.items():
-            behave(behaviour)
-            with pytest.raises(ProgramError, match=expected):
-                work()
-            behave("")
-            assert work()
 
-    return check
+@pytest.fixture
+def avatar(method, clip, tmp_path):
+    return fit(method, clip, tmp_path / "train" / "avatar")
 
 
 def brightness(pose, refined):

@@ -172,6 +172,6 @@ class FlashAvatarStandIn(FlashAvatarOfficial):
 
     repository = replace(FlashAvatarOfficial.repository, modules=("json",), trial="")
 
-    def shrink_command(self, fit, checkout, work):
+    def shrink_command(self, fit, work):
         """Nothing: its checkpoints are no torch files."""
         return

@@ -24,7 +24,7 @@ arguments = parser.parse_args()
 if arguments.version:
     print("neural graphics primitives version 1.0dev")
     sys.exit()
-behaviour = Path(__file__).with_name("behaviour.txt")
+behaviour = Path(__file__).parents[1].joinpath("behaviour.txt")
 behaviour = behaviour.read_text() if behaviour.exists() else ""
 config = json.loads((Path("configs/nerf") / arguments.config).read_text())
 config = json.loads((Path("configs/nerf") / config["parent"]).read_text()) | config

@@ -20,8 +20,9 @@ from headbench.datasets.tracker_files.metrical import MEMBERS, metrical_frame
 from headbench.methods.official.config import GAOfficialConfig
 from headbench.methods.official.ga.method import GAOfficial
 from headbench.methods.official.gha.method import GHAOfficial
-from headbench.methods.official.method import TRAINING_LOG, Workplace
+from headbench.methods.official.method import TRAINING_LOG
 from headbench.methods.official.tga.method import TGAOfficial
+from headbench.methods.official.workplace import Workplace
 
 BUDGET = Budget(iterations=20)
 
@@ -41,17 +42,17 @@ def renders(avatar, clip, ground=(1.0, 1.0, 1.0)):
     return dict(avatar.render_listed(views(clip, "novel_view"), ground, no_progress))
 
 
-def workplace(folder):
+def workplace(method, folder):
     """An empty place to export to."""
-    work = Workplace.at(folder)
+    work = Workplace.at(folder, method.inspect())
     work.make()
     return work
 
 
 def export(method, clip, folder):
     """Export the clip's training frames: the place, and the images in it by key."""
-    work = workplace(folder)
-    return work, method.export(TrainingView(clip), method.inspect(), work, no_progress)
+    work = workplace(method, folder)
+    return work, method.export(TrainingView(clip), work, no_progress)
 
 
 class Killed(KeyboardInterrupt):

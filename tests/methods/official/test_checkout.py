@@ -4,19 +4,16 @@ import subprocess
 import sys
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from headbench.bench.configuration import deciding_settings
 from headbench.bench.errors import InputError
-from headbench.methods.official import needs
 from headbench.methods.official.checkout import Repository, inspect_checkout
 from headbench.methods.official.config import GAOfficialConfig
-from headbench.methods.official.ga.method import GAOfficial
-from headbench.methods.official.tga.method import TGAOfficial
 
-from .repository import BUDGET, StandIn, settings
+from .repository import settings
 
+NAME = "ga"
 REPOSITORY = Repository("https://example.org/code", "0" * 40, ("train.py", "render.py"), ("json",))
 
 
@@ -65,18 +62,6 @@ def test_a_trial_that_fails_says_what_to_do(repository):
     trying = replace(REPOSITORY, trial="import json; json.loads('{')", trial_remedy="Install another.")
     with pytest.raises(InputError, match=r"JSONDecodeError.*Install another\."):
         inspect_checkout("ga-official", settings(*repository), trying)
-    for method in (GAOfficial, TGAOfficial):
-        compile(method.repository.trial, "trial", "exec")
-
-
-def test_doctor_says_what_is_there_and_what_is_not(repository, monkeypatch):
-    nothing = [*needs.ga(GAOfficialConfig(), "cpu")]
-    assert [(need.what, need.found) for need in nothing] == [("checkout", ""), ("environment", "")]
-    assert "git clone" in nothing[0].remedy
-    monkeypatch.setattr(needs, "GAOfficial", StandIn)
-    found = [*needs.ga(settings(*repository), "cpu")]
-    assert found[0].found.endswith(repository[1][:12])
-    assert found[1].found.startswith("Python 3")
 
 
 def test_a_folder_without_git_needs_an_empty_commit(repository, tmp_path):
@@ -109,28 +94,3 @@ def test_where_the_checkout_lies_does_not_make_another_avatar():
     one, other = (GAOfficialConfig(checkout=place, python=place) for place in ("a", "b"))
     assert deciding_settings(one) == deciding_settings(other)
     assert deciding_settings(one) != deciding_settings(replace(one, commit="1234567"))
-
-
-@pytest.mark.parametrize(
-    ("changes", "found"),
-    [
-        ({"background": np.full(3, 0.5)}, "white or black"),
-        ({"head": {"parents": np.array([-1, 0, 0, 0, 0])}}, "FLAME's joints"),
-        ({"head": {"expression_basis": np.zeros((300, 3, 101))}}, "at most 100 directions"),
-        ({"head": {"regions": {}}}, "lips"),
-    ],
-)
-def test_clips_that_the_code_cannot_take_are_refused(repository, official_clip, changes, found):
-    if "head" in changes:
-        changes = {"head": replace(official_clip.head, **changes["head"])}
-    with pytest.raises(InputError, match=found):
-        StandIn(settings(*repository)).check(replace(official_clip, **changes), BUDGET)
-
-
-def test_pixels_that_are_not_square_are_refused(repository, official_clip):
-    cameras = dict(official_clip.cameras)
-    K = cameras["02"].K.copy()
-    K[1, 1] *= 1.05
-    cameras["02"] = replace(cameras["02"], K=K)
-    with pytest.raises(InputError, match="square pixels"):
-        StandIn(settings(*repository)).check(replace(official_clip, cameras=cameras), BUDGET)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from headbench.bench.contracts import Budget
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.images import read_pixels
@@ -21,13 +20,13 @@ from headbench.methods.official.flashavatar import method as implementation
 from headbench.methods.official.flashavatar.export import ParsingMasks, flame_subject, image_names
 from headbench.methods.official.flashavatar.method import FLASHAVATAR_REPOSITORY, SHRINK
 from headbench.methods.official.ga.windows import inside
-from headbench.methods.official.method import TRAINING_LOG, check_export
-from headbench.methods.official.spec import FLASHAVATAR_OFFICIAL
+from headbench.methods.official.method import TRAINING_LOG
 from headbench.methods.official.surface import VisibleMesh
-from headbench.methods.official.video import cameras_at_rest
+from headbench.methods.official.video import training_frames
+from headbench.methods.official.workplace import check_export
 from headbench.methods.shared.avatar_files import Subject
 
-from .flashavatar_repository import FlashAvatarStandIn, make_flashavatar_repository
+from .flashavatar_repository import FlashAvatarStandIn
 from .repository import (
     BUDGET,
     check_killed_training,
@@ -38,18 +37,8 @@ from .repository import (
     views,
 )
 
+NAME = "flashavatar"
 WHITE = (1.0, 1.0, 1.0)
-
-
-@pytest.fixture
-def repository(tmp_path, video_clip):
-    folder = tmp_path / "repository"
-    return folder, make_flashavatar_repository(folder, len(video_clip.head.template))
-
-
-@pytest.fixture
-def method(repository):
-    return FlashAvatarStandIn(FlashAvatarOfficialConfig(str(repository[0]), sys.executable, repository[1]))
 
 
 def test_frames_are_rendered_under_their_keys(avatar, video_clip, monkeypatch):
@@ -151,9 +140,13 @@ def test_masks_of_head_and_mouth_are_those_of_the_mesh(method, video_clip):
     head = video_clip.head
     subject = flame_subject(Subject.of(video_clip), head, method.inspect())
     masks = ParsingMasks(head, subject)
-    frames = [(video_clip.cameras[name], video_clip.poses[t]) for name, t in (("00", 0), ("01", 3))]
+    frames = [
+        frame
+        for frame in training_frames(video_clip, subject.posed)
+        if (frame.camera.id, frame.key.timestep) in (("00", 0), ("01", 3))
+    ]
     counts = np.zeros(3, int)
-    for camera, (_, pose) in zip(cameras_at_rest(subject.posed, frames), frames):
+    for camera, pose in ((frame.camera, frame.pose) for frame in frames):
         large = camera.resized(16 * camera.width, 16 * camera.height)
         whole = np.full((large.height, large.width), 255, np.uint8)
         inside_head, mouth = masks.of(pose, large, whole)
@@ -180,23 +173,13 @@ def test_masks_of_head_and_mouth_are_those_of_the_mesh(method, video_clip):
     assert counts.min() > 10
 
 
-def test_head_model_regions_and_eyelids_are_the_clips_own(exported, repository, video_clip):
+def test_mesh_and_sources_are_theirs(exported, repository):
     work, _ = exported
-    for index, side in enumerate("lr"):
-        name = f"flame/blendshapes/{side}_eyelid.npy"
-        assert np.array_equal(np.load(work.program / name), video_clip.head.eyelid_basis[..., index])
-        assert not np.load(repository[0] / name).any()
     for name in ("flame/FlameMesh.obj", "scene/__init__.py", "train.py"):
         assert (work.program / name).read_bytes() == (repository[0] / name).read_bytes()
 
 
 # ------------------------------------------------------------------ what happens where it fails
-
-
-def test_trainings_that_fail_say_so(method, video_clip, faults_are_found, tmp_path):
-    faults = {"crash": "exit code 1.*out of memory", "no checkpoint": "no whole avatar.*chkpnt20.pth"}
-    for name, expected in faults.items():
-        faults_are_found({name: expected}, lambda name=name: fit(method, video_clip, tmp_path / name).files())
 
 
 def test_a_killed_training_starts_again_on_its_export(method, video_clip, behave, tmp_path):
@@ -205,62 +188,16 @@ def test_a_killed_training_starts_again_on_its_export(method, video_clip, behave
     assert found == ["[]", "[]"], "nothing of the killed training is left"
 
 
-def test_renders_that_are_not_what_was_listed_are_found(avatar, faults_are_found, video_clip):
-    faults = {
-        "crash in rendering": "exit code 1.*out of memory",
-        "one too few": r"lacks 1 of 6 renders, first 000001.png \(toy/",
-        "other size": r"expected \d+x\d+ pixels, found \d+x\d+",
-        "reversed": "the mark of frame 0",
-    }
-    faults_are_found(faults, lambda: renders(avatar, video_clip))
-
-
 @pytest.mark.parametrize(
-    ("case", "expected"),
-    [
-        ("mask", "a mask"),
-        ("background", r"white, or green \(0, 1, 0\)"),
-        ("intrinsics", "camera 01: expected size and intrinsics of camera 00"),
-        ("pixels", "square pixels"),
-        ("boundary", r"regions\[boundary\].*FLAME_masks.pkl"),
-        ("topology", "FlameMesh.obj has.*Refit the capture to FLAME 2020"),
-        ("frames", "at most 7 training frames"),
-    ],
+    ("file", "expected"),
+    {
+        "flame/FlameMesh.obj": "FlameMesh.obj has.*Refit the capture to FLAME 2020",
+        "scene/__init__.py": "at most 7 training frames",
+    }.items(),
 )
-def test_clips_that_their_code_cannot_take_are_refused(method, repository, video_clip, case, expected):
-    clip, cameras, head = video_clip, video_clip.cameras, video_clip.head
-    if case == "mask":
-        clip = replace(clip, masks=dict.fromkeys(clip.masks))
-    elif case == "background":
-        clip = replace(clip, background=np.zeros(3))
-    elif case in ("intrinsics", "pixels"):
-        name, place = ("01", (0, 0)) if case == "intrinsics" else ("02", (1, 1))
-        K = cameras[name].K.copy()
-        K[place] *= 1.05
-        clip = replace(clip, cameras={**cameras, name: replace(cameras[name], K=K)})
-    elif case == "boundary":
-        regions = {name: members for name, members in head.regions.items() if name != "boundary"}
-        clip = replace(clip, head=replace(head, regions=regions))
-    else:
-        path = repository[0] / ("flame/FlameMesh.obj" if case == "topology" else "scene/__init__.py")
-        path.write_text(
-            path.read_text().replace("max_train_num = 10000", "max_train_num = 7") + "\nv 0 0 0\n"
-        )
-    with pytest.raises(InputError, match=expected):
-        method.check(clip, BUDGET)
-
-
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({"commit": "0" * 40}, "expected commit 000000000000, found commit"),
-        ({"checkout": "/nowhere"}, "no such folder.*git clone.*USTC3DV/FlashAvatar-code"),
-        ({"python": ""}, "settings.flashavatar-official.python="),
-        ({"device": "cpu-shim"}, "device: expected cuda"),
-    ],
-)
-def test_faults_of_settings_are_named_before_any_work(method, video_clip, changes, expected):
-    method.config = replace(method.config, **changes)
+def test_limits_of_their_files_are_kept(method, repository, video_clip, file, expected):
+    path = repository[0] / file
+    path.write_text(path.read_text().replace("max_train_num = 10000", "max_train_num = 7") + "\nv 0 0 0\n")
     with pytest.raises(InputError, match=expected):
         method.check(video_clip, BUDGET)
 
@@ -274,8 +211,8 @@ def test_missing_weights_are_named_before_any_work(method, video_clip, tmp_path,
     weights = tmp_path / "hub/hub/checkpoints/vgg16-397923af.pth"
     weights.parent.mkdir(parents=True)
     weights.write_bytes(b"")
-    monkeypatch.setattr(needs, "FlashAvatarOfficial", FlashAvatarStandIn)
-    (_, environment) = needs.flashavatar(method.config, "cpu")
+    monkeypatch.setitem(needs.METHODS, FlashAvatarOfficialConfig, FlashAvatarStandIn)
+    (_, environment) = needs.official(method.config, "cpu")
     assert "CUDA build of PyTorch" in environment.remedy or environment.found
 
 
@@ -309,17 +246,3 @@ def test_checkpoints_lose_their_optimisers_and_nothing_else(tmp_path):
     for optimiser, values in ((first, lean), (second, leaner)):
         assert values["state"] == {}
         optimiser.load_state_dict(values)  # as their renderer does
-
-
-def test_presets_and_needs_are_those_of_the_spec():
-    assert set(FLASHAVATAR_OFFICIAL.presets) == {"smoke", "demo", "fast", "paper"}
-    assert FLASHAVATAR_OFFICIAL.presets["paper"]["budget"] == {"iterations": 150_000}
-    assert FLASHAVATAR_OFFICIAL.monocular
-    assert FLASHAVATAR_OFFICIAL.head_models == ("flame2020",)
-    assert [need.found for need in needs.flashavatar(FlashAvatarOfficialConfig(), "cpu")] == ["", ""]
-    compile(FLASHAVATAR_REPOSITORY.trial, "trial", "exec")
-
-
-def test_a_budget_in_seconds_is_refused(method, video_clip):
-    with pytest.raises(InputError, match="only iterations"):
-        method.check(video_clip, Budget(seconds=5.0))

@@ -21,14 +21,14 @@ from headbench.methods.official.checkout import Checkout
 from headbench.methods.official.config import GBSOfficialConfig
 from headbench.methods.official.gbs.export import GRIDS
 from headbench.methods.official.gbs.method import SHRINK, GBSOfficial
-from headbench.methods.official.method import Listed, Workplace, check_export
-from headbench.methods.official.spec import GBS_OFFICIAL
+from headbench.methods.official.workplace import Listed, Workplace, check_export
 from headbench.methods.shared.schedule import ShuffledEpochs
 
 from .blendshapes_repository import CYLINDER, HELD_OUT, BlendshapesStandIn, make_blendshapes_repository
 from .repository import export, settings, views, workplace
 from .repository import fit as train
 
+NAME = "gbs"
 BUDGET = Budget(iterations=2_000)
 
 
@@ -36,11 +36,6 @@ def stand_in(folder, vertices=1, change="shown"):
     commit = make_blendshapes_repository(folder, vertices, change)
     found = settings(folder, commit)
     return BlendshapesStandIn(GBSOfficialConfig(found.checkout, found.python, found.commit))
-
-
-@pytest.fixture
-def method(tmp_path):
-    return stand_in(tmp_path / "repository")
 
 
 @pytest.fixture
@@ -106,7 +101,7 @@ def test_the_record_tells_placeholders_padding_and_the_fix(method, official_clip
     assert "placeholders of one pixel" in told
     assert "8 directions is padded" in told
     assert "5017124" not in told
-    assert any("5017124" in line for line in BlendshapesStandIn().remarks(official_clip, 0)["differences"])
+    assert any("5017124" in line for line in BlendshapesStandIn().differences(official_clip, 0))
 
 
 def test_the_schedule_keeps_its_fractions_of_a_shorter_run(method, official_clip, tmp_path):
@@ -120,18 +115,6 @@ def test_the_schedule_keeps_its_fractions_of_a_shorter_run(method, official_clip
         "test_iterations": 0,
     }.items():
         assert f"'{name}': '{value}'" in log
-
-
-def test_images_times_their_alpha_are_the_frames_on_black(exported, moving_clip):
-    work, images = exported
-    assert sorted(images) == [f"input/images/{number:05d}.png" for number in range(len(images))]
-    assert set(images.values()) == set(moving_clip.splits["train"])
-    for place, key in images.items():
-        pixels = read_pixels(work.root / place).astype(float)
-        share = moving_clip.masks[key][..., None] / 255
-        assert np.array_equal(pixels[..., 3:], moving_clip.masks[key][..., None])
-        on_black = moving_clip.images[key][..., ::-1] - (1 - share) * 255 * moving_clip.background
-        assert np.abs(pixels[..., :3] * share - np.clip(on_black, 0, 255 * share)).max() < 0.51
 
 
 def test_frames_hold_pose_and_both_cameras_in_the_heads_frame(exported, moving_clip):
@@ -206,44 +189,15 @@ def test_a_head_of_flames_topology_keeps_theirs(moving_clip, tmp_path):
         assert path.read_text() == "3\n1\n2\n"
 
 
-def test_eyelid_bases_are_those_of_the_clips_head(official_clip, tmp_path):
-    basis = np.random.default_rng(0).standard_normal((*official_clip.head.template.shape, 2))
-    clip = replace(official_clip, head=replace(official_clip.head, eyelid_basis=basis))
-    method = stand_in(tmp_path / "repository")
-    work, _ = export(method, clip, tmp_path / "work")
-    for index, side in enumerate("lr"):
-        path = work.program / f"FLAME/blendshapes/{side}_eyelid.npy"
-        assert np.array_equal(np.load(path), basis[..., index])
-    assert not np.load(tmp_path / f"repository/FLAME/blendshapes/{side}_eyelid.npy").any()
-
-
 def test_grids_that_nobody_reads_have_one_node(method, official_clip, tmp_path):
     avatar = fit(method, official_clip, tmp_path / "a")
-    work = workplace(tmp_path / "work")
+    work = workplace(method, tmp_path / "work")
     listed = [next(iter(views(official_clip, "novel_view").values()))]
     frames = [Listed(0, official_clip.splits["novel_view"][0], *listed[0])]
-    method.write_list(tmp_path / "a", frames, (1, 1, 1), method.inspect(), work)
+    method.render_command(tmp_path / "a", frames, (1, 1, 1), work)
     for file, name in GRIDS.items():
         assert torch.load(work.input / file, weights_only=True)[name].numel() == 1
     assert (work.model / "fix_chkpnt1.pth").resolve() == avatar.files()[0].resolve()
-
-
-@pytest.mark.parametrize(
-    ("changes", "found"),
-    [
-        ({"masks": None}, "a mask"),
-        ({"regions": {"scalp": np.arange(2)}}, "regions"),
-        ({"regions": {}}, "scalp"),
-        ({"expression_basis": np.zeros((300, 3, 101))}, "at most 100 directions"),
-    ],
-)
-def test_clips_without_mask_or_head_to_fit_are_refused(method, official_clip, changes, found):
-    if "masks" in changes:
-        clip = replace(official_clip, masks=dict.fromkeys(official_clip.masks))
-    else:
-        clip = replace(official_clip, head=replace(official_clip.head, **changes))
-    with pytest.raises(InputError, match=found):
-        method.check(clip, BUDGET)
 
 
 def test_a_mask_that_is_missing_later_is_named(method, official_clip, tmp_path):
@@ -287,16 +241,7 @@ def test_checkpoints_lose_their_optimiser_and_nothing_else(tmp_path):
 def test_what_rendering_never_reads_is_left_out_by_their_python(official_clip, tmp_path):
     fit = SimpleNamespace(budget=BUDGET, clip=official_clip)
     checkout = Checkout(tmp_path, ("conda", "run", "python"), {})
-    command = GBSOfficial.shrink_command(stand_in(tmp_path / "r"), fit, checkout, Workplace(tmp_path))
+    command = GBSOfficial.shrink_command(stand_in(tmp_path / "r"), fit, Workplace(tmp_path, checkout))
     assert command[:4] == ["conda", "run", "python", "-c"]
     names = [f"{name}2000.pth" for name in ("fix_chkpnt", "mouth0_chkpnt", "mouth1_chkpnt")]
     assert command[5:] == [str(tmp_path / "model" / name) for name in names]
-
-
-def test_short_presets_take_the_native_rates():
-    assert GBS_OFFICIAL.monocular
-    assert set(GBS_OFFICIAL.presets) == {"smoke", "demo", "fast", "paper"}
-    demo = GBS_OFFICIAL.presets["demo"]
-    assert demo["budget"] == {"iterations": 2_000}
-    assert demo["arguments"][-2:] == ("--init_face_point_number", "12000")
-    assert "arguments" not in GBS_OFFICIAL.presets["paper"]

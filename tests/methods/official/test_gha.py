@@ -1,7 +1,6 @@
 """What GHA's adapter has beyond the others: two stages, squares, smoothing undone, renders of each camera by number."""
 
 import re
-import sys
 from dataclasses import replace
 
 import cv2
@@ -14,31 +13,14 @@ from headbench.bench.io.documents import read_json
 from headbench.bench.io.images import read_png
 from headbench.methods.official.config import GHAOfficialConfig
 from headbench.methods.official.ga.windows import square, square_side
-from headbench.methods.official.gha import method as implementation
 from headbench.methods.official.gha.export import MOUTH_ROWS, GHATracking, overshot
-from headbench.methods.official.method import TRAINING_LOG, check_export
+from headbench.methods.official.method import TRAINING_LOG
+from headbench.methods.official.workplace import check_export
 from headbench.methods.shared.avatar_files import Subject
 
-from .repository import BUDGET, HeadAvatarStandIn, export, fit, make_head_avatar_repository, renders, views
+from .repository import BUDGET, export, fit, views
 
-
-@pytest.fixture
-def repository(tmp_path):
-    """Folder and commit of the stand-in."""
-    return tmp_path / "repository", make_head_avatar_repository(tmp_path / "repository")
-
-
-@pytest.fixture(autouse=True)
-def small_renders(monkeypatch):
-    """Renders of 64 pixels instead of 2048."""
-    monkeypatch.setattr(implementation, "RENDERED", 64)
-
-
-@pytest.fixture
-def method(repository):
-    return HeadAvatarStandIn(
-        GHAOfficialConfig(str(repository[0]), sys.executable, repository[1], mesh_fraction=0.25)
-    )
+NAME = "gha"
 
 
 def test_both_stages_are_run_and_frames_come_back_by_key(method, official_clip, tmp_path):
@@ -72,23 +54,6 @@ def test_both_stages_are_run_and_frames_come_back_by_key(method, official_clip, 
         assert np.abs(frame.rgb[0, 0] * 255 - np.clip([red, green, 120], 0, 255)).max() <= 1.01
 
 
-@pytest.mark.parametrize(
-    "fault", [{"crash": "exit code 1.*CUDA out of memory"}, {"stop": "ended before its 5 iterations"}]
-)
-def test_a_stage_that_fails_says_so(method, faults_are_found, official_clip, tmp_path, fault):
-    faults_are_found(fault, lambda: fit(method, official_clip, tmp_path / "avatar").files())
-
-
-def test_renders_that_are_not_what_was_listed_are_found(method, faults_are_found, official_clip, tmp_path):
-    avatar = fit(method, official_clip, tmp_path / "avatar")
-    faults = {
-        "reversed": "the mark of frame",
-        "other size": "expected 128x64 pixels, found 124x62",
-        "one too few": r"lacks 1 of 3 renders, first 000001.png",
-    }
-    faults_are_found(faults, lambda: renders(avatar, official_clip))
-
-
 def test_only_training_frames_are_exported_and_to_the_bit(method, official_clip, tmp_path):
     # A neck that is not bent has no pose correctives and skins nothing: the face moves rigidly.
     straight = {t: replace(pose, neck=np.zeros(3, np.float32)) for t, pose in official_clip.poses.items()}
@@ -119,34 +84,6 @@ def test_only_training_frames_are_exported_and_to_the_bit(method, official_clip,
         assert np.abs(moved - np.load(folder / "lmk_3d.npy")).max() < 1e-6
     lips = set(official_clip.head.regions["lips"])
     assert set(tracking.rows[MOUTH_ROWS]) <= lips
-
-
-def without(clip):
-    regions = {name: part for name, part in clip.head.regions.items() if name != "lips"}
-    _, *rest = clip.splits["train"]
-    return {
-        "background": replace(clip, background=np.zeros(3)),
-        "lips": replace(clip, head=replace(clip.head, regions=regions)),
-        "frame": replace(clip, splits={**clip.splits, "train": tuple(rest)}),
-        "skew": replace(
-            clip,
-            cameras={n: replace(c, K=c.K + np.eye(3, k=1) * [0, 1, 0]) for n, c in clip.cameras.items()},
-        ),
-    }
-
-
-@pytest.mark.parametrize(
-    ("case", "expected"),
-    [
-        ("background", "expected white"),
-        ("lips", "region 'lips'"),
-        ("frame", "training frame of each of 2 cameras"),
-        ("skew", "no skew"),
-    ],
-)
-def test_clips_that_their_code_cannot_take_are_refused(method, official_clip, case, expected):
-    with pytest.raises(InputError, match=expected):
-        method.check(without(official_clip)[case], BUDGET)
 
 
 def test_what_is_missing_of_checkout_and_length_is_named(method, repository, official_clip):

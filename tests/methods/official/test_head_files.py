@@ -21,6 +21,8 @@ from headbench.methods.official.ga.head_files import (
 
 from ...datasets.head.toy import toy_head
 
+NAME = "ga"
+
 
 @pytest.fixture
 def heads(repository):

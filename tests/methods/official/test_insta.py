@@ -8,56 +8,22 @@ import cv2
 import numpy as np
 import pytest
 
-from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
-from headbench.bench.process import ProgramError
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
 from headbench.datasets.monocular.mesh_fit import read_vertices
-from headbench.methods.official import checkout, needs
 from headbench.methods.official.config import INSTAOfficialConfig
 from headbench.methods.official.insta import export
 from headbench.methods.official.insta.export import HAIR, MOUTH, SKIN, VideoMesh
 from headbench.methods.official.insta.method import INSTAOfficial
-from headbench.methods.official.method import TRAINING_LOG, Listed, check_export
+from headbench.methods.official.method import TRAINING_LOG
+from headbench.methods.official.workplace import Listed, check_export
 from headbench.methods.shared.avatar_files import Subject
 
 from .insta_repository import make_insta_repository
-from .repository import BUDGET, fit, renders, views, workplace
-from .repository import export as export_to
+from .repository import fit, views, workplace
 
+NAME = "insta"
 GROUND = (1.0, 1.0, 1.0)
-
-
-@pytest.fixture(autouse=True)
-def a_gpu(monkeypatch):
-    monkeypatch.setattr(checkout, "_DEVICES", "print('headbench-devices', 1)")
-
-
-@pytest.fixture
-def repository(tmp_path):
-    """Folder and commit of the stand-in, at a place with words in it that their program looks for in paths."""
-    folder = tmp_path / "train and test $(false)"
-    return folder, make_insta_repository(folder)
-
-
-@pytest.fixture
-def method(repository):
-    return INSTAOfficial(INSTAOfficialConfig(str(repository[0]), commit=repository[1]))
-
-
-@pytest.fixture
-def behave(repository):
-    return (repository[0] / "build" / "behaviour.txt").write_text
-
-
-@pytest.fixture
-def avatar(method, official_clip, tmp_path):
-    return fit(method, official_clip, tmp_path / "train" / "avatar")
-
-
-@pytest.fixture
-def exported(method, official_clip, tmp_path):
-    return export_to(method, official_clip, tmp_path / "work")
 
 
 def test_frames_are_rendered_under_their_keys_on_any_ground(avatar, official_clip, monkeypatch):
@@ -102,60 +68,6 @@ def test_progress_log_and_record_are_those_of_the_program(method, repository, of
     assert any("8 expression coefficients" in line for line in record["differences"])
 
 
-@pytest.mark.parametrize(
-    ("behaviour", "expected"),
-    {"crash": "exit code 1.*out of memory", "no snapshot": "no whole avatar.*snapshot.msgpack"}.items(),
-)
-def test_a_training_that_fails_begins_anew(method, behave, official_clip, tmp_path, behaviour, expected):
-    """Renders that it left beside its input are none of the images that it may be given."""
-    behave(behaviour)
-    with pytest.raises(ProgramError, match=expected):
-        fit(method, official_clip, tmp_path / "a")
-    behave("")
-    calls = []
-    assert fit(method, official_clip, tmp_path / "a", lambda done, *_: calls.append(done)).files()
-    assert min(calls) > len(official_clip.splits["train"]), "the export was kept"
-
-
-def test_renders_that_are_not_what_was_listed_are_found(avatar, faults_are_found, official_clip):
-    faults = {
-        "crash in rendering": "exit code 1.*out of memory",
-        "one too few": r"lacks 1 of 3 renders, first 000001.png \(toy/",
-        "other size": "expected 28x36 pixels, found 27x36",
-        "reversed": "exit code 1.*rendered by the camera of another",
-        "no cameras": "exit code 1.*wrote no .*transforms_overlay.json",
-        "no coverage": "expected colours and coverage",
-    }
-    faults_are_found(faults, lambda: renders(avatar, official_clip))
-
-
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({"program": "build/none"}, "build/none.*program: expected a program that can be run.*cmake"),
-        ({"program": "no-such-program build/rta"}, "no-such-program"),
-        ({"program": "'unclosed"}, "the program that was built"),
-        ({"program": "/bin/true"}, "to --version.*cmake"),
-        ({"commit": "0" * 40}, "expected commit 000000000000"),
-        ({"checkout": "/nowhere"}, "no such folder.*git clone.*built as its installation page says"),
-        ({"device": "cpu-shim"}, "device: expected cuda"),
-    ],
-)
-def test_faults_of_settings_are_named_before_any_work(method, official_clip, changes, expected):
-    with pytest.raises(InputError, match=expected):
-        INSTAOfficial(replace(method.config, **changes)).check(official_clip, BUDGET)
-
-
-def test_doctor_says_whether_program_and_gpu_are_there(method, monkeypatch):
-    assert [need.found for need in needs.insta(INSTAOfficialConfig(), "cpu")] == ["", ""]
-    found = [*needs.insta(method.config, "cpu")]
-    assert [need.what for need in found] == ["checkout", "environment"]
-    assert found[0].found
-    assert found[1].found == "instant-ngp 1.0dev"
-    monkeypatch.setattr(checkout, "_DEVICES", "print('headbench-devices', 0)")
-    assert "a CUDA device" in [*needs.insta(method.config, "cpu")][1].remedy
-
-
 @pytest.mark.parametrize("change", [{"python": "python"}, {"images_on_gpu": 0}])
 def test_settings_without_a_meaning_are_refused(change):
     with pytest.raises(ValueError, match="python|images_on_gpu"):
@@ -166,23 +78,6 @@ def test_words_may_start_the_program(method, repository):
     program = f"env A=1 '{repository[0]}/build/rta'"
     found = INSTAOfficial(replace(method.config, program=program)).inspect()
     assert found.python[1:] == ("A=1", f"{repository[0]}/build/rta")
-
-
-def clips(clip):
-    skewed = replace(clip.cameras["00"], K=clip.cameras["00"].K + [[0, 1, 0], [0, 0, 0], [0, 0, 0]])
-    return {
-        "mask": replace(clip, masks=dict.fromkeys(clip.masks)),
-        "skew": replace(clip, cameras={**clip.cameras, "00": skewed}),
-        "place": replace(clip, static_offset=clip.static_offset + np.array([0, 0.5, 0])),
-    }
-
-
-@pytest.mark.parametrize(
-    ("case", "expected"), {"mask": "a mask", "skew": "no skew", "place": "of the origin"}.items()
-)
-def test_clips_that_their_code_cannot_take_are_refused(method, official_clip, case, expected):
-    with pytest.raises(InputError, match=expected):
-        method.check(clips(official_clip)[case], BUDGET)
 
 
 # ------------------------------------------------------------------ what the program is given
@@ -279,7 +174,7 @@ def test_regions_of_another_head_are_red_vertices(method, official_clip, tmp_pat
 
 
 def test_a_list_has_focal_lengths_for_images_of_a_pixel(method, official_clip, tmp_path):
-    work = workplace(tmp_path / "work")
+    work = workplace(method, tmp_path / "work")
     mesh = VideoMesh.of(Subject.of(official_clip), official_clip.head, method.inspect())
     wanted = views(official_clip, "novel_view", "train")
     frames = [Listed(7 + i, key, *view) for i, (key, view) in enumerate(wanted.items())]

@@ -1,7 +1,5 @@
 """What TGA's adapter has beyond GaussianAvatars': sizes fixed in their code, jaw bases, clusters, an author's path."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,15 +9,10 @@ from headbench.bench.io.arrays import read_npz
 from headbench.bench.io.documents import read_json
 from headbench.datasets.steps.clusters import cluster_expressions
 from headbench.datasets.steps.jaw_bases import jaw_quaternions
-from headbench.methods.official.config import TGAOfficialConfig
 
-from .repository import BUDGET, LINES_BEGIN, TensorialStandIn, export, fit, settings, views
+from .repository import BUDGET, LINES_BEGIN, export, fit, views
 
-
-@pytest.fixture
-def method(repository):
-    found = settings(*repository)
-    return TensorialStandIn(TGAOfficialConfig(found.checkout, found.python, found.commit))
+NAME = "tga"
 
 
 def test_it_trains_and_renders_though_their_log_has_no_place(method, official_clip, tmp_path):
@@ -65,9 +58,3 @@ def test_a_mesh_of_another_size_than_theirs_is_refused(method, official_clip, re
     source.write_text("")
     with pytest.raises(InputError, match="Check out the commit"):
         method.check(official_clip, BUDGET)
-
-
-def test_a_head_without_a_face_is_refused(method, official_clip):
-    regions = {name: part for name, part in official_clip.head.regions.items() if name != "face"}
-    with pytest.raises(InputError, match="a region face"):
-        method.check(replace(official_clip, head=replace(official_clip.head, regions=regions)), BUDGET)
