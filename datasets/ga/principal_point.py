@@ -19,6 +19,7 @@ import numpy as np
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray
 from ...bench.errors import InputError
 from ...bench.protocol import evenly_with_ends
+from ..head.geometry import project
 from ..head.subject import PosedSubject
 from ..images import read_image, read_mask
 from .cameras import CaptureCameras
@@ -143,18 +144,11 @@ def weigh_cy(views: Sequence[OutlineView], faces: IntArray) -> CyEvidence:
         foreground = (view.mask() > 127).astype(np.uint8)
         distance = _distance_to_outline(foreground)
         flipped = view.camera.height - 2 * float(view.camera.K[1, 2])
-        projected = _project(view.vertices, view.camera)
+        projected = project(view.vertices, view.camera)
         top.append(_agreement(projected, faces, distance))
         bottom.append(_agreement(projected + np.array([0.0, flipped]), faces, distance))
     favour = np.sign(np.array(top) - np.array(bottom))
     return CyEvidence(float(np.mean(top)), float(np.mean(bottom)), float(np.mean((favour + 1) / 2)))
-
-
-def _project(vertices: FloatArray, camera: Camera) -> FloatArray:
-    """(V, 2) pixels."""
-    points = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    pixels = points @ camera.K.T
-    return pixels[:, :2] / np.maximum(pixels[:, 2:], 1e-6)
 
 
 def _agreement(pixels: FloatArray, faces: IntArray, distance: FloatArray) -> float:

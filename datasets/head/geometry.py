@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...bench.contracts import FloatArray, IntArray
+from ...bench.contracts import Camera, FloatArray, IntArray
 
 
 def smoothstep(values: FloatArray, low: float | FloatArray, high: float | FloatArray) -> FloatArray:
@@ -76,6 +76,13 @@ def fit_sphere(points: FloatArray) -> tuple[FloatArray, float]:
     design = np.concatenate([2.0 * local, np.ones((len(local), 1))], axis=1)
     solution = np.linalg.lstsq(design, (local**2).sum(axis=1), rcond=None)[0]
     return middle + solution[:3], float(np.sqrt(solution[3] + solution[:3] @ solution[:3]))
+
+
+def project(points: FloatArray, camera: Camera) -> FloatArray:
+    """(n, 2) pixels of points (n, 3) in the world; those of points behind the camera have no meaning."""
+    seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels: FloatArray = (seen @ camera.K.T)[:, :2] / np.maximum(seen[:, 2:], 1e-6)
+    return pixels
 
 
 def rigid_alignment(points: FloatArray, wanted: FloatArray, weights: FloatArray | None = None) -> FloatArray:

@@ -5,15 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-import numpy as np
-
-from ...bench.contracts import Clip, FrameKey
+from ...bench.contracts import Clip
 from ...bench.io.images import ImageInfo
-from ..ga import layout
 from ..ga.tracking import Tracking
-from ..ga.transforms import FrameEntry
 from .catalogue import RULES
-from .evidence import Evidence
+from .evidence import Evidence, clip_entry
 from .mesh import Parameters, TrackedSubject
 from .rules import apply
 from .settings import LintSettings
@@ -35,9 +31,10 @@ def errors(clip: Clip) -> list[str]:
     """Errors of the linter for a clip: code, fault and remedy of each error in `CODES`."""
     if clip.head is None:
         return []  # a capture without a head, for methods that need none
+    folder = Path(clip.subject)
     keys = sorted({key for part in clip.splits.values() for key in part})
     keys = keys[:: max(1, len(keys) // MOST)]
-    entries = {_entry(clip, key): key for key in keys}
+    entries = {clip_entry(folder, clip, key): key for key in keys}
     by_image = {entry.image: key for entry, key in entries.items()}
     headers = {
         entry.image: ImageInfo(clip.cameras[key.camera].width, clip.cameras[key.camera].height, 3)
@@ -57,7 +54,7 @@ def errors(clip: Clip) -> list[str]:
     }
     background = tuple(map(float, clip.background))
     evidence = Evidence(
-        folder=Path(clip.subject),
+        folder=folder,
         settings=LintSettings(),
         of_layout=False,
         background=background,
@@ -73,23 +70,3 @@ def errors(clip: Clip) -> list[str]:
     )
     rules = [rule for rule in RULES if rule.code in CODES]
     return [f"{found.code}: {found.message}. {found.remedy}" for found in apply(rules, evidence)]
-
-
-def _entry(clip: Clip, key: FrameKey) -> FrameEntry:
-    """A clip's frame as an entry of the layout, with the key in place of paths."""
-    camera = clip.cameras[key.camera]
-    return FrameEntry(
-        file=Path(clip.subject),
-        where=f"frame {key}",
-        timestep=key.timestep,
-        camera_index=list(clip.cameras).index(key.camera),
-        camera_id=key.camera,
-        sequence_folder=key.sequence,
-        image=Path(str(key)),
-        mask=None,
-        parameters=Path(clip.subject),
-        width=camera.width,
-        height=camera.height,
-        intrinsics=layout.intrinsics_to_json(camera, "top"),
-        camera_to_world=np.array(layout.extrinsics_to_json(camera.world_to_camera)),
-    )

@@ -17,17 +17,14 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ...bench.contracts import Camera, FloatArray, Progress, no_progress
+from ...bench.contracts import Camera, FloatArray, Progress
 from ...bench.errors import InputError
 from ...bench.protocol import evenly_with_ends
 from ..ga.layout import CyConvention
 from ..ga.transforms import FrameEntry
-from ..head.geometry import vertex_normals
+from ..head.geometry import project, vertex_normals
 from .mesh import Parameters, TrackedSubject
 from .views import BLANK_LEVELS, Pixels, entry_camera, structure
-
-TIMESTEPS = 8
-"""Timesteps to measure on."""
 
 WORKING_HEIGHT = 400
 """Maximum height of compared images, pixels."""
@@ -57,7 +54,6 @@ at least the second value."""
 FEWEST_CAMERAS = 3
 """Minimum number of cameras; with two it is unknown which one is wrong."""
 
-_NOT_SKIN = ("mouth_socket", "left_eyeball", "right_eyeball", "teeth")
 _CANDIDATES = 6
 
 
@@ -141,8 +137,8 @@ def measure_cameras(
     parameters: Mapping[int, Parameters],
     cy: CyConvention,
     *,
-    timesteps: int = TIMESTEPS,
-    progress: Progress = no_progress,
+    timesteps: int,
+    progress: Progress,
 ) -> dict[str, CameraFacts]:
     """Measure every camera on up to ``timesteps`` timesteps: those in which the head moves most, spread over time."""
     cameras = sorted({entry.camera_id for entry in entries})
@@ -280,10 +276,7 @@ class _Table:
         shots: Mapping[str, Mapping[int, _Shot]],
         around: Mapping[int, Sequence[int]],
     ) -> None:
-        regions = subject.head.regions
-        face = regions.get("face", np.arange(len(subject.head.template)))
-        face = np.setdiff1d(face, np.concatenate([regions.get(n, np.empty(0, np.int64)) for n in _NOT_SKIN]))
-        self.members = face[:: max(1, -(-len(face) // MOST_VERTICES))]
+        self.members = subject.skin[:: max(1, -(-len(subject.skin) // MOST_VERTICES))]
         posed = self.around = {t: steps for t, steps in around.items() if steps[MAX_LAG] >= 0}
         self.shots = {c: {t: s for t, s in taken.items() if t in posed} for c, taken in shots.items()}
         self.shots = {camera: taken for camera, taken in self.shots.items() if taken}
@@ -311,7 +304,7 @@ class _Table:
         points = self.points[timestep]
         towards = camera.center - points
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        pixels = _project(points, camera)
+        pixels = project(points, camera)
         within = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1)
         facing = (self.normals[timestep] * towards).sum(axis=1) > FACING
         return _Picked(pixels, facing & within, shot.smooth)
@@ -376,7 +369,7 @@ class _Table:
                 picked, view = self.picked[camera][timestep], self.shots[camera][timestep].camera
                 if shown < 0 or not picked.seen.any():
                     continue
-                moved = _project(self.points[shown][picked.seen], view) - picked.pixels[picked.seen]
+                moved = project(self.points[shown][picked.seen], view) - picked.pixels[picked.seen]
                 rest.append(offset - np.median(moved, axis=0))
             if len(rest) > len(offsets) / 2:
                 middle = np.median(rest, axis=0)
@@ -410,13 +403,6 @@ class _Table:
             return np.nan
         ratio = np.maximum(fine[both], 1e-6) / np.maximum(typical[both], 1e-6)
         return float(0.5 * np.median(np.log2(ratio)))
-
-
-def _project(points: FloatArray, camera: Camera) -> FloatArray:
-    """(F, 2) pixels."""
-    seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    pixels: FloatArray = (seen @ camera.K.T)[:, :2] / np.maximum(seen[:, 2:], 1e-6)
-    return pixels
 
 
 def _sample(image: FloatArray, pixels: FloatArray) -> FloatArray:

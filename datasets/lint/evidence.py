@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...bench.contracts import FrameKey, Progress, no_progress
+from ...bench.contracts import Clip, FrameKey, Progress
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.files import digest
@@ -140,7 +140,7 @@ class Evidence:
         return found
 
 
-def gather(folder: Path, settings: LintSettings, progress: Progress = no_progress) -> Evidence:
+def gather(folder: Path, settings: LintSettings, progress: Progress) -> Evidence:
     """Read all readable content of a capture."""
     declaration, declaration_faults = _read_declaration(folder)
     splits, unread, json_faults, frame_faults = _read_splits(folder)
@@ -175,9 +175,7 @@ def gather(folder: Path, settings: LintSettings, progress: Progress = no_progres
     )
 
 
-def gather_clip(
-    folder: Path, clip: CaptureClip, settings: LintSettings, progress: Progress = no_progress
-) -> Evidence:
+def gather_clip(folder: Path, clip: CaptureClip, settings: LintSettings, progress: Progress) -> Evidence:
     """Evidence from a clip of any reader, without the layout's files."""
     entries = {key: _entry_of(folder, clip, key) for part in clip.splits.values() for key in part}
     headers = {
@@ -231,30 +229,30 @@ def _looked_at(
     chosen = whole if settings.thorough else pick_views(whole, settings.views)
     views = inspect_views(chosen, pixels, subject, parameters, background, cy, progress=progress)
     limit = len(whole) if settings.thorough else settings.duplicates
+    timesteps = THOROUGH_TIMESTEPS if settings.thorough else settings.camera_timesteps
     return {
         "views": views,
         "thumbnails": make_thumbnails(there, pixels.image, limit, progress=progress),
         "expression_fit": weigh_expression(whole, views, pixels, subject, parameters, cy),
-        "cameras": {}
-        if not (settings.thorough or settings.camera_timesteps)
-        else measure_cameras(
-            whole,
-            pixels,
-            subject,
-            parameters,
-            cy,
-            timesteps=THOROUGH_TIMESTEPS if settings.thorough else settings.camera_timesteps,
-            progress=progress,
-        ),
+        "cameras": measure_cameras(
+            whole, pixels, subject, parameters, cy, timesteps=timesteps, progress=progress
+        )
+        if timesteps
+        else {},
     }
 
 
 def _entry_of(folder: Path, clip: CaptureClip, key: FrameKey) -> FrameEntry:
-    """A clip's frame as an entry of the layout, with the key in place of paths."""
-    camera, files = clip.cameras[key.camera], clip.files[key]
-    on_disk = files.image is not None and not clip.pixel_steps
-    image = files.image if on_disk and files.image is not None else Path(str(key))
+    files = clip.files[key]
     mask = Path(f"{key} mask") if clip.has_mask(key) else None
+    return clip_entry(folder, clip, key, None if clip.pixel_steps else files.image, mask)
+
+
+def clip_entry(
+    folder: Path, clip: Clip, key: FrameKey, image: Path | None = None, mask: Path | None = None
+) -> FrameEntry:
+    """A clip's frame as an entry of the layout, with the key in place of a path that is not given."""
+    camera = clip.cameras[key.camera]
     return FrameEntry(
         file=folder,
         where=f"frame {key}",
@@ -262,7 +260,7 @@ def _entry_of(folder: Path, clip: CaptureClip, key: FrameKey) -> FrameEntry:
         camera_index=list(clip.cameras).index(key.camera),
         camera_id=key.camera,
         sequence_folder=key.sequence,
-        image=image,
+        image=image or Path(str(key)),
         mask=mask,
         parameters=folder,
         width=camera.width,

@@ -21,7 +21,7 @@ from ...bench.errors import InputError
 from ...bench.protocol import evenly_with_ends
 from ..ga.layout import CyConvention
 from ..ga.transforms import FrameEntry
-from ..head.geometry import vertex_normals
+from ..head.geometry import project, vertex_normals
 from .mesh import Parameters, TrackedSubject
 from .views import Pixels, ViewFacts, entry_camera
 
@@ -36,8 +36,6 @@ FACING = 0.5
 
 MOVES_PX = 0.5
 """Minimum motion of a vertex's projection by expression, for vertices that are compared."""
-
-_NOT_SKIN = ("mouth_socket", "left_eyeball", "right_eyeball", "teeth")
 
 
 class ExpressionFit(NamedTuple):
@@ -92,7 +90,6 @@ def weigh_expression(
     if not usable:
         return None
     usable.sort(key=lambda entry: entry.timestep)
-    members = _members(subject)
     moving: list[_Picked] = []
     resting: list[_Picked] = []
     for entry in evenly_with_ends(usable, FRAMES):
@@ -106,7 +103,7 @@ def weigh_expression(
         still = replace(pose, expression=np.zeros_like(pose.expression))
         place = entry_camera(entry, pixels.headers[entry.image], cy)
         for kept, mesh in zip((moving, resting), subject.meshes([pose, still])):
-            kept.append(_pick(mesh, subject, members, place, image))
+            kept.append(_pick(mesh, subject, place, image))
     return _compare(camera, moving, resting)
 
 
@@ -118,23 +115,12 @@ def _facing_camera(views: Sequence[ViewFacts]) -> str | None:
     return max(facing, key=lambda name: float(np.median(facing[name]))) if facing else None
 
 
-def _members(subject: TrackedSubject) -> np.ndarray:
-    regions = subject.head.regions
-    face = regions.get("face", np.arange(len(subject.head.template)))
-    return np.setdiff1d(
-        face, np.concatenate([regions.get(name, np.empty(0, np.int64)) for name in _NOT_SKIN])
-    )
-
-
-def _pick(
-    vertices: FloatArray, subject: TrackedSubject, members: np.ndarray, camera: Camera, image: ByteArray
-) -> _Picked:
-    points = vertices[members]
-    outward = vertex_normals(vertices, subject.head.faces)[members]
+def _pick(vertices: FloatArray, subject: TrackedSubject, camera: Camera, image: ByteArray) -> _Picked:
+    points = vertices[subject.skin]
+    outward = vertex_normals(vertices, subject.head.faces)[subject.skin]
     towards = camera.center - points
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    pixels = (seen @ camera.K.T)[:, :2] / np.maximum(seen[:, 2:], 1e-6)
+    pixels = project(points, camera)
     where = (pixels - 0.5).astype(np.float32)  # OpenCV's pixel centres are at integers
     picked = cv2.remap(image.astype(np.float32), where[:, :1], where[:, 1:], cv2.INTER_LINEAR)
     colours = picked[:, 0].astype(np.float64)

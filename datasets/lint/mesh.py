@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,7 @@ from ...bench.io.arrays import read_npz
 from ..ga.tracking import Tracking, read_tracking
 from ..ga.transforms import FrameEntry
 from ..head.arrays import HeadArrays
-from ..head.geometry import rigid_alignment
+from ..head.geometry import project, rigid_alignment
 from ..head.subject import PosedSubject
 from ..mesh_pictures import rasterize_mesh
 
@@ -60,6 +61,13 @@ class TrackedSubject(PosedSubject):
     def __init__(self, tracking: Tracking) -> None:
         super().__init__(tracking.head, tracking.shape, tracking.static_offset)
         self.head = tracking.head
+
+    @cached_property
+    def skin(self) -> IntArray:
+        """Vertices of the face without eyeballs and mouth, whose colours can be compared; sorted."""
+        regions = self.head.regions
+        inner = [regions.get(name, np.empty(0, np.int64)) for name in INNER]
+        return np.setdiff1d(regions.get("face", np.arange(len(self.head.template))), np.concatenate(inner))
 
 
 def read_parameters(
@@ -130,7 +138,8 @@ def _largest(array: np.ndarray) -> float:
 FACE = ("face", "forehead", "nose")
 """Regions that neither hair nor cloth should cover, whose mesh must be inside the foreground."""
 
-NOT_SKIN = ("lips", "eye_region", "left_eyeball", "right_eyeball", "mouth_socket", "teeth")
+INNER = ("mouth_socket", "left_eyeball", "right_eyeball", "teeth")
+NOT_SKIN = ("lips", "eye_region", *INNER)
 
 SLACK = 0.04
 """Distance outside the foreground that a vertex of the face may have, relative to the mesh's height in the
@@ -255,9 +264,7 @@ def _skin(
 def _face_outside(
     subject: TrackedSubject, vertices: FloatArray, camera: Camera, filled: np.ndarray, foreground: np.ndarray
 ) -> float:
-    points = vertices[_members(subject, FACE)]
-    points = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    pixels = (points @ camera.K.T)[:, :2] / np.maximum(points[:, 2:], 1e-6)
+    pixels = project(vertices[_members(subject, FACE)], camera)
     column, row = np.floor(np.clip(pixels, -1, 2**20)).astype(int).T
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     if not inside.any():
