@@ -33,7 +33,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import check_name, digest, entries
 from ...bench.io.images import probe_image
 from ..clip import CaptureClip, FrameFiles
-from ..ga.content_digests import content_digests
+from ..ga.content_digests import digests_below
 from ..ga.layout import DECLARATION_FILE, Declaration, parameter_name
 from ..ga.tracking import find_head, read_tracking
 from ..ga.validate import split_by_holding_out
@@ -184,8 +184,7 @@ def read_dataset(
         raise InputError(root, "splits", "training frames left", "none left")
     used = {*timesteps.values(), *model.files}
     used |= {file for frame in files.values() for file in (frame.image, frame.mask) if file is not None}
-    digests = content_digests(used, cached_for=root if use_cache else None, progress=progress)
-    contents = {Path(os.path.relpath(file, root)).as_posix(): value for file, value in digests.items()}
+    contents = digests_below(root, used, use_cache=use_cache, progress=progress)
     declared = declaration.background if declaration else (1.0, 1.0, 1.0)
     ground = check_colour(declared if background is None else background)
     source = digest(tracking.head.fingerprint(), contents, subject, ground)

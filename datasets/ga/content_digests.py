@@ -71,6 +71,14 @@ def content_digests(
     return result
 
 
+def digests_below(
+    folder: Path, files: Iterable[Path], *, use_cache: bool, progress: Progress
+) -> dict[str, str]:
+    """`content_digests` of a capture's files by their paths relative to its folder, such as "../a/b.png"."""
+    digests = content_digests(files, cached_for=folder if use_cache else None, progress=progress)
+    return {Path(os.path.relpath(file, folder)).as_posix(): value for file, value in digests.items()}
+
+
 def _place(folder: Path) -> Path | None:
     """Cache file of a capture; None if the user has no home folder."""
     try:

@@ -27,7 +27,7 @@ from ..steps.exclude import exclude_given, exclude_timesteps
 from ..steps.masks import check_colour, mask_below_neck, set_background
 from . import layout
 from .cameras import CaptureCameras, collect_cameras
-from .content_digests import content_digests
+from .content_digests import digests_below
 from .principal_point import settle_cy
 from .tracking import TeethPolicy, Tracking, find_head, read_tracking
 from .transforms import FrameEntry, read_transforms
@@ -140,7 +140,7 @@ def read_capture(
     images = {
         FrameKey(subject, names[e.sequence_folder], e.timestep, e.camera_id): e.image for e in everything
     }
-    digests = content_digests(used, cached_for=folder if use_cache else None, progress=progress)
+    contents = digests_below(folder, used, use_cache=use_cache, progress=progress)
     found = find_leaks(splits, images, progress=progress)
     record = {
         "cy": convention,
@@ -152,7 +152,6 @@ def read_capture(
         "synthetic": dict(declaration.synthetic) if declaration else {},
         **tracking.notes,
     }
-    contents = {Path(os.path.relpath(file, folder)).as_posix(): value for file, value in digests.items()}
     fingerprint = tracking.head.fingerprint()
     source = digest(fingerprint, contents, subject)
     clip = CaptureClip(

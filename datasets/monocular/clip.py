@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from ...bench.contracts import FloatArray, FrameKey, Progress, StepRecord, no_pr
 from ...bench.errors import InputError
 from ...bench.io.files import check_name, digest
 from ..clip import CaptureClip, FrameFiles, FramePixels
-from ..ga.content_digests import content_digests
+from ..ga.content_digests import digests_below
 from ..ga.tracking import TeethPolicy, check_motion, resolve_teeth
 from ..ga.validate import check_disjoint, split_by_holding_out
 from ..head.arrays import HeadArrays
@@ -97,8 +96,7 @@ def clip_of_track(
     pixels = {names[key]: FrameFiles(frame.image, frame.mask) for key, frame in zip(keys, track.frames)}
     used = {*track.files, *files}
     used |= {file for frame in track.frames for file in (frame.image, frame.mask, frame.inside) if file}
-    digests = content_digests(used, cached_for=root if use_cache else None, progress=progress)
-    contents = {Path(os.path.relpath(file, root)).as_posix(): value for file, value in digests.items()}
+    contents = digests_below(root, used, use_cache=use_cache, progress=progress)
     ground = check_colour(background)
     source = digest(toothed.fingerprint(), contents, subject, ground)
     record = {
