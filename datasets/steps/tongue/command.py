@@ -11,6 +11,7 @@ import tyro
 from ....bench.contracts import Progress
 from ....bench.errors import InputError
 from ....bench.specs import CommandResult
+from ...lint.rules import spans
 from ...options import CaptureOptions
 
 if TYPE_CHECKING:
@@ -115,11 +116,11 @@ def _summary(subject: str, decided: Exclusions) -> str:
     for timestep in reasons:
         frame = decided.frames.get(timestep)  # None where people left out what none of the cameras recorded
         sequences.setdefault(frame.sequence if frame else "in no camera", []).append(timestep)
-    lines += [f"  {name}: {_ranges(timesteps)}" for name, timesteps in sequences.items()]
+    lines += [f"  {name}: {spans(timesteps, len(timesteps))}" for name, timesteps in sequences.items()]
     if near := _near(decided):
-        lines.append(f"  To review, near the threshold: {_ranges(near)}")
+        lines.append(f"  To review, near the threshold: {spans(near, len(near))}")
     if unseen := [t for t, frame in decided.frames.items() if frame.reason.startswith("mouth not seen")]:
-        lines.append(f"  Mouth not seen, kept: {_ranges(unseen)}")
+        lines.append(f"  Mouth not seen, kept: {spans(unseen, len(unseen))}")
     if decided.overrides:
         kept = sum(word == KEEP for word in decided.overrides.values())
         lines.append(f"  Overrides: {kept} kept, {len(decided.overrides) - kept} left out by hand.")
@@ -142,14 +143,3 @@ def _near(decided: Exclusions) -> list[int]:
 
     low, high = decided.threshold / NEAR, decided.threshold * NEAR
     return [t for t, f in decided.frames.items() if low <= f.score < high and t not in decided.overrides]
-
-
-def _ranges(timesteps: list[int]) -> str:
-    """Write [3, 4, 5, 9] as "3-5, 9"."""
-    parts: list[list[int]] = []
-    for timestep in sorted(timesteps):
-        if parts and timestep == parts[-1][1] + 1:
-            parts[-1][1] = timestep
-        else:
-            parts.append([timestep, timestep])
-    return ", ".join(f"{a}-{b}" if b > a else f"{a}" for a, b in parts)
