@@ -13,6 +13,8 @@ from headbench.datasets import mesh_pictures
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.mesh_pictures import draw_mesh, portrait_camera, rasterize_mesh
 
+from .tiny_capture import in_camera, projected
+
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
 CUBE_FACES = np.array([face for a, b, c, d in QUADS for face in ([a, b, c], [a, c, d])])
@@ -27,7 +29,7 @@ def camera(width=41, height=33, distance=5.0):
 
 def cast_rays(vertices, faces, view):
     """The definition: the nearest triangle that the ray through each pixel's centre meets, Cramer's rule."""
-    points = vertices @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+    points = in_camera(vertices, view)
     face = np.full((view.height, view.width), -1)
     depth = np.full((view.height, view.width), np.inf)
     weights = np.zeros((view.height, view.width, 3))
@@ -146,9 +148,7 @@ def test_portrait_shows_the_whole_head_centred(yaw):
     head = procedural_head()
     vertices = head.template.astype(float)
     view = portrait_camera(vertices, 90, 130, yaw=yaw, pitch=0.2)
-    points = vertices @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
-    pixels = points @ view.K.T
-    pixels = pixels[:, :2] / pixels[:, 2:]
+    pixels = projected(vertices, view)
     span = pixels.max(axis=0) - pixels.min(axis=0)
     np.testing.assert_allclose((pixels.max(axis=0) + pixels.min(axis=0)) / 2, [45, 65], atol=1e-9)
     assert np.isclose(max(span / [90, 130]), 0.92)

@@ -32,6 +32,32 @@ def look_at(name: str, position: np.ndarray, width: int, height: int, cx: float,
     return Camera(name, width, height, K, motion)
 
 
+def in_camera(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """(n, 3) points in the camera's axes, metres."""
+    return points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+
+
+def projected(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """(n, 2) pixels of points, by the definition of `Camera`."""
+    rays = in_camera(points, camera) @ camera.K.T
+    return rays[:, :2] / rays[:, 2:]
+
+
+def edit_json(path: Path, change: Callable[[dict], object]) -> None:
+    """Apply ``change`` to the content of a JSON file."""
+    value = json.loads(path.read_text())
+    change(value)
+    path.write_text(json.dumps(value))
+
+
+def edit_npz(path: Path, change: Callable[[dict[str, np.ndarray]], object]) -> None:
+    """Apply ``change`` to the arrays of an npz file."""
+    with np.load(path, allow_pickle=False) as archive:
+        arrays = {name: archive[name].copy() for name in archive.files}
+    change(arrays)
+    np.savez(path, allow_pickle=False, **arrays)
+
+
 def rig(width: int = 48, height: int = 64, cx: float = 24.7, cy: float = 29.3) -> list[Camera]:
     """Three cameras on an arc in front of the head."""
     angles = np.radians([-40.0, 0.0, 40.0])
@@ -95,8 +121,7 @@ def posed_vertices(plan: CapturePlan, pose: HeadPose) -> np.ndarray:
 
 def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
     """(H, W) bool: pixels whose centre is covered, tested triangle by triangle with barycentric signs."""
-    points = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    pixels = (points @ camera.K.T)[:, :2] / points[:, 2:]
+    pixels = projected(vertices, camera)
     covered = np.zeros((camera.height, camera.width), dtype=bool)
     size = [camera.width, camera.height]
     for corners in pixels[faces]:
@@ -140,10 +165,7 @@ class TinyCapture:
 
     def edit(self, file: str, change: Callable[[dict], object]) -> None:
         """Apply ``change`` to a JSON of the union folder."""
-        path = self.union / file
-        value = json.loads(path.read_text())
-        change(value)
-        path.write_text(json.dumps(value))
+        edit_json(self.union / file, change)
 
     def each_frame(self, change: Callable[[dict], object]) -> None:
         """Apply ``change`` to every frame of every split."""

@@ -28,6 +28,8 @@ from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.images import write_image
 from headbench.datasets.open import open_clip
 
+from ..tiny_capture import projected
+
 FILES = ("cameras", "images")
 
 
@@ -85,9 +87,8 @@ def test_cameras_are_read_back_exactly_and_by_pycolmap(clip, exported, kind):
         np.testing.assert_allclose(found.world_to_camera, camera.world_to_camera, rtol=0, atol=1e-12)
         np.testing.assert_allclose(found.K, camera.K, rtol=1e-14)
         np.testing.assert_allclose(image.cam_from_world().matrix(), camera.world_to_camera[:3], atol=1e-12)
-        pixels = (vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]) @ camera.K.T
-        projected = np.array([image.project_point(vertex) for vertex in vertices])
-        np.testing.assert_allclose(projected, pixels[:, :2] / pixels[:, 2:], atol=1e-9)
+        seen = np.array([image.project_point(vertex) for vertex in vertices])
+        np.testing.assert_allclose(seen, projected(vertices, camera), atol=1e-9)
 
 
 def test_points_are_the_mesh_and_observations_what_is_seen(clip, exported):

@@ -10,7 +10,7 @@ from headbench.bench.contracts import Camera
 from headbench.datasets.ga.principal_point import CyEvidence, OutlineView, weigh_cy
 
 from ..head.toy import toy_head
-from ..tiny_capture import look_at, silhouette
+from ..tiny_capture import look_at, projected, silhouette
 
 HEAD = toy_head(24)
 WIDTH, HEIGHT = 138, 200
@@ -20,8 +20,7 @@ def ellipsoid_hull(camera: Camera, center, radii) -> np.ndarray:
     """(H, W) bool outline-filled projection of an ellipsoid, by the hull of points on it."""
     points = np.random.default_rng(1).normal(size=(300, 3))
     points = points / np.linalg.norm(points, axis=1, keepdims=True) * radii + center
-    points = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    pixels = (points @ camera.K.T)[:, :2] / points[:, 2:]
+    pixels = projected(points, camera)
     filled = np.zeros((camera.height, camera.width), np.uint8)
     cv2.fillConvexPoly(filled, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
     return filled > 0

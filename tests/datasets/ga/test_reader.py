@@ -20,7 +20,16 @@ from headbench.datasets.head.teeth import with_teeth
 from headbench.datasets.images import write_image
 
 from ..head.toy import toy_head
-from ..tiny_capture import FRONTAL, SERIALS, make_plan, posed_vertices, rig, write_tiny_capture
+from ..tiny_capture import (
+    FRONTAL,
+    SERIALS,
+    edit_npz,
+    make_plan,
+    posed_vertices,
+    projected,
+    rig,
+    write_tiny_capture,
+)
 
 # Union timesteps follow the plan's training sequences, then FREE.
 ORDER = [("EMO-1-shout+laugh", 2), ("SEN-01-cramp_small_danger", 2), ("FREE", 3)]
@@ -248,8 +257,7 @@ def test_projected_mesh_lies_on_the_mask(clip):
     for key in clip.splits["self_reenactment"]:
         camera = clip.cameras[key.camera]
         vertices = posed_vertices(plan, clip.poses[key.timestep])
-        points = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        x, y = np.floor((points @ camera.K.T)[:, :2] / points[:, 2:]).astype(int).T
+        x, y = np.floor(projected(vertices, camera)).astype(int).T
         inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
         near = cv2.dilate(clip.mask(key), np.ones((3, 3), np.uint8))  # a vertex may touch an uncovered pixel
         assert inside.mean() > 0.95
@@ -324,7 +332,5 @@ def test_fingerprint_follows_content_and_not_place(capture, pristine_capture):
     assert read_capture(capture.union).fingerprint != original.fingerprint
     path = next(capture.writer.sequence_folder("FREE").glob("flame_param/*.npz"))
     before = read_capture(capture.union).fingerprint
-    with np.load(path, allow_pickle=False) as archive:
-        arrays = dict(archive)
-    np.savez(path, **arrays | {"jaw_pose": arrays["jaw_pose"] + np.float32(0.01)})
+    edit_npz(path, lambda arrays: arrays["jaw_pose"].__iadd__(np.float32(0.01)))
     assert read_capture(capture.union).fingerprint != before

@@ -15,7 +15,7 @@ from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.ga.validate import find_leaks
 from headbench.datasets.images import write_image
 
-from ..tiny_capture import FRONTAL, SERIALS
+from ..tiny_capture import FRONTAL, SERIALS, edit_npz
 
 TRAIN, VAL, TEST = (f"transforms_{part}.json" for part in ("train", "val", "test"))
 DECLARED = "headbench.json"
@@ -85,13 +85,11 @@ def move(entry, axis, by):
 def array(key, value):
     """Exchange an array of a parameter file; None leaves it out."""
 
-    def plant(capture):
-        with np.load(parameters(capture), allow_pickle=False) as archive:
-            arrays = dict(archive)
+    def change(arrays):
         arrays.pop(key)
-        np.savez(parameters(capture), **arrays | ({} if value is None else {key: value}))
+        arrays.update({} if value is None else {key: value})
 
-    return plant
+    return lambda capture: edit_npz(parameters(capture), change)
 
 
 BAD_VALUES = [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -12,6 +11,7 @@ import numpy as np
 from headbench.datasets.ga.layout import Declaration
 from headbench.datasets.images import write_image
 
+from ..tiny_capture import edit_json, edit_npz
 from .good_capture import HEIGHT, WIDTH, GoodCapture, read_rgb
 
 Plant = Callable[[GoodCapture], None]
@@ -233,19 +233,17 @@ def _shift_one_camera(good):
 # ------------------------------------------------------------------ tracking
 
 
-def _parameters(**changes) -> Plant:
-    """``changes``: functions of (arrays, position of the file)."""
-    (change,) = changes.values()
+def _parameters(change: Callable[[dict, int], object]) -> Plant:
     return lambda good: good.each_parameters(change)
 
 
 def _one(position: int, change: Callable[[dict], None]) -> Plant:
-    return lambda good: good.parameters(good.files("flame_param")[position], change)
+    return lambda good: edit_npz(good.files("flame_param")[position], change)
 
 
 def _sequence_version(good):
     path = good.writer.sequence_folder("FREE") / "headbench.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"head_model": "flame2020"}))
+    edit_json(path, lambda declared: declared.update(head_model="flame2020"))
 
 
 def _repeat_parameters(good):
@@ -255,7 +253,7 @@ def _repeat_parameters(good):
 
 def _far_test(good):
     for path in good.writer.sequence_folder("FREE").glob("flame_param/*"):
-        good.parameters(path, lambda a: a.update(expr=2.5 * a["expr"]))
+        edit_npz(path, lambda a: a.update(expr=2.5 * a["expr"]))
 
 
 def _jump(arrays):
@@ -359,13 +357,13 @@ FAULTS = (
     Fault("no head", "HB602", lambda good: (good.union / "head_model.npz").unlink()),
     Fault("too many coefficients", "HB603", _one(5, lambda a: a.update(expr=np.zeros((1, 99)))), REFUSED),
     Fault("NaN", "HB604", _one(5, lambda a: a["expr"].fill(np.nan)), REFUSED),
-    Fault("few coefficients", "HB605", _parameters(change=lambda a, i: a.update(expr=a["expr"][:, :5]))),
-    Fault("eyelids", "HB606", _parameters(change=lambda a, i: a.update(eyelids=np.full((1, 2), 0.3)))),
-    Fault("jaw at rest", "HB607", _parameters(change=lambda a, i: a["jaw_pose"].fill(0.0))),
+    Fault("few coefficients", "HB605", _parameters(lambda a, i: a.update(expr=a["expr"][:, :5]))),
+    Fault("eyelids", "HB606", _parameters(lambda a, i: a.update(eyelids=np.full((1, 2), 0.3)))),
+    Fault("jaw at rest", "HB607", _parameters(lambda a, i: a["jaw_pose"].fill(0.0))),
     Fault(
         "huge expressions",
         "HB608",
-        _parameters(change=lambda a, i: a.update(expr=15 * a["expr"])),
+        _parameters(lambda a, i: a.update(expr=15 * a["expr"])),
         ("HB701", "HB702", "HB612", "HB615"),
     ),
     Fault("identity changes", "HB609", _one(8, lambda a: a["shape"].__iadd__(0.01))),
@@ -375,9 +373,9 @@ FAULTS = (
     Fault("parameters repeated", "HB611", _repeat_parameters),
     Fault("tracking jumps", "HB612", _one(15, _jump), ("HB702",)),
     Fault("sequence of another version", "HB613", _sequence_version),
-    Fault("expression at rest", "HB614", _parameters(change=lambda a, i: a["expr"].fill(0.0))),
+    Fault("expression at rest", "HB614", _parameters(lambda a, i: a["expr"].fill(0.0))),
     Fault("untrained test", "HB616", _far_test, ("HB701", "HB702", "HB612", "HB615")),
-    Fault("mesh aside", "HB701", _parameters(change=lambda a, i: a["translation"].__iadd__(0.04))),
+    Fault("mesh aside", "HB701", _parameters(lambda a, i: a["translation"].__iadd__(0.04))),
     Fault("one camera aside", "HB702", _shift_one_camera),
     Fault("small mesh", "HB703", _shrink),
 )

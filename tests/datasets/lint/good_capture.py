@@ -20,7 +20,7 @@ from headbench.datasets.images import write_image
 from headbench.datasets.mesh_pictures import rasterize_mesh
 
 from ..head.toy import toy_head
-from ..tiny_capture import TinyCapture, look_at
+from ..tiny_capture import TinyCapture, edit_npz, look_at
 
 WIDTH, HEIGHT = 60, 80
 LENGTHS = {"EMO-1-shout+laugh": 6, "SEN-01-cramp_small_danger": 6, "FREE": 10}
@@ -140,14 +140,7 @@ class GoodCapture(TinyCapture):
     def each_parameters(self, change: Callable[[dict[str, np.ndarray], int], None]) -> None:
         """Apply ``change`` to the arrays of every parameter file, given its position in the order of files."""
         for index, path in enumerate(self.files("flame_param")):
-            self.parameters(path, lambda arrays, index=index: change(arrays, index))
-
-    def parameters(self, path: Path, change: Callable[[dict[str, np.ndarray]], None]) -> None:
-        """Apply ``change`` to the arrays of one parameter file."""
-        with np.load(path) as archive:
-            arrays = {name: archive[name].copy() for name in archive.files}
-        change(arrays)
-        np.savez(path, allow_pickle=False, **arrays)
+            edit_npz(path, lambda arrays, index=index: change(arrays, index))
 
 
 def write_good_capture(root: Path, plan: CapturePlan | None = None) -> GoodCapture:

@@ -13,6 +13,7 @@ from headbench.bench.errors import InputError
 from headbench.datasets.lint.command import lint
 from headbench.datasets.lint.settings import LintSettings
 
+from ..tiny_capture import edit_npz
 from .good_capture import GoodCapture
 
 PLACED = ([], {}, "../../../../etc/passwd", [[1.0] * 4] * 4, 1e-300)
@@ -76,7 +77,7 @@ def test_junk_in_parameters(pristine, tmp_path, key, shape, value, kind):
     capture = pristine.copied(tmp_path / f"{next(_numbers)}")
     finite = value if np.isfinite(value) or kind in ("f4", "f8") else 7
     array = np.full(shape, finite if kind != "i8" else int(min(max(finite, -(2**62)), 2**62))).astype(kind)
-    capture.parameters(capture.files("flame_param")[3], lambda arrays: arrays.update({key: array}))
+    edit_npz(capture.files("flame_param")[3], lambda arrays: arrays.update({key: array}))
     outcome(capture)
 
 

@@ -24,28 +24,11 @@ from headbench.datasets.open import find_reader, open_clip
 
 from ...memory import memory_below
 from ..head.toy import toy_head
-from ..tiny_capture import FRONTAL, make_plan, rig, write_tiny_capture
-from .videos import HEAD_FILE, Recording, write_imavatar, write_insta
+from ..tiny_capture import edit_json, in_camera, make_plan, rig, write_tiny_capture
+from .videos import HEAD_FILE, recording_of, write_imavatar, write_insta
 
+LENGTHS = {"FREE": 4, "EMO-1-shout+laugh": 4, "SEN-01-port": 4}
 KINDS = ["insta", "insta, meshes", "insta, eyelids", "imavatar"]
-
-
-def recording_of(folder, **changes):
-    """A capture whose necks rest, and one of its cameras."""
-    plan = make_plan(
-        cameras=rig()[:2], lengths={"FREE": 4, "EMO-1-shout+laugh": 4, "SEN-01-port": 4}, **changes
-    )
-    sequences = [
-        replace(
-            sequence,
-            poses=[replace(pose, neck=np.zeros(3, np.float32)) for pose in sequence.poses],
-            excluded={},
-        )
-        for sequence in plan.sequences
-    ]
-    still = replace(plan, sequences=sequences, static_offset=np.zeros_like(plan.static_offset))
-    # The files' meshes have no teeth, which readers add to FLAME's.
-    return Recording(read_capture(write_tiny_capture(folder, still).union), FRONTAL, plan.head)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +36,7 @@ def recordings(tmp_path_factory):
     made = {}
     for lids in (False, True):
         head = toy_head(16, eyelids=lids)
-        made[lids] = recording_of(tmp_path_factory.mktemp("capture"), head=head)
+        made[lids] = recording_of(tmp_path_factory.mktemp("capture"), LENGTHS, head=head)
     return made
 
 
@@ -108,7 +91,7 @@ def test_eyelids_without_a_basis_are_said(tmp_path, caplog):
     basis = np.zeros((*head.template.shape, 2))
     for side, name in enumerate(("left_eye_region", "right_eye_region")):
         basis[head.regions[name], 1, side] = -0.008
-    recording = recording_of(tmp_path / "capture", head=replace(head, eyelid_basis=basis))
+    recording = recording_of(tmp_path / "capture", LENGTHS, head=replace(head, eyelid_basis=basis))
     write_insta(recording, tmp_path / "video")
     able = read_video(tmp_path / "video")
     assert able.steps[0].parameters["eyelids"].startswith("from meshes, closed by up to 0.")
@@ -131,7 +114,7 @@ def test_a_file_of_another_tool_is_not_taken_for_imavatars(tmp_path):
 def seen(clip, camera, pose):
     """(V, 3) vertices before the camera, metres."""
     vertices = PosedSubject(clip.head, clip.shape, clip.static_offset).meshes([pose])[0]
-    return vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    return in_camera(vertices, camera)
 
 
 def test_one_camera_serves_all_and_is_that_of_the_first_frame(written):
@@ -169,7 +152,7 @@ def test_the_convention_is_350_frames_of_at_least_700(frames, held_out):
 
 def test_the_order_of_the_json_means_nothing(written, copied):
     folder = copied("insta, meshes")
-    edit(folder / "transforms.json", lambda document: document["frames"].reverse())
+    edit_json(folder / "transforms.json", lambda document: document["frames"].reverse())
     one, other = open_clip(folder), open_clip(folder_of(written, "insta, meshes"))
     assert one.splits["train"] == tuple(key._replace(subject="copied") for key in other.splits["train"])
     np.testing.assert_array_equal(one.poses[7].rotation, other.poses[7].rotation)
@@ -196,12 +179,6 @@ def test_each_reader_takes_its_own_folders(written, pristine_capture):
     assert find_videos(written)[:3] == [written / name for name in sorted(KINDS)[1:]]
     with pytest.raises(InputError, match="choose it with --reader monocular"):
         read_capture(folder_of(written, "insta"))
-
-
-def edit(path, change):
-    document = json.loads(path.read_text())
-    change(document)
-    path.write_text(json.dumps(document))
 
 
 def each(document, **entries):
@@ -280,7 +257,7 @@ IMAVATAR_FAULTS = {
 
 
 def changed(file, change):
-    return lambda folder: edit(folder / file, change)
+    return lambda folder: edit_json(folder / file, change)
 
 
 def replaced(file, content):
@@ -320,13 +297,13 @@ def test_faults_are_named(copied, fault):
 def test_short_coefficients_are_padded_and_zeros_cut(copied):
     folder = copied("imavatar")
     for video in folder.glob("MVI*"):
-        edit(
+        edit_json(
             video / "flame_params.json", lambda document: each(document, expression=[0.5, -1.0, *[0.0] * 48])
         )
     clip = read_video(folder)
     np.testing.assert_array_equal(clip.poses[0].expression, [0.5, -1.0, *[0.0] * 6])
     for video in folder.glob("MVI*"):
-        edit(video / "flame_params.json", lambda document: each(document, expression=[0.5, -1.0]))
+        edit_json(video / "flame_params.json", lambda document: each(document, expression=[0.5, -1.0]))
     np.testing.assert_array_equal(read_video(folder).poses[0].expression, clip.poses[0].expression)
 
 

@@ -11,9 +11,12 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from headbench.bench.contracts import HeadPose
+from headbench.bench.contracts import Camera, HeadPose
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import HeadArrays, save_head
 from headbench.datasets.head.subject import PosedSubject
+
+from ..tiny_capture import FRONTAL, make_plan, rig, write_tiny_capture
 
 HEAD_FILE = "head_model.npz"
 
@@ -44,6 +47,26 @@ class Recording:
         share = np.maximum(mask[..., None] / 255, 1e-6)
         straight = (image - (1 - share) * 255 * self.clip.background[::-1]) / share
         return np.dstack([np.clip(np.round(straight), 0, 255).astype(np.uint8), mask])
+
+
+def recording_of(
+    folder: Path,
+    lengths: dict[str, int],
+    *,
+    neck: bool = False,
+    cameras: Sequence[Camera] | None = None,
+    **changes,
+) -> Recording:
+    """The frontal camera of a capture without excluded frames, whose necks rest unless they may turn."""
+    plan = make_plan(cameras=[*(cameras or rig()[:2])], lengths=lengths, **changes)
+    rest = {} if neck else {"neck": np.zeros(3, np.float32)}
+    sequences = [
+        replace(sequence, poses=[replace(pose, **rest) for pose in sequence.poses], excluded={})
+        for sequence in plan.sequences
+    ]
+    still = replace(plan, sequences=sequences, static_offset=np.zeros_like(plan.static_offset))
+    # The files' meshes have no teeth, which readers add to FLAME's.
+    return Recording(read_capture(write_tiny_capture(folder, still).union), FRONTAL, plan.head)
 
 
 def write_insta(

@@ -28,6 +28,7 @@ from headbench.datasets.nersemble.benchmark.submission import after_encoding, ch
 from headbench.datasets.nersemble.benchmark.tracks import MONO, NVS, tracking_file
 
 from ..head.toy import toy_head
+from ..tiny_capture import edit_json
 from .benchmark_folder import SCALE, tracking, write_benchmark
 
 # Tracking
@@ -95,9 +96,7 @@ def test_tracking_of_version_1_is_refused(head, benchmark):
 
 def test_a_missing_camera_is_named(head, benchmark):
     path = benchmark / MONO.name / "393" / "calibration" / "camera_params.json"
-    document = json.loads(path.read_text())
-    del document["world_2_cam"]["220700191"]
-    path.write_text(json.dumps(document))
+    edit_json(path, lambda document: document["world_2_cam"].pop("220700191"))
     with pytest.raises(InputError, match="no 220700191"):
         read_sequence(benchmark, MONO, "393", "FREE", head)
 

@@ -9,6 +9,7 @@ from headbench.bench.errors import InputError
 from headbench.datasets.head.arrays import read_head, save_head
 from headbench.datasets.nersemble.plan import plan_subject
 
+from ..tiny_capture import edit_npz
 from .recordings import SEQUENCES, SUBJECT, tracked_arrays, world_cameras
 
 COUNT = SEQUENCES["FREE"]
@@ -56,10 +57,8 @@ def test_tracking_of_neither_all_nor_the_cut_frames_is_refused(recording, tmp_pa
     for number in (4, 5):
         remove(recording, number)
     path = next(recording.tracking.glob("*FREE*/*/*.npz"))
-    with np.load(path) as file:
-        arrays = dict(file)
-    cut = {key: value[:5] if value.shape[:1] == (COUNT,) else value for key, value in arrays.items()}
-    np.savez(path, **cut)
+    moving = {key for key, value in np.load(path).items() if value.shape[:1] == (COUNT,)}
+    edit_npz(path, lambda arrays: arrays.update({key: arrays[key][:5] for key in moving}))
     with pytest.raises(InputError, match="4 timesteps.*or 6, as before --cut") as error:
         free_of(recording, tmp_path / "out", cut=True)
     assert (error.value.file, error.value.key) == (str(path), "translation")

@@ -25,6 +25,7 @@ from headbench.datasets.nersemble.names import UNION10_SEQUENCES, union10_held_o
 from headbench.datasets.nersemble.prepare import RECORD_FILE
 from headbench.datasets.nersemble.recording import read_calibration
 
+from ..tiny_capture import edit_json, edit_npz
 from .recordings import HEIGHT, SEQUENCES, SUBJECT, WIDTH, colour_of, tone, world_cameras, write_recording
 
 IMAGES = 3 * sum(SEQUENCES.values())
@@ -193,8 +194,7 @@ def test_broken_and_missing_images_are_made_again(whole, pristine_recording, tmp
     assert contents(out) == contents(whole[0])
     # A machine that went down can leave a name without content; without a record of completion it is noticed.
     record = folder / RECORD_FILE
-    value = json.loads(record.read_text())
-    record.write_text(json.dumps(value | {"images_complete": False}))
+    edit_json(record, lambda value: value.update(images_complete=False))
     (folder / "images" / "00003_02.png").write_bytes(b"")
     cv2.imwrite(str(folder / "images" / "00004_00.png"), np.zeros((4, 4, 3), np.uint8))
     prepared(pristine_recording, out)
@@ -265,8 +265,7 @@ def test_new_tracking_replaces_the_old_and_keeps_the_images(recording, whole, tm
     out = tmp_path / "out"
     union = prepared(recording, out)[0]["union"]
     file = next(recording.tracking.rglob("*FREE*/**/*.npz"))
-    arrays = dict(np.load(file, allow_pickle=False))
-    np.savez(file, **(arrays | {"translation": arrays["translation"] + np.array([0, 0.5, 0], np.float32)}))
+    edit_npz(file, lambda arrays: arrays["translation"].__iadd__(np.array([0, 0.5, 0], np.float32)))
     # Broken off on the way: no capture of old and new.
     error_of_a_full_disk(prepare, "save_npz", lambda path: path.name == "00003.npz", recording, out)
     for folder in (union, next(out.glob(f"{SUBJECT}_FREE_*"))):
@@ -282,9 +281,9 @@ def test_new_tracking_replaces_the_old_and_keeps_the_images(recording, whole, tm
 
 
 def test_images_are_never_enlarged(recording, tmp_path):
-    path = recording.writer.calibration_file
-    value = json.loads(path.read_text())
-    path.write_text(json.dumps(value | {"height": 2 * HEIGHT, "width": 2 * WIDTH}))
+    edit_json(
+        recording.writer.calibration_file, lambda value: value.update(height=2 * HEIGHT, width=2 * WIDTH)
+    )
     with pytest.raises(InputError) as error:
         prepared(recording, tmp_path / "out", downscale=1)
     assert error.value.key == "downscale"

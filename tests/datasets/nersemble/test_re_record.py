@@ -1,6 +1,5 @@
 """There and back: a capture recorded raw and prepared again shows the same head in the same pixels."""
 
-import json
 import shutil
 
 import numpy as np
@@ -14,7 +13,7 @@ from headbench.datasets.nersemble.command import prepare_nersemble, record_nerse
 from headbench.datasets.nersemble.re_record import re_record
 from headbench.datasets.nersemble.settings import PrepareSettings, RecordSettings
 
-from ..tiny_capture import make_plan, rig, write_tiny_capture
+from ..tiny_capture import edit_json, make_plan, projected, rig, write_tiny_capture
 
 SEQUENCES = "EMO-1,SEN-01,FREE"
 
@@ -26,13 +25,10 @@ def clip(tmp_path_factory):
     return read_capture(write_tiny_capture(tmp_path_factory.mktemp("capture"), plan).union)
 
 
-def projected(clip, timestep, camera):
+def seen(clip, timestep, camera):
     """(V, 2) pixels of the posed mesh."""
     (vertices,) = PosedSubject(clip.head, clip.shape, clip.static_offset).meshes([clip.poses[timestep]])
-    view = clip.cameras[camera]
-    points = vertices @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
-    pixels = points @ view.K.T
-    return pixels[:, :2] / pixels[:, 2:]
+    return projected(vertices, clip.cameras[camera])
 
 
 @pytest.mark.parametrize(("release", "frames"), [("v2", "images"), ("v1", "video"), ("paper2023", "images")])
@@ -56,7 +52,7 @@ def test_there_and_back(release, frames, clip, tmp_path):
     assert again.timesteps("train") == clip.timesteps("train")
     assert [*again.cameras] == [*clip.cameras]
     for key in again.files:
-        moved = np.abs(projected(again, key.timestep, key.camera) - projected(clip, key.timestep, key.camera))
+        moved = np.abs(seen(again, key.timestep, key.camera) - seen(clip, key.timestep, key.camera))
         assert moved.max() < 1e-4
         assert key in clip.files
         if frames == "images":
@@ -79,10 +75,8 @@ def test_a_missing_frame_is_named_before_anything_is_written(clip, tmp_path):
     source = clip.files[clip.splits["train"][0]].image.parents[2]
     shutil.copytree(source, tmp_path / "capture")
     union = tmp_path / "capture" / "UNION3_901"
-    path = union / "transforms_train.json"
-    value = json.loads(path.read_text())
-    gone = value["frames"].pop(1)
-    path.write_text(json.dumps(value))
+    gone = {}
+    edit_json(union / "transforms_train.json", lambda value: gone.update(value["frames"].pop(1)))
     with pytest.raises(InputError, match="no such frame") as caught:
         record_nersemble(RecordSettings(str(union), str(tmp_path / "raw")))
     assert caught.value.file == str(union)

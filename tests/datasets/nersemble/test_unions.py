@@ -1,6 +1,5 @@
 """Captures exported elsewhere: checked, listed, joined anew for the paper's split."""
 
-import json
 import shutil
 
 import pytest
@@ -13,6 +12,7 @@ from headbench.datasets.nersemble.names import UNION10_SEQUENCES, union10_held_o
 from headbench.datasets.nersemble.prepare import RECORD_FILE
 from headbench.datasets.nersemble.settings import PrepareSettings
 
+from ..tiny_capture import edit_json
 from .recordings import SUBJECT, write_recording
 
 SEQUENCES = {**dict.fromkeys(UNION10_SEQUENCES, 1), "FREE": 2}
@@ -72,8 +72,8 @@ def test_the_papers_split_is_joined_from_the_same_files(download, pristine_downl
 @pytest.mark.parametrize("named", [None, "08"], ids=["no id", "id by index"])
 def test_a_held_out_camera_named_by_its_index_is_not_trained_on(named, download, pristine_download):
     """Older exports lack serials: there the frontal camera is the one of index 8."""
-    for path in download.glob("*/transforms*.json"):
-        document = json.loads(path.read_text())
+
+    def rename(document):
         for frame in document["frames"]:
             if frame["camera_id"] == "222200037":
                 frame["camera_index"] = 8
@@ -81,7 +81,9 @@ def test_a_held_out_camera_named_by_its_index_is_not_trained_on(named, download,
                 del frame["camera_id"]
             else:
                 frame["camera_id"] = f"{frame['camera_index']:02d}"
-        path.write_text(json.dumps(document))
+
+    for path in download.glob("*/transforms*.json"):
+        edit_json(path, rename)
     findings = check(download, rejoin=True)
     assert findings.passed, findings.text
     union = download / findings.data[SUBJECT]["rejoined"]
@@ -119,11 +121,10 @@ def test_damage_is_found(damage, download):
 
 def test_another_test_sequence_is_noted(download):
     union = next(download.glob("UNION10*"))
-    train, test = union / "transforms_train.json", union / "transforms_test.json"
-    documents = [json.loads(path.read_text()) for path in (train, test)]
-    documents[0]["frames"], documents[1]["frames"] = documents[1]["frames"], documents[0]["frames"]
-    for path, document in zip((train, test), documents):
-        path.write_text(json.dumps(document))
+    train, test, other = (union / f"transforms_{part}.json" for part in ("train", "test", "other"))
+    train.rename(other)
+    test.rename(train)
+    other.rename(test)
     findings = check(download)
     assert findings.passed
     assert any(union10_held_out(SUBJECT) in note for note in findings.data[SUBJECT]["notes"])

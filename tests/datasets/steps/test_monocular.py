@@ -10,6 +10,8 @@ from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.steps.for_method import as_single_video
 from headbench.datasets.steps.resolution import align_clip
 
+from ..tiny_capture import projected
+
 
 @pytest.fixture(scope="module")
 def video(clip):
@@ -63,16 +65,13 @@ def test_the_mesh_projects_where_it_did(clip, video):
     rigid = clip.head.skinning_weights[:, 1] > 1 - 1e-9
     assert rigid.sum() > 20
 
-    def project(source, key):
+    def seen(source, key):
         pose, camera = source.poses[key.timestep], source.cameras[key.camera]
-        vertices = subject.meshes([pose])[0, rigid]
-        points = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        pixels = points @ camera.K.T
-        return pixels[:, :2] / pixels[:, 2:]
+        return projected(subject.meshes([pose])[0, rigid], camera)
 
     for old in clip.files:
         new = video.keys[old]
-        assert np.abs(project(video.clip, new) - project(clip, old)).max() < 1e-4
+        assert np.abs(seen(video.clip, new) - seen(clip, old)).max() < 1e-4
         pose = video.clip.poses[new.timestep]
         assert not np.any([pose.rotation, pose.neck, pose.translation])
         assert np.array_equal(pose.expression, clip.poses[old.timestep].expression)

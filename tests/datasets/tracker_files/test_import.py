@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,7 +11,6 @@ import torch
 
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.ga.writer import CapturePlan
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.images import read_image
 from headbench.datasets.tracker_files.command import import_tracking
@@ -20,8 +18,8 @@ from headbench.datasets.tracker_files.formats import FORMATS
 from headbench.datasets.tracker_files.settings import ImportTrackingSettings
 
 from ..head.toy import toy_head
-from ..monocular.videos import Recording
-from ..tiny_capture import FRONTAL, make_plan, rig, write_tiny_capture
+from ..monocular.videos import recording_of
+from ..tiny_capture import in_camera, rig
 from .trackers import (
     HEAD_FILE,
     rest_mesh,
@@ -37,35 +35,21 @@ from .trackers import (
 
 KINDS = ["metrical", "eyelids", "flashavatar", "pixel3dmm"]
 FRAMES, SIZE, TRACKED = 8, 96, 48
-
-
-def recording_of(folder, *, neck, cameras, **head):
-    plan: CapturePlan = make_plan(
-        head=toy_head(16, **head), cameras=cameras, lengths={"FREE": FRAMES - 2, "SEN-01-port": 2}
-    )
-    sequences = [
-        replace(
-            one,
-            poses=[pose if neck else replace(pose, neck=np.zeros(3, np.float32)) for pose in one.poses],
-            excluded={},
-        )
-        for one in plan.sequences
-    ]
-    still = replace(plan, sequences=sequences, static_offset=np.zeros_like(plan.static_offset))
-    return Recording(read_capture(write_tiny_capture(folder, still).union), FRONTAL, plan.head)
+LENGTHS = {"FREE": FRAMES - 2, "SEN-01-port": 2}
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
-    def made(**settings):
-        return recording_of(tmp_path_factory.mktemp("capture"), **settings)
+    def made(eyelids=False, **settings):
+        head = toy_head(16, eyelids=eyelids)
+        return recording_of(tmp_path_factory.mktemp("capture"), LENGTHS, head=head, **settings)
 
-    plain = made(neck=False, cameras=rig()[:2])
+    plain = made()
     square = rig(SIZE, SIZE, 0.45 * SIZE, 0.53 * SIZE)[:2]
     return {
         "metrical": plain,
         "flashavatar": plain,
-        "eyelids": made(neck=False, cameras=rig()[:2], eyelids=True),
+        "eyelids": made(eyelids=True),
         "pixel3dmm": made(neck=True, cameras=square),
     }
 
@@ -122,14 +106,13 @@ def test_the_capture_projects_as_the_trackers_program(recordings, written, resul
             points, pixels = seen_by_nvdiffrast(content, rest, SIZE)
         else:
             points, pixels = seen_by_pytorch3d(content, rest)
-        found = mesh[:vertices] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        found = in_camera(mesh[:vertices], camera)
         np.testing.assert_allclose(found, points, rtol=0, atol=1e-7)  # 1e-4 mm
         projected = found @ camera.K.T
         np.testing.assert_allclose(projected[:, :2] / projected[:, 2:], pixels, rtol=0, atol=1e-3)
         # The same as the camera and the head that the tracker saw.
         truth = subject_of(recording.clip).meshes([recording.pose(key)])[0][:vertices]
-        seen = truth @ recording.camera.world_to_camera[:3, :3].T + recording.camera.world_to_camera[:3, 3]
-        np.testing.assert_allclose(found, seen, rtol=0, atol=5e-7)
+        np.testing.assert_allclose(found, in_camera(truth, recording.camera), rtol=0, atol=5e-7)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -172,7 +155,7 @@ def test_what_is_written_and_said(results, written):
 
 def test_a_turned_neck_moves_lids_otherwise(tmp_path):
     recording = recording_of(
-        tmp_path / "c", neck=True, cameras=rig(SIZE, SIZE)[:1] + rig(SIZE, SIZE)[1:2], eyelids=True
+        tmp_path / "c", LENGTHS, neck=True, cameras=rig(SIZE, SIZE)[:2], head=toy_head(16, eyelids=True)
     )
     source = write_pixel3dmm(recording, tmp_path / "p", tracked=TRACKED)
     assert "lids turn with the neck here: up to 0." in imported(source, tmp_path / "out").text

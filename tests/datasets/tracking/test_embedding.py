@@ -10,6 +10,8 @@ from headbench.datasets.tracking.drawn import AZIMUTHS, ELEVATIONS, drawn_head
 from headbench.datasets.tracking.embedding import learn_embedding
 from headbench.datasets.tracking.landmarks import spread_vertices
 
+from ..tiny_capture import projected
+
 
 @pytest.fixture(scope="module")
 def head():
@@ -35,16 +37,14 @@ class Network:
 
     def find(self, image, near=None):
         _, camera, mesh = self.known[image.tobytes()]
-        seen = mesh[self.vertices] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        pixels = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
+        pixels = projected(mesh[self.vertices], camera)
         return pixels + self.error * self.rng.normal(size=pixels.shape)
 
 
 def test_the_head_is_drawn_whole_from_all_directions(head, pictures):
     assert len(pictures) == len(AZIMUTHS) * len(ELEVATIONS)
     for image, camera, mesh in pictures:
-        seen = mesh[head.regions["face"]] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        pixels = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
+        pixels = projected(mesh[head.regions["face"]], camera)
         assert (pixels > 0).all()
         assert (pixels < [camera.width, camera.height]).all()
         assert image.shape == (camera.height, camera.width, 3)

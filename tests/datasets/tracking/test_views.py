@@ -6,7 +6,7 @@ from headbench.datasets.mesh_pictures import rasterize_mesh
 from headbench.datasets.tracking.views import Occlusion, Views
 
 from ..head.toy import toy_head
-from ..tiny_capture import rig
+from ..tiny_capture import projected, rig
 
 
 def test_projection_and_its_derivative():
@@ -14,8 +14,7 @@ def test_projection_and_its_derivative():
     views, points = Views(cameras), 0.1 * rng.standard_normal((5, 3))
     found = views.project(points)
     for row, camera in enumerate(cameras):
-        seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        wanted = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
+        wanted = projected(points, camera)
         np.testing.assert_allclose(found.pixels[row], wanted, atol=1e-9)
         np.testing.assert_allclose(views.place(points)[0][row], wanted, atol=1e-3)
     step = 1e-6
