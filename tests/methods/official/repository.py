@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from headbench.bench.contracts import Budget, no_progress
@@ -20,7 +19,6 @@ from headbench.datasets.tracker_files.metrical import MEMBERS, metrical_frame
 from headbench.methods.official.config import GAOfficialConfig
 from headbench.methods.official.ga.method import GAOfficial
 from headbench.methods.official.gha.method import GHAOfficial
-from headbench.methods.official.method import TRAINING_LOG
 from headbench.methods.official.tga.method import TGAOfficial
 from headbench.methods.official.workplace import Workplace
 
@@ -37,9 +35,30 @@ def views(clip, *splits):
     return {k: (clip.cameras[k.camera], clip.poses[k.timestep]) for s in splits for k in clip.splits[s]}
 
 
-def renders(avatar, clip, ground=(1.0, 1.0, 1.0)):
+WHITE = (1.0, 1.0, 1.0)
+
+
+def renders(avatar, clip, ground=WHITE):
     """Frames of the held-out view by key."""
     return dict(avatar.render_listed(views(clip, "novel_view"), ground, no_progress))
+
+
+def rendered(avatar, wanted, ground=WHITE):
+    """Frames of a list by key; each is there in the size of its camera, and the progress goes up to their number."""
+    done = []
+    found = dict(avatar.render_listed(wanted, ground, lambda count, total, note="": done.append(count)))
+    assert found.keys() == wanted.keys()
+    assert done == sorted(done)
+    assert done[-1] == len(wanted)
+    for key, (camera, _) in wanted.items():
+        assert found[key].rgb.shape == (camera.height, camera.width, 3)
+    return found
+
+
+def with_an_odd_size(wanted):
+    """The same list, whose first frame has another width than the others."""
+    odd, (camera, pose) = next(iter(wanted.items()))
+    return wanted | {odd: (replace(camera, width=30), pose)}
 
 
 def workplace(method, folder):
@@ -68,18 +87,6 @@ def kill_at(iteration, clip):
             raise Killed
 
     return progress
-
-
-def check_killed_training(method, clip, behave, folder):
-    """A training that is killed and started again keeps the export; returns the log of the second one."""
-    behave("hang")
-    with pytest.raises(Killed):
-        fit(method, clip, folder, kill_at(5, clip))
-    behave("")
-    calls = []
-    assert fit(method, clip, folder, lambda done, *_: calls.append(done)).files()
-    assert min(calls) > len(clip.splits["train"]), "the export was kept"
-    return (folder / TRAINING_LOG).read_text()
 
 
 def read_tracked(path):

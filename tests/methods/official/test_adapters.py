@@ -1,5 +1,6 @@
 """What all adapters have in common: faults of trainings, renders, settings and clips are found and named."""
 
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,10 +12,11 @@ from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.images import read_pixels
 from headbench.bench.process import ProgramError
 from headbench.methods.official import checkout, needs, spec
+from headbench.methods.official.method import TRAINING_LOG
 from headbench.methods.official.workplace import check_export
 
 from .conftest import ADAPTERS, OF_VIDEO
-from .repository import BUDGET, export, fit, renders
+from .repository import BUDGET, Killed, export, fit, kill_at, renders
 
 MEMORY = "exit code 1.*out of memory"
 TRAININGS = {
@@ -36,6 +38,19 @@ def test_a_training_that_fails_says_so_and_begins_anew(method, clip, behave, tmp
     calls = []
     assert fit(method, clip, tmp_path / "a", lambda done, *_: calls.append(done)).files()
     assert min(calls) > len(clip.splits["train"]), "the export was kept"
+
+
+@pytest.mark.parametrize(("name", "nothing"), {"rgbavatar": "False", "flashavatar": "[]"}.items())
+def test_a_killed_training_starts_again_on_its_export(method, clip, behave, tmp_path, nothing):
+    behave("hang")
+    with pytest.raises(Killed):
+        fit(method, clip, tmp_path / "a", kill_at(5, clip))
+    behave("")
+    calls = []
+    assert fit(method, clip, tmp_path / "a", lambda done, *_: calls.append(done)).files()
+    assert min(calls) > len(clip.splits["train"]), "the export was kept"
+    found = re.findall(r"^finds (.*)", (tmp_path / "a" / TRAINING_LOG).read_text(), re.MULTILINE)
+    assert found == [nothing, nothing], "nothing of the killed training is left"
 
 
 SIZE, RENDERING = r"expected \d+x\d+ pixels, found \d+x\d+", {"crash in rendering": MEMORY}

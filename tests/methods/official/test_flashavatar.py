@@ -1,6 +1,5 @@
 """FlashAvatar's adapter: images, masks and numbers that their loader reads, texts changed, renders read back by key."""
 
-import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -29,32 +28,25 @@ from headbench.methods.shared.avatar_files import Subject
 from .flashavatar_repository import FlashAvatarStandIn
 from .repository import (
     BUDGET,
-    check_killed_training,
+    WHITE,
     check_tracked,
     fit,
     read_tracked,
+    rendered,
     renders,
     views,
+    with_an_odd_size,
 )
 
 NAME = "flashavatar"
-WHITE = (1.0, 1.0, 1.0)
 
 
 def test_frames_are_rendered_under_their_keys(avatar, video_clip, monkeypatch):
     monkeypatch.setattr(implementation, "PART", 8)  # more than one call for a camera's frames
     assert {path.name for path in avatar.files()} == {"chkpnt.pth", "options.json", "subject.npz"}
-    wanted = views(video_clip, "self_reenactment", "novel_view", "train")
-    odd = next(iter(wanted))
-    wanted[odd] = (replace(wanted[odd][0], width=30), wanted[odd][1])  # and one of another size
-    done: list[int] = []
-    found = dict(avatar.render_listed(wanted, WHITE, lambda count, total, note="": done.append(count)))
-    assert found.keys() == wanted.keys()
-    assert done == sorted(done)
-    assert done[-1] == len(wanted)
-    for key, (camera, pose) in wanted.items():
-        frame = found[key]
-        assert frame.rgb.shape == (camera.height, camera.width, 3)
+    wanted = with_an_odd_size(views(video_clip, "self_reenactment", "novel_view", "train"))
+    for key, frame in rendered(avatar, wanted).items():
+        camera, pose = wanted[key]
         assert np.ptp(frame.rgb, axis=(0, 1)).max() == 0
         levels = [60 + 20 * pose.expression[0], 60 + 200 * -np.sin(pose.jaw[0]), camera.K[0, 0]]
         assert np.abs(frame.rgb[0, 0] * 255 - np.floor(levels)).max() < 1.01
@@ -180,12 +172,6 @@ def test_mesh_and_sources_are_theirs(exported, repository):
 
 
 # ------------------------------------------------------------------ what happens where it fails
-
-
-def test_a_killed_training_starts_again_on_its_export(method, video_clip, behave, tmp_path):
-    log = check_killed_training(method, video_clip, behave, tmp_path / "a")
-    found = re.findall(r"^finds (.*)", log, re.MULTILINE)
-    assert found == ["[]", "[]"], "nothing of the killed training is left"
 
 
 @pytest.mark.parametrize(

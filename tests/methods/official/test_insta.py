@@ -20,29 +20,27 @@ from headbench.methods.official.workplace import Listed, check_export
 from headbench.methods.shared.avatar_files import Subject
 
 from .insta_repository import make_insta_repository
-from .repository import fit, views, workplace
+from .repository import (
+    WHITE,
+    fit,
+    rendered,
+    views,
+    with_an_odd_size,
+    workplace,
+)
 
 NAME = "insta"
-GROUND = (1.0, 1.0, 1.0)
 
 
 def test_frames_are_rendered_under_their_keys_on_any_ground(avatar, official_clip, monkeypatch):
     monkeypatch.setattr(export, "PART", 4)  # more than one call of the program
     assert {path.name for path in avatar.files()} == {"snapshot.msgpack", "subject.npz"}
-    wanted = views(official_clip, "self_reenactment", "novel_view", "train")
-    odd = next(iter(wanted))
-    wanted[odd] = (replace(wanted[odd][0], width=30), wanted[odd][1])  # and one of another size
+    wanted = with_an_odd_size(views(official_clip, "self_reenactment", "novel_view", "train"))
     subject = PosedSubject.of(official_clip)
-    drawn: list[int] = []
-    for ground in (GROUND, (0.0, 0.5, 1.0)):
-        drawn.clear()
-        found = dict(avatar.render_listed(wanted, ground, lambda done, total, note="": drawn.append(done)))
-        assert found.keys() == wanted.keys()
-        assert drawn == sorted(drawn)
-        assert drawn[-1] == len(wanted)
+    for ground in (WHITE, (0.0, 0.5, 1.0)):
+        found = rendered(avatar, wanted, ground)
         for key, (camera, pose) in wanted.items():
             rgb = found[key].rgb
-            assert rgb.shape == (camera.height, camera.width, 3)
             mesh = subject.meshes([pose_in_head_frame(pose)])[0]
             levels = [30 + 20 * pose.expression[0], 5000 * mesh.std(), camera.K[0, 0]]
             place = np.linalg.inv(camera.world_to_camera @ subject.motions([pose])[0])[:3, 3]

@@ -1,8 +1,6 @@
 """RGBAvatar's adapter: the video that their loader reads, the configuration of a run, renders read back by key."""
 
-import re
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -17,12 +15,13 @@ from headbench.methods.official.spec import RGBAVATAR_OFFICIAL
 
 from .repository import (
     BUDGET,
-    check_killed_training,
     check_tracked,
     export,
     fit,
     read_tracked,
+    rendered,
     views,
+    with_an_odd_size,
 )
 from .rgbavatar_repository import CONFIG, make_rgbavatar_repository
 
@@ -32,19 +31,12 @@ NAME = "rgbavatar"
 def test_frames_are_rendered_under_their_keys_on_any_ground(avatar, video_clip, monkeypatch):
     monkeypatch.setattr(implementation, "PART", 8)  # more than one call for a camera's frames
     assert {path.name for path in avatar.files()} == {"model.ply", "config.yaml", "subject.npz"}
-    several = views(video_clip, "self_reenactment", "novel_view", "train")
-    odd = next(iter(several))
-    several[odd] = (replace(several[odd][0], width=30), several[odd][1])  # and one of another size
+    several = with_an_odd_size(views(video_clip, "self_reenactment", "novel_view", "train"))
     for wanted, ground in ((several, (0.0, 0.5, 1.0)), (views(video_clip, "novel_view"), (1.0, 1.0, 1.0))):
-        done: list[int] = []
-        found = dict(avatar.render_listed(wanted, ground, partial(_note, done)))
-        assert found.keys() == wanted.keys()
-        assert done == sorted(done)
-        assert done[-1] == len(wanted)
+        found = rendered(avatar, wanted, ground)
         motions = PosedSubject.of(video_clip).motions([pose for _, pose in wanted.values()])
         for (key, (camera, pose)), motion in zip(wanted.items(), motions):
             frame = found[key]
-            assert frame.rgb.shape == (camera.height, camera.width, 3)
             assert frame.alpha == pytest.approx(0.6)
             shift = (camera.world_to_camera @ motion)[0, 3]
             shown = 60 + np.array([20 * pose.expression[0], 200 * -np.sin(pose.jaw[0]), 100 * shift])
@@ -52,10 +44,6 @@ def test_frames_are_rendered_under_their_keys_on_any_ground(avatar, video_clip, 
             for pixel, levels in ((frame.rgb[1, 1], np.clip(shown, 0, 153)), (frame.rgb[0, 0], corner)):
                 expected = np.clip(np.floor(levels) / 255 + 0.4 * np.array(ground), 0, 1)
                 assert np.abs(pixel - expected).max() < 1.01 / 255
-
-
-def _note(done, count, total, note=""):
-    done.append(count)
 
 
 def test_the_published_configuration_is_scaled_to_the_run(method, repository, video_clip, tmp_path):
@@ -105,12 +93,6 @@ def test_the_texture_chart_is_theirs(exported, repository):
     work, _ = exported
     name = "data/FLAME2020/flame_uv.npz"
     assert (work.program / name).read_bytes() == (repository[0] / name).read_bytes()
-
-
-def test_a_killed_training_starts_again_on_its_export(method, video_clip, behave, tmp_path):
-    log = check_killed_training(method, video_clip, behave, tmp_path / "a")
-    found = re.findall(r"^finds (\w+)", log, re.MULTILINE)
-    assert found == ["False", "False"], "nothing of the killed training is left"
 
 
 @pytest.mark.parametrize(
