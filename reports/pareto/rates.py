@@ -10,6 +10,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from ...bench.engine.config import CODED
+from ...bench.errors import InputError
 from ...bench.specs import MetricSpec
 from ..aggregate import subject_means, whole_images
 from ..runs import RunData
@@ -59,8 +60,12 @@ class RateDifference:
 
 
 def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], list[MetricSpec]]:
-    """Coded avatars of runs at their steps, and the metrics of `METRICS` that the runs have; empty without coded ones."""
-    points: list[RatePoint] = []
+    """Coded avatars of runs at their steps, and the metrics of `METRICS` that the runs have; empty without coded ones.
+
+    Runs of different subjects are joined. Raises `InputError` for a coded avatar of one subject that is in two runs.
+    """
+    sizes: dict[tuple[str, str], dict[str, float]] = {}
+    quality: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
     metrics = [m for m in runs[0].metrics if m.name in METRICS and m.per_frame] if runs else []
     for run in runs:
         derived = {c.name for c in run.manifest.configuration.conditions if c.derive}
@@ -68,9 +73,17 @@ def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], lis
         for record in run.manifest.methods:
             if record.trivial or (record.condition and record.condition not in steps):
                 continue
-            sizes = _by_subject(run, record.label, SIZE, "")
-            quality = {metric.name: _by_subject(run, record.label, metric.name, task) for metric in metrics}
-            points.append(RatePoint(record.name, record.condition, sizes, quality))
+            key = record.name, record.condition
+            known = sizes.setdefault(key, {})
+            own = _by_subject(run, record.label, SIZE, "")
+            if record.condition and (twice := sorted(known.keys() & own.keys())):
+                expected = f"each subject's avatars of {record.label} in one run"
+                raise InputError(run.folder.root, "subject", expected, f"{twice[0]} in another run too")
+            known.update(own)
+            for metric in metrics:
+                values = _by_subject(run, record.label, metric.name, task)
+                quality.setdefault(key, {}).setdefault(metric.name, {}).update(values)
+    points = [RatePoint(*key, sizes[key], quality.get(key, {})) for key in sizes]
     coded = {point.method for point in points if point.variant}
     return [point for point in points if point.method in coded], metrics
 

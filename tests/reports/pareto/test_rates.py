@@ -66,13 +66,13 @@ def test_points_that_another_beats_do_not_count():
 def coded_run(tmp_path, write_manifest):
     """A run whose method "wide" takes twice the bytes of "slim" at equal quality, but for a factor by subject."""
 
-    def make(factors=(1.0, 1.0, 1.0, 1.0), steps=STEPS):
-        folder, rows, labels = RunFolder(tmp_path / "run"), [], {}
-        conditions = (PLAIN, *(Condition(name, derive=Named("variant", {"name": name})) for name in steps))
+    def make(factors=(1.0, 1.0, 1.0, 1.0), steps=STEPS, name="run", subjects="abcd"):
+        folder, rows, labels = RunFolder(tmp_path / name), [], {}
+        conditions = (PLAIN, *(Condition(step, derive=Named("variant", {"name": step})) for step in steps))
         for method, base in (("slim", 1.0), ("wide", 2.0)):
             for number, condition in enumerate(("", *steps)):
                 labels[f"{method}+{condition}" if condition else method] = None
-                for subject, factor in zip("abcd", factors):
+                for subject, factor in zip(subjects, factors):
                     size = (
                         base * (factor if method == "wide" else 1) * (40 if not condition else 2.0**-number)
                     )
@@ -121,6 +121,19 @@ def test_the_interval_covers_the_mean_of_subjects(coded_run, tmp_path):
     mean = 100 * (2 * math.exp(np.mean(np.log(factors))) - 1)
     assert rate["percent"] == pytest.approx(mean)
     assert rate["low"] < mean < rate["high"]
+
+
+def test_runs_of_single_subjects_are_those_of_one_run_of_all(coded_run, tmp_path):
+    factors = (0.8, 1.0, 1.1, 1.3)
+    whole = pareto_runs(ParetoSettings((coded_run(factors),), str(tmp_path / "whole")))
+    parts = tuple(coded_run((factor,), name=each, subjects=each) for each, factor in zip("abcd", factors))
+    joined = pareto_runs(ParetoSettings(parts, str(tmp_path / "joined")))
+    assert joined.data["rates"] == whole.data["rates"]
+    for name in ("rates.csv", "rate_distortion.png"):
+        one, other = (tmp_path / each / name for each in ("whole", "joined"))
+        assert sorted(one.read_bytes().splitlines()) == sorted(other.read_bytes().splitlines())
+    with pytest.raises(InputError, match="a in another run too"):
+        pareto_runs(ParetoSettings((*parts, coded_run(name="e", subjects="a")), str(tmp_path / "twice")))
 
 
 def test_too_few_steps_have_no_difference(coded_run, tmp_path):
