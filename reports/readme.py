@@ -4,6 +4,7 @@ python -m headbench.reports.readme demo demo-output .
 python -m headbench.reports.readme suite suite-output .
 python -m headbench.reports.readme profiles run-of-one-subject .
 python -m headbench.reports.readme faces run-of-one-subject .
+python -m headbench.reports.readme rates folder-of-sweeps .
 """
 
 from __future__ import annotations
@@ -33,8 +34,11 @@ from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from ..bench.specs import CommandResult
 from .aggregate import summarise
+from .pareto.plot import write_rates
+from .pareto.rates import read_rates
+from .pareto.table import rate_tables
 from .protocols import USUAL, ProtocolsSettings, protocols_command
-from .runs import RunSet, synthetic_settings
+from .runs import RunData, RunSet, synthetic_settings
 from .statistics.primary import primary_table
 from .suite.extremes import FOLDER as EXTREMES
 from .suite.extremes import read_extremes
@@ -48,6 +52,8 @@ SUITE = "suite"
 """Stored results of the suite in `GALLERY`."""
 PROFILES, FACES = "profiles", "faces"
 """Stored results of one of its subjects: by the definitions of all protocols, and by metrics of faces."""
+RATES = "rates"
+"""Stored sweeps over steps of the codec, one for each of some of its subjects."""
 PICTURE = "contact_sheet.jpg"
 RESULTS = "results.md"
 MEASURED = "reports/measured.json"
@@ -58,6 +64,7 @@ PAGES = {
     PROTOCOLS: "docs/explanation/protocols.md",
     PROFILES: "docs/explanation/protocols.md",
     FACES: "docs/explanation/metrics.md",
+    RATES: "docs/explanation/fairness.md",
 }
 """The page of each block, in the repository."""
 OURS = "ours"
@@ -65,6 +72,8 @@ COMPARED = (OURS, "ga")
 """Methods of the tables of protocols."""
 CHOICES = ("pixels: face", "pixels: mouth", "pixels: hair", "pooled: 16 frames", "cameras: unseen")
 """Those of the README; the page of protocols has all."""
+RATES_PICTURE = "docs/pictures/rate-distortion.png"
+RATES_TASKS = ("novel_view", "self_reenactment")
 SHOWN = ("psnr", "lpips")
 """Metrics of frames in the README, whose table would not fit a page with all; those of the suite's tables are in `RESULTS`."""
 
@@ -98,6 +107,15 @@ def publish_subject(name: str, out: Path, root: Path) -> None:
     target = root / GALLERY / name
     _copy(RunFolder(out), RunFolder(target))
     _write(root / PAGES[name], name, SUBJECT_BLOCKS[name](target))
+
+
+def publish_rates(out: Path, root: Path) -> None:
+    """Copy manifests and rows of the sweeps in a folder to the repository ``root``, and write their block and its plot."""
+    target = root / GALLERY / RATES
+    for run in sorted(path.parent for path in out.glob("*/rows.parquet")):
+        _copy(RunFolder(run), RunFolder(target / run.name))
+    write_rates(root / RATES_PICTURE, *read_rates(rate_runs(target), RATES_TASKS[0]), RATES_TASKS[0])
+    _write(root / PAGES[RATES], RATES, rates_block(target))
 
 
 def _copy(source: RunFolder, target: RunFolder) -> None:
@@ -197,6 +215,18 @@ def _worth_of_choices(runs: Sequence[Path]) -> str:
     return f"`{'` and `'.join(COMPARED)}`, {subjects} of the suite:\n\n{found.text}"
 
 
+def rate_runs(folder: Path) -> list[RunData]:
+    """The stored sweeps over steps of the codec."""
+    return [RunData.read(path.parent) for path in sorted(folder.glob("*/rows.parquet"))]
+
+
+def rates_block(folder: Path) -> str:
+    """Bytes and losses by step of the codec, and BD-rates: Markdown."""
+    runs = rate_runs(folder)
+    subjects = counted(len({subject for run in runs for subject in run.rows.subjects}), "subject")
+    return f"Means of {subjects} of the suite:\n\n{rate_tables(runs, RATES_TASKS, COMPARED[1])}"
+
+
 SUBJECT_BLOCKS: dict[str, Callable[[Path], str]] = {
     PROFILES: lambda folder: _worth_of_choices([folder]),
     FACES: lambda folder: table_text([folder], "md").strip(),
@@ -279,6 +309,7 @@ def suite_block(root: Path) -> str:
 PUBLISH: dict[str, Callable[[Path, Path], None]] = {
     "demo": publish_demo,
     SUITE: publish_suite,
+    RATES: publish_rates,
     **{name: partial(publish_subject, name) for name in SUBJECT_BLOCKS},
 }
 

@@ -19,6 +19,8 @@ from headbench.bench.specs import MetricSpec
 from headbench.reports.pareto.command import pareto_runs
 from headbench.reports.pareto.rates import rate_difference
 from headbench.reports.pareto.settings import ParetoSettings
+from headbench.reports.pareto.table import rate_tables
+from headbench.reports.runs import RunData
 
 STEPS = ("coded-x0.25", "coded-x0.5", "coded", "coded-x2")
 METRICS = [
@@ -134,6 +136,18 @@ def test_runs_of_single_subjects_are_those_of_one_run_of_all(coded_run, tmp_path
         assert sorted(one.read_bytes().splitlines()) == sorted(other.read_bytes().splitlines())
     with pytest.raises(InputError, match="a in another run too"):
         pareto_runs(ParetoSettings((*parts, coded_run(name="e", subjects="a")), str(tmp_path / "twice")))
+
+
+def test_a_table_has_bytes_and_losses_of_every_step(coded_run):
+    run = RunData.read(Path(coded_run()))
+    text = rate_tables([run], ["novel_view"], "slim")
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line]
+    assert cells[0][2:] == ["MB", "bytes per primitive", "PSNR, novel view", "LPIPS, novel view"]
+    assert cells[7:9] == [
+        ["wide", "none", "80.00", "–", "36.00", "0.640"],
+        ["wide", "coded-x0.25", "1.00", "–", "-0.50", "+0.005"],
+    ]
+    assert cells[-2] == ["wide", "novel view", "PSNR", "+100 %", "+100 to +100 %"]
 
 
 def test_too_few_steps_have_no_difference(coded_run, tmp_path):
