@@ -38,7 +38,7 @@ from .pareto.plot import write_rates
 from .pareto.rates import read_rates
 from .pareto.table import rate_tables
 from .protocols import USUAL, ProtocolsSettings, protocols_command
-from .runs import RunData, RunSet, synthetic_settings
+from .runs import RunData, RunSet, joined_subjects, synthetic_settings
 from .statistics.primary import primary_table
 from .suite.extremes import FOLDER as EXTREMES
 from .suite.extremes import read_extremes
@@ -216,8 +216,8 @@ def _worth_of_choices(runs: Sequence[Path]) -> str:
 
 
 def rate_runs(folder: Path) -> list[RunData]:
-    """The stored sweeps over steps of the codec."""
-    return [RunData.read(path.parent) for path in sorted(folder.glob("*/rows.parquet"))]
+    """The stored sweeps over steps of the codec, of all subjects."""
+    return joined_subjects([RunData.read(path.parent) for path in sorted(folder.glob("*/rows.parquet"))])
 
 
 def rates_block(folder: Path) -> str:

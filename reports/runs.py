@@ -379,6 +379,25 @@ def _with_one_protocol(runs: tuple[RunData, ...]) -> tuple[RunData, ...]:
     return tuple(replace(run, rows=run.rows.of_protocols(whole)) for run in runs) if whole else runs
 
 
+def joined_subjects(runs: Sequence[RunData]) -> list[RunData]:
+    """Several runs of different subjects as one run of all, in a list; the runs themselves if two share a subject.
+
+    Raises `InputError` for runs of different subjects that do not have the same methods, settings, metrics and kind of protocol.
+    """
+    subjects = [subject for run in runs for subject in run.rows.subjects]
+    if len(runs) < 2 or len(set(subjects)) < len(subjects):
+        return list(runs)
+    expected = f"the methods and settings of {runs[0].folder.root}"
+    for run, labels in zip(runs, training_labels(runs)):
+        if {*run.methods} != {*runs[0].methods}:
+            raise InputError(run.folder.manifest, "methods", expected, ", ".join(run.methods))
+        if changed := [label for name, label in labels.items() if label != name]:
+            raise InputError(run.folder.manifest, "methods", expected, changed[0])
+    _metrics(runs)
+    rows = Rows.joined([run.rows for run in _with_one_protocol(tuple(runs))])
+    return [replace(runs[0], rows=rows)]
+
+
 def _subjects(run: RunData, task: str) -> list[str]:
     return [subject for subject, _ in run.manifest.protocols[task].clips]
 

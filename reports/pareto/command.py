@@ -14,8 +14,9 @@ from ...bench.specs import CommandResult
 from .settings import ParetoSettings
 
 if TYPE_CHECKING:
+    from ...bench.specs import MetricSpec
     from .points import ParetoPoint
-    from .rates import RateDifference
+    from .rates import RateDifference, RatePoint
 
 
 COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
@@ -31,12 +32,15 @@ def pareto(
     runs: Sequence[str], out: Path, task: str, metric_name: str = "", time: str = "", reference: str = ""
 ) -> CommandResult:
     """Write ``points.csv`` and ``pareto.png`` of finished runs, and ``rates.csv`` and ``rate_distortion.png`` if they have
-    coded avatars at several steps. Raises `InputError` for runs that cannot be compared."""
+    coded avatars at several steps. Runs of different subjects are joined. Raises `InputError` for runs that cannot be compared."""
+    from ..runs import RunData, joined_subjects
     from ..writers import csv_text
     from .plot import write_plot
     from .points import ParetoPoint, front_of, read_points
+    from .rates import read_rates
 
-    points, left_out, metric, note = read_points([Path(r) for r in runs], task, metric_name, time)
+    read = joined_subjects([RunData.read(Path(run)) for run in runs])
+    points, left_out, metric, note = read_points(read, task, metric_name, time)
     check_output_folder(out)
     rising = metric.higher_is_better
     fronts = {cost: front_of(points, cost, higher_is_better=rising) for cost in COSTS}
@@ -52,7 +56,13 @@ def pareto(
         labels["milliseconds"] = f"{time.replace('_', ' ').capitalize()}, ms"
     quality = f"{metric.label}{unit}, {task.replace('_', ' ')}"
     write_plot(out / "pareto.png", points, labels, quality, higher_is_better=rising)
-    rates = _rates(runs, out, task, reference)
+    rates: list[RateDifference] = []
+    try:
+        curves = read_rates(read, task)
+    except InputError as error:
+        left_out.append(f"curves of rate and distortion: {error}")
+    else:
+        rates = _rates(*curves, out, task, reference)
     data = {
         "out": out,
         "points": [asdict(point) for point in points],
@@ -65,14 +75,14 @@ def pareto(
     return CommandResult("\n".join([text, *map(_rate_text, rates)]), data)
 
 
-def _rates(runs: Sequence[str], out: Path, task: str, reference: str) -> list[RateDifference]:
+def _rates(
+    points: Sequence[RatePoint], metrics: Sequence[MetricSpec], out: Path, task: str, reference: str
+) -> list[RateDifference]:
     """Write the files of rate and distortion; return the differences to the reference, none with fewer than two steps."""
-    from ..runs import RunData
     from ..writers import csv_text
     from .plot import write_rates
-    from .rates import rate_differences, read_rates
+    from .rates import rate_differences
 
-    points, metrics = read_rates([RunData.read(Path(run)) for run in runs], task)
     methods = list(dict.fromkeys(point.method for point in points))
     if reference and reference not in methods:
         raise InputError("command line", "--reference", ", ".join(methods) or "coded avatars", reference)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from ...bench.errors import InputError
 from ...bench.specs import MetricSpec
@@ -67,9 +66,9 @@ def front_of(
 
 
 def read_points(
-    folders: Sequence[Path], task: str, metric: str, time: str = ""
+    runs: Sequence[RunData], task: str, metric: str, time: str = ""
 ) -> tuple[list[ParetoPoint], list[str], MetricSpec, str]:
-    """Read every method of every run except trivial baselines; return points, omitted methods with reasons,
+    """Every method of every run except trivial baselines, as points; return these, omitted methods with reasons,
     the metric, and a note on frame times that are not comparable ("": all are).
 
     ``metric`` "" is the first of frames that the runs have; ``time`` names the metric of milliseconds; "" the
@@ -79,11 +78,9 @@ def read_points(
     points: list[ParetoPoint] = []
     left_out: list[str] = []
     timings: dict[str, Conditions] = {}
-    runs: list[RunData] = []
     spec = None
-    for folder in folders:
-        data = RunData.read(folder)
-        runs.append(data)
+    for data in runs:
+        folder = data.folder.root
         data.rows.check()
         if task not in data.tasks:
             raise InputError(folder, "task", ", ".join(data.tasks), task)
@@ -114,7 +111,7 @@ def read_points(
             if milliseconds is None and not time and speed.value:
                 milliseconds, timed = 1000.0 / speed.value, SPEED
             if milliseconds is not None and label in measured.get(timed, {}):
-                timings[label if len(folders) == 1 else f"{label} of {folder}"] = measured[timed][label]
+                timings[label if len(runs) == 1 else f"{label} of {folder}"] = measured[timed][label]
             source, variant = (record.name, record.condition) if record.condition in derived else ("", "")
             costs = size.value, milliseconds
             points.append(

@@ -62,10 +62,10 @@ class RateDifference:
 def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], list[MetricSpec]]:
     """Coded avatars of runs at their steps, and the metrics of `METRICS` that the runs have; empty without coded ones.
 
-    Runs of different subjects are joined. Raises `InputError` for a coded avatar of one subject that is in two runs.
+    Several runs may have different steps of one method. Raises `InputError` for two runs with different values of the
+    same avatar. Runs of different subjects are joined before (`runs.joined_subjects`).
     """
-    sizes: dict[tuple[str, str], dict[str, float]] = {}
-    quality: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
+    points: dict[tuple[str, str], RatePoint] = {}
     metrics = [m for m in runs[0].metrics if m.name in METRICS and m.per_frame] if runs else []
     for run in runs:
         derived = {c.name for c in run.manifest.configuration.conditions if c.derive}
@@ -73,19 +73,14 @@ def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], lis
         for record in run.manifest.methods:
             if record.trivial or (record.condition and record.condition not in steps):
                 continue
-            key = record.name, record.condition
-            known = sizes.setdefault(key, {})
-            own = _by_subject(run, record.label, SIZE, "")
-            if record.condition and (twice := sorted(known.keys() & own.keys())):
-                expected = f"each subject's avatars of {record.label} in one run"
-                raise InputError(run.folder.root, "subject", expected, f"{twice[0]} in another run too")
-            known.update(own)
-            for metric in metrics:
-                values = _by_subject(run, record.label, metric.name, task)
-                quality.setdefault(key, {}).setdefault(metric.name, {}).update(values)
-    points = [RatePoint(*key, sizes[key], quality.get(key, {})) for key in sizes]
-    coded = {point.method for point in points if point.variant}
-    return [point for point in points if point.method in coded], metrics
+            sizes = _by_subject(run, record.label, SIZE, "")
+            quality = {metric.name: _by_subject(run, record.label, metric.name, task) for metric in metrics}
+            point = RatePoint(record.name, record.condition, sizes, quality)
+            if points.setdefault((record.name, record.condition), point) != point:
+                expected = f"the values of {record.label} in another run"
+                raise InputError(run.folder.root, "method", expected, "other values", "Give one of the runs.")
+    coded = {point.method for point in points.values() if point.variant}
+    return [point for point in points.values() if point.method in coded], metrics
 
 
 def _by_subject(run: RunData, label: str, metric: str, task: str) -> dict[str, float]:

@@ -12,7 +12,8 @@ class ParetoSettings:
     """Quality against size and frame time, over finished runs of the same frames; CSV, and a plot with the front."""
 
     runs: tyro.conf.Positional[tuple[str, ...]]
-    """Folders of finished runs: every method in each is a point, such as the settings of a sweep."""
+    """Folders of finished runs: every method in each is a point, such as the settings of a sweep. Runs of different subjects
+    with the same methods and settings are joined."""
 
     out: str
     """Folder to write: points.csv and pareto.png; with coded avatars also rates.csv and rate_distortion.png."""

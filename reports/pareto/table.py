@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from statistics import fmean
 
+from ...bench.errors import InputError
 from ...bench.protocol import TASK_TITLES
 from ...bench.specs import MetricSpec
 from ..aggregate import subject_means, whole_images
@@ -18,9 +19,18 @@ PER_PRIMITIVE = "primitive_bytes"
 def rate_tables(runs: Sequence[RunData], tasks: Sequence[str], reference: str) -> str:
     """Bytes and losses of each method at each step of the codec, means over subjects, and BD-rates to a method: Markdown.
 
-    Losses are differences from the same avatars as trained.
+    Losses are differences from the same avatars as trained. Raises `InputError` if a value of a subject is missing.
     """
     found = {task: read_rates(runs, task) for task in tasks}
+    subjects = {subject for run in runs for subject in run.rows.subjects}
+    for task, (own, _) in found.items():
+        for point in own:
+            for what, values in {"storage": point.megabytes, **point.quality}.items():
+                if missing := sorted(subjects - values.keys()):
+                    key = f"{point.method}, {point.variant or 'as trained'}, {task}"
+                    raise InputError(
+                        runs[0].folder.root, key, f"{what} of every subject", f"none of {missing[0]}"
+                    )
     points = {
         task: {(point.method, point.variant): point for point in own} for task, (own, _) in found.items()
     }

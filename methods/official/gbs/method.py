@@ -42,8 +42,8 @@ for path in sys.argv[1:]:
 """
 """Removes the optimiser's state, two thirds of their size, from checkpoints, since their renderer ignores it."""
 
-WITHOUT_FIX = GBSOfficialConfig().commit
-"""The commit that the adapter was written for."""
+WITHOUT_FIX = "2952da7d246e5790140dbb477d1468214564f092"
+"""The commit that the adapter was written for, from before the authors' fix of June 2025."""
 
 
 class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
@@ -53,7 +53,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
     config_class = GBSOfficialConfig
     repository = Repository(
         "https://github.com/zjumsj/GaussianBlendshapes",
-        WITHOUT_FIX,
+        GBSOfficialConfig().commit,
         ("train.py", "test.py", "FLAME/dataset.py", "FLAME/FLAME.py", "FLAME/blendshapes/l_eyelid.npy"),
         (
             *("torch", "torch.utils.tensorboard", "pytorch3d.renderer", "diff_gaussian_rasterization"),

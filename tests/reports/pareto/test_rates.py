@@ -22,6 +22,7 @@ from headbench.reports.pareto.settings import ParetoSettings
 from headbench.reports.pareto.table import rate_tables
 from headbench.reports.runs import RunData
 
+GALLERY = Path(__file__).parents[3] / "reports" / "gallery"
 STEPS = ("coded-x0.25", "coded-x0.5", "coded", "coded-x2")
 METRICS = [
     MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr"),
@@ -132,10 +133,29 @@ def test_runs_of_single_subjects_are_those_of_one_run_of_all(coded_run, tmp_path
     joined = pareto_runs(ParetoSettings(parts, str(tmp_path / "joined")))
     assert joined.data["rates"] == whole.data["rates"]
     for name in ("rates.csv", "rate_distortion.png"):
-        one, other = (tmp_path / each / name for each in ("whole", "joined"))
-        assert sorted(one.read_bytes().splitlines()) == sorted(other.read_bytes().splitlines())
-    with pytest.raises(InputError, match="a in another run too"):
-        pareto_runs(ParetoSettings((*parts, coded_run(name="e", subjects="a")), str(tmp_path / "twice")))
+        assert (tmp_path / "joined" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    other = coded_run(name="e", subjects="e", steps=STEPS[:2])
+    with pytest.raises(InputError, match="methods"):
+        pareto_runs(ParetoSettings((*parts, other), str(tmp_path / "other")))
+
+
+def test_two_trainings_of_a_subject_have_no_curves(coded_run, tmp_path):
+    runs = (coded_run(), coded_run((1.5, 1.0, 1.0, 1.0), name="again"))
+    result = pareto_runs(ParetoSettings(runs, str(tmp_path / "out")))
+    assert result.data["rates"] == []
+    assert "curves of rate and distortion" in result.text
+    assert "expected the values of wide in another run" in result.text
+
+
+def test_stored_sweeps_of_single_subjects_are_joined(tmp_path):
+    """Their protocols differ by the subject."""
+    runs = sorted(str(path.parent) for path in (GALLERY / "rates").glob("*/rows.parquet"))
+    result = pareto_runs(ParetoSettings(tuple(runs), str(tmp_path / "out"), reference="ga"))
+    assert {rate["subjects"] for rate in result.data["rates"]} <= {0, len(runs)}
+    assert all(
+        rate["low"] <= rate["percent"] <= rate["high"] for rate in result.data["rates"] if rate["subjects"]
+    )
+    assert len(result.data["points"]) == 4 * 5
 
 
 def test_a_table_has_bytes_and_losses_of_every_step(coded_run):
