@@ -22,8 +22,9 @@ from headbench.datasets.tracking.command import track_capture
 from headbench.datasets.tracking.programs import LOG, PROGRAMS
 from headbench.datasets.tracking.settings import TrackSettings
 
+from ..monocular.videos import recording_of
 from ..tiny_capture import rig
-from ..tracker_files.test_import import SIZE, TRACKED, recording_of
+from ..tracker_files.test_import import LENGTHS, SIZE, TRACKED
 from ..tracker_files.trackers import HEAD_FILE, write_pixel3dmm
 
 SCRIPT = """
@@ -82,7 +83,8 @@ def made(tmp_path_factory):
     """What Pixel3DMM writes for a small capture."""
     root = tmp_path_factory.mktemp("made")
     square = rig(SIZE, SIZE, 0.45 * SIZE, 0.53 * SIZE)[:2]
-    write_pixel3dmm(recording_of(root / "capture", neck=True, cameras=square), root / "made", tracked=TRACKED)
+    recording = recording_of(root / "capture", LENGTHS, neck=True, cameras=square)
+    write_pixel3dmm(recording, root / "made", tracked=TRACKED)
     return root / "made"
 
 
