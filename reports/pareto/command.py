@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_output_folder, write_text
+from ...bench.progress import counted
 from ...bench.specs import CommandResult
 from .settings import ParetoSettings
 
@@ -104,7 +105,7 @@ def _rate_text(rate: RateDifference) -> str:
     name = f"BD-rate by {rate.metric}, {rate.method} against {rate.reference}:"
     if rate.percent is None:
         return f"{name} none ({rate.reason})"
-    bounds = "no interval with fewer than 3 subjects"
+    bounds = f"no interval of {counted(rate.subjects, 'subject')}"
     if rate.low is not None and rate.high is not None:
         bounds = f"95 % interval over {rate.subjects} subjects {rate.low:+.1f} to {rate.high:+.1f} %"
     return f"{name} {rate.percent:+.1f} % ({bounds})"

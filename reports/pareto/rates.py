@@ -45,7 +45,7 @@ class RatePoint:
 class RateDifference:
     """Bjontegaard difference of a method to a reference, percent; negative: fewer bytes at equal quality.
 
-    ``low`` and ``high`` are the 95 % interval over subjects, None with fewer than three; ``reason`` says why there is no
+    ``low`` and ``high`` are the 95 % interval over subjects, None with fewer than four; ``reason`` says why there is no
     ``percent``.
     """
 
