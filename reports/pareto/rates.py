@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -13,14 +14,16 @@ from ...bench.engine.config import CODED
 from ...bench.errors import InputError
 from ...bench.specs import MetricSpec
 from ..aggregate import subject_means, whole_images
+from ..curve.points import half_width
 from ..runs import RunData
-from ..statistics.bootstrap import SequencePairs, SubjectPairs, interval
 from .points import SIZE, pareto_front
 
 Curve = Sequence[tuple[float, float]]
 """Megabytes and quality at each step of the codec."""
 LEAST_POINTS = 3
 """Number of steps that make a curve."""
+LEAST_SUBJECTS = 3
+"""Number of subjects that have an interval."""
 METRICS = ("psnr", "lpips")
 
 
@@ -45,8 +48,8 @@ class RatePoint:
 class RateDifference:
     """Bjontegaard difference of a method to a reference, percent; negative: fewer bytes at equal quality.
 
-    ``low`` and ``high`` are the 95 % interval over subjects, None with fewer than four; ``reason`` says why there is no
-    ``percent``.
+    ``low`` and ``high`` are the 95 % interval over subjects, by Student's t of the logarithm, None with fewer than
+    `LEAST_SUBJECTS`; ``reason`` says why there is no ``percent``.
     """
 
     method: str
@@ -127,7 +130,7 @@ def rate_difference(reference: Curve, other: Curve, *, higher_is_better: bool = 
 def rate_differences(
     points: Sequence[RatePoint], metrics: Sequence[MetricSpec], reference: str
 ) -> list[RateDifference]:
-    """The difference of every method to the reference in every metric: mean over subjects, with a bootstrap interval."""
+    """The difference of every method to the reference in every metric: mean over subjects, with an interval."""
     methods = [name for name in dict.fromkeys(point.method for point in points) if name != reference]
     subjects = sorted({subject for point in points for subject in point.megabytes})
     found = []
@@ -155,15 +158,10 @@ def _difference(
             "without a common quality"
         )
         return RateDifference(method, reference, metric, None, reason=reason)
-    known = {subject: float(value) for subject, value in values.items() if value is not None}
-    pairs = [
-        SubjectPairs(name, (SequencePairs(np.array([[value]]), np.zeros((1, 1)), np.ones(1)),))
-        for name, value in known.items()
-    ]
-    bounds = interval(pairs)
-    mean = _percent(float(np.mean([*known.values()])))
-    low, high = (None, None) if bounds is None else (_percent(bounds[0]), _percent(bounds[1]))
-    return RateDifference(method, reference, metric, mean, low, high, len(known))
+    known = [float(value) for value in values.values() if value is not None]
+    mean, half = fmean(known), half_width(known) if len(known) >= LEAST_SUBJECTS else None
+    low, high = (None, None) if half is None else (_percent(mean - half), _percent(mean + half))
+    return RateDifference(method, reference, metric, _percent(mean), low, high, len(known))
 
 
 def _percent(logarithm: float) -> float:

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from scipy import stats
 
 from headbench.bench.condition import PLAIN, Condition, Named
 from headbench.bench.engine.store import RunFolder
@@ -123,7 +124,9 @@ def test_the_interval_covers_the_mean_of_subjects(coded_run, tmp_path):
     rate = pareto_runs(settings).data["rates"][0]
     mean = 100 * (2 * math.exp(np.mean(np.log(factors))) - 1)
     assert rate["percent"] == pytest.approx(mean)
-    assert rate["low"] < mean < rate["high"]
+    logarithms = np.log(2 * np.array(factors))
+    bounds = stats.t.interval(0.95, 3, loc=logarithms.mean(), scale=stats.sem(logarithms))
+    assert (rate["low"], rate["high"]) == pytest.approx(tuple(100 * np.expm1(bounds)))
 
 
 def test_runs_of_single_subjects_are_those_of_one_run_of_all(coded_run, tmp_path):
