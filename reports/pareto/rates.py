@@ -16,14 +16,13 @@ from ...bench.specs import MetricSpec
 from ..aggregate import subject_means, whole_images
 from ..curve.points import half_width
 from ..runs import RunData
+from ..statistics.bootstrap import LEAST_SUBJECTS
 from .points import SIZE, pareto_front
 
 Curve = Sequence[tuple[float, float]]
 """Megabytes and quality at each step of the codec."""
 LEAST_POINTS = 3
 """Number of steps that make a curve."""
-LEAST_SUBJECTS = 3
-"""Number of subjects that have an interval."""
 METRICS = ("psnr", "lpips")
 
 
@@ -76,8 +75,8 @@ def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], lis
         for record in run.manifest.methods:
             if record.trivial or (record.condition and record.condition not in steps):
                 continue
-            sizes = _by_subject(run, record.label, SIZE, "")
-            quality = {metric.name: _by_subject(run, record.label, metric.name, task) for metric in metrics}
+            sizes = by_subject(run, record.label, SIZE, "")
+            quality = {metric.name: by_subject(run, record.label, metric.name, task) for metric in metrics}
             point = RatePoint(record.name, record.condition, sizes, quality)
             if points.setdefault((record.name, record.condition), point) != point:
                 expected = f"the values of {record.label} in another run"
@@ -86,7 +85,7 @@ def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], lis
     return [point for point in points.values() if point.method in coded], metrics
 
 
-def _by_subject(run: RunData, label: str, metric: str, task: str) -> dict[str, float]:
+def by_subject(run: RunData, label: str, metric: str, task: str) -> dict[str, float]:
     """Mean of a metric by subject; subjects with missing values are left out."""
     rows = whole_images(run.rows, label, metric, task)
     bad = set(rows[rows["status"] != "ok"]["subject"])

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from statistics import fmean
 
+from ...bench.condition import label_of
 from ...bench.errors import InputError
 from ...bench.protocol import TASK_TITLES
 from ...bench.specs import MetricSpec
-from ..aggregate import subject_means, whole_images
 from ..runs import RunData
 from ..writers import pipe_table
-from .rates import RateDifference, RatePoint, rate_differences, read_rates
+from .rates import RateDifference, RatePoint, by_subject, rate_differences, read_rates
 
 PER_PRIMITIVE = "primitive_bytes"
 
@@ -42,19 +42,15 @@ def rate_tables(runs: Sequence[RunData], tasks: Sequence[str], reference: str) -
         [":--", ":--", *["--:"] * (2 + len(titles))],
     ]
     methods = [method for method, _ in points[tasks[0]]]
-    by_size = sorted(points[tasks[0]].items(), key=lambda item: -fmean(item[1].megabytes.values()))
-    for (method, variant), point in sorted(by_size, key=lambda item: methods.index(item[0][0])):
-        label = f"{method}+{variant}" if variant else method
-        per_primitive = [
-            value
-            for run in runs
-            for value in subject_means(whole_images(run.rows, label, PER_PRIMITIVE, "")).values()
-        ]
+    sizes = {key: fmean(point.megabytes.values()) for key, point in points[tasks[0]].items()}
+    for method, variant in sorted(sizes, key=lambda key: (methods.index(key[0]), -sizes[key])):
+        label = label_of(method, variant)
+        per_primitive = [size for run in runs for size in by_subject(run, label, PER_PRIMITIVE, "").values()]
         lines.append(
             [
                 method,
                 variant or "none",
-                f"{fmean(point.megabytes.values()):.2f}",
+                f"{sizes[method, variant]:.2f}",
                 f"{fmean(per_primitive):.1f}" if per_primitive else "–",
                 *(_change(points[task], method, variant, metric) for task, metric in columns),
             ]
