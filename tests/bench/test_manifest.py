@@ -20,10 +20,8 @@ GALLERY = Path(__file__).parents[2] / "reports" / "gallery" / "run.json"
 @pytest.fixture
 def published(tmp_path):
     """A copy of the published run, with its protocols in its own folder."""
-    shutil.copytree(
-        GALLERY.parent, tmp_path / "run", ignore=shutil.ignore_patterns("suite", "faces", "profiles", "*.jpg")
-    )
-    return tmp_path / "run" / "run.json"
+    shutil.copytree(GALLERY.parent / PROTOCOLS, tmp_path / "run" / PROTOCOLS)
+    return Path(shutil.copy(GALLERY, tmp_path / "run"))
 
 
 def change_json(path, change):
