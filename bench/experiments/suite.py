@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 from ..comparison import closing
@@ -137,20 +138,33 @@ def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:
         asked = settings.equal_iterations or others
         names = tuple(name for name in asked if name != NONE)
         found.append(Condition(EQUAL, names, {"budget": {"iterations": count}}))
-    return [condition for condition in found if condition.methods] + _ablations(settings.ablations, specs)
+    found = [condition for condition in found if condition.methods]
+    estimated = [condition for condition in found if condition.clip and OURS in condition.methods]
+    crossed = _ablations("--tracked-ablations", settings.tracked_ablations, specs)
+    if crossed and not estimated:
+        expected = f"{OURS} among those of --tracked, which --tracked-ablations are compared with"
+        raise InputError("command line", "--tracked", expected, " ".join(tracked) or NONE)
+    return [
+        *found,
+        *_ablations("--ablations", settings.ablations, specs),
+        *(
+            replace(ablation, name=f"{ablation.name}-{condition.name}", clip=condition.clip)
+            for ablation, condition in product(crossed, estimated)
+        ),
+    ]
 
 
-def _ablations(asked: Sequence[str], specs: dict[str, MethodSpec]) -> list[Condition]:
+def _ablations(option: str, asked: Sequence[str], specs: dict[str, MethodSpec]) -> list[Condition]:
     """The requested ablations in the order of the method's spec. Raises `InputError` for unknown ones, and without the method."""
     if not asked:
         return []
     if OURS not in specs:
-        expected = f"{OURS} among them, which --ablations are compared with"
+        expected = f"{OURS} among them, which {option} are compared with"
         raise InputError("command line", "--methods", expected, ", ".join(specs))
     known = specs[OURS].ablations
     unknown = [name for name in asked if name not in (*known, ALL)]
     if unknown:
-        raise InputError("command line", "--ablations", f"{', '.join(known)} or {ALL}", unknown[0])
+        raise InputError("command line", option, f"{', '.join(known)} or {ALL}", unknown[0])
     return [
         Condition(name, (OURS,), dict(changed))
         for name, changed in known.items()

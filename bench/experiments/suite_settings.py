@@ -56,6 +56,10 @@ class SuiteSettings(ExecutionOptions):
     the run; or "none". Default: those of ga, gbs, ours and ours-plus that run. Tracking takes about 1 second a timestep, once a
     subject; each method one more training."""
 
+    tracked_ablations: tuple[str, ...] = ()
+    """Train ours with these parts left out or changed also under the conditions of --tracked and --levels, as conditions such as
+    `no-lines-tracked`: does an effect depend on the tracking? For example lines-move-splats (Table 4 of the paper)."""
+
     levels: tuple[float, ...] = ()
     """Train the methods of --tracked a further time for each of these levels of simulated tracking errors (see `headbench synth`), as
     conditions such as `tracking-3`."""

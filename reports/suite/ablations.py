@@ -15,15 +15,18 @@ from ..tables import Table, TableCell, TableRow
 FIRST_TASK = "novel_view"
 
 
-def ablation_table(runs: RunSet, method: str, *, crossed: bool = False) -> Table:
+def ablation_table(runs: RunSet, method: str, names: Mapping[str, str], *, crossed: bool = False) -> Table:
     """Differences of ablations from a method, as `difference_table`.
 
     Parameters
     ----------
     runs : RunSet
-        A run with only ``method`` itself and the conditions that are its ablations.
+        A run with only ``method`` itself and its ablations.
+    method : str
+        Label of the method, of one under a condition of tracking for ablations under this condition.
+    names : mapping of str
+        Name of each ablation by its label.
     """
-    names = {label: record.condition for label, record in runs.records.items() if record.condition}
     pairs = [(label, method) for label in names]
     meaning = meaning_of("Ablation minus method")
     if crossed:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from .tracked import DROP_MEANING, condition_table, drop_table
 from .variance import variance_section
 
 LARGE = "Images of twice the size"
+CROSSED = "novel views minus self-reenactment"
 LEVEL_START = LEVEL.partition("{")[0]
 CONDITION_TEXTS = {
     TRACKED: (
@@ -118,23 +119,33 @@ def _tables(read: RunSet, method: str, *, primary: bool) -> str:
         own = whole.only([*changed, *changed.values()]).shared
         for region in regions:
             sections.append(_condition_section(own.of(FrameSelection(region)), condition, changed, region))
-    ablations = [
-        label
-        for condition, labels in by_condition.items()
-        if condition not in ("", EQUAL, AS_TRACKED, *tracking)
-        for name, label in labels.items()
-        if name == method
-    ]
-    if ablations:
-        runs = whole.only([method, *ablations]).shared
-        for region, chosen in product(regions, ((), *((name,) for name in tested))):
-            table = ablation_table(runs.of(FrameSelection(region, chosen)), method)
-            title = _title(f"Ablations of {method}", region, *chosen)
-            sections.append(f"## {title} (exploratory)\n\n{to_markdown(table).strip()}")
-        table = ablation_table(runs, method, crossed=True)
-        title = f"Ablations of {method}, novel views minus self-reenactment (exploratory)"
-        sections.append(f"## {title}\n\n{to_markdown(table).strip()}")
+    ablations: dict[str, dict[str, str]] = {name: {} for name in ("", *tracking)}
+    """Name of each ablation by its label, for each condition of tracking."""
+    for condition, by_name in by_condition.items():
+        if method in by_name and condition not in ("", EQUAL, AS_TRACKED, *tracking):
+            under = next((name for name in tracking if condition.endswith(f"-{name}")), "")
+            ablations[under][by_name[method]] = condition.removesuffix(f"-{under}")
+    for under, named in ablations.items():
+        if named:
+            sections += _ablation_sections(whole, by_condition[under][method], named, regions, tested)
     return "\n\n".join(sections) + "\n"
+
+
+def _ablation_sections(
+    whole: RunSet, method: str, names: Mapping[str, str], regions: Sequence[str], tested: Sequence[str]
+) -> list[str]:
+    """Differences of ablations from a method: whole frames and regions, each held-out sequence, and between the tasks."""
+    runs = whole.only([method, *names]).shared
+    chosen = [(region, parts) for region, parts in product(regions, ((), *((name,) for name in tested)))]
+    tables = {_title("", region, *parts): FrameSelection(region, parts) for region, parts in chosen}
+    found = {title: ablation_table(runs.of(part), method, names) for title, part in tables.items()}
+    for region in regions:
+        title = f"{_title('', region)}, {CROSSED}"
+        found[title] = ablation_table(runs.of(FrameSelection(region)), method, names, crossed=True)
+    return [
+        f"## Ablations of {method}{title} (exploratory)\n\n{to_markdown(table).strip()}"
+        for title, table in found.items()
+    ]
 
 
 def _machines(runs: RunSet) -> str:

@@ -111,6 +111,10 @@ ONE = ("--subjects", "1", "--large", "0")
             {"tracked": ("ga", "ours-plus"), "tracking-3": ("ga", "ours-plus")},
         ),
         (["--methods", "ga", "--tracked", "none", "--levels", "3"], {}),
+        (
+            ["--methods", "ours", "--levels", "3", "--tracked-ablations", "no-lines"],
+            dict.fromkeys(("tracked", "tracking-3", "no-lines-tracked", "no-lines-tracking-3"), ("ours",)),
+        ),
         (["--methods", "insta"], {}),
     ],
 )
@@ -196,6 +200,8 @@ def test_the_additions_together_are_ours_plus():
             ["--ablations", "no-lines", "fixed-sizes"],
             "fixed-sizes",
         ),
+        (["--tracked-ablations", "no-lines", "--methods", "ga"], "ours among them"),
+        (["--tracked-ablations", "no-lines", "--tracked", "none"], "ours among those of --tracked"),
         (["--methods", "ours", "ga-official"], "checkout"),
         (["--tracked", "ours", "--methods", "ga"], "methods of tracked"),
         (["--tracked", "ga", "none"], "names of methods, or none"),

@@ -16,7 +16,7 @@ def test_rows_are_ablations_and_cells_their_differences(make_run):
     runs = RunSet.read(
         [make_run("run", methods=both, settings={"toy": {"level": 0.25}}, conditions=conditions)]
     )
-    table = ablation_table(runs, "toy")
+    table = ablation_table(runs, "toy", {"toy+less": "less"})
     (row,) = table.rows
     assert row.method == "less"
     plain = {line.method: line for line in table_of(runs).rows}
@@ -30,7 +30,8 @@ def test_rows_are_ablations_and_cells_their_differences(make_run):
 def test_crossed_cells_are_differences_between_the_tasks(make_run):
     conditions = (PLAIN, Condition("less", ("toy",), {"level": 0.5}))
     runs = RunSet.read([make_run("run", settings={"toy": {"level": 0.25}}, conditions=conditions)])
-    plain, crossed = (ablation_table(runs, "toy", crossed=each) for each in (False, True))
+    names = {"toy+less": "less"}
+    plain, crossed = (ablation_table(runs, "toy", names, crossed=each) for each in (False, True))
     (cells,), (found,) = ([row.cells for row in table.rows] for table in (plain, crossed))
     by_task = {c.task: cell.value for c, cell in zip(plain.columns, cells) if c.task}
     views = by_task.pop("novel_view")
@@ -44,7 +45,7 @@ def test_crossed_cells_are_differences_between_the_tasks(make_run):
 
 def test_speeds_of_different_runs_are_not_compared(write_run):
     runs = RunSet.read([write_run("run", {"ours": 30.0, "ours+less": 29.0})])
-    table = ablation_table(runs, "ours")
+    table = ablation_table(runs, "ours", {"ours+less": "less"})
     assert "fps" in {column.metric for column in table_of(runs).columns}
     assert "fps" not in {column.metric for column in table.columns}
     assert [cell.value for cell in table.rows[0].cells] == pytest.approx(

@@ -7,7 +7,7 @@ import pytest
 
 from headbench.bench.engine.store import RunFolder
 from headbench.reports.runs import RunSet
-from headbench.reports.suite.suite import LARGE, suite_report
+from headbench.reports.suite.suite import CROSSED, LARGE, suite_report
 from headbench.reports.suite.tracked import condition_table, drop_table
 from headbench.reports.table_report import table_of
 
@@ -69,7 +69,7 @@ def test_rows_are_methods_and_cells_tracked_minus_plain(tracked_run):
 def test_tracking_from_images_is_no_ablation(tracked_run):
     sections = re.split("^## ", suite_report(tracked_run.parent, "ours"), flags=re.MULTILINE)[1:]
     by_title = {section.partition("\n")[0]: section for section in sections}
-    ablations = ["", ", EMO", ", novel views minus self-reenactment"]
+    ablations = ["", ", EMO", f", {CROSSED}"]
     ablations = [f"Ablations of ours{what} (exploratory)" for what in ablations]
     tracked = "Tracked from images (exploratory)"
     plain = [
@@ -79,6 +79,22 @@ def test_tracking_from_images_is_no_ablation(tracked_run):
     assert [*by_title] == [*plain, tracked, *ablations]
     assert {title for title, text in by_title.items() if "tracked" in text} == {tracked}
     assert {title for title, text in by_title.items() if "| less" in text} == {*ablations}
+
+
+def test_ablations_are_compared_under_their_own_tracking(write_run):
+    values = {"ga": 30.0, "ours": 31.0, "ours+less": 30.5, "ours+tracked": 29.0, "ours+less-tracked": 29.75}
+    text = suite_report(write_run("suite/run", values).parent, "ours")
+    found = {
+        title: re.search(r"^\| less +\|.*$", section, re.MULTILINE)
+        for title, section in re.findall(
+            r"^## (Ablations .*?) \(exploratory\)$(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL
+        )
+    }
+    for method, difference in {"ours": "-0.500", "ours+tracked": "+0.750"}.items():
+        for title in (f"Ablations of {method}", f"Ablations of {method}, EMO"):
+            assert difference in found[title].group(), title
+        assert "0.000" in found[f"Ablations of {method}, {CROSSED}"].group()
+    assert len(found) == 6
 
 
 def test_a_second_run_has_its_own_heading(tracked_run, write_run):
