@@ -158,7 +158,7 @@ _REMEDY = (
 )
 
 
-def lip_rings(asset: HeadAsset, length: int = RING_LENGTH) -> tuple[IntArray, IntArray]:
+def lip_rings(asset: HeadAsset) -> tuple[IntArray, IntArray]:
     """Upper and lower ring: (n,) vertices each, from one corner of the mouth to the other, pairs matching.
 
     Rings that are found run from the subject's left to the right, as GaussianAvatars' do. The region ``lips`` is a band
@@ -170,9 +170,7 @@ def lip_rings(asset: HeadAsset, length: int = RING_LENGTH) -> tuple[IntArray, In
     ----------
     asset : HeadAsset
         Head whose ring regions are returned unchanged if it has both; otherwise the rings are found
-        from ``lips``.
-    length : int
-        Number of vertices of rings that are found; fewer if the lips have fewer.
+        from ``lips``, with `RING_LENGTH` vertices, fewer if the lips have fewer.
 
     Raises
     ------
@@ -194,7 +192,7 @@ def lip_rings(asset: HeadAsset, length: int = RING_LENGTH) -> tuple[IntArray, In
     deepest = int(depth.max())
     upper = _arc(asset, edges, depth == deepest // 2, 0)
     lower = _arc(asset, edges, depth == deepest // 3, 1)
-    count = min(length, len(upper), len(lower))
+    count = min(RING_LENGTH, len(upper), len(lower))
     weights = asset.skinning_weights[:, JOINT_NAMES.index("jaw")]
     if count < 3 or weights[lower].mean() - weights[upper].mean() < 0.2:
         found = f"{len(upper)} and {len(lower)} vertices, told apart by the jaw's skinning weight"

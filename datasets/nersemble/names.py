@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import random
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from os import PathLike
 
 from ...bench.errors import InputError
@@ -105,12 +105,12 @@ PAPER_SEQUENCES = (*UNION10_SEQUENCES, TEST_SEQUENCE)
 """Training sequences and FREE: tongue, hair, glasses and head-turning sequences are usually left out."""
 
 
-def union10_held_out(subject: str, sequences: Sequence[str] = UNION10_SEQUENCES) -> str:
+def union10_held_out(subject: str) -> str:
     """Sequence that VHAP's union export holds out of ten: drawn by Python's generator, seeded with the subject.
 
     ``subject`` is the id as text, leading zeros included.
     """
-    return sequences[random.Random(subject).randint(0, len(sequences) - 1)]
+    return UNION10_SEQUENCES[random.Random(subject).randint(0, len(UNION10_SEQUENCES) - 1)]
 
 
 def chosen_subjects(text: str) -> list[str]:

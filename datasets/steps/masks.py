@@ -85,26 +85,14 @@ class NeckLine:
         return ndtr((self.normal[0] * x + self.normal[1] * y) / deviation).astype(np.float32)
 
 
-def mask_below_neck(clip: CaptureClip, *, softness: float = SOFTNESS) -> CaptureClip:
+def mask_below_neck(clip: CaptureClip) -> CaptureClip:
     """Replace everything below the tracked neck by background, in images and masks, like VHAP's "below line".
 
     The line goes through the projected front of the neck's lower boundary, parallel to the line through its left
     and right; its edge is Gaussian. Head models end there and do not explain the motion of clothes below it.
 
-    Parameters
-    ----------
-    softness : float
-        Standard deviation of the edge, in image widths.
-
-    Raises
-    ------
-    InputError
-        The head model has no regions "boundary" or "neck", or softness is not positive.
+    Raises `InputError` if the head model has no region "boundary" or "neck".
     """
-    if not softness > 0:
-        raise InputError(
-            "mask_below_neck", "softness", "a positive share of the image's width", str(softness)
-        )
     anchors = neck_anchors(clip.head)
     timesteps = sorted({key.timestep for key in clip.files})
     meshes = PosedSubject.of(clip, torch.float32).each(clip, timesteps)
@@ -119,12 +107,12 @@ def mask_below_neck(clip: CaptureClip, *, softness: float = SOFTNESS) -> Capture
         if line is None:
             return pixels
         height, width = pixels.image.shape[:2]
-        weights = line.weights(width, height, softness * width)
+        weights = line.weights(width, height, SOFTNESS * width)
         coverage = None if pixels.coverage is None else pixels.coverage * weights
         # a w F + (1 - a w) B equals w (a F + (1 - a) B) + (1 - w) B, which does not need F.
         return FramePixels(composite(pixels.image, weights, ground), coverage)
 
-    return clip.derive_pixels("mask_below_neck", {"softness": softness, "anchors": anchors.tolist()}, cut)
+    return clip.derive_pixels("mask_below_neck", {"softness": SOFTNESS, "anchors": anchors.tolist()}, cut)
 
 
 def neck_anchors(head: HeadAsset) -> IntArray:

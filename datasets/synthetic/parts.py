@@ -27,11 +27,8 @@ class EyeMesh:
     albedo: FloatArray
 
 
-def eye_mesh(person: Person, eye: Eye, *, inset: float = 0.0) -> EyeMesh:
-    """Build the ball around ``eye``, its pole on the gaze axis.
-
-    ``inset`` (metres) makes it smaller than the tracked ball, so that lids that touch the ball stay in front.
-    """
+def eye_mesh(person: Person, eye: Eye) -> EyeMesh:
+    """Build the ball around ``eye``, its pole on the gaze axis."""
     rings, spokes = 72, 96
     # Rings crowd where the iris is.
     polar = np.pi * np.linspace(0.0, 1.0, rings) ** 1.8
@@ -40,7 +37,7 @@ def eye_mesh(person: Person, eye: Eye, *, inset: float = 0.0) -> EyeMesh:
     theta, phi = (np.concatenate([[0.0], a.ravel(), [b]]) for a, b in ((theta, np.pi), (phi, 0.0)))
     unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
     lift = 1.0 + _CORNEA_LIFT * smoothstep(theta, 1.15 * _IRIS_ANGLE, 0.0)
-    vertices = eye.center + (eye.radius - inset) * lift[:, None] * unit
+    vertices = eye.center + eye.radius * lift[:, None] * unit
     return EyeMesh(vertices, _ball_faces(rings, spokes), _paint(person, eye, theta, phi, unit))
 
 

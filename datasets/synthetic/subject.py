@@ -28,6 +28,7 @@ _STRETCH_GLOSS, _LEAST, _MOST = 3.0, 0.6, 1.25  # exponent of the stretch of are
 _WET = 1.2  # what wetness adds to the gloss of lips
 HEAD_JOINT, EYE_JOINTS = 1, (3, 4)
 _NECK_ROUNDS = 6  # of averaging over neighbours
+_ROUNDS = 4  # of splitting long edges
 
 # Edge lengths of the fine mesh (metres at average size) by distance from the bridge of the nose.
 _DETAIL = ((0.085, 0.0018), (0.13, 0.0035), (np.inf, 0.007))
@@ -305,8 +306,8 @@ class FineMesh:
         return np.stack([edge, np.cross(normal, edge), normal], axis=-1)
 
 
-def refine(vertices: FloatArray, faces: IntArray, target: FloatArray, rounds: int = 4) -> FineMesh:
-    """Split the edges longer than wanted, conformingly, until none is or ``rounds`` are over.
+def refine(vertices: FloatArray, faces: IntArray, target: FloatArray) -> FineMesh:
+    """Split the edges longer than wanted, conformingly, at most `_ROUNDS` times.
 
     Parameters
     ----------
@@ -328,7 +329,7 @@ def refine(vertices: FloatArray, faces: IntArray, target: FloatArray, rounds: in
     point_face = np.zeros(len(used), np.int64)
     point_face[triangles] = owner[:, None]
     position, wanted = vertices[used], target[used]
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         unique, inverse, _ = unique_pairs(edges)
         length = np.linalg.norm(position[unique[:, 0]] - position[unique[:, 1]], axis=1)

@@ -34,6 +34,7 @@ PARTS = (
 
 
 _TRIED, _FEWEST = 4, 6  # cameras for the rigid pose, and landmarks of one
+_RIGID, _STEPS = 8, 10  # on landmarks alone: of the rigid pose, and of all parameters
 
 
 class BlurLevel(NamedTuple):
@@ -181,16 +182,14 @@ class Fitter:
             equations.add(row, posed, curvature, slope)
         return distance
 
-    def fit_landmarks(
-        self, state: HeadState, *, keep_shape: bool = False, steps: int = 10, rigid: int = 8
-    ) -> HeadState:
+    def fit_landmarks(self, state: HeadState, *, keep_shape: bool = False) -> HeadState:
         """Steps on the landmarks alone, the first of the rigid pose only."""
         rig, prior = self.landmark_rig(), self._prior(keep_shape)
         still = HeadPrior(np.where(np.isinf(prior.pose), np.inf, 0.0), np.zeros(len(prior.shape)))
-        for step in range(rigid + steps):
+        for step in range(_RIGID + _STEPS):
             equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
-            self.add_landmarks(equations, rig, state, leave_out=step >= rigid)
-            state = equations.step(state, still if step < rigid else prior, 1e-3)
+            self.add_landmarks(equations, rig, state, leave_out=step >= _RIGID)
+            state = equations.step(state, still if step < _RIGID else prior, 1e-3)
         return state
 
     def fit_colours(

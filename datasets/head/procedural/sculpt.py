@@ -35,6 +35,7 @@ from .anatomy import (
 from .sculpture import EAR_ORIGIN, sculpture
 
 SHORTEST_EDGE = 0.00035  # metres; lids and lips are sculpted several times further apart
+ITERATIONS = 40  # of centring the clusters that become coarse vertices
 LOW, HIGH = (0.0, FLOOR, -0.13), (0.115, 0.15, 0.11)
 
 
@@ -244,7 +245,6 @@ def coarsen(
     *,
     fixed: IntArray,
     border: IntArray,
-    iterations: int = 40,
 ) -> tuple[FloatArray, IntArray]:
     """Coarse mesh of a fine one.
 
@@ -272,8 +272,8 @@ def coarsen(
     free = np.setdiff1d(initial_seeds(vertices, density, count), fixed)
     seeds = np.concatenate([fixed, free])
     label = np.zeros(len(vertices), int)
-    for step in range(iterations):
-        last = step == iterations - 1
+    for step in range(ITERATIONS):
+        last = step == ITERATIONS - 1
         _, _, source = dijkstra(
             connected if last else even,
             directed=False,

@@ -98,9 +98,9 @@ def stroke(points: FloatArray, center: Point, sigma: Point, degrees: Point | Non
     return np.exp(-0.5 * np.einsum("ij,ij->i", scaled, scaled))
 
 
-def ridge(points: FloatArray, knots: Sequence[Point], width: float, samples: int = 10) -> FloatArray:
+def ridge(points: FloatArray, knots: Sequence[Point], width: float) -> FloatArray:
     """Weight in [0, 1] of a stroke along a spline: Gaussian of the distance with standard deviation ``width``."""
-    distance = tube(points, knots, [0.0] * len(knots), samples)
+    distance = tube(points, knots, [0.0] * len(knots), 10)
     return np.exp(-0.5 * (distance / width) ** 2)
 
 

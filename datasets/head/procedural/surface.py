@@ -32,7 +32,6 @@ from .sculpture import EAR_ORIGIN, head_mass
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
 PACKAGED = Path(__file__).with_name("head.npz")
-EYE_RINGS, EYE_SECTORS = 16, 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +106,9 @@ class SculptedHead:
         return int(candidates[np.argmin(np.linalg.norm(self.vertices[candidates] - point, axis=1))])
 
 
-def eyeball(rings: int = EYE_RINGS, sectors: int = EYE_SECTORS) -> tuple[FloatArray, IntArray]:
+def eyeball() -> tuple[FloatArray, IntArray]:
     """Unit sphere around the z axis, a pole in front: vertices (2 + (rings-1) sectors, 3) and triangles."""
+    rings, sectors = 16, 24
     polar = np.linspace(0, np.pi, rings + 1)[1:-1, None]
     around = np.linspace(0, 2 * np.pi, sectors, endpoint=False)[None]
     body = np.stack(

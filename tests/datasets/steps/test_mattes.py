@@ -116,7 +116,6 @@ def test_what_a_mask_step_needs_is_said(clip):
     for step, said in (
         (lambda: set_background(bare, BLUE), "a mask for every frame"),
         (lambda: set_background(clip, (1.0, 2.0, 0.0)), r"three numbers in \[0, 1\]"),
-        (lambda: mask_below_neck(clip, softness=0.0), "softness"),
         (lambda: mask_below_neck(faceless), "a region 'boundary' or 'neck'"),
     ):
         with pytest.raises(InputError, match=said):

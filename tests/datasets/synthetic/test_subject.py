@@ -124,7 +124,7 @@ def sphere():
 def fine(sphere):
     points, faces = sphere
     # Finer on one side, so that all kinds of splits happen.
-    return refine(points, faces, np.where(points[:, 0] > 0, 0.08, 0.3), rounds=5)
+    return refine(points, faces, np.where(points[:, 0] > 0, 0.08, 0.3))
 
 
 def test_closed_and_consistently_turned(sphere, fine):

@@ -67,7 +67,7 @@ def test_coarsening_keeps_border_fixed_points_and_edge_length():
     border = (np.abs(vertices[:, 0]) < 1e-9).astype(int)
     fixed = np.array([np.argmax(vertices[:, 0]), np.argmax(np.where(border, vertices[:, 1], -1))])
     size = np.full(len(vertices), 0.010)
-    coarse, triangles = coarsen(vertices, faces, size, fixed=fixed, border=border, iterations=15)
+    coarse, triangles = coarsen(vertices, faces, size, fixed=fixed, border=border)
     np.testing.assert_array_equal(coarse[:2], vertices[fixed])
     rim = np.unique(border_edges(triangles))
     np.testing.assert_allclose(coarse[rim, 0], 0, atol=1e-9)
