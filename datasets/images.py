@@ -33,11 +33,6 @@ class ImageStore:
         self._arrays: OrderedDict[Hashable, ByteArray] = OrderedDict()
         self._lock = threading.Lock()
 
-    @property
-    def held_bytes(self) -> int:
-        """Bytes of cached arrays, at most the limit."""
-        return self._held
-
     def image(self, path: Path, background: Iterable[float]) -> ByteArray:
         """(H, W, 3) 8-bit RGB; straight alpha is composited on ``background`` (three numbers in [0, 1])."""
         return self._get(path, tuple(float(c) for c in background))

@@ -17,14 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.io.files import atomic_path, write_json, write_text
+from ...bench.io.files import write_json, write_text
 from ...bench.io.video import write_video
 from ..clip import CaptureClip
 from ..ga.validate import require_full_grid
 from ..ga.writer import pose_to_parameters, save_npz
 from ..images import write_image
 from .names import BACKGROUND, FPS, FULL_SIZE, is_subject
-from .recording import CAMERA_FILE, COLOUR_FILE, SEQUENCES_FILE, read_calibration
+from .recording import CAMERA_FILE, SEQUENCES_FILE, read_calibration
 
 
 def re_record(
@@ -183,21 +183,6 @@ class RecordingWriter:
         size = sizes.pop()
         stated = {} if size == FULL_SIZE else {"height": size[1], "width": size[0]}
         write_json(self.calibration_file, {**value, **stated})
-
-    def write_colour(self, matrices: Mapping[str, FloatArray], sequence: str = "") -> None:
-        """Write colour calibrations by serial: 3 x N for "v2", 4 x 4 affine otherwise.
-
-        ``sequence`` names the sequence they hold for in "paper2023".
-        """
-        if self.release == "v2":
-            write_json(self.calibration_file.with_name(COLOUR_FILE), dict(matrices))
-            return
-        folder = self.root / "color_correction" / self.subject
-        if self.release == "paper2023":
-            folder = self._participant / "annotations" / sequence / "color_correction"
-        for serial, matrix in matrices.items():
-            with atomic_path(folder / f"{serial}.npy") as temporary:
-                np.save(temporary, np.asarray(matrix), allow_pickle=False)
 
     def write_background(self, serial: str, rgb: ByteArray) -> None:
         """Write the still of the empty set."""

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
+from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked
 from headbench.datasets.ga import writer
 from headbench.datasets.ga.layout import SPLIT_FILES
@@ -23,7 +24,7 @@ from headbench.datasets.nersemble import prepare, sequence
 from headbench.datasets.nersemble.command import prepare_nersemble
 from headbench.datasets.nersemble.names import UNION10_SEQUENCES, union10_held_out
 from headbench.datasets.nersemble.prepare import RECORD_FILE
-from headbench.datasets.nersemble.recording import read_calibration
+from headbench.datasets.nersemble.recording import COLOUR_FILE, read_calibration
 
 from ..tiny_capture import edit_json, edit_npz
 from .recordings import HEIGHT, SEQUENCES, SUBJECT, WIDTH, colour_of, tone, world_cameras, write_recording
@@ -211,7 +212,7 @@ def test_a_subject_is_prepared_by_one_process_at_a_time(whole, pristine_recordin
 def test_other_settings_never_mix_with_images_that_are_there(change, recording, tmp_path):
     out = tmp_path / "out"
     matrices = {camera.id: np.eye(3) * 0.9 for camera in world_cameras()}
-    recording.writer.write_colour(matrices)
+    write_json(recording.writer.calibration_file.with_name(COLOUR_FILE), matrices)
     for camera in world_cameras():
         recording.writer.write_background(camera.id, np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
     prepared(recording, out, tracking="")
@@ -336,7 +337,8 @@ def test_a_video_that_ends_early_stops_the_run(videos, tmp_path, monkeypatch):
 
 def test_colours_are_corrected(recording, tmp_path):
     swap = [[0, 1.0, 0], [1.0, 0, 0], [0, 0, 1.0]]
-    recording.writer.write_colour({camera.id: swap for camera in world_cameras()})
+    matrices = {camera.id: swap for camera in world_cameras()}
+    write_json(recording.writer.calibration_file.with_name(COLOUR_FILE), matrices)
     result, _ = prepared(recording, tmp_path / "out")
     assert result["missing"] == []
     clip = read_capture(result["union"])

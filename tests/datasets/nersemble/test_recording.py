@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
+from headbench.bench.io.files import write_json
 from headbench.datasets.nersemble.re_record import RecordingWriter
 from headbench.datasets.nersemble.recording import participant, participants, read_calibration
 
@@ -31,6 +32,17 @@ def test_unmerged_parts_of_the_first_release_are_found(tmp_path):
     assert sorted(participant(recording.root, SUBJECT).sequences) == sorted(SEQUENCES)
 
 
+def write_colour(writer, matrices):
+    if writer.release == "v2":
+        write_json(writer.calibration_file.with_name("color_calibration.json"), matrices)
+        return
+    old = f"{SUBJECT}/annotations/FREE/color_correction"
+    folder = writer.root / (old if writer.release == "paper2023" else f"color_correction/{SUBJECT}")
+    folder.mkdir(parents=True)
+    for serial, matrix in matrices.items():
+        np.save(folder / f"{serial}.npy", matrix)
+
+
 @pytest.mark.parametrize("release", ["v2", "v1", "paper2023"])
 def test_colour_files_are_found_where_each_release_has_them(release, tmp_path):
     cameras = world_cameras()
@@ -38,7 +50,7 @@ def test_colour_files_are_found_where_each_release_has_them(release, tmp_path):
     writer.write_calibration()
     writer.sequence_folder("FREE").mkdir(parents=True)
     matrix = np.eye(3, 4) + 0.1 if release != "v2" else np.eye(3, 10) + 0.1
-    writer.write_colour({camera.id: matrix for camera in cameras}, "FREE")
+    write_colour(writer, {camera.id: matrix for camera in cameras})
     corrections = participant(tmp_path, SUBJECT).corrections("FREE", [cameras[0].id])
     np.testing.assert_allclose(corrections[cameras[0].id].matrix, matrix)
 
@@ -49,7 +61,7 @@ def test_a_colour_calibration_without_a_camera_is_an_error(tmp_path):
         writer = RecordingWriter(tmp_path / release, SUBJECT, cameras, release)
         writer.write_calibration()
         writer.sequence_folder("FREE").mkdir(parents=True)
-        writer.write_colour({cameras[0].id: np.eye(3, 4)})
+        write_colour(writer, {cameras[0].id: np.eye(3, 4)})
         with pytest.raises(InputError, match=cameras[1].id):
             participant(tmp_path / release, SUBJECT).corrections("FREE", [c.id for c in cameras])
 
