@@ -114,8 +114,9 @@ def publish_rates(out: Path, root: Path) -> None:
     target = root / GALLERY / RATES
     for run in sorted(path.parent for path in out.glob("*/rows.parquet")):
         _copy(RunFolder(run), RunFolder(target / run.name))
-    write_rates(root / RATES_PICTURE, *read_rates(rate_runs(target), RATES_TASKS[0]), RATES_TASKS[0])
-    _write(root / PAGES[RATES], RATES, rates_block(target))
+    runs = rate_runs(target)
+    write_rates(root / RATES_PICTURE, *read_rates(runs, RATES_TASKS[0]), RATES_TASKS[0])
+    _write(root / PAGES[RATES], RATES, rates_block(runs))
 
 
 def _copy(source: RunFolder, target: RunFolder) -> None:
@@ -220,9 +221,8 @@ def rate_runs(folder: Path) -> list[RunData]:
     return joined_subjects([RunData.read(path.parent) for path in sorted(folder.glob("*/rows.parquet"))])
 
 
-def rates_block(folder: Path) -> str:
+def rates_block(runs: Sequence[RunData]) -> str:
     """Bytes and losses by step of the codec, and BD-rates: Markdown."""
-    runs = rate_runs(folder)
     subjects = counted(len({subject for run in runs for subject in run.rows.subjects}), "subject")
     return f"Means of {subjects} of the suite:\n\n{rate_tables(runs, RATES_TASKS, COMPARED[1])}"
 
