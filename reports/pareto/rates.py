@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from ...bench.condition import label_of
 from ...bench.engine.config import CODED
 from ...bench.errors import InputError
 from ...bench.specs import MetricSpec
 from ..aggregate import subject_means, whole_images
 from ..curve.points import half_width
-from ..runs import RunData
+from ..runs import RunData, training_labels
 from ..statistics.bootstrap import LEAST_SUBJECTS
 from .points import SIZE, pareto_front
 
@@ -64,12 +65,13 @@ class RateDifference:
 def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], list[MetricSpec]]:
     """Coded avatars of runs at their steps, and the metrics of `METRICS` that the runs have; empty without coded ones.
 
-    Several runs may have different steps of one method. Raises `InputError` for two runs with different values of the
-    same avatar. Runs of different subjects are joined before (`runs.joined_subjects`).
+    Several runs may have different steps of one method; a method whose values differ between them has a curve for each
+    training, named as in a `RunSet`. Raises `InputError` for two runs with different values of the same training. Runs of
+    different subjects are joined before (`runs.joined_subjects`).
     """
-    points: dict[tuple[str, str], RatePoint] = {}
+    found: list[tuple[int, RatePoint]] = []
     metrics = [m for m in runs[0].metrics if m.name in METRICS and m.per_frame] if runs else []
-    for run in runs:
+    for index, run in enumerate(runs):
         derived = {c.name for c in run.manifest.configuration.conditions if c.derive}
         steps = {name for name in derived if name == CODED or name.startswith(f"{CODED}-x")}
         for record in run.manifest.methods:
@@ -77,10 +79,19 @@ def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], lis
                 continue
             sizes = by_subject(run, record.label, SIZE, "")
             quality = {metric.name: by_subject(run, record.label, metric.name, task) for metric in metrics}
-            point = RatePoint(record.name, record.condition, sizes, quality)
-            if points.setdefault((record.name, record.condition), point) != point:
-                expected = f"the values of {record.label} in another run"
-                raise InputError(run.folder.root, "method", expected, "other values", "Give one of the runs.")
+            found.append((index, RatePoint(record.name, record.condition, sizes, quality)))
+    first = {(point.method, point.variant): point for _, point in reversed(found)}
+    differing = {point.method for _, point in found if point != first[point.method, point.variant]}
+    labels = training_labels(runs) if differing else []
+    points: dict[tuple[str, str], RatePoint] = {}
+    for index, point in found:
+        if point.method in differing:
+            point = replace(point, method=labels[index].get(point.method, point.method))
+        if points.setdefault((point.method, point.variant), point) != point:
+            expected = f"the values of {label_of(point.method, point.variant)} in another run"
+            raise InputError(
+                runs[index].folder.root, "method", expected, "other values", "Give one of the runs."
+            )
     coded = {point.method for point in points.values() if point.variant}
     return [point for point in points.values() if point.method in coded], metrics
 

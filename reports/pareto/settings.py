@@ -13,7 +13,7 @@ class ParetoSettings:
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of finished runs: every method in each is a point, such as the settings of a sweep. Runs of different subjects
-    with the same methods and settings are joined."""
+    with the same methods and settings are joined; several trainings of a subject have a curve of rates each."""
 
     out: str
     """Folder to write: points.csv and pareto.png; with coded avatars also rates.csv and rate_distortion.png."""
