@@ -1,6 +1,6 @@
 """Readable content of a capture and read errors, the input of the linter's checks.
 
-Unlike `read_capture`, which stops at the first fault, this reads frame by frame and file by file and continues after
+Unlike the reader, which stops at the first fault, this reads frame by frame and file by file and continues after
 each fault, so that one broken frame does not hide other faults.
 """
 
@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...bench.contracts import Clip, FrameKey, Progress
+from ...bench.contracts import Clip, FrameKey, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.files import digest
@@ -23,7 +23,6 @@ from ...bench.io.images import ImageInfo, probe_image
 from ..clip import CaptureClip
 from ..ga import layout
 from ..ga.content_digests import content_digests
-from ..ga.reader import read_capture
 from ..ga.tracking import Tracking, find_head
 from ..ga.transforms import FrameEntry, parse_frame
 from ..ga.validate import sequence_names
@@ -76,7 +75,7 @@ class Evidence:
     expression_fit : ExpressionFit | None
         How well expressions explain the images; None if that cannot be measured.
     refusal : InputError | None
-        Error of `read_capture`; None if it accepts the capture.
+        Error of the reader; None if it accepts the capture.
     """
 
     folder: Path
@@ -353,7 +352,7 @@ def _find_head(
 
 def _refusal(folder: Path, settings: LintSettings) -> InputError | None:
     try:
-        read_capture(folder, head=settings.head, cy=settings.cy, leaks="record")
+        replace(settings, reader=settings.reader or "ga").open(str(folder), no_progress)
     except InputError as error:
         return error
     return None

@@ -102,7 +102,7 @@ def apply(
 
 
 REFUSAL = "HB100"
-"""The rule that reports the error of `read_capture`."""
+"""The rule that reports the error of the reader."""
 
 
 def _said_again(finding: Finding, findings: Sequence[Finding]) -> bool:
