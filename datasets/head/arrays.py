@@ -276,9 +276,7 @@ def read_head(path: Path) -> HeadArrays:
     names, vertices = content["landmark_names"], content["landmark_vertices"]
     return HeadArrays(
         version=str(content["version"]),
-        **{name: content[name] for name in STORED},
-        eyelid_basis=content.get("eyelid_basis"),
-        uv=content.get("uv"),
+        **{name: content[name] for name in (*STORED, *OPTIONAL) if name in content},
         regions=regions,
         landmarks={str(name): int(vertex) for name, vertex in zip(names, vertices)},
         expression_names=tuple(map(str, content.get("expression_names", ()))),

@@ -16,7 +16,7 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.documents import read_json
 from ...bench.io.files import atomic_path, digest, write_json
-from ...datasets.head.arrays import STORED, HeadArrays, read_head, save_head
+from ...datasets.head.arrays import OPTIONAL, STORED, HeadArrays, read_head, save_head
 from .loop import Fit, TrainingSummary
 from .subject_mesh import SubjectMesh
 
@@ -54,8 +54,8 @@ def head_arrays(head: HeadAsset) -> HeadArrays:
     """A head model as writable arrays for storage."""
     if isinstance(head, HeadArrays):
         return head
-    names = ("version", *STORED, "eyelid_basis", "regions")
-    return HeadArrays(**{name: getattr(head, name) for name in names}, uv=getattr(head, "uv", None))
+    names = ("version", *STORED, *OPTIONAL, "regions")
+    return HeadArrays(**{name: getattr(head, name) for name in names if hasattr(head, name)})
 
 
 def save_shared_head(folder: Path, head: HeadAsset) -> None:
