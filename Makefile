@@ -17,7 +17,7 @@ help:
 	@echo "make setup   make $(VENV) with headbench in it, from the lock (TORCH=cpu or cuda chooses PyTorch's build)"
 	@echo "make lock    write the lock again, requirements*.txt, with the newest versions that pyproject.toml admits"
 	@echo "make demo    compare avatar methods on a capture made on the spot (OUT=$(OUT))"
-	@echo "make pictures  screenshots of the pages of a demo (OUT=$(OUT)), in docs/pictures; of REPORT=FILE for the README"
+	@echo "make pictures  pictures of a demo (OUT=$(OUT)), in docs/pictures; of the page REPORT=FILE for the README"
 	@echo "make docs    build the documentation, in build/docs (NOTEBOOKS=no leaves them unexecuted)"
 	@echo "make test    run the tests (in JOBS=$(JOBS) processes)"
 	@echo "make test-latest  run the tests with the newest versions instead of the lock, in $(VENV)-latest"
@@ -68,9 +68,9 @@ docs: setup
 	HEADBENCH_DOCS_NOTEBOOKS=$(NOTEBOOKS) $(BIN)/python -m sphinx -W --keep-going --quiet -j $(JOBS) -d build/docs-cache docs build/docs
 	@echo "The documentation is in build/docs/index.html."
 
-# Screenshots of the pages of a demo and faults of footage on its capture, in docs/pictures, and the picture of the README, of any
-# run's report.
-pictures: docs
+# The page of a demo's avatar and faults of footage on its capture, in docs/pictures, and the picture of the README, of any run's
+# report.
+pictures: setup
 	$(BIN)/python docs/_ext/footage.py $(firstword $(wildcard $(OUT)/capture/UNION*))
 	$(BIN)/python docs/_ext/pictures.py $(OUT) $(or $(REPORT),$(OUT)/report.html)
 

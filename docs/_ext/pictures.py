@@ -1,7 +1,7 @@
-"""``make pictures``: screenshots of the pages of a finished demo, the README's picture, and thirty synthetic people.
+"""``make pictures``: the page of an avatar of a finished demo, the README's picture, and thirty synthetic people.
 
-The report, the page of an avatar, a leaderboard and this site, at three widths in both schemes, as ``docs/pictures/*-after.webp``;
-a report, for example of a subject of the suite, as ``reports/gallery/report.jpg``. These need Chromium. The people are ``docs/pictures/people.webp``.
+The page is ``docs/pictures/avatar.webp``; a report, for example of a subject of the suite, ``reports/gallery/report.jpg``. These need
+Chromium. The people are ``docs/pictures/people.webp``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, sync_playwright
 
 from headbench.datasets.synthetic.history import over_time
 from headbench.datasets.synthetic.performance import CONTROLS
@@ -22,41 +22,29 @@ from headbench.datasets.synthetic.plan import FRONTAL, SyntheticSettings, load_g
 from headbench.datasets.synthetic.renderer import CaptureRenderer
 
 ROOT = Path(__file__).parents[2]
-SIZES = {1440: 1800, 1024: 1365, 390: 2000}
-"""Height of a picture by width, pixels of the page."""
-STORED = 0.6
-"""Scale of stored pictures, except those of phones."""
+WIDTH = 1440
+"""Of a window, pixels."""
 PEOPLE = (91001, 91002, 91003)
 """Seeds of the people, ten subjects and one row each."""
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
-def pages_of(demo: Path, work: Path) -> dict[str, Path]:
-    """Make the pages that a demo does not leave."""
-    headbench = str(Path(sys.executable).with_name("headbench"))
-    avatar = next(demo.glob("*/ours/seed-*"))
-    capture = next((demo / "capture").glob("UNION*"))
-    bundles = work / "bundles"
-    bundles.mkdir(parents=True)
-    for line in (
-        ["export", "html", avatar, "--capture", capture, "--out", work / "avatar.html"],
-        ["bundle", demo, "--out", bundles / "demo.zip", "--by", "headbench"],
-        ["report", "leaderboard", bundles, "--out", work],
-    ):
-        subprocess.run([headbench, *map(str, line)], check=True)
-    return {
-        "report": demo / "report.html",
-        "avatar": work / "avatar.html",
-        "leaderboard": work / "leaderboard.html",
-        "site": ROOT / "build" / "docs" / "index.html",
-    }
+def avatar_page(demo: Path) -> Path:
+    """Make the page of an avatar of a demo."""
+    headbench, page = Path(sys.executable).with_name("headbench"), ROOT / "build" / "avatar.html"
+    avatar, capture = next(demo.glob("*/ours/seed-*")), next((demo / "capture").glob("UNION*"))
+    subprocess.run([headbench, "export", "html", avatar, "--capture", capture, "--out", page], check=True)
+    return page
 
 
-def picture(page: Page, path: Path) -> Image.Image:
-    """A page after its pictures are there, as large as the window."""
+def picture(browser: Browser, path: Path, height: int, scale: float) -> Image.Image:
+    """A page after its pictures are there, as large as a window ``height`` pixels high."""
+    page = browser.new_page(viewport={"width": WIDTH, "height": height}, color_scheme="light")
     page.goto(path.resolve().as_uri())
     page.wait_for_timeout(1500)
-    return Image.open(BytesIO(page.screenshot())).convert("RGB")
+    image = Image.open(BytesIO(page.screenshot())).convert("RGB")
+    page.close()
+    return image.resize((round(scale * WIDTH), round(scale * height)), Image.Resampling.LANCZOS)
 
 
 def people() -> Image.Image:
@@ -78,29 +66,16 @@ def people() -> Image.Image:
 
 def main(demo: Path, report: Path) -> None:
     """Take the pictures of a demo's folder, and the README's of a file ``report.html``."""
-    people().save(ROOT / "docs" / "pictures" / "people.webp", quality=80)
-    work = ROOT / "build" / "pictures"
-    shutil.rmtree(work, ignore_errors=True)
+    pictures = ROOT / "docs" / "pictures"
+    people().save(pictures / "people.webp", quality=80)
     names = ("chromium", "chromium-browser", "google-chrome")
     program = next(filter(None, map(shutil.which, names)), None)
     if program is None:
         raise SystemExit("Chromium is not installed.")
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=program, args=list(FLAGS))
-        for name, path in pages_of(demo, work).items():
-            for width, height in SIZES.items():
-                for scheme in ("light", "dark"):
-                    page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
-                    image = picture(page, path)
-                    page.close()
-                    scale = 0.8 if width < 600 else STORED
-                    small = image.resize(
-                        (round(scale * width), round(scale * height)), Image.Resampling.LANCZOS
-                    )
-                    small.save(ROOT / "docs" / "pictures" / f"{name}-{width}-{scheme}-after.webp", quality=60)
-        page = browser.new_page(viewport={"width": 1440, "height": 1270}, color_scheme="light")
-        readme = picture(page, report).resize((1152, 1016), Image.Resampling.LANCZOS)
-        readme.save(ROOT / "reports" / "gallery" / "report.jpg", quality=88)
+        picture(browser, avatar_page(demo), 1800, 0.6).save(pictures / "avatar.webp", quality=60)
+        picture(browser, report, 1270, 0.8).save(ROOT / "reports" / "gallery" / "report.jpg", quality=88)
         browser.close()
 
 
