@@ -74,7 +74,7 @@ def difference_table(
     if crossed:
         others = [column for column in kept if column.task not in ("", FIRST_TASK)]
         kept = tuple(replace(c, title=f"{TASK_TITLES[FIRST_TASK]} minus {c.title.lower()}") for c in others)
-    columns, tested = [], []
+    shown, columns, tested = [], [], []
     for column in kept:
         found = compare(
             *(runs.rows, pairs),
@@ -84,6 +84,9 @@ def difference_table(
             higher_is_better=column.higher_is_better,
             level=LEVEL,
         )
+        if not column.task and all(each.difference is None for each in found):
+            continue  # of coded avatars, which conditions do not have
+        shown.append(column)
         columns.append([_cell(each, column.digits) for each in found])
         tested += [each for each in found if each.p_holm is not None]
     versions = {row.method: row.version for row in table.rows}
@@ -92,7 +95,7 @@ def difference_table(
         for (label, _), cells in zip(pairs, zip(*columns), strict=True)
     )
     marking = _marking(tested, meaning, family)
-    return replace(table, columns=kept, groups=((title, rows),), notes=(), marking=marking)
+    return replace(table, columns=tuple(shown), groups=((title, rows),), notes=(), marking=marking)
 
 
 def _marking(tested: Sequence[PairedComparison], meaning: str, family: str) -> str:

@@ -153,9 +153,14 @@ def _machines(runs: RunSet) -> str:
     trained = runs.rows.select(
         method=ALL, condition=ALL, metric="training_time", task="", region=FULL, seeds=ALL
     )
-    known: dict[str, dict[str, None]] = {}
+    machines: dict[str, set[str]] = {}
     for subject, machine in zip(trained["subject"], trained["machine"]):
-        known.setdefault(str(machine) or "unknown processors", {})[str(subject)] = None
+        machines.setdefault(str(subject), set()).add(str(machine))
+    known: dict[str, list[str]] = {}
+    for subject, found in machines.items():
+        # A training that was interrupted has no time, and so no machine.
+        for machine in sorted(found - {""}) or ["unknown processors"]:
+            known.setdefault(machine, []).append(subject)
     listed = [f"{machine}: subjects {', '.join(subjects)}" for machine, subjects in known.items()]
     return f"Trained on: {'; '.join(listed) or 'unknown processors'}."
 

@@ -1,8 +1,10 @@
 """Tables of ablations: each cell a difference from the method in the first run."""
 
+import pandas as pd
 import pytest
 
 from headbench.bench.condition import PLAIN, Condition
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from headbench.reports.runs import RunSet
 from headbench.reports.statistics.comparisons import PairedComparison
@@ -52,6 +54,15 @@ def test_speeds_of_different_runs_are_not_compared(write_run):
         [{"psnr": -1.0, "ssim": -0.025, "lpips": 0.001, "storage": -0.1}[c.metric] for c in table.columns]
     )
     assert "Speed" not in table.caption
+
+
+def test_coded_avatars_that_ablations_do_not_have_get_no_column(write_run):
+    folder = RunFolder(write_run("run", {"ours": 30.0, "ours+less": 29.0}))
+    rows = pd.read_parquet(folder.rows)
+    rows[~((rows.condition == "less") & (rows.metric == "storage"))].to_parquet(folder.rows)
+    table = ablation_table(RunSet.read([folder.root]), "ours", {"ours+less": "less"})
+    assert {column.metric for column in table.columns} == {"psnr", "ssim", "lpips"}
+    assert len(table.rows[0].cells) == len(table.columns)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Tables of methods trained on tracking from images: beside the plain method, and not among ablations."""
 
+import json
 import re
 
 import pandas as pd
@@ -95,6 +96,21 @@ def test_ablations_are_compared_under_their_own_tracking(write_run):
             assert difference in found[title].group(), title
         assert "0.000" in found[f"Ablations of {method}, {CROSSED}"].group()
     assert len(found) == 6
+
+
+def test_an_interrupted_training_has_the_processor_of_others(tracked_run):
+    folder = RunFolder(tracked_run)
+    record = json.loads(folder.manifest.read_text())
+    (spec,) = (metric for metric in record["metrics"] if metric["name"] == "storage")
+    record["metrics"].append({**spec, "name": "training_time"})
+    folder.manifest.write_text(json.dumps(record))
+    rows = pd.read_parquet(folder.rows)
+    times = rows[rows.metric == "storage"].assign(metric="training_time", machine="one kind")
+    times.loc[times.method == "ours", "machine"] = ""  # without a time
+    times.loc[times.subject == "d", "machine"] = ""
+    pd.concat([rows, times]).to_parquet(folder.rows)
+    text = suite_report(tracked_run.parent, "ours")
+    assert "Trained on: one kind: subjects a, b, c; unknown processors: subjects d." in text
 
 
 def test_a_second_run_has_its_own_heading(tracked_run, write_run):
