@@ -28,7 +28,7 @@ from ..gbs.training import GBSTraining
 from ..ours.appearance import OursAppearance
 from ..ours.config import OursConfig
 from ..ours.spec import OURS
-from ..shared import splat_training
+from ..shared import rendering
 from ..shared.avatar_files import Subject
 from ..shared.schedule import ShuffledEpochs, Timeline
 from ..shared.splat_training import BoundTraining, SplatTrainer, Start
@@ -93,17 +93,17 @@ def iterate(training: SplatTrainer) -> None:
 
 def _rasteriser(training: SplatTrainer) -> Callable[[], None]:
     """A function that runs the rasteriser's two passes as an iteration calls them."""
-    rasterize, calls = splat_training.rasterize, []
+    rasterize, calls = rendering.rasterize, []
 
     def noting(*arguments: Any, **options: Any) -> Any:
         calls.append((arguments, options))
         return rasterize(*arguments, **options)
 
-    splat_training.rasterize = noting
+    rendering.rasterize = noting
     try:
         training.loss(ITERATION, 0)
     finally:
-        splat_training.rasterize = rasterize
+        rendering.rasterize = rasterize
     ((arguments, options),) = calls
 
     def leaf(value: Any) -> Any:
@@ -115,8 +115,8 @@ def _rasteriser(training: SplatTrainer) -> Callable[[], None]:
     options = {name: leaf(value) for name, value in options.items()}
 
     def run() -> None:
-        rendering = rasterize(*inputs, **options)
-        (rendering.image.sum() + rendering.alpha.sum()).backward()
+        drawn = rasterize(*inputs, **options)
+        (drawn.image.sum() + drawn.alpha.sum()).backward()
 
     return run
 

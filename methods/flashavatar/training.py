@@ -17,10 +17,10 @@ from ..shared.avatar_files import clip_mesh
 from ..shared.image_training import ImageTrainer, Initial
 from ..shared.networks import initial_network, layer_names, tracked_inputs
 from ..shared.optimisation import logit
+from ..shared.rendering import rasterize_view
 from ..shared.schedule import ShuffledEpochs, Timeline
 from ..shared.subject_mesh import BoundedCache, TrainingPoses
 from ..shared.surface_points import spacing, spread_points
-from ..splats import rasterize
 from .config import FlashAvatarConfig
 from .hyper_gaussians import initial_gaussians
 from .model import (
@@ -85,12 +85,8 @@ class FlashAvatarTraining(ImageTrainer):
         world = self._surface.place(frames, changed(tensors, outputs, config))
         degree = min(config.sh_degree, iteration // self._degree_every)
         colors = colors_seen(tensors, world, frames, view.center, degree)
-        rendering = rasterize(
-            *(*world, tensors["opacities"].sigmoid(), colors),
-            *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
-            background=self._background,
-            check_values=False,
-        )
+        opacities = tensors["opacities"].sigmoid()
+        rendering = rasterize_view(world, opacities, colors, view, self._background)
         truth = self._images.get(iteration, index)
         return image_loss(rendering.image, truth, self._masks(index), config)
 

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from ...bench.contracts import Camera
 from ..ops.splats import WorldSplats, left_products
-from ..shared.rendering import view_of
-from ..splats import rasterize
+from ..shared.rendering import rasterize_view, view_of
 from .config import GHAConfig
 from .driving import HeadMotion, Signal, influences
 from .networks import ATTRIBUTES, Controllers, Influences, Weights, encode, encode_pose, uniform
@@ -122,12 +121,8 @@ class GaussianHead:
         """Splat the features for a camera of full size; their background is a (3,) colour, then ones."""
         world = splats.world
         view = view_of(feature_camera(camera, self.config.upscale), str(world.means.device))
-        rendering = rasterize(
-            *(world.means, world.quats, world.scales, splats.opacities, splats.features),
-            *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
-            background=feature_background(background, self.config.channels),
-            check_values=False,
-        )
+        ground = feature_background(background, self.config.channels)
+        rendering = rasterize_view(world, splats.opacities, splats.features, view, ground)
         return FeatureImage(rendering.image, rendering.alpha)
 
     def sharpen(

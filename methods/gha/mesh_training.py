@@ -17,9 +17,8 @@ from ...bench.native.dispatch import to_device
 from ..shared.checkpoint import load_checkpoint, save_checkpoint
 from ..shared.loop import CHECKPOINT, Fit, recomposited, train
 from ..shared.optimisation import Optimiser
-from ..shared.rendering import View, view_of
+from ..shared.rendering import View, rasterize_view, view_of
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
-from ..splats import rasterize
 from .config import GHAConfig
 from .driving import TrainingScene
 from .mesh_head import DISC_OPACITY, MeshHead, TetGrid, spacing_for, tet_grid, vertex_discs
@@ -112,12 +111,7 @@ class MeshTraining:
         chosen = self._views(iteration, key)
         for seen in chosen:
             view, target, mask, background = self._target(seen)
-            rendering = rasterize(
-                *(discs.means, discs.quats, discs.scales, opacities, colors),
-                *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
-                background=background,
-                check_values=False,
-            )
+            rendering = rasterize_view(discs, opacities, colors, view, background)
             part = COLOR * (rendering.image - target).abs().mean()
             if mask is not None:
                 part = part + SILHOUETTE * (1 - soft_overlap(rendering.alpha, mask))

@@ -19,11 +19,10 @@ from ..shared.image_training import ImageTrainer, Initial
 from ..shared.loop import recomposited
 from ..shared.networks import initial_network, tracked_inputs
 from ..shared.optimisation import logit
-from ..shared.rendering import View
+from ..shared.rendering import View, rasterize_view
 from ..shared.schedule import Batches, GroupedBatches, log_linear, numpy_generator
 from ..shared.subject_mesh import BoundedCache, TrainingPoses
 from ..shared.surface_points import spread_points
-from ..splats import rasterize
 from .config import RGBAvatarConfig
 from .model import (
     BIASES,
@@ -94,12 +93,7 @@ class RGBAvatarTraining(ImageTrainer):
             view, (world, colors) = self._views[key.camera], placed[self._tracked.row[key.timestep]]
             pixels = self._images.get(position, image)
             truth, background = self._on_background(pixels, iteration, image)
-            camera = view.camera
-            rendering = rasterize(
-                *(*world, opacities, colors, view.world_to_camera, view.K, camera.width, camera.height),
-                background=background,
-                check_values=False,
-            )
+            rendering = rasterize_view(world, opacities, colors, view, background)
             total = total + photometric_loss(rendering.image, truth, self._config.ssim_weight)
             self._seen.append((world, opacities, view, pixels))
         return total / len(batch)
@@ -176,13 +170,8 @@ class RGBAvatarTraining(ImageTrainer):
             if self._masks:
                 truth = truth * (pixels[:, :, 3:] > 0.5)
             values = torch.zeros_like(sums).requires_grad_()
-            camera = view.camera
-            means, quats, scales, opacity = (part.detach() for part in (*world, opacities))
-            rendering = rasterize(
-                *(means, quats, scales, opacity, values),
-                *(view.world_to_camera, view.K, camera.width, camera.height),
-                check_values=False,
-            )
+            still = WorldSplats(*(part.detach() for part in world))
+            rendering = rasterize_view(still, opacities.detach(), values, view)
             (sums_of_view,) = torch.autograd.grad((rendering.image * truth).sum(), values)
             sums += sums_of_view
         new = (sums[:, 3] > self._config.color_weight) & ~self.colored

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -81,23 +81,28 @@ def draw_splats(
     cutoffs: Cutoffs = USUAL,
 ) -> Drawn:
     """Rasterize and clip to [0, 1]: the last two stages of `StagedAvatar.draw`."""
-    rendering = _rasterized(world, opacities, colors, view, cutoffs)
+    rendering = rasterize_view(world, opacities, colors, view, view.background, **cutoffs._asdict())
     end_stage("rasterize")
     drawn = Drawn(rendering.image.clamp(0, 1), rendering.alpha.clamp(0, 1))
     end_stage("post")
     return _copied_ahead(drawn) if is_cuda(drawn.image.device) else drawn
 
 
-def _rasterized(
-    world: WorldSplats, opacities: Tensor, colors: Tensor, view: View, cutoffs: Cutoffs
+def rasterize_view(
+    world: WorldSplats,
+    opacities: Tensor,
+    colors: Tensor,
+    view: View,
+    background: Tensor | None = None,
+    **options: Any,
 ) -> Rendering:
+    """`rasterize` for a view, without its checks of values; (C,) ``background``, black if None."""
     return rasterize(
         *(world.means, world.quats, world.scales, opacities, colors),
         *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
-        background=view.background,
-        alpha_min=cutoffs.alpha_min,
-        transmittance_min=cutoffs.transmittance_min,
+        background=background,
         check_values=False,
+        **options,
     )
 
 
@@ -107,8 +112,8 @@ def splat_depth(
     """(H, W) mean depth of the centres of the splats that a pixel shows, weighted as their colours; NaN below an alpha of 0.5."""
     view = view_of(camera, device, (0.0, 0.0, 0.0))
     axis = view.world_to_camera[2]
-    along = (world.means @ axis[:3] + axis[3]).clamp(min=0)
-    drawn = _rasterized(world, opacities, along[:, None].expand(-1, 3).contiguous(), view, cutoffs)
+    along = (world.means @ axis[:3] + axis[3]).clamp(min=0)[:, None].expand(-1, 3).contiguous()
+    drawn = rasterize_view(world, opacities, along, view, view.background, **cutoffs._asdict())
     return _numpy(torch.where(drawn.alpha < 0.5, torch.nan, drawn.image[..., 0] / drawn.alpha))
 
 

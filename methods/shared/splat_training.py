@@ -11,14 +11,13 @@ from ...bench.contracts import Camera, Clip
 from ..ops.mesh import TriangleFrames
 from ..ops.photometric import photometric_loss
 from ..ops.splats import WorldSplats, unturned
-from ..splats import rasterize
 from ..splats.request import Rendering
 from .config import DensifiedTraining, SplatTraining
 from .image_training import ImageTrainer, Initial
 from .loop import COST_GROWTH
 from .losses import position_penalty, scale_penalty
 from .optimisation import Densifier, Optimiser
-from .rendering import View, scene_center, scene_extent
+from .rendering import View, rasterize_view, scene_center, scene_extent
 from .schedule import DensifySchedule, Sampler, Timeline, log_linear
 
 
@@ -116,13 +115,7 @@ class SplatTrainer(ImageTrainer):
             (F,) metres per unit of the local scales, by triangle.
         """
         offset = opacities.new_zeros(len(opacities), 2).requires_grad_()
-        rendering = rasterize(
-            *(world.means, world.quats, world.scales, opacities, colors),
-            *(view.world_to_camera, view.K, view.camera.width, view.camera.height),
-            background=self._background,
-            means2d_offset=offset,
-            check_values=False,
-        )
+        rendering = rasterize_view(world, opacities, colors, view, self._background, means2d_offset=offset)
         visible = rendering.radii > 0  # of any opacity, as published
         self._seen: tuple[Tensor, Tensor, Camera, Tensor] = (offset, visible, view.camera, face_sizes)
         return rendering, visible
