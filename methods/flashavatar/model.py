@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import linear, normalize
 
@@ -19,15 +18,14 @@ from ...bench.contracts import HeadAsset
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.documents import parse_json
-from ...bench.io.files import write_bytes
 from ...datasets.head.rotations import axis_angle_to_quaternion, quaternion_to_matrix
 from ..ops.harmonics import coefficient_count, harmonic_colors
 from ..ops.mesh import TriangleFrames
 from ..ops.splats import WorldSplats, apply_matrices, left_products, to_world
 from ..shared.networks import input_count, layer_names
 from ..shared.subject_mesh import SubjectMesh
-from ..shared.surface_points import POINT_MEMBERS, MeshPoints, SurfacePoints, point_tensors, read_points
-from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
+from ..shared.surface_points import MeshPoints, SurfacePoints, point_tensors, take_points
+from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors, write_tensors
 from .config import FlashAvatarConfig
 from .hyper_gaussians import WIDTHS, check_diagonals, conditional_means, gaussian_shapes
 
@@ -143,7 +141,6 @@ def colors_seen(
     return harmonic_colors(splats["sh_dc"], splats["sh_rest"], along, degree)
 
 
-AVATAR_FILE = "avatar.safetensors"
 SETTINGS_KEY = "settings"
 """Key of the file's metadata: the settings of rendering, as JSON."""
 RENDERING = ("frequencies", "layers", "hidden", "offset_m", "scale_variant", "sh_degree")
@@ -206,16 +203,13 @@ def rendering_of_text(path: Path, text: str) -> FlashAvatarConfig:
 def write_avatar(path: Path, trained: TrainedSplats) -> None:
     """Write an avatar as safetensors, exact: 56 bytes for each splat, 12 for each of its harmonics above degree 0, with
     ``hyper_gaussians`` of L another 128 + 52 L, and the network."""
-    tensors = {name: value.detach().to("cpu", torch.float32) for name, value in trained.tensors.items()}
-    tensors |= point_tensors(trained.points)
-    contiguous = {name: value.contiguous() for name, value in tensors.items()}
-    write_bytes(path, save(contiguous, {SETTINGS_KEY: rendering_text(trained.config)}))
+    tensors = trained.tensors | point_tensors(trained.points)
+    write_tensors(path, tensors, {SETTINGS_KEY: rendering_text(trained.config)})
 
 
 def read_avatar(path: Path, head: HeadAsset, device: str) -> TrainedSplats:
     """Read and check what `write_avatar` wrote. Raises `InputError` where a tensor is missing or does not fit."""
     tensors, metadata = read_safetensors(path)
     config = rendering_of_text(path, metadata.get(SETTINGS_KEY, ""))
-    check_tensors(path, tensors, POINT_MEMBERS)
-    points = read_points(path, tensors.pop("triangles"), tensors.pop("barycentric"), len(head.faces))
+    points = take_points(path, tensors, len(head.faces))
     return TrainedSplats(tensors, points, config).checked(path, head, device)

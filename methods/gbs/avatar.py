@@ -13,10 +13,10 @@ from ...datasets.head.arrays import HeadArrays
 from ..avatars.compact.blended import read_blended
 from ..avatars.harmonics import turn_harmonics
 from ..ops.harmonics import sh_degree
-from ..shared.avatar_files import Subject, read_stored
+from ..shared.avatar_files import AVATAR_FILE, Subject, read_stored
 from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
 from .blendshapes import PointMotions, PosedAttributes, Rig, apply_pose
-from .storage import AVATAR_FILE, Stored, read_avatar
+from .storage import Stored, read_avatar
 
 
 class GBSAvatar(StoredSplatAvatar):

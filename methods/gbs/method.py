@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ...bench.contracts import Clip
-from ..shared.avatar_files import Subject, clip_mesh, finish_fit
+from ..shared.avatar_files import AVATAR_FILE, Subject, clip_mesh, finish_fit
 from ..shared.capacity import CapacityPlan, CapacityPlanner
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
@@ -19,7 +19,7 @@ from .avatar import GBSAvatar
 from .config import GBSConfig
 from .mouth import padded_offset, with_mouth
 from .spec import GBS as SPEC
-from .storage import AVATAR_FILE, write_avatar
+from .storage import write_avatar
 from .training import GBSTraining
 
 

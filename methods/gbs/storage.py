@@ -8,19 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from safetensors.torch import save
 from torch import Tensor
 
 from ...bench.contracts import IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
-from ...bench.io.files import write_bytes
 from ..ops.harmonics import coefficient_count
-from ..shared.surface_points import SurfacePoints, full_barycentric
-from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
+from ..shared.surface_points import POINT_MEMBERS, SurfacePoints, point_tensors, take_points
+from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors, write_tensors
 from .blendshapes import Entries, difference_widths
 
-AVATAR_FILE = "avatar.safetensors"
 EXPRESSIONS = "expressions"
 """Key of the file's metadata: number of leading expressions that may have differences."""
 
@@ -28,8 +25,7 @@ GEOMETRY = {"means": 3, "log_scales": 3, "quats": 4, "opacities": 1, "sh_dc": 3}
 """First columns of the (N, 14 + 3 R) float32 table of neutral splats; R harmonics above degree 0 by channel follow."""
 MEMBERS = {
     "splats": Member("f", ("N", None), MAX_MAGNITUDE, "f4"),
-    "triangles": Member("i", ("N",), dtype="i4"),
-    "barycentric": Member("f", ("N", 2), MAX_MAGNITUDE, "f4"),
+    **POINT_MEMBERS,
     "moved_by": Member("u", ("N", "bytes"), dtype="u1"),
     "differences": Member("f", (None, None), MAX_MAGNITUDE, "f4"),
 }
@@ -75,13 +71,12 @@ def write_avatar(
     moved_by = torch.zeros(count, expressions, dtype=torch.bool)
     moved_by[entries.owners.cpu(), entries.expressions.cpu()] = True
     tensors = {
-        "splats": torch.cat([column.detach().to("cpu", torch.float32) for column in columns], dim=1),
-        "triangles": torch.from_numpy(points.triangles.astype(np.int32)),
-        "barycentric": torch.from_numpy(points.barycentric[:, 1:].astype(np.float32)),
+        **point_tensors(points),
+        "splats": torch.cat(columns, dim=1),
         "moved_by": torch.from_numpy(np.packbits(moved_by.numpy(), axis=1)),
-        "differences": differences.detach().to("cpu", torch.float32).contiguous(),
+        "differences": differences,
     }
-    write_bytes(path, save(tensors, {EXPRESSIONS: str(expressions)}))
+    write_tensors(path, tensors, {EXPRESSIONS: str(expressions)})
 
 
 def read_avatar(path: Path, face_count: int, expression_size: int, device: str) -> Stored:
@@ -91,16 +86,14 @@ def read_avatar(path: Path, face_count: int, expression_size: int, device: str) 
     if not said.isdecimal() or len(said) > 9 or int(said) > expression_size:
         raise InputError(path, EXPRESSIONS, f"a number up to {expression_size}", repr(said[:20]))
     expressions = int(said)
-    moved_by = _check(path, tensors, face_count, expressions)
+    moved_by = _check(path, tensors, expressions)
     owners, moving = np.nonzero(moved_by)
     counts = torch.from_numpy(moved_by.sum(1)).to(device)
     columns = tensors["splats"].to(device).split([*GEOMETRY.values(), _rest(tensors["splats"])], dim=1)
     neutral = {name: column.contiguous() for name, column in zip((*GEOMETRY, "sh_rest"), columns)}
     neutral["opacities"] = neutral["opacities"][:, 0]
     neutral["sh_rest"] = neutral["sh_rest"].reshape(len(counts), 3, -1)
-    points = SurfacePoints(
-        tensors["triangles"].numpy().astype(np.int64), full_barycentric(tensors["barycentric"].numpy())
-    )
+    points = take_points(path, tensors, face_count)
     entries = Entries.of(counts, torch.from_numpy(moving).to(device), torch.ones(len(owners), device=device))
     return Stored(neutral, points, expressions, entries, tensors["differences"].to(device))
 
@@ -109,10 +102,10 @@ def _rest(splats: Tensor) -> int:
     return splats.shape[1] - sum(GEOMETRY.values())
 
 
-def _check(path: Path, tensors: Mapping[str, Tensor], face_count: int, expressions: int) -> IntArray:
+def _check(path: Path, tensors: Mapping[str, Tensor], expressions: int) -> IntArray:
     """(N, K) whether an expression moves a splat. Raises `InputError` for the first tensor that does not fit."""
     sizes = check_tensors(path, tensors, MEMBERS, {"bytes": -(-expressions // 8)})
-    splats, triangles = tensors["splats"], tensors["triangles"]
+    splats = tensors["splats"]
 
     def require(name: str, fits: bool, expected: str) -> None:
         if not fits:
@@ -120,8 +113,6 @@ def _check(path: Path, tensors: Mapping[str, Tensor], face_count: int, expressio
 
     rests = [3 * (coefficient_count(degree) - 1) for degree in range(4)]
     require("splats", sizes["N"] > 0 and _rest(splats) in rests, f"(N, 14 + 3 R), 3 R one of {rests}")
-    fits = 0 <= int(triangles.min()) and int(triangles.max()) < face_count
-    require("triangles", fits, f"triangles 0 to {face_count - 1}")
     check_sizes(path, splats[:, GEOMETRY["means"] : GEOMETRY["means"] + GEOMETRY["log_scales"]])
     moved_by = np.unpackbits(tensors["moved_by"].numpy(), axis=1, count=expressions)
     widths = [sum(difference_widths(d).values()) for d in range(4) if rests[d] <= _rest(splats)]

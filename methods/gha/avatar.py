@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from safetensors.torch import save
 from torch import Tensor
 
 from ...bench.configuration import build
@@ -18,11 +17,11 @@ from ...bench.contracts import Camera, FloatArray, Frame, HeadAsset, HeadPose, n
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.io.documents import parse_json
-from ...bench.io.files import write_bytes
 from ...bench.native.dispatch import to_device
 from ..avatars.compact.container import codec_of, read_content
 from ..avatars.compact.networks import as_tensors, read_networks
 from ..shared.avatar_files import (
+    AVATAR_FILE,
     COMPACT_FILE,
     SUBJECT_FILE,
     RefinedTracking,
@@ -31,7 +30,7 @@ from ..shared.avatar_files import (
     read_subject,
 )
 from ..shared.rendering import Drawn, LastPose, PosedSplats, posed_splats, read_back, splat_depth
-from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
+from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors, write_tensors
 from ..shared.threads import torch_on_one_thread
 from ..splats.cpu import instruction_sets
 from .config import GHAConfig
@@ -154,7 +153,6 @@ class GHAAvatar:
         return self._head.splats(self._tensors, signal, motion, inputs=self._inputs)
 
 
-AVATAR_FILE = "avatar.safetensors"
 CONFIG = "config"
 """Key of the file's metadata: the settings of rendering, as JSON."""
 
@@ -191,8 +189,7 @@ def write_avatar(path: Path, config: GHAConfig, tensors: Mapping[str, Tensor]) -
     kept = {name: value for name, value in tensors.items() if name not in (*POINTS, "features")}
     kept["table"] = table
     settings = {name: value for name, value in asdict(config).items() if name in RENDERING}
-    stored = {name: value.detach().to("cpu", torch.float32).contiguous() for name, value in kept.items()}
-    write_bytes(path, save(stored, {CONFIG: json.dumps(settings)}))
+    write_tensors(path, kept, {CONFIG: json.dumps(settings)})
 
 
 def read_avatar(path: Path, expression_size: int, device: str) -> tuple[GaussianHead, dict[str, Tensor]]:

@@ -23,13 +23,13 @@ import numpy as np
 from torch import Tensor
 
 from ...bench.contracts import Budget, Progress
-from ..shared.avatar_files import TRACKED, RefinedTracking, Subject, finish_fit
+from ..shared.avatar_files import AVATAR_FILE, TRACKED, RefinedTracking, Subject, finish_fit
 from ..shared.loop import Fit, TrainingSummary, train
 from ..shared.method import TrainedMethod
 from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import torch_on_one_thread
 from ..splats.cpu import instruction_sets
-from .avatar import AVATAR_FILE, DRIVING_FILE, GHAAvatar, write_avatar
+from .avatar import DRIVING_FILE, GHAAvatar, write_avatar
 from .config import GHAConfig
 from .driving import TrainingScene, training_scene
 from .gaussian_head import GaussianHead

@@ -9,16 +9,14 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from safetensors.torch import save
 from torch import Tensor
 
 from ...bench.contracts import HeadAsset
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
-from ...bench.io.files import write_bytes
 from ..ops.harmonics import coefficient_count
 from ..ops.planes import ENCODING_SIZE, Bounds
-from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
+from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors, write_tensors
 from .config import Dynamic
 from .field import COLOR_NETWORK, FIRST_LAYER, LAST_LAYER, PLANES, WIDTHS, offset_width
 
@@ -53,11 +51,9 @@ def write_field(
 ) -> None:
     """Write splats, planes, lines, networks, boxes and jaw bases as float32 safetensors."""
     columns = {**splats, "opacities": splats["opacities"][:, None], "binding": binding[:, None]}
-    table = torch.cat([columns[name].detach().to("cpu", torch.float32) for name in SPLAT_WIDTHS], dim=1)
-    tensors = {name: value.detach() for name, value in shared.items()}
-    tensors |= {name: splats[name].detach() for name in PER_SPLAT if name in splats}
+    tensors = dict(shared) | {name: splats[name] for name in PER_SPLAT if name in splats}
     tensors |= {
-        "splats": table,
+        "splats": torch.cat([columns[name] for name in SPLAT_WIDTHS], dim=1),
         "plane_box": torch.stack(list(plane_box)),
         "line_box": torch.stack(list(line_box)),
         "jaw_bases": torch.tensor(np.asarray(jaw_bases, dtype=np.float32)),
@@ -74,8 +70,7 @@ class StoredField(NamedTuple):
 
 def save_field(path: Path, field: StoredField) -> None:
     """Write the exact file of a field, whole or not at all."""
-    tensors = {name: value.cpu().contiguous() for name, value in field.tensors.items()}
-    write_bytes(path, save(tensors, {DYNAMIC: ",".join(field.dynamic)}))
+    write_tensors(path, field.tensors, {DYNAMIC: ",".join(field.dynamic)})
 
 
 def read_field(path: Path, head: HeadAsset, device: str) -> StoredField:

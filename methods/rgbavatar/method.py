@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ...bench.contracts import FloatArray, HeadPose
 from ..avatars.compact.reduced import read_reduced
-from ..shared.avatar_files import Subject, finish_fit, read_stored
+from ..shared.avatar_files import AVATAR_FILE, Subject, finish_fit, read_stored
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.networks import tracked_inputs
@@ -23,7 +23,6 @@ from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
 from ..shared.subject_mesh import SubjectMesh
 from .config import RGBAvatarConfig
 from .model import (
-    AVATAR_FILE,
     StoredShapes,
     Surface,
     blend_weights,

@@ -7,24 +7,21 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import linear
 
 from ...bench.contracts import HeadAsset
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
-from ...bench.io.files import write_bytes
 from ..ops.harmonics import C0
 from ..ops.mesh import TriangleFrames
 from ..ops.splats import WorldSplats, to_world
 from ..shared.networks import input_count, layer_names
 from ..shared.subject_mesh import SubjectMesh
-from ..shared.surface_points import POINT_MEMBERS, MeshPoints, SurfacePoints, point_tensors, read_points
-from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors
+from ..shared.surface_points import MeshPoints, SurfacePoints, point_tensors, take_points
+from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors, write_tensors
 from .config import INPUTS
 
-AVATAR_FILE = "avatar.safetensors"
 INPUTS_KEY = "inputs"
 """Key of the file's metadata: the network's inputs."""
 SHAPES = {"means": "mean_shapes", "quats": "quat_shapes", "colors": "color_shapes"}
@@ -127,19 +124,15 @@ class StoredShapes(NamedTuple):
 
 def write_avatar(path: Path, stored: StoredShapes) -> None:
     """Write an avatar as safetensors, exact: 68 bytes for each splat and 40 for each of its blendshapes."""
-    tensors = {name: value.detach().to("cpu", torch.float32) for name, value in stored.tensors.items()}
-    contiguous = {
-        name: value.contiguous() for name, value in (tensors | point_tensors(stored.points)).items()
-    }
-    write_bytes(path, save(contiguous, {INPUTS_KEY: ",".join(stored.inputs)}))
+    tensors = stored.tensors | point_tensors(stored.points)
+    write_tensors(path, tensors, {INPUTS_KEY: ",".join(stored.inputs)})
 
 
 def read_avatar(path: Path, head: HeadAsset, device: str) -> StoredShapes:
     """Read and check what `write_avatar` wrote. Raises `InputError` where a tensor is missing or does not fit."""
     tensors, metadata = read_safetensors(path)
     inputs = input_names(path, metadata.get(INPUTS_KEY, ""))
-    check_tensors(path, tensors, POINT_MEMBERS)
-    points = read_points(path, tensors.pop("triangles"), tensors.pop("barycentric"), len(head.faces))
+    points = take_points(path, tensors, len(head.faces))
     return StoredShapes(tensors, points, inputs).checked(path, head, device)
 
 

@@ -21,6 +21,8 @@ from .loop import Fit, TrainingSummary
 from .subject_mesh import SubjectMesh
 
 Content = TypeVar("Content")
+AVATAR_FILE = "avatar.safetensors"
+"""The tensors of an avatar as its training leaves them."""
 COMPACT_FILE = "compact.safetensors"
 """The coded file of an avatar (`avatars.compact`), which stands in place of the files of its training."""
 RECORDED_LOSSES = 200  # maximum number of losses in an avatar's record

@@ -15,7 +15,7 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...datasets.head.geometry import triangle_areas
 from .schedule import numpy_generator
-from .tensor_files import MAX_MAGNITUDE
+from .tensor_files import MAX_MAGNITUDE, check_tensors
 
 CANDIDATES = 20
 """Number of random candidates per accepted point."""
@@ -206,8 +206,13 @@ def point_tensors(points: SurfacePoints) -> dict[str, Tensor]:
     }
 
 
-def read_points(path: Path, triangles: Tensor, barycentric: Tensor, face_count: int) -> SurfacePoints:
-    """Points from the tensors of `POINT_MEMBERS`. Raises `InputError` if there are none, or for triangles that a mesh lacks."""
+def take_points(path: Path, tensors: dict[str, Tensor], face_count: int) -> SurfacePoints:
+    """Remove the tensors of `POINT_MEMBERS` from others and return their points.
+
+    Raises `InputError`, naming ``path``, if there are none, or for triangles that a mesh lacks.
+    """
+    check_tensors(path, tensors, POINT_MEMBERS)
+    triangles, barycentric = (tensors.pop(name) for name in POINT_MEMBERS)
     if not len(triangles) or not (0 <= int(triangles.min()) and int(triangles.max()) < face_count):
         expected = f"at least one, each from 0 to {face_count - 1}"
         raise InputError(path, "triangles", expected, f"{len(triangles)}, or others")

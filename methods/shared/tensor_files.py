@@ -1,4 +1,4 @@
-"""Reading of tensors from safetensors files, checked by the same descriptions as the arrays of an npz."""
+"""Tensors in safetensors files, checked when read by the same descriptions as the arrays of an npz."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import struct
 from collections.abc import Mapping
 from pathlib import Path
 
+import torch
 from safetensors import safe_open
+from safetensors.torch import save
 from torch import Tensor
 
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member, check_arrays
-from ...bench.io.files import open_regular, reading
+from ...bench.io.files import open_regular, reading, write_bytes
 
 MAX_HEADER = 2**24
 """Maximum bytes of names, shapes and metadata; those of checkpoints, the largest, have about ten thousand."""
@@ -20,6 +22,15 @@ MAX_MAGNITUDE = 1e6
 """Maximum magnitude of values of an avatar: network weights, features, positions in units of the triangle."""
 MAX_LOGARITHM = 30.0
 """Maximum logarithm of a size; larger ones overflow when they are squared and multiplied."""
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write tensors, real numbers in float32, whole or not at all; equal tensors give equal bytes."""
+    stored = {}
+    for name, value in tensors.items():
+        dtype = torch.float32 if value.is_floating_point() else value.dtype
+        stored[name] = value.detach().to("cpu", dtype).contiguous()
+    write_bytes(path, save(stored, dict(metadata)))
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -21,7 +21,6 @@ from ....bench.io.files import digest, read_bytes
 from ...flashavatar.method import FlashAvatarAvatar
 from ...ga.method import GAAvatar
 from ...gbs.avatar import GBSAvatar
-from ...gha.avatar import AVATAR_FILE as GHA_FILE
 from ...gha.avatar import CONFIG, OF_CODE, TABLE, GHAAvatar
 from ...insta.avatar import FIELD_FILE as INSTA_FILE
 from ...insta.avatar import OCCUPIED, SETTINGS, SETTINGS_FILE, InstaAvatar, read_settings
@@ -29,7 +28,7 @@ from ...insta.avatar import TABLE as GRID
 from ...insta.field import Architecture
 from ...ours.avatar import OursAvatar
 from ...rgbavatar.method import RGBAvatarAvatar
-from ...shared.avatar_files import COMPACT_FILE, SUBJECT_FILE, read_subject, save_shared_head
+from ...shared.avatar_files import AVATAR_FILE, COMPACT_FILE, SUBJECT_FILE, read_subject, save_shared_head
 from ...shared.capacity import training_poses
 from ...shared.tensor_files import read_safetensors
 from ..views import importance, training_views
@@ -121,7 +120,7 @@ def _encode_gbs(avatar: GBSAvatar, head: HeadAsset, precision: Precision, clip: 
 
 
 def _encode_gha(avatar: GHAAvatar, head: HeadAsset, precision: Precision, clip: Clip | None) -> Content:
-    path = _exact(avatar, GHA_FILE)
+    path = _exact(avatar, AVATAR_FILE)
     tensors, metadata = read_safetensors(path)
     arrays = {name: value.numpy() for name, value in tensors.items()}
     exact = ("landmarks", "origin", "center", "background", *OF_CODE)

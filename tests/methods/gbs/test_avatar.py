@@ -7,7 +7,8 @@ from safetensors.torch import load_file, save_file
 
 from headbench.bench.errors import InputError
 from headbench.methods.gbs.blendshapes import Entries, difference_widths
-from headbench.methods.gbs.storage import AVATAR_FILE, EXPRESSIONS, MEMBERS, read_avatar, write_avatar
+from headbench.methods.gbs.storage import EXPRESSIONS, MEMBERS, read_avatar, write_avatar
+from headbench.methods.shared.avatar_files import AVATAR_FILE
 from headbench.methods.shared.surface_points import SurfacePoints, full_barycentric
 
 FACES, EXPRESSION_SIZE = 40, 60

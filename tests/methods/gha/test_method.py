@@ -16,11 +16,12 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.methods.gha import mesh_training as mesh_phase
 from headbench.methods.gha import method
-from headbench.methods.gha.avatar import AVATAR_FILE, DRIVING_FILE, GHAAvatar
+from headbench.methods.gha.avatar import DRIVING_FILE, GHAAvatar
 from headbench.methods.gha.gaussian_head import AT_ONCE, feature_camera
 from headbench.methods.gha.gaussian_training import GaussianTraining
 from headbench.methods.gha.mesh_training import MeshTraining
 from headbench.methods.gha.method import GHA, parted, within
+from headbench.methods.shared.avatar_files import AVATAR_FILE
 
 from ..toy_clip import check_frame, first_view, look_at
 from .small import SMALL, small_config

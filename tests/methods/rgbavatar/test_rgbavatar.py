@@ -11,7 +11,6 @@ from headbench.datasets.head.rotations import axis_angle_to_matrix
 from headbench.methods.ops.harmonics import C0
 from headbench.methods.rgbavatar.config import INPUTS, RGBAvatarConfig
 from headbench.methods.rgbavatar.model import (
-    AVATAR_FILE,
     SHAPES,
     Surface,
     blend_weights,
@@ -21,6 +20,7 @@ from headbench.methods.rgbavatar.model import (
     write_avatar,
 )
 from headbench.methods.rgbavatar.training import RGBAvatarTraining
+from headbench.methods.shared.avatar_files import AVATAR_FILE
 from headbench.methods.shared.networks import initial_network, input_count, tracked_inputs
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.subject_mesh import SubjectMesh
