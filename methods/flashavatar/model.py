@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,15 +11,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear, normalize
 
-from ...bench.configuration import build
 from ...bench.contracts import HeadAsset
-from ...bench.errors import InputError
 from ...bench.io.arrays import Member
-from ...bench.io.documents import parse_json
 from ...datasets.head.rotations import axis_angle_to_quaternion, quaternion_to_matrix
 from ..ops.harmonics import coefficient_count, harmonic_colors
 from ..ops.mesh import TriangleFrames
 from ..ops.splats import WorldSplats, apply_matrices, left_products, to_world
+from ..shared.avatar_files import settings_of_text, settings_text
 from ..shared.networks import input_count, layer_names
 from ..shared.subject_mesh import SubjectMesh
 from ..shared.surface_points import MeshPoints, SurfacePoints, point_tensors, take_points
@@ -143,10 +139,9 @@ def colors_seen(
 
 SETTINGS_KEY = "settings"
 """Key of the file's metadata: the settings of rendering, as JSON."""
-RENDERING = ("frequencies", "layers", "hidden", "offset_m", "scale_variant", "sh_degree")
-"""Settings that affect rendering."""
-ADDED = "hyper_gaussians"
-"""One more that does, which is stored only if it is not 0."""
+OPTIONAL = ("hyper_gaussians",)
+RENDERING = ("frequencies", "layers", "hidden", *OPTIONAL, "offset_m", "scale_variant", "sh_degree")
+"""Settings that affect rendering; those in `OPTIONAL` are not stored if they are 0."""
 PER_SPLAT = {"log_scales": (3,), "quats": (4,), "opacities": (), "sh_dc": (3,)}
 """Shape of a splat's stored values besides the harmonics above degree 0: logarithms of metres, wxyz, logits."""
 
@@ -188,16 +183,12 @@ class TrainedSplats(NamedTuple):
 
 def rendering_text(config: FlashAvatarConfig) -> str:
     """The settings that affect rendering, as JSON."""
-    names = (*RENDERING, ADDED) if config.hyper_gaussians else RENDERING
-    return json.dumps({name: value for name, value in asdict(config).items() if name in names})
+    return settings_text(config, RENDERING, OPTIONAL)
 
 
 def rendering_of_text(path: Path, text: str) -> FlashAvatarConfig:
     """Settings with those of a `rendering_text`. Raises `InputError`, naming ``path``, for other text."""
-    settings = parse_json(text, path, SETTINGS_KEY)
-    if set(settings) - {ADDED} != set(RENDERING):
-        raise InputError(path, SETTINGS_KEY, f"the settings {', '.join(RENDERING)}", repr(text)[:80])
-    return build(FlashAvatarConfig, settings, str(path))
+    return settings_of_text(FlashAvatarConfig, RENDERING, text, path, SETTINGS_KEY, OPTIONAL)
 
 
 def write_avatar(path: Path, trained: TrainedSplats) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +10,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ...bench.configuration import build
 from ...bench.contracts import Camera, FloatArray, Frame, HeadAsset, HeadPose, no_stage
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
-from ...bench.io.documents import parse_json
 from ...bench.native.dispatch import to_device
 from ..avatars.compact.container import codec_of, read_content
 from ..avatars.compact.networks import as_tensors, read_networks
@@ -28,6 +24,8 @@ from ..shared.avatar_files import (
     Subject,
     read_shared_head,
     read_subject,
+    settings_of_text,
+    settings_text,
 )
 from ..shared.rendering import Drawn, LastPose, PosedSplats, posed_splats, read_back, splat_depth
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors, write_tensors
@@ -188,8 +186,7 @@ def write_avatar(path: Path, config: GHAConfig, tensors: Mapping[str, Tensor]) -
     )
     kept = {name: value for name, value in tensors.items() if name not in (*POINTS, "features")}
     kept["table"] = table
-    settings = {name: value for name, value in asdict(config).items() if name in RENDERING}
-    write_tensors(path, kept, {CONFIG: json.dumps(settings)})
+    write_tensors(path, kept, {CONFIG: settings_text(config, RENDERING)})
 
 
 def read_avatar(path: Path, expression_size: int, device: str) -> tuple[GaussianHead, dict[str, Tensor]]:
@@ -199,14 +196,16 @@ def read_avatar(path: Path, expression_size: int, device: str) -> tuple[Gaussian
     float32.
     """
     tensors, metadata = read_safetensors(path)
-    head = GaussianHead.of(_settings(path, metadata.get(CONFIG, "")), expression_size)
+    config = settings_of_text(GHAConfig, RENDERING, metadata.get(CONFIG, ""), path, CONFIG)
+    head = GaussianHead.of(config, expression_size)
     return head, _checked(path, tensors, head, expression_size, device)
 
 
 def read_coded(path: Path, shared: HeadAsset, device: str) -> tuple[Subject, GaussianHead, dict[str, Tensor]]:
     """The same, with the subject, of a coded file (`compact.networks`)."""
     content, size = read_content(path), code_size(shared)
-    head = GaussianHead.of(_settings(path, content.text.get(CONFIG, "")), size)
+    config = settings_of_text(GHAConfig, RENDERING, content.text.get(CONFIG, ""), path, CONFIG)
+    head = GaussianHead.of(config, size)
     subject, arrays = read_networks(path, shared, _shapes(head, size), TABLE, content)
     return subject, head, _checked(path, as_tensors(arrays, "cpu"), head, size, device)
 
@@ -244,11 +243,3 @@ def _checked(
         tensors[name] = (column[:, 0] if name == "opacities" else column).contiguous()
     check_sizes(path, tensors["log_scales"])
     return tensors
-
-
-def _settings(path: Path, text: str) -> GHAConfig:
-    values = parse_json(text, path, CONFIG)
-    known = {field.name for field in fields(GHAConfig)}
-    if set(values) != set(RENDERING) & known:
-        raise InputError(path, CONFIG, f"the settings {', '.join(RENDERING)}", repr(text)[:80])
-    return build(GHAConfig, values, str(path))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,12 +10,12 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from ...bench.configuration import deciding_settings
+from ...bench.configuration import build, deciding_settings
 from ...bench.contracts import Budget, Clip, FloatArray, HeadAsset, HeadPose
 from ...bench.engine.stored import HEAD_FILE, SUBJECT_FILE, TRAINING_FILE
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
-from ...bench.io.documents import read_json
+from ...bench.io.documents import parse_json, read_json
 from ...bench.io.files import atomic_path, digest, write_json
 from ...datasets.head.arrays import OPTIONAL, STORED, HeadArrays, read_head, save_head
 from .loop import Fit, TrainingSummary
@@ -122,6 +123,25 @@ def read_stored(
         return ReadAvatar([coded], head, *read_coded(coded, head))
     files = [folder / name, folder / SUBJECT_FILE]
     return ReadAvatar(files, head, read_subject(files[1], head), read_exact(files[0], head))
+
+
+def settings_text(config: Any, names: Sequence[str], optional: Sequence[str] = ()) -> str:
+    """Settings of a method by name as JSON, for an avatar's file; those in ``optional`` only where they are not 0."""
+    values = {name: getattr(config, name) for name in names}
+    return json.dumps({name: value for name, value in values.items() if value or name not in optional})
+
+
+def settings_of_text(
+    kind: type[Content], names: Sequence[str], text: str, path: Path, key: str, optional: Sequence[str] = ()
+) -> Content:
+    """A configuration of a class with the settings of a `settings_text`, found in ``path`` under ``key``.
+
+    Raises `InputError` for other text.
+    """
+    values = parse_json(text, path, key)
+    if {*values, *optional} != {*names, *optional}:
+        raise InputError(path, key, f"the settings {', '.join(names)}", repr(text)[:80])
+    return build(kind, values, str(path))
 
 
 class RefinedTracking:
