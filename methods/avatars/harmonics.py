@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import HarmonicAvatar, HeadPose, SplatAvatar
+from ...bench.contracts import FloatArray, HarmonicAvatar, HeadPose, SplatAvatar
 from ..ops.harmonics import coefficient_count, sh_basis
 from .views import camera_at, visibility
 
@@ -57,7 +57,7 @@ def sphere(count: int) -> Tensor:
     return torch.from_numpy(points.astype(np.float32))
 
 
-def turn_harmonics(dc: Tensor, rest: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
+def turn_harmonics(dc: Tensor, rest: Tensor, rotation: Tensor) -> tuple[FloatArray, FloatArray]:
     """Harmonics along world directions, (N, 3) and (N, 3, 15), of harmonics along the splats' own directions.
 
     A rotated harmonic is a sum of harmonics of its degree; it is found from as many directions as coefficients, exact
@@ -70,6 +70,7 @@ def turn_harmonics(dc: Tensor, rest: Tensor, rotation: Tensor) -> tuple[Tensor, 
     rotation : Tensor
         (N, 3, 3) from a splat's own axes to the world's.
     """
+    dc, rest, rotation = dc.cpu(), rest.cpu(), rotation.cpu()
     count = coefficient_count(DEGREE)
     directions = sphere(4 * count).to(dc.dtype)
     solve = torch.linalg.pinv(sh_basis(directions, DEGREE).double())
@@ -81,7 +82,7 @@ def turn_harmonics(dc: Tensor, rest: Tensor, rotation: Tensor) -> tuple[Tensor, 
         along = directions @ rotation[rows]  # (n, M, 3) the directions in the splats' own axes
         basis = sh_basis(along.reshape(-1, 3), DEGREE).view(len(along), -1, count)
         turned[rows] = (own[rows] @ basis.transpose(1, 2) @ solve.to(dc.dtype).t()).to(dc.dtype)
-    return turned[:, :, 0].contiguous(), turned[:, :, 1:].contiguous()
+    return turned[:, :, 0].contiguous().numpy(), turned[:, :, 1:].contiguous().numpy()
 
 
 def fit_harmonics(radiance: Callable[[Tensor], Tensor], weights: Tensor, directions: Tensor) -> Harmonics:

@@ -8,11 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from ..shared.config import check_at_least_one
+from ..shared.config import HarmonicsTraining, check_at_least_one
 
 
 @dataclass(frozen=True)
-class FlashAvatarConfig:
+class FlashAvatarConfig(HarmonicsTraining):
     """FlashAvatar (CVPR 2024): splats on a mesh, moved, turned and scaled by a network of the tracked parameters.
 
     Attributes
@@ -44,15 +44,12 @@ class FlashAvatarConfig:
         "product" multiplies the size of a splat by exp(tanh), which is within a factor of e. "official" does
         as the authors' program, which multiplies its logarithm by that: a size s in metres becomes s^c, with c
         from 1/e to e.
-    sh_degree, sh_every, min_sh_every : int
-        Final degree of the spherical harmonics; it is raised by one every ``sh_every`` iterations, but at
-        least ``min_sh_every`` of the actual run.
     mouth_weight : float
         Weight of the Huber loss of the images times the mask of the mouth. 0 disables it, as does a head
         model without the region "lips".
     ssim_weight : float
         Weight of 1 - SSIM, which is added to the loss; 0 as published.
-    opacity_lr, scale_lr, rotation_lr, sh_dc_lr, sh_rest_lr, network_lr : float
+    opacity_lr, scale_lr, rotation_lr, network_lr : float
         Initial learning rates.
     final_rate : float
         Final learning rates relative to the initial ones, log-linear over the last half of the run; 1 keeps
@@ -74,27 +71,23 @@ class FlashAvatarConfig:
     hyper_gaussians: int = 0
     offset_m: float = 1.0
     scale_variant: Literal["official", "product"] = "official"
-    sh_degree: int = 3
     sh_every: int = 500
-    min_sh_every: int = 100
     mouth_weight: float = 40.0
     ssim_weight: float = 0.0
     opacity_lr: float = 0.05
     scale_lr: float = 0.005
     rotation_lr: float = 0.001
-    sh_dc_lr: float = 0.0025
-    sh_rest_lr: float = 0.000125
     network_lr: float = 1e-4
     final_rate: float = 1.0
     mesh_cache_mb: int = 512
     checkpoint_every_s: float = 120.0
 
     def __post_init__(self) -> None:
-        check_at_least_one(self, "schedule_length", "samples", "layers")
-        check_at_least_one(self, "hidden", "sh_every", "min_sh_every")
+        super().__post_init__()
+        check_at_least_one(self, "schedule_length", "samples", "layers", "hidden")
         if not 0 < self.initial_opacity < 1 or not 0 < self.final_rate <= 1:
             raise ValueError("initial_opacity must lie between 0 and 1, and final_rate in (0, 1]")
-        bounds = {"frequencies": 16, "layers": 100, "hidden": 1_024, "sh_degree": 3, "hyper_gaussians": 128}
+        bounds = {"frequencies": 16, "layers": 100, "hidden": 1_024, "hyper_gaussians": 128}
         for name, most in bounds.items():
             if not 0 <= getattr(self, name) <= most:
                 raise ValueError(f"{name} must be 0 to {most}, found {getattr(self, name)}")

@@ -66,9 +66,7 @@ class FlashAvatarAvatar(StoredSplatAvatar):
     def harmonics(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:
         """Colours of a pose; see `HarmonicAvatar`. They are stored along the axes of the head."""
         rotation = self._surface.posed(self.mesh.arguments([pose])).rotation
-        values = self.trained.tensors["sh_dc"], self.trained.tensors["sh_rest"], rotation
-        dc, rest = turn_harmonics(*(value.cpu() for value in values))
-        return dc.numpy(), rest.numpy()
+        return turn_harmonics(self.trained.tensors["sh_dc"], self.trained.tensors["sh_rest"], rotation)
 
     def _posed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
         tensors, config = self.trained.tensors, self.trained.config

@@ -14,7 +14,7 @@ from torch.nn.functional import linear, normalize
 from ...bench.contracts import HeadAsset
 from ...bench.io.arrays import Member
 from ...datasets.head.rotations import axis_angle_to_quaternion, quaternion_to_matrix
-from ..ops.harmonics import coefficient_count, harmonic_colors
+from ..ops.harmonics import coefficient_count, turned_colors
 from ..ops.mesh import TriangleFrames
 from ..ops.splats import WorldSplats, apply_matrices, left_products, to_world
 from ..shared.avatar_files import settings_of_text, settings_text
@@ -133,8 +133,7 @@ def colors_seen(
     splats: Mapping[str, Tensor], world: WorldSplats, frames: TriangleFrames, center: Tensor, degree: int
 ) -> Tensor:
     """(N, 3) colours seen from a camera at ``center`` (3,); the harmonics turn with the axes of the head."""
-    along = torch.bmm((world.means - center)[:, None], frames.rotation)[:, 0]
-    return harmonic_colors(splats["sh_dc"], splats["sh_rest"], along, degree)
+    return turned_colors(splats["sh_dc"], splats["sh_rest"], world.means, frames.rotation, center, degree)
 
 
 SETTINGS_KEY = "settings"

@@ -18,7 +18,7 @@ from ..shared.image_training import ImageTrainer, Initial
 from ..shared.networks import initial_network, layer_names, tracked_inputs
 from ..shared.optimisation import logit
 from ..shared.rendering import rasterize_view
-from ..shared.schedule import ShuffledEpochs, Timeline
+from ..shared.schedule import ShuffledEpochs
 from ..shared.subject_mesh import BoundedCache, TrainingPoses
 from ..shared.surface_points import spacing, spread_points
 from .config import FlashAvatarConfig
@@ -69,11 +69,6 @@ class FlashAvatarTraining(ImageTrainer):
         distances = spacing(self.points.positions(vertices, faces))
         self._optimise(self._initial(distances, seed))
 
-    def begin(self, timeline: Timeline) -> None:
-        """Fit schedules to the length of the run."""
-        super().begin(timeline)
-        self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
-
     def loss(self, iteration: int, index: int) -> Tensor:
         """Loss of one image, see `image_loss`."""
         config, key = self._config, self.keys[index]
@@ -83,7 +78,7 @@ class FlashAvatarTraining(ImageTrainer):
         outputs = network_outputs(tensors, of_points, self._inputs[row], config)
         frames = self._frames(row)
         world = self._surface.place(frames, changed(tensors, outputs, config))
-        degree = min(config.sh_degree, iteration // self._degree_every)
+        degree = self._timeline.sh_degree(config, iteration)
         colors = colors_seen(tensors, world, frames, view.center, degree)
         opacities = tensors["opacities"].sigmoid()
         rendering = rasterize_view(world, opacities, colors, view, self._background)

@@ -63,7 +63,6 @@ class GAAppearance:
         # A frame is 9 + 3 + 1 + 4 floats per triangle.
         entries = config.splats.mesh_cache_mb * 2**20 // (4 * 17 * len(mesh.faces))
         self._cached = BoundedCache(self._tracked_frames, entries)
-        self._degree_every = 1
 
     def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
         """Initial spherical harmonics: nearly zero at degree 0, zero above."""
@@ -82,7 +81,7 @@ class GAAppearance:
 
     def begin(self, timeline: Timeline) -> None:
         """Scale the schedule of the harmonics' degree to the run."""
-        self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
+        self._timeline = timeline
 
     def frames(self, timestep: int, optimiser: Optimiser) -> TriangleFrames:
         """Triangle frames; differentiable in the refined tracking."""
@@ -103,7 +102,7 @@ class GAAppearance:
     ) -> ShadedSplats:
         """Colours by direction from the camera, and unchanged opacities."""
         world = to_world(frames, binding, optimiser["means"], optimiser["log_scales"], optimiser["quats"])
-        degree = min(self._config.sh_degree, iteration // self._degree_every)
+        degree = self._timeline.sh_degree(self._config, iteration)
         vectors = world.means - view.center
         colors = harmonic_colors(optimiser["sh_dc"], optimiser["sh_rest"], vectors, degree)
         return ShadedSplats(world, colors, torch.sigmoid(optimiser["opacities"]), None)

@@ -47,8 +47,7 @@ class GBSAvatar(StoredSplatAvatar):
     def harmonics(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:
         """Colours of a pose; see `HarmonicAvatar`. They are stored along the splats' axes, which turn with the surface."""
         posed = self._last(pose, no_stage)
-        dc, rest = turn_harmonics(posed.sh_dc.cpu(), posed.sh_rest.cpu(), posed.rotation.cpu())
-        return dc.numpy(), rest.numpy()
+        return turn_harmonics(posed.sh_dc, posed.sh_rest, posed.rotation)
 
     def _posed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PosedAttributes:
         arguments, stored = self._rig.arguments([pose]), self.stored

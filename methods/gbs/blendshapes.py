@@ -15,7 +15,7 @@ from ...datasets.head.arrays import HeadArrays
 from ...datasets.head.geometry import rigid_alignment
 from ...datasets.head.model import joint_motions, pose_feature
 from ...datasets.head.rotations import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
-from ..ops.harmonics import coefficient_count, harmonic_colors
+from ..ops.harmonics import coefficient_count, turned_colors
 from ..ops.splats import WorldSplats, apply_matrices, left_products
 from ..shared.subject_mesh import SubjectMesh
 from ..shared.surface_points import MeshPoints, SurfacePoints
@@ -104,8 +104,7 @@ class PosedAttributes(NamedTuple):
 
     def colors(self, center: Tensor, degree: int) -> Tensor:
         """(N, 3) as seen from a camera at ``center`` (3,); the harmonics turn with the surface."""
-        own = torch.bmm((self.world.means - center)[:, None], self.rotation)[:, 0]
-        return harmonic_colors(self.sh_dc, self.sh_rest, own, degree)
+        return turned_colors(self.sh_dc, self.sh_rest, self.world.means, self.rotation, center, degree)
 
 
 def apply_pose(neutral: Mapping[str, Tensor], differences: Tensor, motions: PointMotions) -> PosedAttributes:

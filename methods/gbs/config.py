@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ..shared.config import Capacity, DensifiedTraining
+from ..shared.config import Capacity, DensifiedTraining, HarmonicsTraining
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class BlendshapeTraining(DensifiedTraining):
 
 
 @dataclass(frozen=True)
-class GBSConfig:
+class GBSConfig(HarmonicsTraining):
     """GaussianBlendshapes (SIGGRAPH 2024, arXiv 2404.19398): neutral splats plus differences for expressions.
 
     Attributes
@@ -46,11 +46,6 @@ class GBSConfig:
          0 uses ``samples`` unchanged, as published.
     expressions : int
         Number of leading expression coefficients with differences; all, if there are fewer.
-    sh_degree, sh_every, min_sh_every : int
-        Final degree of the neutral spherical harmonics; it is raised by one every ``sh_every``
-        iterations (published scale), but at least ``min_sh_every`` of the actual run.
-    sh_dc_lr, sh_rest_lr : float
-        Learning rates of the constant term and of the higher degrees of the spherical harmonics.
     difference_sh_degree : int
         Degree up to which the differences change the harmonics.
     difference_..._lr : float
@@ -83,11 +78,6 @@ class GBSConfig:
     teeth_samples: int = 5_000
     sample_spacing: float = 0.0
     expressions: int = 50
-    sh_degree: int = 3
-    sh_every: int = 1_000
-    min_sh_every: int = 100
-    sh_dc_lr: float = 0.0025
-    sh_rest_lr: float = 0.000125
     difference_sh_degree: int = 3
     difference_position_lr: float = 3.2e-7
     difference_sh_lr: float = 1.25e-3
@@ -104,11 +94,12 @@ class GBSConfig:
     lower_teeth_variant: Literal["paper", "official"] = "paper"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.samples < 1 or self.teeth_samples < 0:
             raise ValueError("samples must be at least 1, and teeth_samples not negative")
         if self.expressions < 0 or self.sample_spacing < 0:
             raise ValueError("expressions and sample_spacing must not be negative")
-        if not 0 <= self.difference_sh_degree <= self.sh_degree <= 3:
-            raise ValueError("sh_degree must be 0 to 3, and difference_sh_degree not above it")
+        if not 0 <= self.difference_sh_degree <= self.sh_degree:
+            raise ValueError("difference_sh_degree must be 0 to sh_degree")
         if not 0 <= self.mask_floor_mm < self.mask_full_mm:
             raise ValueError("mask_floor_mm must be at least 0 and less than mask_full_mm")

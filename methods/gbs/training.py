@@ -19,7 +19,7 @@ from ..shared.avatar_files import Subject
 from ..shared.image_training import Initial
 from ..shared.loop import recomposited
 from ..shared.optimisation import logit, rows_of_tables
-from ..shared.schedule import Sampler, Timeline, torch_generator
+from ..shared.schedule import Sampler, torch_generator
 from ..shared.splat_training import SplatTrainer
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, pose_key
 from ..shared.surface_points import SurfacePoints, poisson_disk, spacing
@@ -120,11 +120,6 @@ class GBSTraining(SplatTrainer):
         self._of_teeth: tuple[Tensor, Sequence[Tensor]] | None = None
         self._of_splats: tuple[Tensor, BoundedCache[tuple[PointMotions, Tensor]]] | None = None
 
-    def begin(self, timeline: Timeline) -> None:
-        """Scale schedules to the length of the run."""
-        super().begin(timeline)
-        self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
-
     def loss(self, iteration: int, index: int) -> Tensor:
         """Photometric loss of one image, alpha loss, and penalty on teeth outside the mouth."""
         key, config, optimiser = self.keys[index], self._config, self.optimiser
@@ -134,7 +129,7 @@ class GBSTraining(SplatTrainer):
         motions, shares = self._splat_motions(pose)
         differences = self.entries.blended(optimiser[DIFFERENCES], shares) * self._column_scales
         posed = apply_pose({name: optimiser[name] for name in self.splat_names}, differences, motions)
-        degree = min(config.sh_degree, iteration // self._degree_every)
+        degree = self._timeline.sh_degree(config, iteration)
         colors = posed.colors(view.center, degree)
         rendering, _ = self._render(posed.world, posed.opacities, colors, view, self._sizes)
         loss = photometric_loss(rendering.image, image, config.splats.ssim_weight)

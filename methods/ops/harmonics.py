@@ -112,6 +112,14 @@ class _HarmonicColors(torch.autograd.Function):
         return *gradients, None
 
 
+def turned_colors(
+    dc: Tensor, rest: Tensor, means: Tensor, rotation: Tensor, center: Tensor, degree: int
+) -> Tensor:
+    """`harmonic_colors` along the axes of each splat, (N, 3, 3) from these to the world, seen from a camera at ``center`` (3,)."""
+    along = torch.bmm((means - center)[:, None], rotation)[:, 0]
+    return harmonic_colors(dc, rest, along, degree)
+
+
 class HarmonicShader(Protocol):
     """Colours by constant spherical harmonics for any number of views, without gradients."""
 

@@ -83,7 +83,7 @@ class OursAppearance:
             self._is_face[torch.from_numpy(faces_in_region(clip.head, "face")).to(device)] = True
         entries = config.splats.mesh_cache_mb * 2**20 // (4 * FLOATS_PER_FACE * len(mesh.faces))
         self._prepared = BoundedCache(self._prepare, entries)
-        self._lines_from, self._degree_every = 0, 1
+        self._lines_from = 0
         self._smoothing = None
         if config.planes.direction_smoothing:
             features = torch.ones(sum(config.planes.channels))
@@ -113,7 +113,7 @@ class OursAppearance:
     def begin(self, timeline: Timeline) -> None:
         """Scale the start of the lines and the schedule of the harmonics' degree to the run."""
         self._lines_from = timeline.at(self._config.lines.start)
-        self._degree_every = timeline.every(self._config.sh_every, self._config.min_sh_every)
+        self._timeline = timeline
 
     def frames(self, timestep: int, optimiser: Optimiser) -> TriangleFrames:
         """Triangle frames, without gradient."""
@@ -168,7 +168,7 @@ class OursAppearance:
 
     def _colors(self, optimiser: Optimiser, positions: Tensor, directions: Tensor, iteration: int) -> Tensor:
         if self._config.color == "sh":
-            degree = min(self._config.sh_degree, iteration // self._degree_every)
+            degree = self._timeline.sh_degree(self._config, iteration)
             return harmonic_colors(optimiser["sh_dc"], optimiser["sh_rest"], -directions, degree)
         network = color_network(self._network(optimiser))
         return plane_colors(positions, directions, self.plane_box, network)

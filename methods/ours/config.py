@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ..shared.config import Capacity, SplatTraining
+from ..shared.config import Capacity, HarmonicsTraining, SplatTraining
 
 Dynamic = Literal["opacity", "position", "rotation", "scale", "color"]
 """Attribute of a splat that an expression may change."""
@@ -204,7 +204,7 @@ class PlannedCapacity(Capacity):
 
 
 @dataclass(frozen=True)
-class OursConfig:
+class OursConfig(HarmonicsTraining):
     """Compact tensorial Gaussian avatars (CVPR 2025): tri-plane colour, feature lines for opacity.
 
     Attributes
@@ -218,8 +218,6 @@ class OursConfig:
     color : Literal['planes', 'sh']
         "planes" reads colour from the tri-plane; "sh" gives every splat spherical harmonics of degree
         ``sh_degree`` in canonical directions instead (an ablation).
-    sh_degree, sh_every, min_sh_every, sh_dc_lr, sh_rest_lr : int, int, int, float, float
-        As for `GAConfig`.
     """
 
     splats: SplatTraining = field(default_factory=SplatTraining)
@@ -232,14 +230,8 @@ class OursConfig:
     hidden: int = 128
     direction_jitter: float = 0.0
     color: Literal["planes", "sh"] = "planes"
-    sh_degree: int = 3
-    sh_every: int = 1_000
-    min_sh_every: int = 100
-    sh_dc_lr: float = 0.0025
-    sh_rest_lr: float = 0.000125
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.hidden < 1:
             raise ValueError(f"hidden must be at least 1, found {self.hidden}")
-        if not 0 <= self.sh_degree <= 3:
-            raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")

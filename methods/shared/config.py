@@ -133,6 +133,31 @@ class SplatTraining(DensifiedTraining):
 
 
 @dataclass(frozen=True)
+class HarmonicsTraining:
+    """Training of colours by spherical harmonics.
+
+    Attributes
+    ----------
+    sh_degree, sh_every, min_sh_every : int
+        Final degree of the spherical harmonics; it is raised by one every ``sh_every`` iterations (published scale), but at
+        least ``min_sh_every`` of the actual run.
+    sh_dc_lr, sh_rest_lr : float
+        Learning rates of the constant term and of the higher degrees of the spherical harmonics.
+    """
+
+    sh_degree: int = 3
+    sh_every: int = 1_000
+    min_sh_every: int = 100
+    sh_dc_lr: float = 0.0025
+    sh_rest_lr: float = 0.000125
+
+    def __post_init__(self) -> None:
+        check_at_least_one(self, "sh_every", "min_sh_every")
+        if not 0 <= self.sh_degree <= 3:
+            raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
+
+
+@dataclass(frozen=True)
 class Capacity:
     """Size of an avatar.
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from ...bench.contracts import IntArray
-from .config import DensifiedTraining
+from .config import DensifiedTraining, HarmonicsTraining
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,10 @@ class Timeline:
     def fraction(self, iteration: int) -> float:
         """Relative position of an iteration in the run, in (0, 1]."""
         return iteration / self.total
+
+    def sh_degree(self, settings: HarmonicsTraining, iteration: int) -> int:
+        """Degree of the spherical harmonics in an iteration."""
+        return min(settings.sh_degree, iteration // self.every(settings.sh_every, settings.min_sh_every))
 
 
 def log_linear(start: float, end: float, fraction: float) -> float:
