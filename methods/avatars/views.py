@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ...bench.contracts import Camera, Clip, FloatArray, HeadPose, SplatAvatar, Splats
 from ...bench.protocol import evenly_with_ends
-from ..shared.rendering import view_of
-from ..splats import rasterize
+from ..ops.splats import WorldSplats
+from ..shared.rendering import pixel_sums, view_of
 
 FIELD_OF_VIEW = 30.0
 """Field of view of the cameras of `orbit_camera`, degrees."""
@@ -20,25 +20,17 @@ SIZE = 128
 
 
 def contribution(splats: Splats, camera: Camera) -> Tensor:
-    """(N,) blending weights of each splat, summed over all pixels of one view.
+    """(N,) blending weights of each splat, summed over all pixels of one view, see `pixel_sums`.
 
-    The weight of a splat in a pixel is its alpha times the transmittance in front of it; the sum over pixels is the
-    derivative of the sum of a one-channel image by the splat's colour. Used as importance for pruning by Fang and
-    Wang, "Mini-Splatting", ECCV 2024, section 4.
+    Used as importance for pruning by Fang and Wang, "Mini-Splatting", ECCV 2024, section 4.
     """
-    image, colors = _in_ones(splats, camera, 1)
-    (weights,) = torch.autograd.grad(image.sum(), colors)
-    return weights[:, 0]
+    return _sums(splats, camera, torch.ones(camera.height, camera.width, 1))[:, 0]
 
 
-def _in_ones(splats: Splats, camera: Camera, channels: int) -> tuple[Tensor, Tensor]:
-    """(H, W, channels) image of splats whose colours are 1, and the (N, channels) colours, by which it can be derived."""
-    view = view_of(camera, "cpu")
+def _sums(splats: Splats, camera: Camera, targets: Tensor) -> Tensor:
     geometry = splats.means, splats.quats, splats.scales, splats.opacities
-    means, quats, scales, opacities = (torch.tensor(np.asarray(values, np.float32)) for values in geometry)
-    colors = torch.ones(len(means), channels, requires_grad=True)
-    where = view.world_to_camera, view.K, camera.width, camera.height
-    return rasterize(means, quats, scales, opacities, colors, *where).image, colors
+    *world, opacities = (torch.tensor(np.asarray(values, np.float32)) for values in geometry)
+    return pixel_sums(WorldSplats(*world), opacities, view_of(camera, "cpu"), targets)
 
 
 VIEWS = 64
@@ -57,9 +49,8 @@ def squared_contribution(splats: Splats, camera: Camera, generator: torch.Genera
     derivatives of sums of pixels with random signs, since all other products of weights have the expectation 0 (M.
     Hutchinson, Communications in Statistics 18, 1989); three channels are three draws.
     """
-    image, colors = _in_ones(splats, camera, 3)
-    signs = 2.0 * torch.randint(0, 2, image.shape, generator=generator) - 1.0
-    (weights,) = torch.autograd.grad((image * signs).sum(), colors)
+    signs = 2.0 * torch.randint(0, 2, (camera.height, camera.width, 3), generator=generator) - 1.0
+    weights = _sums(splats, camera, signs)
     return (weights**2).mean(1) / (camera.width * camera.height)
 
 

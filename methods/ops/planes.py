@@ -55,18 +55,18 @@ def sample_plane(plane: Tensor, coordinates: Tensor, resolution: int) -> Tensor:
     return sum_rows(plane, indices, weights)
 
 
-def encode(values: Tensor) -> Tensor:
-    """(N, 9 D) positional encoding of (N, D) values: identity, then sin and cos at 1, 2, 4, 8 (no pi)."""
-    frequencies = _frequencies(values.dtype, values.device)
-    angles = frequencies[:, None] * values[:, None, :]
+def encode(values: Tensor, frequencies: int = len(FREQUENCIES)) -> Tensor:
+    """(N, D + 2 L D) positional encoding of (N, D) values: identity, then sin and cos at L frequencies 1, 2, 4, 8, ... (no pi)."""
+    factors = _frequencies(frequencies, values.dtype, values.device)
+    angles = factors[:, None] * values[:, None, :]
     waves = torch.stack([torch.sin(angles), torch.cos(angles)], dim=2)
     return torch.cat([values, waves.flatten(1)], dim=1)
 
 
 @functools.cache
-def _frequencies(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`FREQUENCIES` on a device, cached because creating them at each call would make the host wait for the device."""
-    on_device: Tensor = to_device(torch.tensor(FREQUENCIES, dtype=dtype), device)
+def _frequencies(count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Frequencies on a device, cached because creating them at each call would make the host wait for the device."""
+    on_device: Tensor = to_device(2 ** torch.arange(count, dtype=dtype), device)
     return on_device
 
 

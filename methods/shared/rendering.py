@@ -106,6 +106,17 @@ def rasterize_view(
     )
 
 
+def pixel_sums(world: WorldSplats, opacities: Tensor, view: View, targets: Tensor) -> Tensor:
+    """(N, C) sums over pixels of (H, W, C) targets times the weight of each splat, its alpha times the transmittance before it.
+
+    They are the derivatives of the sum of a rendering times the targets by the splats' colours.
+    """
+    colors = opacities.new_zeros(len(opacities), targets.shape[2]).requires_grad_()
+    still = WorldSplats(*(part.detach() for part in world))
+    rendering = rasterize_view(still, opacities.detach(), colors, view)
+    return torch.autograd.grad((rendering.image * targets).sum(), colors)[0]
+
+
 def splat_depth(
     world: WorldSplats, opacities: Tensor, camera: Camera, device: str, cutoffs: Cutoffs = USUAL
 ) -> FloatArray:
