@@ -1,97 +1,168 @@
 """FlashAvatar: splats on a tracked mesh, changed by a network of the tracked parameters.
 
 Xiang et al., "FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Embedding", CVPR 2024, arXiv 2312.02214.
+
+An iteration trains on one image, whose loss has a mask of the mouth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import huber_loss
 
-from ...bench.contracts import FloatArray, HeadPose
+from ...bench.contracts import BoolArray, Camera, Clip, FloatArray, HeadAsset, HeadPose
+from ...datasets.head.geometry import project
 from ..avatars.compact.offsets import read_offsets
 from ..avatars.harmonics import turn_harmonics
-from ..shared.avatar_files import AVATAR_FILE, Subject, finish_fit, read_stored
-from ..shared.loop import Fit
-from ..shared.method import TrainedMethod
-from ..shared.networks import tracked_inputs
-from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
-from ..shared.subject_mesh import SubjectMesh
+from ..ops.harmonics import coefficient_count, turned_colors
+from ..ops.mesh import TriangleFrames
+from ..ops.photometric import photometric_loss
+from ..ops.planes import encode
+from ..shared.avatar_files import Subject
+from ..shared.networks import initial_network, layer_names, tracked_inputs
+from ..shared.rendering import PlacedSplats, rasterize_view
+from ..shared.schedule import ShuffledEpochs
+from ..shared.splat_training import initial_shapes
+from ..shared.subject_mesh import BoundedCache
+from ..shared.surface_points import spacing
+from ..shared.surface_splats import SurfaceAvatar, SurfaceMethod, SurfaceTrainer
 from .config import FlashAvatarConfig
+from .hyper_gaussians import initial_gaussians
 from .model import (
     INPUTS,
-    HeadSurface,
     TrainedSplats,
     changed,
-    colors_seen,
     layer_of_points,
     network_outputs,
-    positional_encoding,
-    read_avatar,
-    write_avatar,
+    network_sizes,
 )
 from .spec import FLASHAVATAR as SPEC
-from .training import FlashAvatarTraining
+
+HUBER = 0.1
+"""Difference of colours up to which the loss is quadratic."""
 
 
-class FlashAvatarAvatar(StoredSplatAvatar):
-    """A trained head. Files: ``avatar.safetensors`` and ``subject.npz``, or the coded file in place of both, count as storage.
+class FlashAvatarTraining(SurfaceTrainer[FlashAvatarConfig]):
+    """A `Trainable`: splats on the surface, grey and as large as the distance to their neighbours at first, and the network."""
 
-    The folder also has the shared head model.
+    stored_class = TrainedSplats
+
+    def __init__(self, clip: Clip, config: FlashAvatarConfig, device: str, seed: int):
+        sampler = ShuffledEpochs(len(clip.splits["train"]), seed)
+        # Where the mesh ends there is no texel of the chart, as in the authors' program.
+        super().__init__(clip, config, sampler, INPUTS, device, seed, border="boundary")
+        self._encoded = encode(self._surface.rest, config.frequencies)
+        lips = clip.head.regions.get("lips", ()) if config.mouth_weight else ()
+        self._mouth = np.asarray(lips, np.int64)
+        pixels = max(camera.width * camera.height for camera in self.cameras.values())
+        self._masks = BoundedCache(self._mask, config.mesh_cache_mb * 2**19 // pixels)
+        count, coefficients = len(self.rest), coefficient_count(config.sh_degree)
+        splats = {
+            **initial_shapes(spacing(self.rest), config),
+            "sh_dc": (torch.zeros(count, 3), config.sh_dc_lr),
+            "sh_rest": (torch.zeros(count, 3, coefficients - 1), config.sh_rest_lr),
+        }
+        network = initial_network(network_sizes(config, self._inputs.shape[1]), seed)
+        if config.zero_output and not config.hyper_gaussians:
+            for names in layer_names(config.layers + 1):
+                network[names[-1]].zero_()
+        network |= initial_gaussians(count, config.hyper_gaussians)
+        self._optimise(splats | {name: (value, config.network_lr) for name, value in network.items()})
+
+    def loss(self, iteration: int, index: int) -> Tensor:
+        """Loss of one image, see `image_loss`."""
+        config, key, tensors = self._config, self.keys[index], self.tensors()
+        view, row = self._views[key.camera], self._tracked.row[key.timestep]
+        of_points = layer_of_points(tensors, self._encoded)
+        outputs = network_outputs(tensors, of_points, self._inputs[row], config)
+        frames = self._frames(row)
+        world = self._surface.place(frames, changed(tensors, outputs, config))
+        harmonics = tensors["sh_dc"], tensors["sh_rest"], world.means, frames.rotation
+        colors = turned_colors(*harmonics, view.center, self._timeline.sh_degree(config, iteration))
+        rendering = rasterize_view(world, tensors["opacities"].sigmoid(), colors, view, self._background)
+        mouth = self._masks(index) if len(self._mouth) else None
+        return image_loss(rendering.image, self._images.get(iteration, index), mouth, config)
+
+    @torch.no_grad()
+    def _mask(self, index: int) -> Tensor:
+        """(H, W) bool mask of the mouth in an image."""
+        key = self.keys[index]
+        vertices = self._mesh.posed(self._tracked.at(self._tracked.row[key.timestep])).cpu().numpy()
+        mask = mouth_mask(self.cameras[key.camera], vertices[self._mouth], vertices.mean(0))
+        return torch.from_numpy(mask).to(self._device)
+
+
+def image_loss(image: Tensor, truth: Tensor, mouth: Tensor | None, config: FlashAvatarConfig) -> Tensor:
+    """Huber loss of an image, that of the images times the mask of the mouth with its weight, and 1 - SSIM with its own.
+
+    Both Huber losses are means over all pixels.
+
+    Parameters
+    ----------
+    image, truth : Tensor
+        (H, W, 3) in [0, 1].
+    mouth : Tensor | None
+        (H, W) bool mask.
     """
+    each = huber_loss(image, truth, reduction="none", delta=HUBER)
+    if mouth is not None:
+        each = each * (1 + config.mouth_weight * mouth.to(each.dtype))[:, :, None]
+    loss = each.mean()
+    if config.ssim_weight:
+        loss = loss + config.ssim_weight * photometric_loss(image, truth, 1.0)
+    return loss
+
+
+def mouth_mask(camera: Camera, mouth: FloatArray, middle: FloatArray) -> BoolArray:
+    """(H, W) mask of the pixels within the convex hull of the (M, 3) projected points of the mouth.
+
+    Empty if the mouth faces away, seen from the ``middle`` (3,) of the head, or is not in front of the camera.
+    """
+    mask, center = np.zeros((camera.height, camera.width), np.uint8), mouth.mean(0)
+    depths = mouth @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+    if depths.min() > 0 and (center - middle) @ (camera.center - center) > 0:
+        # cv2 counts from the centre of the first pixel, cameras from its corner.
+        corners = np.round(project(mouth, camera) - 0.5).clip(-(2**15), 2**15).astype(np.int32)
+        cv2.fillConvexPoly(mask, cv2.convexHull(corners), 1)
+    return mask.astype(bool)
+
+
+class FlashAvatarAvatar(SurfaceAvatar[TrainedSplats]):
+    """A trained head; see `SurfaceAvatar` for its files."""
+
+    stored_class, read_coded = TrainedSplats, read_offsets
 
     def __init__(
-        self, files: Sequence[Path], mesh: SubjectMesh, subject: Subject, trained: TrainedSplats, device: str
+        self, files: Sequence[Path], head: HeadAsset, subject: Subject, stored: TrainedSplats, device: str
     ):
-        super().__init__(files, LastPose(self._posed), device)
-        self.mesh, self.subject, self.trained = mesh, subject, trained
-        self._surface = HeadSurface(mesh, trained.points)
-        encoded = positional_encoding(self._surface.rest, trained.config.frequencies)
-        self._of_points = layer_of_points(trained.tensors, encoded)
-        self._opacities = trained.tensors["opacities"].sigmoid()
-
-    @classmethod
-    def read(cls, folder: Path, device: str) -> FlashAvatarAvatar:
-        """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        readers = partial(read_avatar, device=device), partial(read_offsets, device=device)
-        files, head, subject, trained = read_stored(folder, AVATAR_FILE, *readers)
-        mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
-        return cls(files, mesh, subject, trained, device)
+        super().__init__(files, head, subject, stored, device)
+        encoded = encode(self.surface.rest, stored.settings.frequencies)
+        self._of_points = layer_of_points(stored.tensors, encoded)
 
     @torch.no_grad()
     def harmonics(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:
         """Colours of a pose; see `HarmonicAvatar`. They are stored along the axes of the head."""
-        rotation = self._surface.posed(self.mesh.arguments([pose])).rotation
-        return turn_harmonics(self.trained.tensors["sh_dc"], self.trained.tensors["sh_rest"], rotation)
+        rotation = self.surface.posed(self.mesh.arguments([pose])).rotation
+        return turn_harmonics(self.stored.tensors["sh_dc"], self.stored.tensors["sh_rest"], rotation)
 
-    def _posed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
-        tensors, config = self.trained.tensors, self.trained.config
-        arguments = self.mesh.arguments([pose])
-        frames = self._surface.posed(arguments)
-        end_stage("drive")
+    def _placed(self, frames: TriangleFrames, arguments: Mapping[str, Tensor]) -> PlacedSplats:
+        tensors, config = self.stored.tensors, self.stored.settings
         outputs = network_outputs(tensors, self._of_points, tracked_inputs(arguments, INPUTS)[0], config)
-        world = self._surface.place(frames, changed(tensors, outputs, config))
-
-        def colors(center: Tensor) -> Tensor:
-            return colors_seen(tensors, world, frames, center, config.sh_degree)
-
-        return PlacedSplats(world, self._opacities, colors)
+        world = self.surface.place(frames, changed(tensors, outputs, config))
+        harmonics = tensors["sh_dc"], tensors["sh_rest"], world.means, frames.rotation
+        colors = partial(turned_colors, *harmonics, degree=config.sh_degree)
+        return PlacedSplats(world, tensors["opacities"].sigmoid(), colors)
 
 
-class FlashAvatar(TrainedMethod[FlashAvatarConfig, FlashAvatarAvatar]):
+class FlashAvatar(SurfaceMethod[FlashAvatarConfig, FlashAvatarAvatar]):
     """The method: see the module."""
 
     name, version = SPEC.name, SPEC.version
-    config_class, avatar_class = FlashAvatarConfig, FlashAvatarAvatar
-
-    def _train(self, fit: Fit, config: FlashAvatarConfig) -> None:
-        clip = fit.clip
-        training = FlashAvatarTraining(clip, config, fit.device, fit.seed)
-        outcome = training.run(fit)
-        trained = training.result()
-        write_avatar(fit.out / AVATAR_FILE, trained)
-        finish_fit(fit, outcome, Subject.of(clip), clip.head, splats=len(trained.points.triangles))
+    config_class, avatar_class, training_class = FlashAvatarConfig, FlashAvatarAvatar, FlashAvatarTraining

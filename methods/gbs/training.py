@@ -14,13 +14,12 @@ from ...datasets.head.arrays import HeadArrays
 from ...datasets.head.geometry import triangle_areas
 from ..ops.harmonics import initial_coefficients
 from ..ops.photometric import photometric_loss
-from ..ops.splats import unturned
 from ..shared.avatar_files import Subject
 from ..shared.image_training import Initial
 from ..shared.loop import recomposited
-from ..shared.optimisation import logit, rows_of_tables
+from ..shared.optimisation import rows_of_tables
 from ..shared.schedule import Sampler, torch_generator
-from ..shared.splat_training import SplatTrainer
+from ..shared.splat_training import SplatTrainer, initial_shapes
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, pose_key
 from ..shared.surface_points import SurfacePoints, poisson_disk, spacing
 from .blendshapes import (
@@ -79,11 +78,9 @@ class GBSTraining(SplatTrainer):
         device: str,
         seed: int,
     ):
-        masked = clip.mask(clip.splits["train"][0]) is not None
-        super().__init__(clip, config.splats, sampler, device, masks=masked)
-        self._config, self._masked = config, masked
-        self._recorded_on = self._background
-        if masked:
+        super().__init__(clip, config.splats, sampler, device, masks=True)
+        self._config, self._recorded_on = config, self._background
+        if self._masked:
             self._background = torch.zeros_like(self._recorded_on)  # as published
         start = starting_points(clip, config, subject, head, seed)
         self.points = start.points
@@ -196,7 +193,6 @@ class GBSTraining(SplatTrainer):
         self, start: StartingPoints, entries: int, device: str, seed: int
     ) -> tuple[Initial, Initial]:
         config, settings = self._config, self._config.splats
-        count = len(start.spacing)
         widths = difference_widths(config.difference_sh_degree)
         rates = {
             "means": config.difference_position_lr,
@@ -208,19 +204,14 @@ class GBSTraining(SplatTrainer):
         }
         columns = [torch.full((width,), rates[name] / RATE) for name, width in widths.items()]
         self._column_scales = torch.cat(columns).to(device)
-        harmonics = initial_coefficients(count, config.sh_degree, torch_generator(seed, "sh"))
-        log_scales = torch.from_numpy(np.log(start.spacing)).float()[:, None].repeat(1, 3)
-        opacities = torch.full((count,), logit(settings.initial_opacity))
+        harmonics = initial_coefficients(len(start.spacing), config.sh_degree, torch_generator(seed, "sh"))
         splats = {
             "means": (self.rig.rest.clone(), settings.position_lr),
-            "log_scales": (log_scales.to(device), settings.scale_lr),
-            "quats": (unturned(count).to(device), settings.rotation_lr),
-            "opacities": (opacities.to(device), settings.opacity_lr),
-            "sh_dc": (harmonics["sh_dc"].to(device), config.sh_dc_lr),
-            "sh_rest": (harmonics["sh_rest"].to(device), config.sh_rest_lr),
+            **initial_shapes(start.spacing, settings),
+            "sh_dc": (harmonics["sh_dc"], config.sh_dc_lr),
+            "sh_rest": (harmonics["sh_rest"], config.sh_rest_lr),
         }
-        table = torch.zeros(entries, sum(widths.values()), device=device)
-        return splats, {DIFFERENCES: (table, RATE)}
+        return splats, {DIFFERENCES: (torch.zeros(entries, sum(widths.values())), RATE)}
 
 
 def starting_points(

@@ -8,37 +8,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..shared.config import check_at_least_one
+from ..shared.config import SurfaceSettings, check_at_least_one
 
 INPUTS = ("expression", "neck", "jaw", "eyes", "eyelids", "translation")
 """Tracked parameters that the weights may depend on."""
 
 
 @dataclass(frozen=True)
-class RGBAvatarConfig:
+class RGBAvatarConfig(SurfaceSettings):
     """RGBAvatar (CVPR 2025): splats on a mesh, changed by a few blendshapes whose weights a small network gives.
 
     Attributes
     ----------
-    schedule_length : int
-        Steps of the published run; ``join`` and ``position_settles`` below are on its scale.
-    samples : int
-        Number of splats, about.
-    uv_chart : bool
-        One splat for each texel of the head model's chart of texture coordinates, as published, in a resolution that gives
-        about ``samples``. Without it, and on a head model without a chart, splats are spread evenly over the surface.
     initial_scale_mm : float
         Size of every splat at the start, for 60,000 splats; fewer splats are larger, so that they cover as much.
-    initial_opacity : float
-        Opacity of every splat at the start, between 0 and 1.
     blendshapes : int
         Number of blendshapes of position, rotation and colour.
     inputs : tuple[str, ...]
         Tracked parameters that the weights of the blendshapes depend on, among expression, neck, jaw, eyes,
         eyelids and translation; those that the head model lacks are left out. The authors' program uses all of
         them for a video and only the expression for NeRSemble.
-    hidden : int
-        Width of the network's two hidden layers.
     batch, together : int
         Images of a step, and how many of them show the same timestep, if it has that many cameras. The published
         batch draws its images independently, as 1 does.
@@ -57,32 +46,23 @@ class RGBAvatarConfig:
         Step after which the blendshapes are trained.
     position_lr, position_lr_final, position_settles : float, float, int
         Initial and final learning rate of positions in metres, log-linear up to the step ``position_settles``.
-    opacity_lr, scale_lr, rotation_lr, color_lr, network_lr : float
-        Other learning rates.
+    color_lr : float
+        Learning rate of colours.
     position_share, rotation_share, color_share : float
         Learning rates of the blendshapes relative to those of the neutral splats.
-    final_rate : float
-        Final learning rate of all other tensors relative to the initial one, log-linear over the last half of the
-        run; 1 keeps it constant, as published.
     color_weight : float
         A splat takes its initial colour from the images of the first step in which its weights over all pixels
         add up to more than this; 0 disables it.
     color_every : int
         Steps between searches for splats without a colour, each of which costs as much as the step.
-    mesh_cache_mb : int
-        Memory for the posed meshes of known timesteps.
-    checkpoint_every_s : float
-        Seconds between checkpoints of the training.
     """
 
     schedule_length: int = 5_000
     samples: int = 60_000
-    uv_chart: bool = True
     initial_scale_mm: float = 0.8
     initial_opacity: float = 0.5
     blendshapes: int = 20
     inputs: tuple[str, ...] = INPUTS
-    hidden: int = 128
     batch: int = 10
     together: int = 1
     online: bool = False
@@ -97,26 +77,16 @@ class RGBAvatarConfig:
     scale_lr: float = 0.025
     rotation_lr: float = 0.005
     color_lr: float = 0.0125
-    network_lr: float = 1e-3
     position_share: float = 0.05
     rotation_share: float = 0.5
     color_share: float = 0.5
-    final_rate: float = 1.0
     color_weight: float = 0.1
     color_every: int = 1
-    mesh_cache_mb: int = 512
-    checkpoint_every_s: float = 120.0
 
     def __post_init__(self) -> None:
-        check_at_least_one(self, "schedule_length", "samples", "blendshapes", "hidden")
-        check_at_least_one(self, "batch", "together", "color_every", "trained_per_arrival")
-        if not 0 < self.initial_opacity < 1 or not 0 < self.final_rate <= 1:
-            raise ValueError("initial_opacity must lie between 0 and 1, and final_rate in (0, 1]")
-        if (
-            not set(self.inputs) <= set(INPUTS)
-            or len(set(self.inputs)) != len(self.inputs)
-            or not self.inputs
-        ):
+        super().__post_init__()
+        check_at_least_one(self, "blendshapes", "batch", "together", "color_every", "trained_per_arrival")
+        if not self.inputs or not set(self.inputs) <= set(INPUTS) or len(set(self.inputs)) < len(self.inputs):
             raise ValueError(f"inputs must be among {', '.join(INPUTS)}, each once, found {self.inputs}")
         for name in ("initial_scale_mm", "position_lr", "position_lr_final"):
             if not getattr(self, name) > 0:

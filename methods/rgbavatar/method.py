@@ -1,63 +1,172 @@
 """RGBAvatar: splats on a tracked mesh with a few learnt blendshapes.
 
 Li et al., "RGBAvatar: Reduced Gaussian Blendshapes for Online Modeling of Head Avatars", CVPR 2025, arXiv 2503.12886.
+
+Training is on batches of images. Colours are taken from them at the start, and blendshapes join later.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from pathlib import Path
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import FloatArray, HeadPose
+from ...bench.contracts import Clip, FloatArray, HeadPose
+from ...bench.native.dispatch import to_device
 from ..avatars.compact.reduced import read_reduced
-from ..shared.avatar_files import AVATAR_FILE, Subject, finish_fit, read_stored
-from ..shared.loop import Fit
-from ..shared.method import TrainedMethod
-from ..shared.networks import tracked_inputs
-from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
-from ..shared.subject_mesh import SubjectMesh
+from ..ops.harmonics import C0
+from ..ops.mesh import TriangleFrames
+from ..ops.photometric import photometric_loss
+from ..ops.splats import WorldSplats
+from ..shared.loop import recomposited
+from ..shared.networks import initial_network, tracked_inputs
+from ..shared.rendering import PlacedSplats, View, pixel_sums, rasterize_view
+from ..shared.schedule import Batches, GroupedBatches, log_linear, numpy_generator
+from ..shared.splat_training import initial_shapes
+from ..shared.surface_splats import SurfaceAvatar, SurfaceMethod, SurfaceTrainer
 from .config import RGBAvatarConfig
-from .model import (
-    StoredShapes,
-    Surface,
-    blend_weights,
-    blended,
-    read_avatar,
-    seen_colors,
-    write_avatar,
-)
+from .model import PER_SPLAT, SHAPES, StoredShapes, blend_weights, blended, seen_colors
+from .online import OnlineBatches
 from .spec import RGBAVATAR as SPEC
-from .training import RGBAvatarTraining
 
 HARMONICS = 15
 """Coefficients above degree 0 that an export has; they are zero."""
+PUBLISHED_SAMPLES = 60_000
+"""Number of splats for which the published size at the start is given: texels of 256 x 256 that show FLAME, rounded."""
 
 
-class RGBAvatarAvatar(StoredSplatAvatar):
-    """A trained head. Files: ``avatar.safetensors`` and ``subject.npz``, or the coded file in place of both, count as storage.
+class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
+    """A `Trainable`: neutral splats, grey and of equal size at first, their blendshapes, and the network of the weights.
 
-    The folder also has the shared head model.
+    Attributes
+    ----------
+    colored : Tensor
+        (N,) bool, splats that images have given a colour.
     """
 
-    def __init__(
-        self, files: Sequence[Path], mesh: SubjectMesh, subject: Subject, stored: StoredShapes, device: str
-    ):
-        super().__init__(files, LastPose(self._posed), device)
-        self.mesh, self.subject, self.stored = mesh, subject, stored
-        self._surface = Surface(mesh, stored.points)
+    stored_class = StoredShapes
 
-    @classmethod
-    def read(cls, folder: Path, device: str) -> RGBAvatarAvatar:
-        """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        readers = partial(read_avatar, device=device), partial(read_reduced, device=device)
-        files, head, subject, stored = read_stored(folder, AVATAR_FILE, *readers)
-        mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
-        return cls(files, mesh, subject, stored, device)
+    def __init__(self, clip: Clip, config: RGBAvatarConfig, device: str, seed: int):
+        keys, size = clip.splits["train"], config.batch
+        batches: Batches = GroupedBatches([key.timestep for key in keys], size, config.together, seed)
+        if config.online:
+            order = sorted(range(len(keys)), key=lambda index: (keys[index].timestep, keys[index].camera))
+            batches = OnlineBatches(order, size, config.trained_per_arrival, seed)
+        super().__init__(clip, config, batches, config.inputs, device, seed, masks=True)
+        self._batches, self._sampler = batches, lambda iteration: batches.batch(iteration)[0]
+        count = len(self.points.triangles)
+        self.colored = torch.zeros(count, dtype=torch.bool, device=device)
+        size = 1e-3 * config.initial_scale_mm * (PUBLISHED_SAMPLES / count) ** 0.5
+        splats = {
+            "means": (torch.zeros(count, 3), config.position_lr),
+            "colors": (torch.zeros(count, 3), config.color_lr),
+            **initial_shapes(np.full(count, size), config),
+        }
+        shares = config.position_share, config.rotation_share, config.color_share
+        for (name, shapes), share in zip(SHAPES.items(), shares):
+            value, rate = splats[name]
+            splats[shapes] = torch.zeros(config.blendshapes, *value.shape), share * rate
+        sizes = self._inputs.shape[1], config.hidden, config.hidden, config.blendshapes
+        network = initial_network(sizes, seed)
+        self._optimise(splats | {name: (value, config.network_lr) for name, value in network.items()})
+
+    def loss(self, iteration: int, index: int) -> Tensor:
+        """Mean loss of the images of a batch; ``index`` is that of the first."""
+        self._seen: list[tuple[WorldSplats, Tensor, View, Tensor]] = []
+        images, splats = self._batches.positions(iteration), self.tensors()
+        rows = sorted({self._tracked.row[self.keys[image].timestep] for _, image in images})
+        posed = [splats] * len(rows)
+        if self._config.online or iteration > self._timeline.at(self._config.join):
+            posed = blended(splats, blend_weights(splats, self._inputs[rows]))
+        placed = {
+            row: (self._surface.place(self._frames(row), each), seen_colors(each["colors"]))
+            for row, each in zip(rows, posed)
+        }
+        opacities = splats["opacities"].sigmoid()
+        total = opacities.new_zeros(())
+        for position, image in images:
+            key = self.keys[image]
+            view, (world, colors) = self._views[key.camera], placed[self._tracked.row[key.timestep]]
+            pixels = self._images.get(position, image)
+            truth, background = self._on_background(pixels, iteration, image)
+            rendering = rasterize_view(world, opacities, colors, view, background)
+            total = total + photometric_loss(rendering.image, truth, self._config.ssim_weight)
+            self._seen.append((world, opacities, view, pixels))
+        return total / len(images)
+
+    def after_backward(self, iteration: int) -> None:
+        """Give colours to splats that are seen for the first time; set the learning rates."""
+        config = self._config
+        due = config.color_weight > 0 and (iteration - 1) % config.color_every == 0
+        if due and not bool(self.colored.all()):
+            self._take_colors()
+        # While images arrive, time is counted from the first one, whatever the length of the run.
+        settles = config.position_settles if config.online else self._timeline.at(config.position_settles)
+        rate = log_linear(config.position_lr, config.position_lr_final, iteration / max(settles, 1))
+        self.optimiser.set_learning_rate("means", rate)
+        self.optimiser.set_learning_rate(SHAPES["means"], config.position_share * rate)
+        self._decay_rates(iteration, apart=("means", SHAPES["means"]))
+
+    def state(self) -> dict[str, Any]:
+        """Parameters, moments, and which splats have a colour."""
+        return {**super().state(), "colored": self.colored}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Restore what `state` returned."""
+        super().load_state(state)
+        self.colored = state["colored"]
+
+    def result(self) -> StoredShapes:
+        """The trained avatar, without splats that never had a gradient: no image has shown them."""
+        moments = self.optimiser.moments("colors")
+        kept = torch.ones_like(self.colored)
+        if moments and not self._config.online:
+            shown = self.colored | (moments["exp_avg_sq"] > 0).any(1)
+            kept = shown if bool(shown.any()) else kept
+        tensors = self.tensors()
+        tensors |= {name: tensors[name][kept] for name in PER_SPLAT}
+        tensors |= {name: tensors[name][:, kept] for name in SHAPES.values()}
+        return StoredShapes(tensors, self.points.rows(kept.cpu().numpy()), self._config.inputs)
+
+    def _on_background(self, pixels: Tensor, iteration: int, image: int) -> tuple[Tensor, Tensor]:
+        """(H, W, 3) colours, on a random background if there are masks, and that background."""
+        if not self._masked or not self._config.random_background:
+            return pixels[:, :, :3], self._background
+        random = numpy_generator(self._seed, "background", iteration * len(self.keys) + image).random(3)
+        background = to_device(torch.from_numpy(random.astype(np.float32)), self._background.device)
+        return recomposited(pixels[:, :, :3], pixels[:, :, 3:], self._background, background), background
+
+    def _take_colors(self) -> None:
+        """Set colours of splats whose weights over the batch's foreground add up to enough for the first time.
+
+        The colour is the mean of the images' colours, weighted by what the splat contributes to each pixel.
+        """
+        sums = torch.zeros(len(self.colored), 4, device=self.colored.device)
+        for world, opacities, view, pixels in self._seen:
+            truth = torch.cat([pixels[:, :, :3], torch.ones_like(pixels[:, :, :1])], dim=2)
+            if self._masked:
+                truth = truth * (pixels[:, :, 3:] > 0.5)
+            sums += pixel_sums(world, opacities, view, truth)
+        new = (sums[:, 3] > self._config.color_weight) & ~self.colored
+        rows = new.nonzero().squeeze(1)
+        parameter = self.optimiser["colors"]
+        parameter.data[rows] = (sums[rows, :3] / sums[rows, 3:] - 0.5) / C0
+        # The step that follows does not move them.
+        if parameter.grad is not None:
+            parameter.grad[rows] = 0
+        moments = self.optimiser.moments("colors")
+        if moments:
+            moments["exp_avg"][rows] = 0
+        self.colored = self.colored | new
+
+
+class RGBAvatarAvatar(SurfaceAvatar[StoredShapes]):
+    """A trained head; see `SurfaceAvatar` for its files."""
+
+    stored_class, read_coded = StoredShapes, read_reduced
 
     @torch.no_grad()
     def harmonics(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:
@@ -68,31 +177,20 @@ class RGBAvatarAvatar(StoredSplatAvatar):
     @torch.no_grad()
     def weights(self, arguments: Mapping[str, Tensor]) -> Tensor:
         """(T, K) weights of the blendshapes for T poses, given as `SubjectMesh.arguments` gives them."""
-        return blend_weights(self.stored.tensors, tracked_inputs(arguments, self.stored.inputs))
+        return blend_weights(self.stored.tensors, tracked_inputs(arguments, self.stored.settings))
 
     def _blended(self, arguments: Mapping[str, Tensor]) -> dict[str, Tensor]:
         (splats,) = blended(self.stored.tensors, self.weights(arguments))
         return splats
 
-    def _posed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
-        arguments = self.mesh.arguments([pose])
-        surface = self._surface.posed(arguments)
-        end_stage("drive")
+    def _placed(self, frames: TriangleFrames, arguments: Mapping[str, Tensor]) -> PlacedSplats:
         splats = self._blended(arguments)
-        world, colors = self._surface.place(surface, splats), seen_colors(splats["colors"])
+        world, colors = self.surface.place(frames, splats), seen_colors(splats["colors"])
         return PlacedSplats(world, splats["opacities"].sigmoid(), lambda center: colors)
 
 
-class RGBAvatar(TrainedMethod[RGBAvatarConfig, RGBAvatarAvatar]):
+class RGBAvatar(SurfaceMethod[RGBAvatarConfig, RGBAvatarAvatar]):
     """The method: see the module."""
 
     name, version = SPEC.name, SPEC.version
-    config_class, avatar_class = RGBAvatarConfig, RGBAvatarAvatar
-
-    def _train(self, fit: Fit, config: RGBAvatarConfig) -> None:
-        clip = fit.clip
-        training = RGBAvatarTraining(clip, config, fit.device, fit.seed)
-        outcome = training.run(fit)
-        stored = training.result()
-        write_avatar(fit.out / AVATAR_FILE, stored)
-        finish_fit(fit, outcome, Subject.of(clip), clip.head, splats=len(stored.points.triangles))
+    config_class, avatar_class, training_class = RGBAvatarConfig, RGBAvatarAvatar, RGBAvatarTraining

@@ -23,23 +23,79 @@ def check_at_least_one(settings: object, *names: str) -> None:
 
 
 @dataclass(frozen=True)
-class DensifiedTraining:
-    """Training and density control of splats: 3DGS, section 5, with GaussianAvatars' values.
+class SplatSettings:
+    """Settings of every training of splats on images.
 
     Attributes
     ----------
     schedule_length : int
-        Iterations of the published run; every ``..._from`` and ``..._every`` below is on its scale.
-    position_lr, position_lr_final : float
-        Initial and final rate, log-linear over the run, times the scene extent.
+        Iterations of the published run; all settings in iterations are on its scale, unless they say otherwise.
     opacity_lr, scale_lr, rotation_lr : float
         Initial learning rates of opacities, scales and rotations of the splats.
     initial_opacity : float
         Opacity of every splat at the start, between 0 and 1.
     final_rate : float
-        Final learning rate of all other tensors relative to the initial one, log-linear over the last
+        Final learning rate of all tensors but positions relative to the initial one, log-linear over the last
         half of the run; 1 keeps it constant, as published. A short run lacks the steps to average
         Adam's noise.
+    mesh_cache_mb : int
+        Memory for the posed meshes of known timesteps.
+    checkpoint_every_s : float
+        Seconds between checkpoints of the training.
+    """
+
+    schedule_length: int = 600_000
+    opacity_lr: float = 0.05
+    scale_lr: float = 0.017
+    rotation_lr: float = 1e-3
+    initial_opacity: float = 0.1
+    final_rate: float = 1.0
+    mesh_cache_mb: int = 512
+    checkpoint_every_s: float = 120.0
+
+    def __post_init__(self) -> None:
+        check_at_least_one(self, "schedule_length")
+        if not 0 < self.initial_opacity < 1:
+            raise ValueError(f"initial_opacity must lie between 0 and 1, found {self.initial_opacity}")
+        if not 0 < self.final_rate <= 1:
+            raise ValueError(f"final_rate must lie in (0, 1], found {self.final_rate}")
+
+
+@dataclass(frozen=True)
+class SurfaceSettings(SplatSettings):
+    """Settings of a fixed number of splats on the surface of a head, with a network of the tracked parameters.
+
+    Attributes
+    ----------
+    samples : int
+        Number of splats, about.
+    uv_chart : bool
+        One splat for each texel of the head model's chart of texture coordinates, as published, in a resolution that gives
+        about ``samples``. Without it, and on a head model without a chart, splats are spread evenly over the surface.
+    hidden : int
+        Width of the network's hidden layers.
+    network_lr : float
+        Learning rate of the network.
+    """
+
+    samples: int = 10_000
+    uv_chart: bool = True
+    hidden: int = 128
+    network_lr: float = 1e-3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least_one(self, "samples", "hidden")
+
+
+@dataclass(frozen=True)
+class DensifiedTraining(SplatSettings):
+    """Training and density control of splats: 3DGS, section 5, with GaussianAvatars' values.
+
+    Attributes
+    ----------
+    position_lr, position_lr_final : float
+        Initial and final rate, log-linear over the run, times the scene extent.
     ssim_weight : float
         The loss is ``(1 - w) L1 + w (1 - SSIM)``.
     densify_from, densify_every, densify_until : int
@@ -67,21 +123,11 @@ class DensifiedTraining:
         steps to recover.
     min_settle : int
         Number of last iterations of the actual run without densification and reset.
-    mesh_cache_mb : int
-        Memory for the posed meshes of known timesteps.
-    checkpoint_every_s : float
-        Seconds between checkpoints of the training.
     """
 
-    schedule_length: int = 600_000
     position_lr: float = 5e-3
     position_lr_final: float = 5e-5
-    opacity_lr: float = 0.05
-    scale_lr: float = 0.017
-    rotation_lr: float = 1e-3
-    final_rate: float = 1.0
     ssim_weight: float = 0.2
-    initial_opacity: float = 0.1
     densify_from: int = 10_000
     densify_every: int = 2_000
     densify_until: int = 600_000
@@ -98,16 +144,12 @@ class DensifiedTraining:
     min_densify_every: int = 100
     min_reset_every: int = 3_000
     min_settle: int = 300
-    mesh_cache_mb: int = 512
-    checkpoint_every_s: float = 120.0
 
     def __post_init__(self) -> None:
-        check_at_least_one(self, "schedule_length", "densify_every", "reset_every")
-        check_at_least_one(self, "min_densify_every", "min_reset_every")
-        if not 0 < self.initial_opacity < 1 or not 0 < self.reset_opacity < 1:
-            raise ValueError("initial_opacity and reset_opacity must lie between 0 and 1")
-        if not 0 < self.final_rate <= 1:
-            raise ValueError(f"final_rate must lie in (0, 1], found {self.final_rate}")
+        super().__post_init__()
+        check_at_least_one(self, "densify_every", "reset_every", "min_densify_every", "min_reset_every")
+        if not 0 < self.reset_opacity < 1:
+            raise ValueError(f"reset_opacity must lie between 0 and 1, found {self.reset_opacity}")
         if not 0 <= self.ssim_weight <= 1:
             raise ValueError(f"ssim_weight must lie in [0, 1], found {self.ssim_weight}")
         if self.max_splats is not None and self.max_splats < 1:

@@ -1,15 +1,16 @@
-"""Training on the images of a clip, independent of what is rendered: images, cameras, optimiser, the run."""
+"""Training on the images of a clip: images, cameras, optimiser, learning rates, the run."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ...bench.contracts import Clip, FrameKey
+from .config import SplatSettings
 from .loop import Fit, TrainingImages, TrainingSummary, train
 from .optimisation import Optimiser
 from .rendering import view_of
@@ -19,17 +20,13 @@ Initial = Mapping[str, tuple[Tensor, float]]
 """Initial tensors with their learning rates, by name."""
 
 
-class TrainingRun(Protocol):
-    """Settings of every training: iterations of the published run, and seconds between checkpoints."""
-
-    @property
-    def schedule_length(self) -> int: ...
-    @property
-    def checkpoint_every_s(self) -> float: ...
-
-
 class ImageTrainer:
     """A `Trainable` except for its loss. A derived class calls `_optimise` in its initialiser.
+
+    Parameters
+    ----------
+    masks : bool
+        Whether images have a fourth channel, the foreground coverage, if the clip has masks.
 
     Attributes
     ----------
@@ -42,11 +39,12 @@ class ImageTrainer:
     """Cost of a late step relative to an early one with the same parts, to turn a time into iterations."""
 
     def __init__(
-        self, clip: Clip, settings: TrainingRun, sampler: Sampler, device: str, *, masks: bool = False
+        self, clip: Clip, settings: SplatSettings, sampler: Sampler, device: str, *, masks: bool = False
     ):
-        self._run_settings, self._sampler, self._device = settings, sampler, device
+        self._settings, self._sampler, self._device = settings, sampler, device
         self.keys: Sequence[FrameKey] = clip.splits["train"]
-        self._images = TrainingImages(clip, self.keys, sampler, device, masks=masks)
+        self._masked = masks and clip.mask(self.keys[0]) is not None
+        self._images = TrainingImages(clip, self.keys, sampler, device, masks=self._masked)
         self.cameras = {key.camera: clip.cameras[key.camera] for key in self.keys}
         self._views = {name: view_of(camera, device) for name, camera in self.cameras.items()}
         self._background = torch.tensor(np.asarray(clip.background), dtype=torch.float32, device=device)
@@ -59,14 +57,19 @@ class ImageTrainer:
         )
         self._rates = {name: rate for name, (_, rate) in initial.items()}
 
-    def _decay_rates(self, iteration: int, final_rate: float, apart: Collection[str] = ()) -> None:
+    def tensors(self) -> dict[str, Tensor]:
+        """The current tensors by name."""
+        return {name: self.optimiser[name] for name in self._rates}
+
+    def _decay_rates(self, iteration: int, apart: Collection[str] = ()) -> None:
         """Set learning rates: the initial ones, falling to ``final_rate`` of them, log-linear over the last half of the run.
 
         Those of the tensors in ``apart`` are not changed.
         """
-        if final_rate == 1:
+        final = self._settings.final_rate
+        if final == 1:
             return
-        decay = log_linear(1.0, final_rate, max(0.0, 2 * self._timeline.fraction(iteration) - 1))
+        decay = log_linear(1.0, final, max(0.0, 2 * self._timeline.fraction(iteration) - 1))
         for name, rate in self._rates.items():
             if name not in apart:
                 self.optimiser.set_learning_rate(name, decay * rate)
@@ -80,7 +83,8 @@ class ImageTrainer:
         raise NotImplementedError
 
     def after_backward(self, iteration: int) -> None:
-        """Hook between gradients and step."""
+        """Set the learning rates; called between gradients and step."""
+        self._decay_rates(iteration)
 
     def state(self) -> dict[str, Any]:
         """Parameters and moments."""
@@ -96,12 +100,11 @@ class ImageTrainer:
 
     def run(self, fit: Fit) -> TrainingSummary:
         """Train to the end of the budget; see `train`."""
-        length, seconds = self._run_settings.schedule_length, self._run_settings.checkpoint_every_s
         try:
             return train(
                 *(self, self._sampler, fit),
-                published_length=length,
-                checkpoint_every_s=seconds,
+                published_length=self._settings.schedule_length,
+                checkpoint_every_s=self._settings.checkpoint_every_s,
                 cost_growth=self.cost_growth,
             )
         finally:

@@ -1,12 +1,12 @@
-"""Networks of the tracked parameters: their inputs, and their layers at the start of a training."""
+"""Networks of the tracked parameters: their inputs and their layers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 
 import torch
 from torch import Tensor
+from torch.nn.functional import linear
 
 from ...bench.contracts import HeadAsset
 from ...datasets.head.rotations import axis_angle_to_matrix
@@ -45,6 +45,22 @@ def layer_names(layers: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return weights, biases
 
 
+def layer_shapes(sizes: Sequence[int | str]) -> dict[str, tuple[int | str, ...]]:
+    """Shapes of weights and biases by name; ``sizes`` as for `initial_network`, or names of those that are not known."""
+    shapes: dict[str, tuple[int | str, ...]] = {}
+    for weight, bias, fan_in, fan_out in zip(*layer_names(len(sizes) - 1), sizes, sizes[1:]):
+        shapes |= {weight: (fan_out, fan_in), bias: (fan_out,)}
+    return shapes
+
+
+def outputs_of(network: Mapping[str, Tensor], sums: Tensor, layers: int) -> Tensor:
+    """Outputs of a network of some ``layers`` with ReLU between them, from the (N, H) sums of its first layer."""
+    weights, biases = layer_names(layers)
+    for weight, bias in zip(weights[1:], biases[1:]):
+        sums = linear(sums.relu(), network[weight], network[bias])
+    return sums
+
+
 def initial_network(sizes: Sequence[int], seed: int) -> dict[str, Tensor]:
     """Weights and biases by name, uniform in the inverse root of the layer's inputs, as `torch.nn.Linear` has them.
 
@@ -54,8 +70,7 @@ def initial_network(sizes: Sequence[int], seed: int) -> dict[str, Tensor]:
         Number of inputs, widths of the hidden layers, number of outputs.
     """
     generator, tensors = torch_generator(seed, "network"), {}
-    names = zip(*layer_names(len(sizes) - 1))
-    for (weight, bias), (fan_in, fan_out) in zip(names, pairwise(sizes)):
+    for weight, bias, fan_in, fan_out in zip(*layer_names(len(sizes) - 1), sizes, sizes[1:]):
         for name, shape in ((weight, (fan_out, fan_in)), (bias, (fan_out,))):
             tensors[name] = (2 * torch.rand(shape, generator=generator) - 1) * fan_in**-0.5
     return tensors

@@ -4,21 +4,33 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Camera, Clip
+from ...bench.contracts import Camera, Clip, FloatArray
 from ..ops.mesh import TriangleFrames
 from ..ops.photometric import photometric_loss
 from ..ops.splats import WorldSplats, unturned
 from ..splats.request import Rendering
-from .config import DensifiedTraining, SplatTraining
+from .config import DensifiedTraining, SplatSettings, SplatTraining
 from .image_training import ImageTrainer, Initial
 from .loop import COST_GROWTH
 from .losses import position_penalty, scale_penalty
-from .optimisation import Densifier, Optimiser
+from .optimisation import Densifier, Optimiser, logit
 from .rendering import View, rasterize_view, scene_center, scene_extent
 from .schedule import DensifySchedule, Sampler, Timeline, log_linear
+
+
+def initial_shapes(sizes: FloatArray, settings: SplatSettings) -> dict[str, tuple[Tensor, float]]:
+    """Round splats of (N,) sizes in metres at the start: logarithms of sizes, rotations, logits of opacities, with their rates."""
+    log_scales = torch.from_numpy(np.log(sizes)).float()[:, None].repeat(1, 3)
+    opacities = torch.full((len(sizes),), logit(settings.initial_opacity))
+    return {
+        "log_scales": (log_scales, settings.scale_lr),
+        "quats": (unturned(len(sizes)), settings.rotation_lr),
+        "opacities": (opacities, settings.opacity_lr),
+    }
 
 
 class SplatTrainer(ImageTrainer):
@@ -28,12 +40,7 @@ class SplatTrainer(ImageTrainer):
     """
 
     cost_growth = COST_GROWTH
-
-    def __init__(
-        self, clip: Clip, settings: DensifiedTraining, sampler: Sampler, device: str, *, masks: bool = False
-    ):
-        super().__init__(clip, settings, sampler, device, masks=masks)
-        self._settings = settings
+    _settings: DensifiedTraining
 
     def _start(
         self,
@@ -85,7 +92,7 @@ class SplatTrainer(ImageTrainer):
         progress = self._position_progress(iteration)
         rate = log_linear(settings.position_lr, settings.position_lr_final, progress)
         self.optimiser.set_learning_rate("means", rate * self.extent)
-        self._decay_rates(iteration, settings.final_rate, apart=("means",))
+        self._decay_rates(iteration, apart=("means",))
 
     def state(self) -> dict[str, Any]:
         """Parameters, moments, binding and densification statistics."""

@@ -71,8 +71,8 @@ def check_tensors(
     return check_arrays(path, arrays, members, sizes)
 
 
-def check_sizes(path: Path, log_scales: Tensor) -> None:
-    """Raise `InputError` for splats of a size beyond `MAX_LOGARITHM`."""
-    largest = float(log_scales.max()) if log_scales.numel() else 0.0
+def check_sizes(path: Path, logarithms: Tensor, name: str = "log_scales") -> None:
+    """Raise `InputError` for logarithms of sizes beyond `MAX_LOGARITHM`."""
+    largest = float(logarithms.max()) if logarithms.numel() else 0.0
     if largest > MAX_LOGARITHM:
-        raise InputError(path, "log_scales", f"logarithms of sizes up to {MAX_LOGARITHM:g}", f"{largest:g}")
+        raise InputError(path, name, f"logarithms of sizes up to {MAX_LOGARITHM:g}", f"{largest:g}")

@@ -8,10 +8,9 @@ import pytest
 from headbench.bench.contracts import Budget, no_progress
 from headbench.datasets.head.arrays import read_head
 from headbench.methods.flashavatar.config import FlashAvatarConfig
-from headbench.methods.flashavatar.method import FlashAvatar
-from headbench.methods.flashavatar.training import FlashAvatarTraining
+from headbench.methods.flashavatar.method import FlashAvatar, FlashAvatarTraining
 from headbench.methods.rgbavatar.config import RGBAvatarConfig
-from headbench.methods.rgbavatar.training import RGBAvatarTraining
+from headbench.methods.rgbavatar.method import RGBAvatarTraining
 
 from .flashavatar.small import SMALL as FLASHAVATAR
 from .rgbavatar.small import SMALL as RGBAVATAR
@@ -52,7 +51,7 @@ def test_an_avatar_keeps_its_points_and_the_chart(charted, tmp_path):
     method = FlashAvatar(FlashAvatarConfig(**FLASHAVATAR))
     avatar = method.fit(charted, tmp_path, Budget(iterations=2), device="cpu", seed=0, progress=no_progress)
     points = FlashAvatarTraining(charted, FlashAvatarConfig(**FLASHAVATAR), "cpu", 0).points
-    np.testing.assert_array_equal(avatar.trained.points.triangles, points.triangles)
+    np.testing.assert_array_equal(avatar.stored.points.triangles, points.triangles)
     heads = [read_head(path) for path in tmp_path.rglob("head*.npz")]
     assert heads
     assert all(np.array_equal(head.uv, charted.head.uv) for head in heads)

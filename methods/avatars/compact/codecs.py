@@ -153,7 +153,7 @@ def _encode_rgbavatar(
 def _encode_flashavatar(
     avatar: FlashAvatarAvatar, head: HeadAsset, precision: Precision, clip: Clip | None
 ) -> Content:
-    return encode_offsets(avatar.trained, avatar.subject, precision, weights_of(avatar, clip))
+    return encode_offsets(avatar.stored, avatar.subject, precision, weights_of(avatar, clip))
 
 
 def _exact(avatar: Avatar, name: str) -> Path:

@@ -9,7 +9,7 @@ import torch
 
 from ....bench.contracts import FloatArray, HeadAsset
 from ...flashavatar.hyper_gaussians import gaussian_shapes
-from ...flashavatar.model import SETTINGS_KEY, TrainedSplats, rendering_of_text, rendering_text
+from ...flashavatar.model import TrainedSplats
 from ...shared.avatar_files import Subject
 from ...shared.networks import layer_names
 from .container import Arrays, Content, read_content
@@ -56,14 +56,14 @@ def encode_offsets(
     points = encode_points(trained.points.rows(order), precision, BARYCENTRIC_STEP)
     arrays = {"classes": store_classes(classes), **points, **shapes}
     arrays |= encode_harmonics(dc, rest, precision.harmonics, classes, own, None)
-    for weight, bias in zip(*layer_names(trained.config.layers + 1)):
+    for weight, bias in zip(*layer_names(trained.settings.layers + 1)):
         arrays |= encode_matrix(weight, tensors[weight], FINER * precision.networks)
         arrays[bias] = tensors[bias].astype(np.float32)
-    for name in gaussian_shapes(trained.config.hyper_gaussians):
+    for name in gaussian_shapes(trained.settings.hyper_gaussians):
         # By columns, as the splats' numbers of one kind are of a size.
         arrays |= encode_matrix(name, tensors[name][order].T, FINER * precision.networks)
     person = encode_subject(subject, precision)
-    text = {**person.text, SETTINGS_KEY: rendering_text(trained.config)}
+    text = {**person.text, trained.KEY: trained.text()}
     return Content({**arrays, **person.arrays}, text, {**steps, **person.steps})
 
 
@@ -71,7 +71,7 @@ def read_offsets(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Tra
     """Subject and splats of a file of `encode_offsets`. Raises `InputError` for anything else."""
     arrays = Arrays(path, read_content(path))
     subject = decode_subject(arrays, head)
-    config = rendering_of_text(path, arrays.text.get(SETTINGS_KEY, ""))
+    config = TrainedSplats.settings_of(path, arrays.text.get(TrainedSplats.KEY, ""))
     points = decode_points(arrays, head, BARYCENTRIC_STEP)
     classes = read_classes(arrays, "classes", len(points.triangles))
     shapes = decode_shapes(arrays, classes, FLOOR, turned=True)

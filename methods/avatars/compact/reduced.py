@@ -9,7 +9,7 @@ import torch
 
 from ....bench.contracts import FloatArray, HeadAsset
 from ....bench.errors import InputError
-from ...rgbavatar.model import BIASES, INPUTS_KEY, SHAPES, WEIGHTS, StoredShapes, input_names
+from ...rgbavatar.model import BIASES, SHAPES, WEIGHTS, StoredShapes
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import SubjectMesh
 from ...shared.surface_points import SurfacePoints
@@ -90,14 +90,15 @@ def encode_reduced(
         arrays |= encode_matrix(name, tensors[name], precision.networks)
     arrays |= {name: tensors[name].astype(np.float32) for name in BIASES}
     person = encode_subject(subject, precision)
-    text = {**person.text, INPUTS_KEY: ",".join(stored.inputs)}
+    text = {**person.text, stored.KEY: stored.text()}
     return Content({**arrays, **person.arrays}, text, {**steps, **person.steps})
 
 
 def read_reduced(path: Path, head: HeadAsset, device: str) -> tuple[Subject, StoredShapes]:
     """Subject and splats of a file of `encode_reduced`. Raises `InputError` for anything else."""
     arrays = Arrays(path, read_content(path))
-    subject, inputs = decode_subject(arrays, head), input_names(path, arrays.text.get(INPUTS_KEY, ""))
+    subject = decode_subject(arrays, head)
+    inputs = StoredShapes.settings_of(path, arrays.text.get(StoredShapes.KEY, ""))
     points = decode_points(arrays, head)
     classes = read_classes(arrays, "classes", len(points.triangles))
     shapes = decode_shapes(arrays, classes, FLOOR, turned=True)

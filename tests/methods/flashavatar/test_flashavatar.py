@@ -14,22 +14,20 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.engine.config import resolve_method
 from headbench.bench.errors import InputError
 from headbench.methods.flashavatar.config import FlashAvatarConfig
-from headbench.methods.flashavatar.method import FlashAvatar
+from headbench.methods.flashavatar.method import FlashAvatar, FlashAvatarTraining, image_loss, mouth_mask
 from headbench.methods.flashavatar.model import (
     INPUTS,
     HeadSurface,
+    TrainedSplats,
     changed,
     layer_of_points,
     network_outputs,
     network_sizes,
-    positional_encoding,
-    read_avatar,
-    write_avatar,
 )
 from headbench.methods.flashavatar.spec import FLASHAVATAR
-from headbench.methods.flashavatar.training import FlashAvatarTraining, image_loss, mouth_mask
 from headbench.methods.official.video import six_numbers
 from headbench.methods.ops.harmonics import C0, sh_basis
+from headbench.methods.ops.planes import encode
 from headbench.methods.shared.avatar_files import clip_mesh
 from headbench.methods.shared.networks import initial_network, input_count, layer_names, tracked_inputs
 from headbench.methods.shared.schedule import Timeline
@@ -54,10 +52,10 @@ def random_splats(count=6, dtype=torch.float64):
 def test_outputs_of_zero_change_nothing(variant):
     splats = random_splats()
     outputs = torch.zeros_like(splats["outputs"])
-    offsets, log_scales, quats = changed(splats, outputs, replace(CONFIG, scale_variant=variant))
-    assert not offsets.any()
-    torch.testing.assert_close(log_scales, splats["log_scales"])
-    torch.testing.assert_close(quats, splats["quats"])
+    found = changed(splats, outputs, replace(CONFIG, scale_variant=variant))
+    assert not found["means"].any()
+    torch.testing.assert_close(found["log_scales"], splats["log_scales"])
+    torch.testing.assert_close(found["quats"], splats["quats"])
 
 
 def test_a_size_becomes_its_power_or_its_multiple():
@@ -65,7 +63,7 @@ def test_a_size_becomes_its_power_or_its_multiple():
     outputs = torch.zeros(1, 10)
     outputs[0, 7:] = torch.tensor([-1.0, 1.0, 1.0])
     official, product = (
-        changed(splats, outputs, replace(CONFIG, scale_variant=variant))[1].exp()
+        changed(splats, outputs, replace(CONFIG, scale_variant=variant))["log_scales"].exp()
         for variant in ("official", "product")
     )
     # A millimetre becomes 79 mm at c = 1 / e and 7 nm at c = e.
@@ -76,7 +74,8 @@ def test_a_size_becomes_its_power_or_its_multiple():
 def test_offsets_are_bounded_and_turns_come_after_the_splats_own():
     splats = random_splats()
     outputs = splats["outputs"]
-    offsets, _, quats = changed(splats, outputs, replace(CONFIG, offset_m=0.2))
+    found = changed(splats, outputs, replace(CONFIG, offset_m=0.2))
+    offsets, quats = found["means"], found["quats"]
     torch.testing.assert_close(offsets, 0.2 * outputs[:, :3])
     own = Rotation.from_quat(splats["quats"].roll(-1, 1).numpy())
     added = torch.cat([outputs[:, 4:7], outputs[:, 3:4].exp()], 1)
@@ -87,7 +86,7 @@ def test_offsets_are_bounded_and_turns_come_after_the_splats_own():
 
 def test_the_encoding_is_that_of_the_publication():
     points = torch.tensor([[0.0, 0.0, 0.0], [0.1, -0.05, 0.02]], dtype=torch.float64)
-    encoded = positional_encoding(points, FlashAvatarConfig().frequencies)
+    encoded = encode(points, FlashAvatarConfig().frequencies)
     assert encoded.shape == (2, 51)
     assert encoded[0].tolist() == [0.0] * 3 + 8 * ([0.0] * 3 + [1.0] * 3)
     assert float(encoded[1, 3 + 6 * 7]) == pytest.approx(np.sin(128 * 0.1))
@@ -117,7 +116,7 @@ def test_the_split_first_layer_is_the_concatenated_one():
     generator = torch.Generator().manual_seed(1)
     points, inputs = (torch.randn(shape, generator=generator) for shape in ((7, 3), (5,)))
     network = initial_network(network_sizes(CONFIG, 5), 3)
-    encoded = positional_encoding(points, CONFIG.frequencies)
+    encoded = encode(points, CONFIG.frequencies)
     found = network_outputs(network, layer_of_points(network, encoded), inputs, CONFIG)
     layers = []
     for weight, bias in zip(*layer_names(3)):
@@ -183,7 +182,7 @@ def test_moving_the_head_is_moving_the_camera(avatar, clip):
     np.testing.assert_allclose(seen.rgb, avatar.render(moved, still).rgb, atol=2e-3)
     assert np.abs(seen.rgb - avatar.render(camera, still).rgb).max() > 0.1
     splats = avatar.splats(still)
-    surface = avatar._surface.posed(avatar.mesh.arguments([still]))
+    surface = avatar.surface.posed(avatar.mesh.arguments([still]))
     assert np.linalg.norm(splats.means - surface.center.numpy(), axis=1).max() > 1e-3
 
 
@@ -243,8 +242,8 @@ def test_defaults_are_the_published_values():
 )
 def test_settings_that_do_not_fit_the_tensors_are_refused(avatar, clip, tmp_path, change):
     path = tmp_path / "avatar.safetensors"
-    write_avatar(path, avatar.trained)
+    avatar.stored.write(path)
     tensors, metadata = read_safetensors(path)
     save_file(tensors, path, {"settings": json.dumps({**json.loads(metadata["settings"]), **change})})
     with pytest.raises(InputError, match=r"avatar\.safetensors"):
-        read_avatar(path, clip.head, "cpu")
+        TrainedSplats.read(path, clip.head, "cpu")

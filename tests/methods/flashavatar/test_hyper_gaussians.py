@@ -19,9 +19,8 @@ from headbench.methods.flashavatar.hyper_gaussians import (
     gaussian_shapes,
     initial_gaussians,
 )
-from headbench.methods.flashavatar.method import FlashAvatar
-from headbench.methods.flashavatar.model import layer_of_points, network_outputs, read_avatar, write_avatar
-from headbench.methods.flashavatar.training import FlashAvatarTraining
+from headbench.methods.flashavatar.method import FlashAvatar, FlashAvatarTraining
+from headbench.methods.flashavatar.model import TrainedSplats, layer_of_points, network_outputs
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.tensor_files import read_safetensors
 
@@ -108,11 +107,11 @@ def test_an_avatar_is_stored_with_its_gaussians(trained, clip):
     folder, method, avatar = trained
     camera, pose = first_view(clip)
     loaded = method.load(folder, device="cpu")
-    assert loaded.trained.config.hyper_gaussians == LATENT
+    assert loaded.stored.settings.hyper_gaussians == LATENT
     np.testing.assert_array_equal(loaded.render(camera, pose).rgb, avatar.render(camera, pose).rgb)
-    tensors = avatar.trained.tensors
+    tensors = avatar.stored.tensors
     assert all(tensors[name].abs().max() > 1e-3 for name in gaussian_shapes(LATENT))
-    count = len(avatar.trained.points.triangles)
+    count = len(avatar.stored.points.triangles)
     stored = sum(4 * tensors[name].numel() for name in gaussian_shapes(LATENT))
     assert stored == (128 + 52 * LATENT) * count
     assert sum(path.stat().st_size for path in loaded.files()) > stored
@@ -126,12 +125,12 @@ def test_a_coded_avatar_has_its_gaussians(trained, clip, tmp_path, precision, to
     camera, pose = first_view(clip)
     difference = np.abs(coded.render(camera, pose).rgb - avatar.render(camera, pose).rgb)
     assert difference.max() < tolerance
-    assert coded.trained.config.hyper_gaussians == LATENT
+    assert coded.stored.settings.hyper_gaussians == LATENT
 
 
 def test_files_without_gaussians_say_nothing_of_them(clip, tmp_path):
     plain = FlashAvatarTraining(clip, replace(CONFIG, hyper_gaussians=0), "cpu", 0).result()
-    write_avatar(tmp_path / "avatar.safetensors", plain)
+    plain.write(tmp_path / "avatar.safetensors")
     tensors, metadata = read_safetensors(tmp_path / "avatar.safetensors")
     assert not tensors.keys() & gaussian_shapes(LATENT).keys()
     assert "hyper" not in metadata["settings"]
@@ -140,7 +139,7 @@ def test_files_without_gaussians_say_nothing_of_them(clip, tmp_path):
 def test_damaged_gaussians_are_refused(trained, clip, tmp_path):
     _, _, avatar = trained
     path = tmp_path / "avatar.safetensors"
-    write_avatar(path, avatar.trained)
+    avatar.stored.write(path)
     tensors, metadata = read_safetensors(path)
     name = gaussian_names("turn")[1]
     broken = tensors[name].clone()
@@ -148,10 +147,10 @@ def test_damaged_gaussians_are_refused(trained, clip, tmp_path):
     for change in ({name: broken}, {name: tensors[name][:, :3].clone()}):
         save_file({**tensors, **change}, path, metadata)
         with pytest.raises(InputError, match=name):
-            read_avatar(path, clip.head, "cpu")
+            TrainedSplats.read(path, clip.head, "cpu")
     save_file({key: value for key, value in tensors.items() if key != name}, path, metadata)
     with pytest.raises(InputError, match=name):
-        read_avatar(path, clip.head, "cpu")
+        TrainedSplats.read(path, clip.head, "cpu")
 
 
 @pytest.mark.parametrize("latent", [-1, 129])

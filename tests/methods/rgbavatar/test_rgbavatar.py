@@ -10,21 +10,20 @@ from headbench.bench.errors import InputError
 from headbench.datasets.head.rotations import axis_angle_to_matrix
 from headbench.methods.ops.harmonics import C0
 from headbench.methods.rgbavatar.config import INPUTS, RGBAvatarConfig
+from headbench.methods.rgbavatar.method import RGBAvatarTraining
 from headbench.methods.rgbavatar.model import (
     SHAPES,
-    Surface,
+    StoredShapes,
     blend_weights,
     blended,
-    read_avatar,
     seen_colors,
-    write_avatar,
 )
-from headbench.methods.rgbavatar.training import RGBAvatarTraining
 from headbench.methods.shared.avatar_files import AVATAR_FILE
 from headbench.methods.shared.networks import initial_network, input_count, tracked_inputs
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.subject_mesh import SubjectMesh
 from headbench.methods.shared.surface_points import poisson_disk
+from headbench.methods.shared.surface_splats import PointSurface
 from headbench.methods.splats import rasterize
 
 SMALL = {"samples": 400, "hidden": 8, "blendshapes": 3, "schedule_length": 40, "join": 4}
@@ -96,7 +95,7 @@ def test_splats_sit_on_the_surface_and_turn_with_the_head(clip, head):
     mesh = SubjectMesh(head, clip.shape, clip.static_offset, "cpu")
     vertices, faces = mesh.canonical.double().numpy(), np.asarray(head.faces)
     points = poisson_disk(vertices, faces, np.arange(len(faces)), 200, 0)
-    surface, count = Surface(mesh, points), len(points.triangles)
+    surface, count = PointSurface(mesh, points), len(points.triangles)
     generator = torch.Generator().manual_seed(0)
     splats = {
         "means": 0.01 * torch.randn(count, 3, generator=generator),
@@ -265,23 +264,23 @@ def test_files_that_do_not_fit_are_refused(clip, head, tmp_path):
     stored = training.result()
     training.close()
     path = tmp_path / AVATAR_FILE
-    write_avatar(path, stored)
-    again = read_avatar(path, head, "cpu")
+    stored.write(path)
+    again = StoredShapes.read(path, head, "cpu")
     assert all(torch.equal(again.tensors[name], value) for name, value in stored.tensors.items())
     broken = {
-        "triangles": stored._replace(
-            points=stored.points._replace(triangles=stored.points.triangles + 10**6)
+        "triangles": replace(
+            stored, points=stored.points._replace(triangles=stored.points.triangles + 10**6)
         ),
-        "inputs": stored._replace(inputs=("expression", "smile")),
-        "network_weight_0": stored._replace(inputs=("neck",)),
-        "color_shapes": stored._replace(
-            tensors={**stored.tensors, "color_shapes": stored.tensors["color_shapes"][:-1]}
+        "inputs": replace(stored, settings=("expression", "smile")),
+        "network_weight_0": replace(stored, settings=("neck",)),
+        "color_shapes": replace(
+            stored, tensors={**stored.tensors, "color_shapes": stored.tensors["color_shapes"][:-1]}
         ),
     }
     for name, each in broken.items():
-        write_avatar(path, each)
+        each.write(path)
         with pytest.raises(InputError, match=name):
-            read_avatar(path, head, "cpu")
+            StoredShapes.read(path, head, "cpu")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,224 @@
+"""A fixed number of splats on the surface of a head, changed by a network of the tracked parameters: file, avatar, training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Generic, Self, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...bench.contracts import Clip, HeadAsset, HeadPose
+from ...bench.io.arrays import Member
+from ..ops.mesh import TriangleFrames
+from ..ops.splats import WorldSplats, to_world
+from .avatar_files import AVATAR_FILE, Subject, clip_mesh, finish_fit, read_stored
+from .config import SurfaceSettings
+from .image_training import ImageTrainer
+from .loop import Fit
+from .method import TrainedMethod
+from .networks import tracked_inputs
+from .rendering import LastPose, PlacedSplats, StoredSplatAvatar
+from .schedule import Sampler
+from .subject_mesh import BoundedCache, SubjectMesh, TrainingPoses
+from .surface_points import MeshPoints, SurfacePoints, point_tensors, spread_points, take_points
+from .tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors, write_tensors
+
+Settings = TypeVar("Settings")
+Config = TypeVar("Config", bound=SurfaceSettings)
+Avatar = TypeVar("Avatar")
+
+
+class PointSurface:
+    """Points on the mesh of a subject with axes at each: those of its triangle, or what a derived class has.
+
+    Attributes
+    ----------
+    rest : Tensor
+        (N, 3) points on the neutral mesh, metres.
+    """
+
+    def __init__(self, mesh: SubjectMesh, points: SurfacePoints):
+        self.mesh, self._at_points = mesh, MeshPoints(points, mesh.faces, mesh.canonical)
+        self.rest = self._at_points(mesh.canonical)
+        self._each = torch.arange(len(self.rest), device=self.rest.device)
+        self._unit = torch.ones_like(self.rest[:, 0])
+
+    @torch.no_grad()
+    def posed(self, arguments: Mapping[str, Tensor]) -> TriangleFrames:
+        """Axes at the points for the arguments of one timestep, each centred on its point, in metres."""
+        vertices = self.mesh.posed(arguments)
+        rotation, quaternion = self._axes(arguments, vertices)
+        return TriangleFrames(rotation, self._at_points(vertices), self._unit, quaternion)
+
+    def place(self, frames: TriangleFrames, splats: Mapping[str, Tensor]) -> WorldSplats:
+        """Splats in the world: ``means`` and ``quats`` are along the axes at their points, positions and ``log_scales`` in metres."""
+        return to_world(frames, self._each, splats["means"], splats["log_scales"], splats["quats"])
+
+    def _axes(self, arguments: Mapping[str, Tensor], vertices: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 3, 3) rotations and their (N, 4) quaternions, for one timestep's arguments and (V, 3) vertices."""
+        frames, triangles = self.mesh.frames(vertices), self._at_points.triangles
+        return frames.rotation[triangles], frames.quaternion[triangles]
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSplats(Generic[Settings]):
+    """Content of an avatar's file. A derived class describes the tensors and the text of the settings.
+
+    Attributes
+    ----------
+    tensors : dict[str, Tensor]
+        Those of `shapes`.
+    points : SurfacePoints
+        Surface point of each of the N splats.
+    settings : Settings
+        What rendering needs besides.
+    """
+
+    tensors: dict[str, Tensor]
+    points: SurfacePoints
+    settings: Settings
+
+    KEY: ClassVar[str]
+    """Key of the settings in the file's metadata."""
+    surface_class: ClassVar[type[PointSurface]] = PointSurface
+
+    def shapes(self, head: HeadAsset) -> Mapping[str, tuple[int | str, ...]]:
+        """Shapes of the float32 tensors by name; "N" is the number of splats, and other names stand for any size."""
+        raise NotImplementedError
+
+    def text(self) -> str:
+        """The settings as text."""
+        raise NotImplementedError
+
+    @classmethod
+    def settings_of(cls, path: Path, text: str) -> Settings:
+        """Settings of a `text`. Raises `InputError`, naming ``path``, for other text."""
+        raise NotImplementedError
+
+    def checked(self, path: Path, head: HeadAsset, device: str) -> Self:
+        """The same on a device. Raises `InputError`, naming ``path``, where the tensors do not fit each other or the head."""
+        members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in self.shapes(head).items()}
+        check_tensors(path, self.tensors, members, {"N": len(self.points.triangles)})
+        check_sizes(path, self.tensors["log_scales"])
+        return replace(self, tensors={name: self.tensors[name].to(device) for name in members})
+
+    def write(self, path: Path) -> None:
+        """Write the file, exact: 12 bytes for the point of each splat, 4 for each number of a tensor."""
+        write_tensors(path, self.tensors | point_tensors(self.points), {self.KEY: self.text()})
+
+    @classmethod
+    def read(cls, path: Path, head: HeadAsset, device: str) -> Self:
+        """Read and check what `write` wrote. Raises `InputError` where a tensor is missing or does not fit."""
+        tensors, metadata = read_safetensors(path)
+        settings = cls.settings_of(path, metadata.get(cls.KEY, ""))
+        points = take_points(path, tensors, len(head.faces))
+        return cls(tensors, points, settings).checked(path, head, device)
+
+
+Stored = TypeVar("Stored", bound=SurfaceSplats[Any])
+
+
+class SurfaceAvatar(StoredSplatAvatar, Generic[Stored]):
+    """Base class of the trained heads: a derived class has the classes of its file and its surface, and places splats.
+
+    Files: ``avatar.safetensors`` and ``subject.npz``, or the coded file in place of both, count as storage. The folder also has
+    the shared head model.
+    """
+
+    stored_class: ClassVar[Any]
+    read_coded: ClassVar[Any]
+    """Subject and content of a coded file, of its path, the head model and a device."""
+
+    def __init__(self, files: Sequence[Path], head: HeadAsset, subject: Subject, stored: Stored, device: str):
+        super().__init__(files, LastPose(self._posed), device)
+        self.mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
+        self.subject, self.stored = subject, stored
+        self.surface = stored.surface_class(self.mesh, stored.points)
+
+    @classmethod
+    def read(cls, folder: Path, device: str) -> Self:
+        """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
+        readers = partial(cls.stored_class.read, device=device), partial(cls.read_coded, device=device)
+        return cls(*read_stored(folder, AVATAR_FILE, *readers), device)
+
+    def _posed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
+        arguments = self.mesh.arguments([pose])
+        frames = self.surface.posed(arguments)
+        end_stage("drive")
+        return self._placed(frames, arguments)
+
+    def _placed(self, frames: TriangleFrames, arguments: Mapping[str, Tensor]) -> PlacedSplats:
+        """Splats of a pose, given by the axes at the points and its arguments."""
+        raise NotImplementedError
+
+
+class SurfaceTrainer(ImageTrainer, Generic[Config]):
+    """A `Trainable` except for its loss. A derived class calls `_optimise` in its initialiser.
+
+    Parameters
+    ----------
+    inputs : Sequence[str]
+        Tracked parameters that the network takes.
+    border : str
+        Region of the head model whose triangles get no texel of the chart.
+
+    Attributes
+    ----------
+    points, rest : SurfacePoints, FloatArray
+        Surface point of each splat, and its (N, 3) position on the neutral mesh, metres.
+    """
+
+    stored_class: ClassVar[Any]
+
+    def __init__(
+        self,
+        clip: Clip,
+        config: Config,
+        sampler: Sampler,
+        inputs: Sequence[str],
+        device: str,
+        seed: int,
+        *,
+        masks: bool = False,
+        border: str = "",
+    ):
+        super().__init__(clip, config, sampler, device, masks=masks)
+        self._config, self._seed, self._mesh = config, seed, clip_mesh(clip, device)
+        vertices = self._mesh.canonical.cpu().numpy().astype(np.float64)
+        without = clip.head.regions.get(border)
+        self.points = spread_points(
+            *(clip.head, vertices, config.samples, seed), chart=config.uv_chart, chart_without=without
+        )
+        self.rest = self.points.positions(vertices, np.asarray(clip.head.faces))
+        self._surface = self.stored_class.surface_class(self._mesh, self.points)
+        self._tracked = TrainingPoses(clip, self._mesh)
+        self._inputs = tracked_inputs(self._tracked.arguments, inputs)
+        entries = config.mesh_cache_mb * 2**20 // (4 * 17 * len(self.rest))
+        self._frames = BoundedCache(lambda row: self._surface.posed(self._tracked.at(row)), entries)
+
+    def note(self) -> str:
+        """Number of splats."""
+        return f"{len(self.rest)} splats"
+
+    def result(self) -> SurfaceSplats[Any]:
+        """The trained avatar."""
+        stored: SurfaceSplats[Any] = self.stored_class(self.tensors(), self.points, self._config)
+        return stored
+
+
+class SurfaceMethod(TrainedMethod[Config, Avatar]):
+    """A `Method`: a derived class has the class of its training beside those of a `TrainedMethod`."""
+
+    training_class: ClassVar[Any]
+
+    def _train(self, fit: Fit, config: Config) -> None:
+        training = self.training_class(fit.clip, config, fit.device, fit.seed)
+        outcome, stored = training.run(fit), training.result()
+        stored.write(fit.out / AVATAR_FILE)
+        splats = len(stored.points.triangles)
+        finish_fit(fit, outcome, Subject.of(fit.clip), fit.clip.head, splats=splats)
