@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip, FloatArray, HeadPose
+from ...datasets.head.arrays import HeadArrays
 from ..avatars.compact.bound import read_bound
 from ..ops.harmonics import (
     coefficient_count,
@@ -24,17 +25,7 @@ from ..ops.harmonics import (
 )
 from ..ops.mesh import TriangleFrames
 from ..ops.splats import activate, to_world
-from ..shared.avatar_files import (
-    COMPACT_FILE,
-    SUBJECT_FILE,
-    TRACKED,
-    RefinedTracking,
-    Subject,
-    clip_mesh,
-    finish_fit,
-    read_shared_head,
-    read_subject,
-)
+from ..shared.avatar_files import TRACKED, RefinedTracking, Subject, clip_mesh, finish_fit, read_stored
 from ..shared.capacity import CapacityPlan, CapacityPlanner
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
@@ -159,14 +150,12 @@ class GAAvatar(StoredSplatAvatar):
     @classmethod
     def read(cls, folder: Path, device: str) -> GAAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        head, coded = read_shared_head(folder), folder / COMPACT_FILE
-        if coded.exists():
-            stored = [coded]
-            subject, splats, binding = read_bound(coded, head, device)
-        else:
-            stored = [folder / PLY_FILE, folder / SUBJECT_FILE]
-            subject = read_subject(folder / SUBJECT_FILE, head)
-            splats, binding = read_ga_splats(folder / PLY_FILE, len(head.faces), device)
+
+        def exact(path: Path, head: HeadArrays) -> tuple[dict[str, Tensor], Tensor]:
+            return read_ga_splats(path, len(head.faces), device)
+
+        coded = partial(read_bound, device=device)
+        stored, head, subject, (splats, binding) = read_stored(folder, PLY_FILE, exact, coded)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
         driving = folder / DRIVING_FILE
         refined = RefinedTracking.read(driving) if driving.exists() else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +19,9 @@ from ..avatars.compact.container import codec_of, read_content
 from ..avatars.compact.networks import as_tensors, read_networks
 from ..shared.avatar_files import (
     AVATAR_FILE,
-    COMPACT_FILE,
-    SUBJECT_FILE,
     RefinedTracking,
     Subject,
-    read_shared_head,
-    read_subject,
+    read_stored,
     settings_of_text,
     settings_text,
 )
@@ -70,14 +68,8 @@ class GHAAvatar:
     @classmethod
     def read(cls, folder: Path, device: str) -> GHAAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
-        shared, coded = read_shared_head(folder), folder / COMPACT_FILE
-        if coded.exists():
-            files = [coded]
-            subject, head, tensors = read_coded(coded, shared, device)
-        else:
-            files = [folder / AVATAR_FILE, folder / SUBJECT_FILE]
-            subject = read_subject(folder / SUBJECT_FILE, shared)
-            head, tensors = read_avatar(files[0], code_size(shared), device)
+        readers = partial(read_avatar, device=device), partial(read_coded, device=device)
+        files, shared, subject, (head, tensors) = read_stored(folder, AVATAR_FILE, *readers)
         driver = Driver(
             *(shared, subject.shape, subject.static_offset),
             origin=tensors["origin"].cpu().numpy(),
@@ -189,25 +181,27 @@ def write_avatar(path: Path, config: GHAConfig, tensors: Mapping[str, Tensor]) -
     write_tensors(path, kept, {CONFIG: settings_text(config, RENDERING)})
 
 
-def read_avatar(path: Path, expression_size: int, device: str) -> tuple[GaussianHead, dict[str, Tensor]]:
+def read_avatar(path: Path, shared: HeadAsset, device: str) -> tuple[GaussianHead, dict[str, Tensor]]:
     """Read what `write_avatar` wrote: the networks and their tensors, and those of the points.
 
     Raises `InputError` if the file is damaged, or a tensor is missing, does not fit the settings, or is not finite
     float32.
     """
-    tensors, metadata = read_safetensors(path)
+    (tensors, metadata), size = read_safetensors(path), code_size(shared)
     config = settings_of_text(GHAConfig, RENDERING, metadata.get(CONFIG, ""), path, CONFIG)
-    head = GaussianHead.of(config, expression_size)
-    return head, _checked(path, tensors, head, expression_size, device)
+    head = GaussianHead.of(config, size)
+    return head, _checked(path, tensors, head, size, device)
 
 
-def read_coded(path: Path, shared: HeadAsset, device: str) -> tuple[Subject, GaussianHead, dict[str, Tensor]]:
+def read_coded(
+    path: Path, shared: HeadAsset, device: str
+) -> tuple[Subject, tuple[GaussianHead, dict[str, Tensor]]]:
     """The same, with the subject, of a coded file (`compact.networks`)."""
     content, size = read_content(path), code_size(shared)
     config = settings_of_text(GHAConfig, RENDERING, content.text.get(CONFIG, ""), path, CONFIG)
     head = GaussianHead.of(config, size)
     subject, arrays = read_networks(path, shared, _shapes(head, size), TABLE, content)
-    return subject, head, _checked(path, as_tensors(arrays, "cpu"), head, size, device)
+    return subject, (head, _checked(path, as_tensors(arrays, "cpu"), head, size, device))
 
 
 TABLE = "table"

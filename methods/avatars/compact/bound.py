@@ -45,8 +45,8 @@ def encode_bound(
     return Content({**arrays, **person.arrays}, person.text, {**steps, **person.steps})
 
 
-def read_bound(path: Path, head: HeadAsset, device: str) -> tuple[Subject, dict[str, Tensor], Tensor]:
-    """Subject, per-splat tensors and binding of a file of `encode_bound`. Raises `InputError` for anything else."""
+def read_bound(path: Path, head: HeadAsset, device: str) -> tuple[Subject, tuple[dict[str, Tensor], Tensor]]:
+    """Subject, and per-splat tensors with their binding, of a file of `encode_bound`. Raises `InputError` for anything else."""
     arrays = Arrays(path, read_content(path))
     subject, tensors = decode_subject(arrays, head), decode_splats(arrays)
     if "sh_dc" not in tensors:
@@ -59,4 +59,4 @@ def read_bound(path: Path, head: HeadAsset, device: str) -> tuple[Subject, dict[
         expected = f"triangles 0 to {len(head.faces) - 1}"
         raise InputError(path, "triangles", expected, str(int(binding.max())))
     splats["opacities"] = splats["opacities"][:, 0]
-    return subject, splats, binding
+    return subject, (splats, binding)

@@ -62,7 +62,7 @@ def _make(
         path = out / COMPACT_FILE
         reduced = GAAvatar([], whole.mesh, subject, splats, binding, whole.refined, device)
         write_content(path, encode_avatar(reduced, head, Precision(step=recipe.step), clip))
-        subject, splats, binding = read_bound(path, head, device)
+        subject, (splats, binding) = read_bound(path, head, device)
         stored = [path]
     else:
         write_subject(out / SUBJECT_FILE, subject)
