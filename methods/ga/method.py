@@ -33,7 +33,7 @@ from ..shared.optimisation import Optimiser
 from ..shared.rendering import USUAL, Cutoffs, PlacedSplats, StoredSplatAvatar, View
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
 from ..shared.splat_training import BoundTraining, ShadedSplats
-from ..shared.subject_mesh import BoundedCache, SubjectMesh
+from ..shared.subject_mesh import BoundedCache, SubjectMesh, TrainingPoses
 from .config import GAConfig
 from .spec import GA as SPEC
 from .storage import PLY_FILE, read_ga_splats, write_ga_splats
@@ -48,9 +48,7 @@ class GAAppearance:
 
     def __init__(self, mesh: SubjectMesh, clip: Clip, config: GAConfig, device: str, seed: int):
         self._mesh, self._config, self._device, self._seed = mesh, config, device, seed
-        self.timesteps = sorted({key.timestep for key in clip.splits["train"]})
-        self._row = {timestep: row for row, timestep in enumerate(self.timesteps)}
-        self.tracked = mesh.arguments([clip.poses[timestep] for timestep in self.timesteps])
+        self.tracked = TrainingPoses(clip, mesh)
         # A frame is 9 + 3 + 1 + 4 floats per triangle.
         entries = config.splats.mesh_cache_mb * 2**20 // (4 * 17 * len(mesh.faces))
         self._cached = BoundedCache(self._tracked_frames, entries)
@@ -68,7 +66,7 @@ class GAAppearance:
         config = self._config
         rates = {"expression": config.expression_lr, "translation": config.translation_lr}
         rates |= dict.fromkeys(POSES, config.pose_lr)
-        return {name: (self.tracked[name].clone(), rates[name]) for name in TRACKED}
+        return {name: (self.tracked.arguments[name].clone(), rates[name]) for name in TRACKED}
 
     def begin(self, timeline: Timeline) -> None:
         """Scale the schedule of the harmonics' degree to the run."""
@@ -76,11 +74,11 @@ class GAAppearance:
 
     def frames(self, timestep: int, optimiser: Optimiser) -> TriangleFrames:
         """Triangle frames; differentiable in the refined tracking."""
-        row = self._row[timestep]
+        row = self.tracked.row[timestep]
         if not self._config.refine_tracking:
             return self._cached(row)
         refined = {name: optimiser[name][row : row + 1] for name in TRACKED}
-        return self._mesh.frames(self._mesh.posed(self._at(row) | refined))
+        return self._mesh.frames(self._mesh.posed(self.tracked.at(row) | refined))
 
     def place(
         self,
@@ -102,16 +100,13 @@ class GAAppearance:
         """Tracking before and after refinement, or None if it is not refined."""
         if not self._config.refine_tracking:
             return None
-        before = {name: self.tracked[name].cpu().numpy() for name in TRACKED}
+        before = {name: self.tracked.arguments[name].cpu().numpy() for name in TRACKED}
         after = {name: optimiser[name].detach().cpu().numpy() for name in TRACKED}
-        return RefinedTracking(subject, np.array(self.timesteps), before, after)
+        return RefinedTracking(subject, np.array([*self.tracked.row]), before, after)
 
     @torch.no_grad()
     def _tracked_frames(self, row: int) -> TriangleFrames:
-        return self._mesh.frames(self._mesh.posed(self._at(row)))
-
-    def _at(self, row: int) -> dict[str, Tensor]:
-        return {name: values[row : row + 1] for name, values in self.tracked.items()}
+        return self._mesh.frames(self._mesh.posed(self.tracked.at(row)))
 
 
 class GAAvatar(StoredSplatAvatar):

@@ -90,7 +90,7 @@ def test_tracking_of_the_timestep_alone_is_refined_if_asked(clip, refine):
     assert set(appearance.parameters()) == (set(TRACKED) if refine else set())
     if refine:
         means.square().sum().backward()
-        row = appearance.timesteps.index(key.timestep)
+        row = appearance.tracked.row[key.timestep]
         for name in TRACKED:
             moved = optimiser[name].grad.abs().sum(1) > 0
             assert moved.nonzero().flatten().tolist() == [row]
