@@ -7,9 +7,8 @@ An iteration trains on one image, whose loss has a mask of the mouth.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import partial
-from pathlib import Path
+from collections.abc import Mapping
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
-from ...bench.contracts import BoolArray, Camera, Clip, FloatArray, HeadAsset, HeadPose
+from ...bench.contracts import BoolArray, Camera, Clip, FloatArray, HeadPose
 from ...datasets.head.geometry import project
 from ..avatars.compact.offsets import read_offsets
 from ..avatars.harmonics import turn_harmonics
@@ -25,7 +24,6 @@ from ..ops.harmonics import coefficient_count, turned_colors
 from ..ops.mesh import TriangleFrames
 from ..ops.photometric import photometric_loss
 from ..ops.planes import encode
-from ..shared.avatar_files import Subject
 from ..shared.networks import initial_network, layer_names, tracked_inputs
 from ..shared.rendering import PlacedSplats, rasterize_view
 from ..shared.schedule import ShuffledEpochs
@@ -35,14 +33,7 @@ from ..shared.surface_points import spacing
 from ..shared.surface_splats import SurfaceAvatar, SurfaceMethod, SurfaceTrainer
 from .config import FlashAvatarConfig
 from .hyper_gaussians import initial_gaussians
-from .model import (
-    INPUTS,
-    TrainedSplats,
-    changed,
-    layer_of_points,
-    network_outputs,
-    network_sizes,
-)
+from .model import INPUTS, TrainedSplats, changed, layer_of_points, network_outputs, network_sizes
 from .spec import FLASHAVATAR as SPEC
 
 HUBER = 0.1
@@ -102,14 +93,7 @@ class FlashAvatarTraining(SurfaceTrainer[FlashAvatarConfig]):
 def image_loss(image: Tensor, truth: Tensor, mouth: Tensor | None, config: FlashAvatarConfig) -> Tensor:
     """Huber loss of an image, that of the images times the mask of the mouth with its weight, and 1 - SSIM with its own.
 
-    Both Huber losses are means over all pixels.
-
-    Parameters
-    ----------
-    image, truth : Tensor
-        (H, W, 3) in [0, 1].
-    mouth : Tensor | None
-        (H, W) bool mask.
+    Images are (H, W, 3) in [0, 1], the mask (H, W) bool. Both Huber losses are means over all pixels.
     """
     each = huber_loss(image, truth, reduction="none", delta=HUBER)
     if mouth is not None:
@@ -139,12 +123,11 @@ class FlashAvatarAvatar(SurfaceAvatar[TrainedSplats]):
 
     stored_class, read_coded = TrainedSplats, read_offsets
 
-    def __init__(
-        self, files: Sequence[Path], head: HeadAsset, subject: Subject, stored: TrainedSplats, device: str
-    ):
-        super().__init__(files, head, subject, stored, device)
-        encoded = encode(self.surface.rest, stored.settings.frequencies)
-        self._of_points = layer_of_points(stored.tensors, encoded)
+    @cached_property
+    def _of_points(self) -> Tensor:
+        """(N, H) part of the network's first layer that is the same in every pose."""
+        encoded = encode(self.surface.rest, self.stored.settings.frequencies)
+        return layer_of_points(self.stored.tensors, encoded)
 
     @torch.no_grad()
     def harmonics(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:

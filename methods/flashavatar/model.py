@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -16,8 +17,6 @@ from ..ops.harmonics import coefficient_count
 from ..ops.splats import apply_matrices, left_products
 from ..shared.avatar_files import settings_of_text, settings_text
 from ..shared.networks import input_count, layer_names, layer_shapes, outputs_of
-from ..shared.subject_mesh import SubjectMesh
-from ..shared.surface_points import SurfacePoints
 from ..shared.surface_splats import PointSurface, SurfaceSplats
 from ..shared.tensor_files import check_sizes
 from .config import FlashAvatarConfig
@@ -54,10 +53,7 @@ def network_outputs(
     The inputs of the network are the encoded point and the tracked parameters, one after the other; the first layer is linear, so the
     parts of both are added. With ``hyper_gaussians`` the outputs are conditional means of the splats' Gaussians, also in ``network``.
 
-    Parameters
-    ----------
-    of_points, inputs : Tensor
-        (N, H) from `layer_of_points`, and the (I,) `tracked_inputs` of the pose.
+    ``of_points`` (N, H) is from `layer_of_points`, and ``inputs`` (I,) are the `tracked_inputs` of the pose.
     """
     of_inputs = network[FIRST][:, -len(inputs) :] @ inputs
     values = outputs_of(network, of_points + of_inputs, config.layers + 1)
@@ -88,9 +84,10 @@ class HeadSurface(PointSurface):
     alone elsewhere. They do not turn with jaw and eyes, whose effect the network learns, as in that program.
     """
 
-    def __init__(self, mesh: SubjectMesh, points: SurfacePoints):
-        super().__init__(mesh, points)
-        self._of_root = self._at_points(mesh.model.skinning_weights[:, :1])
+    @cached_property
+    def _of_root(self) -> Tensor:
+        """(N, 1) skinning weights of the root."""
+        return self._at_points(self.mesh.model.skinning_weights[:, :1])
 
     def _axes(self, arguments: Mapping[str, Tensor], vertices: Tensor) -> tuple[Tensor, Tensor]:
         root, neck = (axis_angle_to_quaternion(arguments[name]) for name in ("rotation", "neck"))
@@ -104,7 +101,7 @@ class TrainedSplats(SurfaceSplats[FlashAvatarConfig]):
     """Content of an avatar's file: splats by the names of `PER_SPLAT`, `gaussian_shapes` and the network.
 
     Sizes are logarithms of metres, rotations wxyz, opacities logits. A splat takes 56 bytes, 12 for each of its harmonics above
-    degree 0, and with ``hyper_gaussians`` of L another 128 + 52 L. Of the configuration the settings in `RENDERING` are stored.
+    degree 0, and with ``hyper_gaussians`` of L another 128 + 52 L.
     """
 
     KEY, surface_class = "settings", HeadSurface

@@ -17,7 +17,8 @@ from torch import Tensor
 from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...bench.native.dispatch import to_device
 from ..avatars.compact.reduced import read_reduced
-from ..ops.harmonics import C0
+from ..avatars.harmonics import DEGREE
+from ..ops.harmonics import C0, coefficient_count
 from ..ops.mesh import TriangleFrames
 from ..ops.photometric import photometric_loss
 from ..ops.splats import WorldSplats
@@ -32,8 +33,6 @@ from .model import PER_SPLAT, SHAPES, StoredShapes, blend_weights, blended, seen
 from .online import OnlineBatches
 from .spec import RGBAVATAR as SPEC
 
-HARMONICS = 15
-"""Coefficients above degree 0 that an export has; they are zero."""
 PUBLISHED_SAMPLES = 60_000
 """Number of splats for which the published size at the start is given: texels of 256 x 256 that show FLAME, rounded."""
 
@@ -172,16 +171,11 @@ class RGBAvatarAvatar(SurfaceAvatar[StoredShapes]):
     def harmonics(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:
         """Colours of a pose, equal in all directions; see `HarmonicAvatar`."""
         colors = self._blended(self.mesh.arguments([pose]))["colors"].cpu().numpy()
-        return colors, np.zeros((*colors.shape, HARMONICS), np.float32)
-
-    @torch.no_grad()
-    def weights(self, arguments: Mapping[str, Tensor]) -> Tensor:
-        """(T, K) weights of the blendshapes for T poses, given as `SubjectMesh.arguments` gives them."""
-        return blend_weights(self.stored.tensors, tracked_inputs(arguments, self.stored.settings))
+        return colors, np.zeros((*colors.shape, coefficient_count(DEGREE) - 1), np.float32)
 
     def _blended(self, arguments: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        (splats,) = blended(self.stored.tensors, self.weights(arguments))
-        return splats
+        inputs = tracked_inputs(arguments, self.stored.settings)
+        return blended(self.stored.tensors, blend_weights(self.stored.tensors, inputs))[0]
 
     def _placed(self, frames: TriangleFrames, arguments: Mapping[str, Tensor]) -> PlacedSplats:
         splats = self._blended(arguments)

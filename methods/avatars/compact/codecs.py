@@ -28,8 +28,10 @@ from ...insta.avatar import TABLE as GRID
 from ...insta.field import Architecture
 from ...ours.avatar import OursAvatar
 from ...rgbavatar.method import RGBAvatarAvatar
+from ...rgbavatar.model import blend_weights
 from ...shared.avatar_files import AVATAR_FILE, COMPACT_FILE, SUBJECT_FILE, read_subject, save_shared_head
 from ...shared.capacity import training_poses
+from ...shared.networks import tracked_inputs
 from ...shared.tensor_files import read_safetensors
 from ..views import importance, training_views
 from .blended import encode_blended
@@ -144,8 +146,8 @@ def _encode_rgbavatar(
 ) -> Content:
     moments = None
     if clip is not None:
-        poses = avatar.mesh.arguments(training_poses(clip))
-        found = avatar.weights(poses).double().cpu().numpy()
+        inputs = tracked_inputs(avatar.mesh.arguments(training_poses(clip)), avatar.stored.settings)
+        found = blend_weights(avatar.stored.tensors, inputs).double().cpu().numpy()
         moments = found.T @ found / len(found)
     return encode_reduced(avatar.stored, avatar.subject, head, precision, weights_of(avatar, clip), moments)
 

@@ -11,13 +11,7 @@ from headbench.datasets.head.rotations import axis_angle_to_matrix
 from headbench.methods.ops.harmonics import C0
 from headbench.methods.rgbavatar.config import INPUTS, RGBAvatarConfig
 from headbench.methods.rgbavatar.method import RGBAvatarTraining
-from headbench.methods.rgbavatar.model import (
-    SHAPES,
-    StoredShapes,
-    blend_weights,
-    blended,
-    seen_colors,
-)
+from headbench.methods.rgbavatar.model import SHAPES, StoredShapes, blend_weights, blended, seen_colors
 from headbench.methods.shared.avatar_files import AVATAR_FILE
 from headbench.methods.shared.networks import initial_network, input_count, tracked_inputs
 from headbench.methods.shared.schedule import Timeline
