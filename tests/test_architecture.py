@@ -197,6 +197,7 @@ READ_IN_ONE_PLACE = {
         "bench/io/images.py",  # the words, in the names of OpenCV's functions
         "bench/io/video.py",  # the package that brings ffmpeg
         "methods/official/gha/method.py",  # names of packages that the authors' code needs
+        "methods/official/shim/unused.py",
     },
     r"\bcv2\.VideoCapture\(": {
         "bench/io/video.py",

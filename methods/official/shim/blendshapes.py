@@ -16,6 +16,8 @@ from torch import Tensor
 from ....datasets.head.refit.identity import closest_points
 from ...ops.harmonics import sh_basis
 from ...shared.surface_points import poisson_disk
+from .meshes import load_obj, matrix_to_rotation_6d, read_obj, rotation_6d_to_matrix
+from .unused import Silent
 
 FAR = 0.015
 """Distance from the nearest vertex, metres, from which a point gets that vertex instead of the nearest triangle. No
@@ -189,31 +191,6 @@ def ids_and_weights(points: Tensor, grid: Tensor, align_corners: bool) -> tuple[
 # ---------------------------------------------------------------------- pytorch3d
 
 
-def rotation_6d_to_matrix(six: Tensor) -> Tensor:
-    """(..., 3, 3) rotations whose first two rows are (..., 6) numbers, made orthonormal (Zhou et al., CVPR 2019)."""
-    first, second = six[..., :3], six[..., 3:]
-    x = torch.nn.functional.normalize(first, dim=-1)
-    y = torch.nn.functional.normalize(second - (x * second).sum(-1, keepdim=True) * x, dim=-1)
-    return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-2)
-
-
-def matrix_to_rotation_6d(matrices: Tensor) -> Tensor:
-    """(..., 6) first two rows of (..., 3, 3) rotations."""
-    return matrices[..., :2, :].clone().reshape(*matrices.shape[:-2], 6)
-
-
-class Faces(NamedTuple):
-    """Corners of the triangles of an OBJ file, (F, 3) int64."""
-
-    verts_idx: Tensor
-
-
-def load_obj(path: str) -> tuple[Tensor, Faces, None]:
-    """(V, 3) vertices and the triangles of an OBJ file."""
-    vertices, faces = _read_obj(path)
-    return torch.from_numpy(vertices).float(), Faces(torch.from_numpy(faces)), None
-
-
 class Attributes:
     """Holds its arguments: cameras and settings of a mesh renderer."""
 
@@ -238,11 +215,10 @@ class SoftPhongShader(Attributes):
 # ---------------------------------------------------------------------- point_cloud_utils, tensorboard
 
 
-def _read_obj(path: str) -> tuple[np.ndarray, np.ndarray]:
-    lines = [line.split() for line in open(path, encoding="utf-8")]  # noqa: SIM115
-    vertices = [[float(word) for word in words[1:4]] for words in lines if words[:1] == ["v"]]
-    faces = [[int(word.split("/")[0]) - 1 for word in words[1:4]] for words in lines if words[:1] == ["f"]]
-    return np.array(vertices), np.array(faces, np.int64)
+def load_mesh(path: str) -> tuple[np.ndarray, np.ndarray]:
+    """(V, 3) vertices and (F, 3) triangles of an OBJ file."""
+    found = read_obj(path)
+    return found.vertices, found.faces
 
 
 def sample_mesh_poisson_disk(
@@ -254,16 +230,6 @@ def sample_mesh_poisson_disk(
     """
     found = poisson_disk(vertices, faces, np.arange(len(faces)), count, 0)
     return found.triangles, found.barycentric.astype(vertices.dtype)
-
-
-class Ignoring:
-    """Ignores all calls."""
-
-    def __init__(self, *arguments: Any, **options: Any):
-        pass
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda *arguments, **options: None
 
 
 RASTERIZER: dict[str, Any] = {
@@ -299,8 +265,8 @@ PACKAGES: dict[str, dict[str, Any]] = {
     },
     "point_cloud_utils": {
         "sample_mesh_poisson_disk": sample_mesh_poisson_disk,
-        "load_mesh_vf": _read_obj,
+        "load_mesh_vf": load_mesh,
     },
-    "torch.utils.tensorboard": {"SummaryWriter": Ignoring},
+    "torch.utils.tensorboard": {"SummaryWriter": Silent},
 }
 """Stand-in modules for packages that are not installed, by name."""

@@ -22,13 +22,14 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from . import blendshapes, rasterizer
+from . import blendshapes, meshes, rasterizer
+from .unused import OF_FLASHAVATAR, REPLACED, Silent
 
 
 def install(threads: int, code: str) -> None:
     """Install the shim for everything that is imported later.
 
-    ``code``: "bound splats" or "blendshapes", see `OfficialMethod.shimmed`. Packages that code imports optionally must
+    ``code``: "bound splats", "blendshapes" or "charted splats", see `OfficialMethod.shimmed`. Packages that code imports optionally must
     stay missing, so stand-ins are limited to the required ones.
     """
     torch.set_num_threads(threads)
@@ -36,8 +37,14 @@ def install(threads: int, code: str) -> None:
     _module("diff_gaussian_rasterization._C", blendshapes.RASTERIZER_KERNELS)
     _module("simple_knn")
     _module("simple_knn._C", {"distCUDA2": mean_square_distances, **blendshapes.NEIGHBOURS})
+    packages = {
+        "blendshapes": blendshapes.PACKAGES,
+        "charted splats": {**meshes.PACKAGES, **OF_FLASHAVATAR},
+    }
+    for name, content in REPLACED.items() if code == "charted splats" else ():
+        _module(name, content)
     # Imported by scripts, but not used: no mesh is drawn, no external OBJ file read and no LPIPS measured.
-    context = dict.fromkeys(("RasterizeCudaContext", "RasterizeGLContext"), blendshapes.Ignoring)
+    context = dict.fromkeys(("RasterizeCudaContext", "RasterizeGLContext"), Silent)
     unused: dict[str, dict[str, Any]] = {
         "nvdiffrast": {},
         "nvdiffrast.torch": context,
@@ -46,7 +53,7 @@ def install(threads: int, code: str) -> None:
         "iopath.common.file_io": {"PathManager": LocalPaths},
         "torchvision": {},
         "torchvision.models": {},
-        **(blendshapes.PACKAGES if code == "blendshapes" else {}),
+        **packages.get(code, {}),
     }
     for name, content in unused.items():
         if not _is_installed(name):
@@ -115,7 +122,7 @@ def _on_cpu(value: Any) -> Any:
     return "cpu" if isinstance(value, str | torch.device) and str(value).startswith("cuda") else value
 
 
-class _Event(blendshapes.Ignoring):
+class _Event(Silent):
     """A CUDA event that measures nothing."""
 
     def elapsed_time(self, other: Any) -> float:
