@@ -128,6 +128,13 @@ TRACKED = ConditionSpec(
     implementation="headbench.datasets.tracked_clip:with_tracking",
 )
 
+RIGID_HEAD = ConditionSpec(
+    name="rigid-head",
+    summary="Clip: the rotation of the neck moved into the motion of the head, as trackers without a neck joint have it.",
+    kind="clip",
+    implementation="headbench.datasets.steps.rigid:as_rigid_head",
+)
+
 IMPORT_TRACKING = CommandSpec(
     name="import tracking",
     group="data",

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from headbench.bench.engine.config import RunConfig
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.steps.for_method import as_single_video
 from headbench.datasets.steps.resolution import align_clip
+from headbench.datasets.steps.rigid import as_rigid_head
 
 from ..tiny_capture import projected
 
@@ -85,3 +87,27 @@ def test_pixel_steps_before_and_after_see_the_same_frames(clip):
     for key in before.clip.splits["self_reenactment"]:
         assert np.array_equal(before.clip.image(key), after.image(key))
         assert np.allclose(before.clip.cameras[key.camera].K, after.cameras[key.camera].K)
+
+
+def test_a_rigid_head_follows_no_neck(clip):
+    """Vertices that follow the neck fully stay where they were; those of the root move with the head."""
+    neck = np.array([0.1, -0.2, 0.05])
+    poses = {t: replace(pose, neck=neck * (1 + t), translation=neck) for t, pose in clip.poses.items()}
+    # Without correctives, since those of the neck go with its rotation.
+    head = replace(clip.head, pose_basis=np.zeros_like(clip.head.pose_basis))
+    turned = replace(clip, poses=poses, head=head)
+    rigid = as_rigid_head(turned, RunConfig(data="", out=""))
+    assert rigid.steps[-1].name == "as_rigid_head"
+    assert rigid.fingerprint != turned.fingerprint
+    subject = PosedSubject.of(turned)
+    weights = clip.head.skinning_weights
+    above, below = weights[:, 0] == 0, weights[:, 0] > 0.5
+    assert above.any()
+    assert below.any()
+    for timestep, pose in rigid.poses.items():
+        assert not pose.neck.any()
+        before, after = subject.meshes([turned.poses[timestep], pose])
+        moved = np.linalg.norm(after - before, axis=1)
+        assert moved[above].max() < 1e-6
+        assert moved[below].max() > 1e-3
+        assert np.array_equal(pose.jaw, turned.poses[timestep].jaw)
