@@ -29,6 +29,7 @@ SHIM = "headbench.methods.official.shim.cpu"
 SHIMMED = (
     *("diff_gaussian_rasterization", "simple_knn", "nvdiffrast"),
     *("pytorch3d", "point_cloud_utils", "torch.utils.tensorboard"),
+    *("lpips", "yacs", "loguru", "skimage"),
 )
 """Packages and modules that the shim replaces."""
 

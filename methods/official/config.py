@@ -141,6 +141,19 @@ class RGBAvatarOfficialConfig(OfficialConfig):
 
 @dataclass(frozen=True)
 class FlashAvatarOfficialConfig(OfficialConfig):
-    """FlashAvatar by its authors' code; the default commit is the one that the adapter was written for."""
+    """FlashAvatar by its authors' code; the default commit is the one that the adapter was written for.
+
+    Attributes
+    ----------
+    samples : int
+        With ``device=cpu-shim``, number of splats, about, on a head of another topology than FLAME's: they are those of the
+        native method with this setting. On FLAME's topology the authors' chart of 128 x 128 texels is used.
+    """
 
     commit: str = "2d4cb25ca9166b795c03692aec12114d595eff15"
+    samples: int = 13_500
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.samples < 1:
+            raise ValueError(f"samples must be at least 1, found {self.samples}")

@@ -46,6 +46,7 @@ class PartsMethod(OfficialMethod[Config]):
     """Renders a list by the launcher `parts`, which gives each render the number of its frame."""
 
     frame_line = r"^headbench: drawn (\d+)"
+    starts_launcher = False
 
     def command_of(self, calls: Sequence[RenderCall], drawn: str, work: Workplace) -> list[str]:
         """Write the launcher and its plan; return its command, for headbench's interpreter.

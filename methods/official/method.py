@@ -65,7 +65,7 @@ class OfficialMethod(ABC, Generic[Config]):
     version: ClassVar[str]
     config_class: ClassVar[Any]
     repository: ClassVar[Repository]
-    shimmed: ClassVar[Literal["", "bound splats", "blendshapes"]] = ""
+    shimmed: ClassVar[Literal["", "bound splats", "blendshapes", "charted splats"]] = ""
     """Kind of code for `shim`; "" if it does not support the repository."""
     variables: ClassVar[Mapping[str, str]] = {}
     """Environment variables of the authors' programs besides `process.environment`."""
@@ -85,6 +85,8 @@ class OfficialMethod(ABC, Generic[Config]):
     """File name of a render by its number in the list, according to the repository."""
     render_files: ClassVar[str] = "*"
     """Pattern of the names of renders, since the program may write other files into their folder."""
+    starts_launcher: ClassVar[bool] = True
+    """Whether a render command is started by the launcher of changed sources; False if the calls in it are."""
     excused: ClassVar[str] = ""
     """Regular expression of a line of a renderer that failed after all frames were rendered; "" for none."""
 
@@ -142,6 +144,10 @@ class OfficialMethod(ABC, Generic[Config]):
     def patches_to_render(self, folder: Path, checkout: Checkout) -> list[Patch]:
         """The same for rendering an avatar."""
         return []
+
+    def render_patches(self, folder: Path, checkout: Checkout) -> list[Patch]:
+        """`patches_to_render` with the shim, else none."""
+        return [] if self.config.device == "cuda" else self.patches_to_render(folder, checkout)
 
     def image_name(self, path: str) -> str:
         """Name of an exported image in their loader, by its position."""
@@ -378,9 +384,8 @@ class OfficialAvatar:
                 if drawn is not None:
                     progress(min(int(drawn[1]), len(frames)), len(frames))
 
-            shim = method.config.device != "cuda"
-            patches = method.patches_to_render(folder, work.checkout) if shim else []
-            command = method.launched(command, work, patches)
+            if method.starts_launcher:
+                command = method.launched(command, work, method.render_patches(folder, work.checkout))
             ended = method.run(command, work, folder / RENDERING_LOG, on_line, held)
             excused = method.excused and any(re.search(method.excused, line) for line in ended.lines)
             if ended.code and not excused:

@@ -145,5 +145,6 @@ FLASHAVATAR_OFFICIAL = MethodSpec(
     | {"paper": {"budget": FLASHAVATAR.presets["paper"]["budget"]}},
     head_models=("flame2020",),
     monocular=True,
+    conversion="published",
     **_paper_of(FLASHAVATAR),
 )

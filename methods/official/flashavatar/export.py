@@ -4,6 +4,9 @@ Of an identity NAME: ``metrical-tracker/output/NAME/checkpoint/00000.frame``, nu
 ``dataset/NAME/imgs/00001.jpg``, ``alpha/00001.jpg``, ``parsing/00001_neckhead.png`` and ``parsing/00001_mouth.png``,
 whose numbers are one higher. Images are PNG under these names; the loader recognises the format by the content. It
 takes identity, image size and focal lengths from frame 0, and the principal point to be the middle of the image.
+
+With the CPU shim, a head of another topology than FLAME's has a mesh file of its own, whose chart has one texel for each
+splat of the native method (`chart_of_points`).
 """
 
 from __future__ import annotations
@@ -14,15 +17,31 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from ....bench.contracts import ByteArray, Camera, Clip, FrameKey, HeadAsset, HeadPose, Progress
-from ....bench.io.files import grouped_writes, read_bytes, write_bytes
+from ....bench.contracts import (
+    ByteArray,
+    Camera,
+    Clip,
+    FloatArray,
+    FrameKey,
+    HeadAsset,
+    HeadPose,
+    IntArray,
+    Progress,
+)
+from ....bench.errors import InputError
+from ....bench.io.files import grouped_writes, read_bytes, write_bytes, write_text
 from ....bench.io.images import write_png
 from ....datasets.head.arrays import region
+from ....datasets.head.subject import PosedSubject
+from ...flashavatar.config import FlashAvatarConfig
+from ...flashavatar.training import points_of
 from ...insta.warp import mouth_triangles, touching
 from ...shared.avatar_files import Subject
+from ...shared.subject_mesh import SubjectMesh
+from ...shared.surface_points import SurfacePoints
 from ..checkout import Checkout
 from ..ga.export import mark
-from ..ga.head_files import MOST_TEMPLATE, pickled, read_obj
+from ..ga.head_files import MOST_TEMPLATE, OfficialHead, pickled, read_obj
 from ..ga.windows import around, inside
 from ..surface import VisibleMesh
 from ..video import FlameSubject, at_rest, frame_name, straight_rgba, training_frames, write_torch
@@ -47,29 +66,108 @@ BOUNDARY = "boundary"
 FULL = 255
 
 
-def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout) -> FlameSubject:
-    """The head model and one identity. Raises `InputError` for another topology than FLAME's, and without regions."""
-    vertices, _ = read_obj(checkout.folder / MESH_FILE)
+TEXEL_SIDE = 0.5
+"""Sides of a triangle of `chart_of_points`, texels: no other texel's centre lies in it."""
+SMALLEST_WEIGHT = 1e-4
+"""Smallest barycentric coordinate in `chart_of_points`, so that a texel's centre is inside its triangle also in float32."""
+
+
+def has_their_topology(head: HeadAsset, folder: Path) -> bool:
+    """Whether a head without its teeth has as many vertices as the mesh file of a checkout."""
+    vertices, _ = read_obj(folder / MESH_FILE)
+    return len(OfficialHead.numbered(head).order) == vertices
+
+
+def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout, *, own_chart: bool) -> FlameSubject:
+    """The head model and one identity. Raises `InputError` without regions, and for another topology than FLAME's.
+
+    With ``own_chart``, another topology has a chart of its own instead; its head model keeps its teeth.
+    """
     for name in (BOUNDARY, "lips"):
         region(head, name)
-    return FlameSubject.of(head, subject, vertices, MESH_FILE)
+    if not own_chart or has_their_topology(head, checkout.folder):
+        vertices, _ = read_obj(checkout.folder / MESH_FILE)
+        return FlameSubject.of(head, subject, vertices, MESH_FILE)
+    whole = OfficialHead(head, np.arange(len(head.template)), np.asarray(head.faces))
+    return FlameSubject(whole, subject, PosedSubject(head, subject.shape, subject.static_offset))
 
 
-def write_program(identity: Subject, head: HeadAsset, work: Workplace) -> FlameSubject:
+def write_program(
+    identity: Subject, head: HeadAsset, work: Workplace, *, own_chart: bool = False
+) -> FlameSubject:
     """Write their program and the files that it opens relative to its working directory or beside itself.
 
-    Returns the identity on the head model; raises the errors of `flame_subject`.
+    With ``own_chart``, the mesh file of another topology is left to `write_points`. Returns the identity on the head model;
+    raises the errors of `flame_subject`.
     """
     checkout, folder = work.checkout, work.program
-    subject = flame_subject(identity, head, checkout)
+    subject = flame_subject(identity, head, checkout, own_chart=own_chart)
+    theirs = not own_chart or has_their_topology(head, checkout.folder)
     paths = [path for pattern in SOURCES for path in sorted(checkout.folder.glob(pattern))]
-    for path in (*paths, *(checkout.folder / name for name in UNCHANGED)):
+    unchanged = [name for name in UNCHANGED if theirs or name != MESH_FILE]
+    for path in (*paths, *(checkout.folder / name for name in unchanged)):
         content = read_bytes(path, "a file of the program", MOST_TEMPLATE)
         write_bytes(folder / path.relative_to(checkout.folder), content)
     write_bytes(folder / MODEL_FILE, pickled(subject.model()))
-    write_bytes(folder / MASKS_FILE, pickled({BOUNDARY: subject.official.region(BOUNDARY)}))
+    # Splats of a chart of their own are those of the native method, of which none is left out.
+    border = subject.official.region(BOUNDARY) if theirs else np.zeros(0, np.int64)
+    write_bytes(folder / MASKS_FILE, pickled({BOUNDARY: border}))
     subject.official.write_eyelids(*(folder / name for name in EYELID_FILES))
     return subject
+
+
+def native_points(identity: Subject, head: HeadAsset, samples: int, seed: int) -> SurfacePoints:
+    """The splats of the native method with these settings on this identity."""
+    mesh = SubjectMesh(head, identity.shape, identity.static_offset, "cpu")
+    return points_of(head, mesh, FlashAvatarConfig(samples=samples), seed)
+
+
+def grid_of(samples: int) -> int:
+    """Texels of a side of a chart for about ``samples`` points, with room for a quarter more."""
+    return int(np.ceil(np.sqrt(1.25 * samples)))
+
+
+def write_points(head: HeadAsset, points: SurfacePoints, samples: int, work: Workplace) -> None:
+    """Write the mesh file of `chart_of_points`."""
+    vertices, faces = np.asarray(head.template), np.asarray(head.faces)[points.triangles]
+    write_text(
+        work.program / MESH_FILE, chart_of_points(vertices, faces, points.barycentric, grid_of(samples))
+    )
+
+
+def chart_of_points(vertices: FloatArray, faces: IntArray, barycentric: FloatArray, grid: int) -> str:
+    """An OBJ file whose chart has one texel for each point, row by row from the top.
+
+    A point's triangle of the mesh is listed once for the point, small in the chart and such that the centre of the texel has
+    the point's barycentric coordinates.
+
+    Parameters
+    ----------
+    vertices, faces, barycentric : FloatArray, IntArray, FloatArray
+        (V, 3) metres; (P, 3) triangle and (P, 3) barycentric coordinates of each point.
+    grid : int
+        Texels of a side.
+
+    Raises
+    ------
+    InputError
+        There are more points than texels.
+    """
+    if len(faces) > grid**2:
+        raise InputError("head model", "points", f"at most {grid**2}, as many as texels", str(len(faces)))
+    row, column = np.divmod(np.arange(len(faces)), grid)
+    centers = np.column_stack([column + 0.5, grid - 0.5 - row])
+    weights = np.maximum(barycentric, SMALLEST_WEIGHT)
+    weights /= weights.sum(1, keepdims=True)
+    around = weights[:, 1:]  # where the point is in the triangle (0, 0), (1, 0), (0, 1)
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) - around[:, None]
+    uv = (centers[:, None] + TEXEL_SIDE * corners) / grid
+    lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices]
+    lines += ["vt {:.9f} {:.9f}".format(*corner) for corner in uv.reshape(-1, 2)]
+    at = np.arange(3 * len(faces)).reshape(-1, 3) + 1
+    numbers = np.stack([faces + 1, at], axis=2).reshape(-1, 6)
+    lines += ["f {}/{} {}/{} {}/{}".format(*six) for six in numbers]
+    return "\n".join(lines) + "\n"
 
 
 class ParsingMasks:

@@ -5,16 +5,17 @@ Xiang et al., "FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Em
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
-from ....bench.contracts import Clip, Frame, FrameKey, Progress
+from ....bench.contracts import Clip, Frame, FrameKey, HeadAsset, Progress
 from ....bench.errors import InputError
 from ....bench.io.documents import read_json
 from ....bench.io.files import write_json
-from ...shared.avatar_files import SUBJECT_FILE, Subject
+from ...shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head
 from ...shared.loop import Fit
 from ..checkout import Checkout, Repository
 from ..config import FlashAvatarOfficialConfig
@@ -26,11 +27,22 @@ from ..method import read_identity
 from ..spec import FLASHAVATAR_OFFICIAL
 from ..video import check_masks, check_one_camera
 from ..workplace import Listed, Patch, Workplace, copy_file, is_white, opaque, read_sized
-from .export import EYELID_FILES, MESH_FILE, flame_subject, write_list, write_program, write_training
+from .export import (
+    EYELID_FILES,
+    MESH_FILE,
+    flame_subject,
+    grid_of,
+    has_their_topology,
+    native_points,
+    write_list,
+    write_points,
+    write_program,
+    write_training,
+)
 
 NAME, LOG = "head", "log"
 CHECKPOINT_FILE, OPTIONS_FILE = "chkpnt.pth", "options.json"
-LOADER = "scene/__init__.py"
+LOADER, MODEL = "scene/__init__.py", "src/deform_model.py"
 PART = 500
 """Maximum number of frames in one call, whose images are in the GPU's memory; as many as their test split has."""
 PICTURES: Patch = (
@@ -55,6 +67,17 @@ RENDERING_CHANGES: tuple[Patch, ...] = (
     ),
 )
 """Every frame of the list is rendered, and written as PNG instead of a video that loses detail."""
+ORDER: Patch = (
+    "train.py",
+    "viewpoint_stack.pop(random.randint(0, len(viewpoint_stack)-1))",
+    "scene.getCameras()[int(images_in_order[iteration - 1])]",
+)
+"""They draw a frame at random; it is replaced by the next of the given order."""
+NUMBERS = {
+    "range": (r"range\((\d+)\)", "range({})"),
+    "uv_size": (r"self\.uv_size = (\d+)", "self.uv_size = {}"),
+}
+"""Texts with the numbers of vertices and of texels of a side, which the CPU shim replaces for another topology."""
 SHRINK = """
 import sys, torch
 path = sys.argv[1]
@@ -62,8 +85,11 @@ network, splats, iteration = torch.load(path)
 def lean(part):
     return {**part, "state": {}} if isinstance(part, dict) and "param_groups" in part else part
 torch.save((tuple(map(lean, network)), tuple(map(lean, splats)), iteration), path)
+print("headbench:", len(splats[1]), "splats")
 """
-"""Removes the state of both optimisers, two thirds of the file, from a checkpoint, since rendering takes no step."""
+"""Removes the state of both optimisers, two thirds of the file, from a checkpoint, since rendering takes no step, and tells the
+number of splats."""
+SPLATS = re.compile(r"^headbench: (\d+) splats$", re.MULTILINE)
 _DRAWN = r"drawn (\d+)"
 _white = partial(is_white, other=(0.0, 1.0, 0.0), known="white, or green (0, 1, 0)")
 
@@ -71,7 +97,7 @@ FLASHAVATAR_REPOSITORY = Repository(
     "https://github.com/USTC3DV/FlashAvatar-code",
     FlashAvatarOfficialConfig().commit,
     (
-        *("train.py", "test.py", LOADER, "src/deform_model.py", "flame/flame_mica.py"),
+        *("train.py", "test.py", LOADER, MODEL, "flame/flame_mica.py"),
         *(path.as_posix() for path in (MESH_FILE, *EYELID_FILES)),
     ),
     (
@@ -90,15 +116,16 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
 
     name, version = FLASHAVATAR_OFFICIAL.name, FLASHAVATAR_OFFICIAL.version
     config_class, repository = FlashAvatarOfficialConfig, FLASHAVATAR_REPOSITORY
-    changes = CHANGES
+    shimmed = "charted splats"
+    changes, order_changes = CHANGES, (ORDER,)
     iteration_line = r"^step: (\d+), huber: ([\d.]+|nan|inf)"
     avatar_files = (CHECKPOINT_FILE, OPTIONS_FILE, SUBJECT_FILE)
     # Frames and checkpoints contain more than tensors, which newer versions of torch read only if requested.
     variables: ClassVar[Mapping[str, str]] = {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
-        """Refuse a clip without masks, on another background, of several intrinsics or too many frames, and a head that is
-        not FLAME's or lacks regions."""
+        """Refuse a clip without masks, on another background, of several intrinsics or too many frames, and a head that lacks
+        regions or, without the CPU shim, is not FLAME's."""
         where = f"clip {clip.subject}"
         check_masks(clip)
         _white(clip.background, where)
@@ -109,22 +136,61 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
         if len(clip.splits["train"]) > most:
             expected = f"at most {most} training frames, as many as their loader reads"
             raise InputError(where, "train", expected, f"{len(clip.splits['train'])}")
-        flame_subject(Subject.of(clip), clip.head, checkout)
+        flame_subject(Subject.of(clip), clip.head, checkout, own_chart=self._shim)
+
+    def check_length(self, iterations: int, checkout: Checkout) -> None:
+        """Refuse a run with the CPU shim in which their perceptual loss is used."""
+        most = int(checkout.constant("train.py", r"mid_num = (\d+)", "mid_num"))
+        if self._shim and iterations > most:
+            expected = f"at most {most} with device=cpu-shim, which has no perceptual loss"
+            raise InputError(f"settings.{self.name}", "budget.iterations", expected, f"{iterations}")
+
+    @property
+    def _shim(self) -> bool:
+        return self.config.device != "cuda"
+
+    def _has_own_chart(self, head: HeadAsset, folder: Path) -> bool:
+        return self._shim and not has_their_topology(head, folder)
 
     def export(self, clip: Clip, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
         """Write the training frames as an identity, and their program with the files that it opens."""
-        return write_training(clip, write_program(Subject.of(clip), clip.head, work), NAME, work, progress)
+        subject = write_program(Subject.of(clip), clip.head, work, own_chart=self._shim)
+        return write_training(clip, subject, NAME, work, progress)
 
     def train_command(self, fit: Fit, work: Workplace) -> list[str]:
         """Their script; its output folder inside the identity's is a link to ``model``."""
         link = work.program / "dataset" / NAME / LOG
         link.unlink(missing_ok=True)
         link.symlink_to(Path("../../..") / work.model.name)
+        self._write_points(Subject.of(fit.clip), fit.clip.head, fit.seed, work)
         camera = inside(check_one_camera(fit.clip)).camera
         options = ["--idname", NAME, "--image_res", str(camera.width), "--seed", str(fit.seed)]
         options += ["--iterations", str(fit.budget.iterations)]
         ground = _flags(_white(fit.clip.background, f"clip {fit.clip.subject}"))
         return [*work.checkout.python, str(work.program / "train.py"), *options, *ground]
+
+    def _write_points(self, identity: Subject, head: HeadAsset, seed: int, work: Workplace) -> None:
+        """Write the mesh file of another topology, which depends on the seed."""
+        if self._has_own_chart(head, work.checkout.folder):
+            samples = self.config.samples
+            write_points(head, native_points(identity, head, samples, seed), samples, work)
+
+    def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
+        """Numbers of vertices and texels for another topology."""
+        if not self._has_own_chart(head, checkout.folder):
+            return []
+        numbers = len(head.template), grid_of(self.config.samples)
+        theirs = (int(checkout.constant(MODEL, pattern, name)) for name, (pattern, _) in NUMBERS.items())
+        texts = [text for _, text in NUMBERS.values()]
+        return [(MODEL, text.format(old), text.format(new)) for text, old, new in zip(texts, theirs, numbers)]
+
+    def patches_to_render(self, folder: Path, checkout: Checkout) -> list[Patch]:
+        """The same."""
+        return self.patches(read_shared_head(folder), 0, checkout)
+
+    def image_name(self, path: str) -> str:
+        """The index of a frame, which is one less than the number of its images."""
+        return str(int(Path(path).stem.partition("_")[0]) - 1)
 
     def shrink_command(self, fit: Fit, work: Workplace) -> list[str] | None:
         """Run in their interpreter, on the device to which tensors are loaded."""
@@ -134,21 +200,25 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
         """The checkpoint, and the background of the training, which their renderer needs as an option."""
         copy_file(_checkpoint(fit, work), fit.out / CHECKPOINT_FILE)
         white = _white(fit.clip.background, f"clip {fit.clip.subject}")
-        write_json(fit.out / OPTIONS_FILE, {"white_background": white})
+        write_json(fit.out / OPTIONS_FILE, {"white_background": white, "seed": fit.seed})
 
     def render_command(
         self, folder: Path, frames: Sequence[Listed], background: Sequence[float], work: Workplace
     ) -> list[str]:
         """Write the frames of each camera's intrinsics as an identity."""
         white = _white(background, "render")
-        if white != bool(read_json(folder / OPTIONS_FILE).get("white_background")):
+        trained = read_json(folder / OPTIONS_FILE)
+        if white != bool(trained.get("white_background")):
             expected = "the background that it was trained on; their renders have no coverage"
             raise InputError(folder, "background", expected, str(tuple(background)))
         for frame in frames:
             check_square_pixels(frame.camera, "render")
-        subject = write_program(*read_identity(folder), work)
+        identity, head = read_identity(folder)
+        subject = write_program(identity, head, work, own_chart=self._shim)
+        self._write_points(identity, head, trained.get("seed", 0), work)
         script = [*work.checkout.python, str(work.program / "test.py")]
-        command = self.launched(script, work, RENDERING_CHANGES)
+        patches = [*RENDERING_CHANGES, *self.render_patches(folder, work.checkout)]
+        command = self.launched(script, work, patches)
         calls = []
         for index, part in enumerate(in_parts(frames, same_intrinsics, PART)):
             name = f"part_{index:04d}"
@@ -185,6 +255,11 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
         if (window.width, window.height) != (camera.width, camera.height):
             differences.append(
                 "their code assumes the principal point in the middle of the image: images are cropped accordingly"
+            )
+        if self._has_own_chart(clip.head, Path(self.config.checkout).expanduser()):
+            differences.append(
+                "the head has another topology than FLAME's: their chart is replaced by one with a texel for each splat of the "
+                + "native method, on the head with its teeth and its border"
             )
         return differences + padding_remarks(clip.head)
 

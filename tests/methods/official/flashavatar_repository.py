@@ -36,7 +36,7 @@ def tensor(path):
 
 class Scene_mica:
     def __init__(self, datadir, mica_datadir, train_type, white_background):
-        self.bg_image = torch.zeros((3, 512, 512))
+        self.bg_image = np.asarray(torch.zeros((3, 512, 512)))
         self.bg_image[:] = np.reshape([white_background, 1, white_background], (3, 1, 1))
         checkpoints = os.path.join(mica_datadir, "checkpoint")
         self.N_frames = len(os.listdir(checkpoints))
@@ -50,6 +50,9 @@ class Scene_mica:
         self.width, self.height = first["img_size"]
         self.K = first["opencv"]["K"][0]
         self.cameras = [self.load(number, checkpoints, datadir) for number in numbers]
+
+    def getCameras(self):
+        return self.cameras
 
     def load(self, number, checkpoints, folder):
         frame = read(os.path.join(checkpoints, "%05d.frame" % number))
@@ -65,11 +68,12 @@ class Scene_mica:
 """
 
 COMMON = """
-import argparse, os, sys, time
+import argparse, os, random, sys, time
 import cv2
 import numpy as np
 from pickle import load
 from scene import Scene_mica
+from src.deform_model import Chart
 
 here = os.path.dirname(os.path.abspath(__file__))
 behaviour = BEHAVIOUR
@@ -79,7 +83,11 @@ with open("flame/generic_model.pkl", "rb") as stream:
 with open("flame/FLAME_masks/FLAME_masks.pkl", "rb") as stream:
     boundary = load(stream, encoding="latin1")["boundary"]
 vertices = len(head["v_template"])
-assert 0 < len(boundary) < vertices and boundary.max() < vertices
+chart = Chart()
+assert chart.vertices == vertices
+listed = [line for line in open("flame/FlameMesh.obj") if line.startswith("f ")]
+print("chart of", chart.uv_size, "for", len(listed), "triangles without", len(boundary), "of", vertices)
+assert len(boundary) < vertices and (not len(boundary) or boundary.max() < vertices)
 assert head["shapedirs"].shape == (vertices, 3, 400)
 for side in "lr":
     assert np.load(os.path.join(here, "flame/blendshapes", side + "_eyelid.npy")).shape == (vertices, 3)
@@ -96,6 +104,13 @@ data = os.path.join("dataset", args.idname)
 tracked = os.path.join("metrical-tracker/output", args.idname)
 """
 
+MODEL = """
+class Chart:
+    def __init__(self):
+        self.uv_size = 128
+        self.vertices = len(range(5023))
+"""
+
 TRAIN = """
 log = os.path.join(data, "log")
 print("finds", sorted(os.listdir(log)))
@@ -104,8 +119,14 @@ for name in ("train", "ckpt"):
 scene = Scene_mica(data, tracked, 0, args.white_background)
 opt = argparse.Namespace(iterations=int(args.iterations))
 print("options", args.seed, len(scene.cameras), "corner", [int(255 * level) for level in scene.cameras[0][0][:, 0, 0]])
+mid_num = 15000
+viewpoint_stack = []
 for iteration in range(1, opt.iterations + 1):
-    image = scene.cameras[0][0]
+    if not viewpoint_stack:
+        viewpoint_stack = scene.getCameras().copy()
+    viewpoint_cam = viewpoint_stack.pop(random.randint(0, len(viewpoint_stack)-1))
+    image, shown = viewpoint_cam
+    print("draws %.6f" % shown["flame"]["eyelids"][0, 0], np.round(shown["opencv"]["t"][0], 3).tolist())
     if iteration % 500 == 0 or iteration==1:
         save_image = np.zeros((args.image_res, args.image_res*2, 3))
         save_image[:, :args.image_res, :] = image.transpose(1, 2, 0)
@@ -157,8 +178,8 @@ def make_flashavatar_repository(folder: Path, vertices: int) -> str:
     (folder / "test.py").write_text(common + TEST)
     (folder / "torch.py").write_text(TORCH)
     (folder / "scene/__init__.py").write_text(SCENE)
-    for name in ("src/deform_model.py", "flame/flame_mica.py"):
-        (folder / name).write_text("")
+    (folder / "flame/flame_mica.py").write_text("")
+    (folder / "src/deform_model.py").write_text(MODEL.replace("5023", str(vertices)))
     (folder / "flame/FlameMesh.obj").write_text("vt 0 0\nvn 0 0 1\n" + "v 0 0 0\n" * vertices)
     for name in ("landmark_embedding.npy", "mediapipe/mediapipe_landmark_embedding.npz"):
         (folder / "flame" / name).write_bytes(b"landmarks")

@@ -100,7 +100,7 @@ def test_renders_that_are_not_what_was_listed_are_found(method, clip, behave, tm
 
 # ------------------------------------------------------------------ settings
 
-NO_SHIM = ("gha", "insta", *OF_VIDEO)
+NO_SHIM = ("gha", "insta", "rgbavatar")
 REPOSITORIES = {
     "insta": "Zielon/INSTA .*built as its installation page says",
     "rgbavatar": "gapszju/RGBAvatar",

@@ -1,7 +1,9 @@
 """FlashAvatar's adapter: images, masks and numbers that their loader reads, texts changed, renders read back by key."""
 
+import re
 import subprocess
 import sys
+import tempfile
 from dataclasses import replace
 
 import numpy as np
@@ -12,18 +14,27 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.images import read_pixels
 from headbench.bench.process import ProgramError
-from headbench.datasets.head.subject import pose_in_head_frame
+from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
 from headbench.methods.official import needs
 from headbench.methods.official.config import FlashAvatarOfficialConfig
 from headbench.methods.official.flashavatar import method as implementation
-from headbench.methods.official.flashavatar.export import ParsingMasks, flame_subject, image_names
-from headbench.methods.official.flashavatar.method import FLASHAVATAR_REPOSITORY, SHRINK
+from headbench.methods.official.flashavatar.export import (
+    ParsingMasks,
+    chart_of_points,
+    flame_subject,
+    grid_of,
+    image_names,
+    native_points,
+)
+from headbench.methods.official.flashavatar.method import FLASHAVATAR_REPOSITORY, SHRINK, SPLATS
 from headbench.methods.official.ga.windows import inside
-from headbench.methods.official.method import TRAINING_LOG
+from headbench.methods.official.method import RENDERING_LOG, TRAINING_LOG
+from headbench.methods.official.shim.meshes import Mesh, load_obj, rasterize_meshes
 from headbench.methods.official.surface import VisibleMesh
 from headbench.methods.official.video import training_frames
 from headbench.methods.official.workplace import check_export
 from headbench.methods.shared.avatar_files import Subject
+from headbench.methods.shared.schedule import ShuffledEpochs
 
 from .flashavatar_repository import FlashAvatarStandIn
 from .repository import (
@@ -130,7 +141,7 @@ def test_images_are_the_frames_around_the_principal_point(exported, video_clip):
 def test_masks_of_head_and_mouth_are_those_of_the_mesh(method, video_clip):
     """Of triangles that nothing is in front of: lips are mouth, the forehead is head alone, the boundary neither."""
     head = video_clip.head
-    subject = flame_subject(Subject.of(video_clip), head, method.inspect())
+    subject = flame_subject(Subject.of(video_clip), head, method.inspect(), own_chart=False)
     masks = ParsingMasks(head, subject)
     frames = [
         frame
@@ -169,6 +180,87 @@ def test_mesh_and_sources_are_theirs(exported, repository):
     work, _ = exported
     for name in ("flame/FlameMesh.obj", "scene/__init__.py", "train.py"):
         assert (work.program / name).read_bytes() == (repository[0] / name).read_bytes()
+
+
+# ------------------------------------------------------------------ the CPU shim
+
+
+@pytest.fixture
+def shimmed(method, repository):
+    """The method on a CPU, with the native method's order, and a checkout whose mesh is not that of the clip's head."""
+    path = repository[0] / "flame/FlameMesh.obj"
+    path.write_text(path.read_text() + "v 0 0 0\n")
+    (repository[0] / "torch.py").unlink()  # the shim needs the real one
+    config = replace(method.config, device="cpu-shim", order="native", samples=200)
+    return type(method)(config)
+
+
+def test_another_topology_has_a_chart_of_its_own(shimmed, repository, video_clip, tmp_path):
+    avatar = fit(shimmed, video_clip, tmp_path / "a", seed=1)
+    log = (tmp_path / "a" / TRAINING_LOG).read_text()
+    points = native_points(Subject.of(video_clip), video_clip.head, 200, 1)
+    count, vertices = len(points.triangles), len(video_clip.head.template)
+    assert f"chart of 16 for {count} triangles without 0 of {vertices}" in log
+    # Eyelids and cameras of each image that was drawn, against the order of the native method.
+    keys = video_clip.splits["train"]
+    frames = {f.key: f for f in training_frames(video_clip, PosedSubject.of(video_clip))}
+    sampler = ShuffledEpochs(len(keys), 1)
+    drawn = re.findall(r"^draws ([\d.]+) \[([^]]*)\]", log, re.MULTILINE)
+    assert len(drawn) == 20
+    for iteration, (lids, place) in enumerate(drawn, start=1):
+        frame = frames[keys[sampler(iteration)]]
+        camera = inside(frame.camera).camera
+        assert float(lids) == pytest.approx(frame.pose.eyelids[0], abs=1e-6)
+        assert [float(v) for v in place.split(",")] == pytest.approx(camera.world_to_camera[:3, 3], abs=1e-3)
+    told = " ".join(read_json(tmp_path / "a" / "training.json")["differences"])
+    for word in ("cpu-shim", "native method draws", "another topology", "'self.uv_size = 128' read as"):
+        assert word in told
+    wanted = views(video_clip, "novel_view")
+    rendered(avatar, wanted)
+    assert f"for {count} triangles" in (tmp_path / "a" / RENDERING_LOG).read_text()
+
+
+def test_a_chart_of_points_has_them_as_its_texels(video_clip):
+    """By the shim's reader and rasteriser, as the authors' code calls them."""
+    head = video_clip.head
+    points = native_points(Subject.of(video_clip), head, 300, 0)
+    weights = points.barycentric.copy()
+    weights[0] = 0.3, 0.7, 0.0  # on an edge
+    grid = grid_of(300)
+    faces = np.asarray(head.faces)[points.triangles]
+    text = chart_of_points(np.asarray(head.template), faces, weights, grid)
+    with tempfile.NamedTemporaryFile("w", suffix=".obj") as stream:
+        stream.write(text)
+        stream.flush()
+        vertices, found, extra = load_obj(stream.name)
+    assert np.abs(vertices.numpy() - head.template).max() < 1e-8
+    assert np.array_equal(found.verts_idx.numpy(), faces)
+    coordinates = 2 * extra.verts_uvs - 1
+    coordinates[:, 1] *= -1
+    flat = torch.cat([-coordinates, torch.ones(len(coordinates), 1)], dim=1)
+    triangles, _, barycentric, _ = rasterize_meshes(
+        Mesh(flat[None], found.textures_idx[None]), image_size=grid
+    )
+    hit = triangles.flatten() >= 0
+    assert torch.equal(triangles.flatten()[hit], torch.arange(len(faces)))
+    assert np.abs(barycentric.view(-1, 3)[hit].numpy() - weights).max() < 2e-4
+    with pytest.raises(InputError, match="at most 256, as many as texels"):
+        chart_of_points(np.asarray(head.template), faces, weights, 16)
+
+
+def test_flame_s_topology_keeps_their_chart(method, repository, video_clip, tmp_path):
+    (repository[0] / "torch.py").unlink()
+    shimmed = type(method)(replace(method.config, device="cpu-shim"))
+    fit(shimmed, video_clip, tmp_path / "a")
+    border = len(video_clip.head.regions["boundary"])
+    log = (tmp_path / "a" / TRAINING_LOG).read_text()
+    assert f"chart of 128 for 0 triangles without {border} of" in log
+
+
+def test_runs_with_their_perceptual_loss_are_refused_on_a_cpu(shimmed, video_clip):
+    shimmed.check(video_clip, replace(BUDGET, iterations=15_000))
+    with pytest.raises(InputError, match="at most 15000 with device=cpu-shim, which has no perceptual loss"):
+        shimmed.check(video_clip, replace(BUDGET, iterations=15_001))
 
 
 # ------------------------------------------------------------------ what happens where it fails
@@ -224,7 +316,9 @@ def test_checkpoints_lose_their_optimisers_and_nothing_else(tmp_path):
     torch.save((state, (3, *splats, second.state_dict(), 0), 20), path)
     before = [value.detach().clone() for value in (*network, *splats)]
     size = path.stat().st_size
-    subprocess.run([sys.executable, "-c", SHRINK, str(path)], check=True)
+    command = [sys.executable, "-c", SHRINK, str(path)]
+    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert SPLATS.search(f"before\n{said}")[1] == "3"
     (net, lean), (degree, *found, leaner, scale), iteration = torch.load(path, weights_only=True)
     assert path.stat().st_size < size
     assert (degree, scale, iteration) == (3, 0, 20)
