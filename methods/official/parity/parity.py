@@ -14,10 +14,10 @@ from typing import Any
 from scipy.stats import t as student_t
 
 from ....bench.benchmarks import table as aligned
-from ....bench.condition import PLAIN
+from ....bench.condition import Condition, Named, label_of
 from ....bench.configuration import build
 from ....bench.contracts import Progress, no_progress
-from ....bench.engine.config import RunConfig, parse_size, resolve_methods
+from ....bench.engine.config import RunConfig, parse_size, resolve_cells
 from ....bench.engine.run import check_settings, run
 from ....bench.engine.scoring import FULL
 from ....bench.engine.store import RunFolder
@@ -31,17 +31,40 @@ from ....bench.registry import get
 from ....bench.rows import Rows
 from ....bench.specs import CommandResult
 from ....bench.streams import on_terminal
+from ...flashavatar.config import FlashAvatarConfig
 from ...shared.config import PAPER_ITERATIONS, SplatTraining
 from ...shared.schedule import DensifySchedule, Timeline
+from ..flashavatar.method import SPLATS
+from ..method import TRAINING_LOG
 from .settings import ParitySettings
 
-OFFICIAL = {"ga": "ga-official", "gbs": "gbs-official", "ours": "tga-official"}
+OFFICIAL = {
+    "flashavatar": "flashavatar-official",
+    "ga": "ga-official",
+    "gbs": "gbs-official",
+    "ours": "tga-official",
+}
+SAMPLES = {"flashavatar": FlashAvatarConfig().samples, "gbs": 5_000}
+"""Default numbers of splats."""
 METRICS = {"psnr": "dB", "ssim": ""}
 TASKS = ("novel_view", "self_reenactment")
 CONFIDENCE = 0.95
 _VERTICES = re.compile(rb"element vertex (\d+)")
 
+_RIGID: dict[str, Any] = {
+    "clip": Named("rigid-head"),
+    "conditions": (Condition("as-tracked", as_tracked=True),),
+}
+"""Both get the capture's head model and views, and poses without rotation of the neck, which the official code does not have."""
 CAUSES = {
+    "flashavatar": (
+        "random numbers besides the order: the network at the start",
+        "initial sizes: official by neighbours in the first frame with the network's offsets, native on the neutral mesh",
+        "official masks of the mouth are where the mesh shows it, native ones the convex hull of the lips",
+        "official images are masked by head and neck; native ones are not",
+        "the network's optimiser has an epsilon of 1e-8 in the official code, 1e-15 in the native method",
+        "splats nearer than 0.2 m are left out by theirs, than 0.01 m by ours",
+    ),
     "ga": (
         "random numbers besides the order: positions of the children of split splats, initial colours",
         "splats nearer than 0.2 m are left out by theirs, than 0.01 m by ours",
@@ -103,23 +126,25 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
     """Train and score both methods, and write the table of their differences; see the command."""
     out = Path(settings.out)
     config = run_config(settings, out)
-    methods = resolve_methods(config)
-    check_settings((method, PLAIN) for method in methods)
+    found = resolve_cells(config)
+    check_settings(found)
     check_executor(settings.execution, config.device)
-    native, official = (method.spec.name for method in methods)
+    native, official = (method.spec.name for method, _ in found)
+    condition = found[0][1].name
     with log_to_file(out / "parity.log"):
         if settings.data is None:
             _make_capture(settings, out, progress)
         rows = run(config, settings.execution)
-    differences = differences_of(rows, native, official, config.seeds)
+    differences = differences_of(rows, native, official, config.seeds, condition)
+    run_folder = RunFolder(Path(config.out))
     cells = {
-        name: _cells(RunFolder(Path(config.out)), rows, name, config.seeds) for name in (native, official)
+        name: _cells(run_folder, rows, label_of(name, condition), config.seeds) for name in (native, official)
     }
     changed = sorted({line for cell in cells[official] for line in cell["differences"]})
     causes = [*CAUSES[settings.method], *changed]
-    found = (settings, native, official, differences, cells, causes, rows)
-    write_text(out / "parity.md", _text(*found))
-    text = _text(*found, markdown=not on_terminal())
+    parts = (settings, native, official, differences, cells, causes, rows)
+    write_text(out / "parity.md", _text(*parts))
+    text = _text(*parts, markdown=not on_terminal())
     data = {
         "native": native,
         "official": official,
@@ -150,8 +175,11 @@ def run_config(settings: ParitySettings, out: Path) -> RunConfig:
     }
     if settings.commit is not None:
         of_theirs["commit"] = settings.commit
+    samples = settings.samples or SAMPLES.get(settings.method, 0)
     if settings.method == "gbs":
-        of_theirs["arguments"] = ("--init_face_point_number", str(settings.samples))
+        of_theirs["arguments"] = ("--init_face_point_number", str(samples))
+    if settings.method == "flashavatar":
+        of_theirs["samples"] = samples
     of_both = {"budget": {"iterations": settings.iterations}}
     values = {
         "data": settings.data or str(_capture(out)),
@@ -165,8 +193,9 @@ def run_config(settings: ParitySettings, out: Path) -> RunConfig:
         "frames_per_task": settings.frames,
         "device": "cuda" if settings.device == "cuda" else "cpu",
         "reader_settings": {} if settings.head is None else {"head": settings.head},
+        **(_RIGID if settings.method == "flashavatar" else {}),
         "settings": {
-            settings.method: {**of_both, **as_theirs(settings.method, settings.iterations, settings.samples)},
+            settings.method: {**of_both, **as_theirs(settings.method, settings.iterations, samples)},
             official: {**of_both, **of_theirs},
         },
     }
@@ -176,10 +205,12 @@ def run_config(settings: ParitySettings, out: Path) -> RunConfig:
 def as_theirs(native: str, iterations: int, samples: int) -> dict[str, Any]:
     """Settings that make a native run of any length equivalent to the run of the authors' program.
 
-    ``samples`` is the initial number of splats of gbs. The authors' program raises the harmonics' degree every 1,000
-    iterations regardless of the length, removes large splats from the first regular reset of opacities, has lines in
+    ``samples`` is the initial number of splats of gbs, and that of flashavatar. The authors' program raises the harmonics' degree
+    every 1,000 iterations regardless of the length (flashavatar: 500), removes large splats from the first regular reset of opacities, has lines in
     the whole head (those of ours), and here uses all images equally often.
     """
+    if native == "flashavatar":
+        return {"min_sh_every": FlashAvatarConfig().sh_every, "samples": samples}
     if native == "gbs":
         errors = {"correctives_variant": "official", "lower_teeth_variant": "official"}
         return {"min_sh_every": 1_000, "samples": samples, "teeth_samples": samples // 10, **errors}
@@ -193,12 +224,16 @@ def as_theirs(native: str, iterations: int, samples: int) -> dict[str, Any]:
     return {**settings, "sampling": {"balanced": False}, "lines": {"bounds": "head"}}
 
 
-def differences_of(rows: Rows, native: str, official: str, orders: Sequence[int]) -> list[Difference]:
-    """Differences by task and metric, over the subjects and orders for which both have values."""
+def differences_of(
+    rows: Rows, native: str, official: str, orders: Sequence[int], condition: str = ""
+) -> list[Difference]:
+    """Differences by task and metric, over the subjects and orders for which both have values under a condition."""
     found = []
     for task in TASKS:
         for metric in METRICS:
-            of_native, of_official = (_means(rows, name, task, metric) for name in (native, official))
+            of_native, of_official = (
+                _means(rows, name, task, metric, condition) for name in (native, official)
+            )
             both = sorted(pair for pair in of_native.keys() & of_official.keys() if pair[1] in orders)
             if not both:
                 continue
@@ -210,9 +245,10 @@ def differences_of(rows: Rows, native: str, official: str, orders: Sequence[int]
     return found
 
 
-def _means(rows: Rows, method: str, task: str, metric: str) -> dict[tuple[str, int], float]:
+def _means(rows: Rows, method: str, task: str, metric: str, condition: str) -> dict[tuple[str, int], float]:
     """Mean over frames, then sequences, by subject and order."""
-    table = rows.select(method=method, metric=metric, task=task, region=FULL, seeds=rows.seeds(method))
+    asked = {"method": method, "metric": metric, "task": task, "region": FULL, "condition": condition}
+    table = rows.select(**asked, seeds=rows.seeds(method))
     by = ["subject", "seed"]
     whole = table.groupby(by)["status"].transform(lambda status: set(status) == {"ok"})
     means = table[whole.astype(bool)].groupby([*by, "sequence"])["value"].mean().groupby(by).mean()
@@ -262,10 +298,11 @@ def _cells(run_folder: RunFolder, rows: Rows, method: str, orders: Sequence[int]
 
 
 def _splats(folder: Path) -> int | None:
-    """Number of splats in an avatar's GaussianAvatars file; None without such a file."""
-    path = folder / "point_cloud.ply"
+    """Number of splats in an avatar's GaussianAvatars file, or as FlashAvatar's log tells it; None without both."""
+    path, log = folder / "point_cloud.ply", folder / TRAINING_LOG
     if not path.is_file():
-        return None
+        told = SPLATS.search(log.read_text(errors="replace")) if log.is_file() else None
+        return None if told is None else int(told[1])
     with path.open("rb") as stream:
         match = _VERTICES.search(stream.read(4096))
     return None if match is None else int(match[1])

@@ -11,6 +11,9 @@ from ....bench.engine.config import parse_size
 from ....bench.executors.options import ExecutionOptions
 from ....bench.options import DependentOptions
 
+WITHOUT_PERCEPTUAL_LOSS = 15_000
+"""Iterations up to which the authors' code of FlashAvatar has no perceptual loss, which the native method never has."""
+
 
 @dataclass(frozen=True)
 class ParitySettings(ExecutionOptions):
@@ -21,7 +24,7 @@ class ParitySettings(ExecutionOptions):
     orders, or a training failed.
     """
 
-    method: tyro.conf.Positional[Literal["ga", "gbs", "ours"]]
+    method: tyro.conf.Positional[Literal["flashavatar", "ga", "gbs", "ours"]]
     """The native method. The authors' code of method ours is TensorialGaussianAvatar (`tga-official`)."""
 
     checkout: str
@@ -59,8 +62,9 @@ class ParitySettings(ExecutionOptions):
     tolerance: float = 0.3
     """Difference of PSNR, in decibels, within which the two count as equivalent; also the limit of the mean difference."""
 
-    samples: int = 5_000
-    """Initial number of splats on the head, for gbs; published: 50,000, whose differences for each expression take gigabytes."""
+    samples: int | None = None
+    """Number of splats on the head. gbs: initial number, 5,000 by default; published: 50,000, whose differences for each expression
+    take gigabytes. flashavatar: 13,500 by default, as published; others only on heads of another topology than FLAME's."""
 
     subjects: int = 2
     """Heads of the synthetic capture; both methods are trained on each with every order."""
@@ -76,15 +80,19 @@ class ParitySettings(ExecutionOptions):
 
     dependent = (
         DependentOptions(("subjects", "size", "cameras", "timesteps"), "data", False),
-        DependentOptions(("samples",), "method", ("gbs",)),
+        DependentOptions(("samples",), "method", ("flashavatar", "gbs")),
     )
 
     def __post_init__(self) -> None:
         """Raise ValueError for invalid settings."""
         parse_size(self.size)
+        if self.method == "flashavatar" and self.iterations > WITHOUT_PERCEPTUAL_LOSS:
+            raise ValueError(
+                f"iterations must be at most {WITHOUT_PERCEPTUAL_LOSS} with flashavatar, as the native method has no perceptual loss"
+            )
         if (
             min(self.iterations, self.orders, self.subjects) < 1
-            or self.samples < 10
+            or (self.samples is not None and self.samples < 10)
             or not self.tolerance > 0
         ):
             raise ValueError(

@@ -12,9 +12,11 @@ from scipy import stats
 from headbench.bench import cli
 from headbench.bench.configuration import build
 from headbench.bench.engine import run as runner
+from headbench.bench.engine.config import resolve_cells
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.rows import Row, Rows
+from headbench.methods.flashavatar.config import FlashAvatarConfig
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.official.parity.parity import as_theirs, differences_of, run_config
 from headbench.methods.official.parity.settings import ParitySettings
@@ -114,6 +116,45 @@ def test_settings_do_what_the_program_is_told(tmp_path):
     assert config.settings["gbs-official"]["arguments"] == ("--init_face_point_number", "300")
     native = build(GBSConfig, {k: v for k, v in config.settings["gbs"].items() if k != "budget"}, "gbs")
     assert (native.samples, native.teeth_samples, native.min_sh_every) == (300, 30, 1_000)
+
+
+def test_flashavatar_is_compared_as_tracked_without_a_neck(tmp_path):
+    config = run_config(ParitySettings("flashavatar", checkout="x", out="y", device="cpu-shim"), tmp_path)
+    assert config.methods == ("flashavatar", "flashavatar-official")
+    assert config.clip.name == "rigid-head"
+    assert [(c.name, c.as_tracked) for c in config.conditions] == [("as-tracked", True)]
+    found = [(method.spec.head_models, method.spec.monocular) for method, _ in resolve_cells(config)]
+    assert found == [((), False)] * 2
+    native, official = (config.settings[name] for name in config.methods)
+    assert (native["samples"], official["samples"]) == (13_500, 13_500)
+    assert official["order"] == "native"
+    iterations = Timeline(native["budget"]["iterations"], 150_000)
+    settings = build(FlashAvatarConfig, {k: v for k, v in native.items() if k != "budget"}, "flashavatar")
+    assert iterations.every(settings.sh_every, settings.min_sh_every) == 500
+    config = run_config(ParitySettings("flashavatar", checkout="x", out="y", samples=300), tmp_path)
+    assert {config.settings[name]["samples"] for name in config.methods} == {300}
+
+
+def test_settings_of_one_method_are_refused_for_others(folder, capsys):
+    for words, expected in (
+        (("ga", "--samples", "300"), "--samples"),
+        (("flashavatar", "--iterations", "15001"), "at most 15000 with flashavatar"),
+    ):
+        assert cli.main(["run", "parity", *words, "--checkout", "repository", "--out", "out"]) == 2
+        assert expected in capsys.readouterr().err
+    assert not (folder / "out").exists()
+
+
+def test_rows_under_a_condition_are_compared():
+    rows = [
+        Row(
+            name, "1", 0, "novel_view", "s", "one", 0, "c", "full", "psnr", value, "hash", condition=condition
+        )
+        for condition, values in (("", (1.0, 2.0)), ("as-tracked", (20.0, 20.5)))
+        for name, value in zip(("native", "official"), values)
+    ]
+    (found,) = differences_of(Rows.of(rows), "native", "official", [0], "as-tracked")
+    assert (found.native, found.official) == ((20.0,), (20.5,))
 
 
 def test_differences_are_paired_by_subject_and_order():
