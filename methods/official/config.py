@@ -148,10 +148,14 @@ class FlashAvatarOfficialConfig(OfficialConfig):
     samples : int
         With ``device=cpu-shim``, number of splats, about, on a head of another topology than FLAME's: they are those of the
         native method with this setting. On FLAME's topology the authors' chart of 128 x 128 texels is used.
+    masks : Literal['parts', 'native']
+        "parts": masks of head with neck and of the visible mouth, in place of those of the authors' network. "native": nothing that
+        a mask of the capture covers is left out, and the mouth is that of the native method, so that both have the same loss.
     """
 
     commit: str = "2d4cb25ca9166b795c03692aec12114d595eff15"
     samples: int = 13_500
+    masks: Literal["parts", "native"] = "parts"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -34,7 +34,7 @@ from ....bench.io.images import write_png
 from ....datasets.head.arrays import region
 from ....datasets.head.subject import PosedSubject
 from ...flashavatar.config import FlashAvatarConfig
-from ...flashavatar.training import points_of
+from ...flashavatar.training import MOUTH, mouth_mask, points_of
 from ...insta.warp import mouth_triangles, touching
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import SubjectMesh
@@ -83,7 +83,7 @@ def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout, *, own_
 
     With ``own_chart``, another topology has a chart of its own instead; its head model keeps its teeth.
     """
-    for name in (BOUNDARY, "lips"):
+    for name in (BOUNDARY, MOUTH):
         region(head, name)
     if not own_chart or has_their_topology(head, checkout.folder):
         vertices, _ = read_obj(checkout.folder / MESH_FILE)
@@ -175,10 +175,12 @@ class ParsingMasks:
 
     The mouth is where the mesh shows lips, teeth or the inside of the mouth. Head and neck are the covered pixels that
     show the mesh above its boundary, and those beside the mesh (hair) whose nearest projected vertex is not on the
-    boundary; shoulders and clothes are left out.
+    boundary; shoulders and clothes are left out. With ``native`` masks head and neck are all covered pixels, and the mouth is
+    that of the native method.
     """
 
-    def __init__(self, head: HeadAsset, subject: FlameSubject):
+    def __init__(self, head: HeadAsset, subject: FlameSubject, *, native: bool = False):
+        self._native, self._lips = native, np.asarray(head.regions[MOUTH])
         self._mesh = VisibleMesh(head, subject.posed)
         self._mouth = mouth_triangles(head).numpy()
         self._below = touching(head, BOUNDARY)
@@ -187,6 +189,9 @@ class ParsingMasks:
     def of(self, pose: HeadPose, camera: Camera, coverage: ByteArray) -> tuple[ByteArray, ByteArray]:
         """(H, W) masks of head with neck, and of the mouth, 0 or 255, for a camera in the head's frame."""
         found = self._mesh.seen(pose, camera, coverage)
+        if self._native:
+            hull = mouth_mask(camera, found.vertices[self._lips], found.vertices.mean(0))
+            return FULL * (coverage > 0).astype(np.uint8), FULL * hull.astype(np.uint8)
         triangles = found.triangles.clip(0)
         head, mouth = (np.zeros(coverage.shape, np.uint8) for _ in range(2))
         mouth[found.rows, found.columns] = FULL * (found.hit & self._mouth[triangles])
@@ -203,14 +208,20 @@ class ParsingMasks:
 
 
 def write_training(
-    clip: Clip, subject: FlameSubject, name: str, work: Workplace, progress: Progress
+    clip: Clip,
+    subject: FlameSubject,
+    name: str,
+    work: Workplace,
+    progress: Progress,
+    *,
+    native_masks: bool = False,
 ) -> dict[str, FrameKey]:
     """Write the training frames as an identity of this name, cut to the window with the principal point in its middle.
 
     Returns the key of every image by its path.
     """
     frames = training_frames(clip, subject.posed)
-    masks = ParsingMasks(clip.head, subject)
+    masks = ParsingMasks(clip.head, subject, native=native_masks)
     images: dict[str, FrameKey] = {}
     with grouped_writes():
         for frame in frames:

@@ -155,7 +155,8 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
     def export(self, clip: Clip, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
         """Write the training frames as an identity, and their program with the files that it opens."""
         subject = write_program(Subject.of(clip), clip.head, work, own_chart=self._shim)
-        return write_training(clip, subject, NAME, work, progress)
+        native_masks = self.config.masks == "native"
+        return write_training(clip, subject, NAME, work, progress, native_masks=native_masks)
 
     def train_command(self, fit: Fit, work: Workplace) -> list[str]:
         """Their script; its output folder inside the identity's is a link to ``model``."""
@@ -243,9 +244,13 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
         """Of the export, the images, the head model and the schedule."""
         camera = check_one_camera(clip)
         window = inside(camera).camera
+        masks = {
+            "parts": "masks of head and neck and of the mouth are those of the head model's mesh, not of a network that parses faces",
+            "native": "masks of head and neck have all covered pixels, those of the mouth are the native method's",
+        }
         differences = [
             "frames are renumbered and all of them are used; their code holds out the last 500",
-            "masks of head and neck and of the mouth are those of the head model's mesh, not of a network that parses faces",
+            masks[self.config.masks],
             "the background is removed from partly covered pixels, and the static offset is part of the template",
             f"images of {window.width}x{window.height} pixels as PNG in place of JPEG of 512x512; renders are PNG in place "
             + "of a video, rounded down to 8 bits",

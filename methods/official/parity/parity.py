@@ -60,8 +60,6 @@ CAUSES = {
     "flashavatar": (
         "random numbers besides the order: the network at the start",
         "initial sizes: official by neighbours in the first frame with the network's offsets, native on the neutral mesh",
-        "official masks of the mouth are where the mesh shows it, native ones the convex hull of the lips",
-        "official images are masked by head and neck; native ones are not",
         "the network's optimiser has an epsilon of 1e-8 in the official code, 1e-15 in the native method",
         "splats nearer than 0.2 m are left out by theirs, than 0.01 m by ours",
     ),
@@ -179,7 +177,7 @@ def run_config(settings: ParitySettings, out: Path) -> RunConfig:
     if settings.method == "gbs":
         of_theirs["arguments"] = ("--init_face_point_number", str(samples))
     if settings.method == "flashavatar":
-        of_theirs["samples"] = samples
+        of_theirs |= {"samples": samples, "masks": "native"}
     of_both = {"budget": {"iterations": settings.iterations}}
     values = {
         "data": settings.data or str(_capture(out)),

@@ -15,6 +15,8 @@ from headbench.bench.io.documents import read_json
 from headbench.bench.io.images import read_pixels
 from headbench.bench.process import ProgramError
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
+from headbench.methods.flashavatar.config import FlashAvatarConfig
+from headbench.methods.flashavatar.training import FlashAvatarTraining
 from headbench.methods.official import needs
 from headbench.methods.official.config import FlashAvatarOfficialConfig
 from headbench.methods.official.flashavatar import method as implementation
@@ -36,11 +38,13 @@ from headbench.methods.official.workplace import check_export
 from headbench.methods.shared.avatar_files import Subject
 from headbench.methods.shared.schedule import ShuffledEpochs
 
+from ..flashavatar.small import SMALL
 from .flashavatar_repository import FlashAvatarStandIn
 from .repository import (
     BUDGET,
     WHITE,
     check_tracked,
+    export,
     fit,
     read_tracked,
     rendered,
@@ -174,6 +178,24 @@ def test_masks_of_head_and_mouth_are_those_of_the_mesh(method, video_clip):
         assert inside_head[0, large.width // 2]
         assert not inside_head[-1, large.width // 2]
     assert counts.min() > 10
+
+
+def test_native_masks_are_those_of_the_native_method(method, video_clip, tmp_path):
+    method = type(method)(replace(method.config, masks="native"))
+    work, images = export(method, video_clip, tmp_path / "work")
+    training = FlashAvatarTraining(video_clip, FlashAvatarConfig(**SMALL), "cpu", 0)
+    pixels = 0
+    for number in range(len(images) // 4):
+        key = images[f"program/{image_names('head', number)[0]}"]
+        window = inside(video_clip.cameras[key.camera])
+        _, alpha, head, mouth = (read_pixels(work.program / name) for name in image_names("head", number))
+        expected = window.cut(training._mask(training.keys.index(key)).numpy().astype(np.uint8))
+        assert np.array_equal(mouth, 255 * expected)
+        assert np.array_equal(head, 255 * (alpha > 0))
+        pixels += int(expected.sum())
+    assert pixels > 10
+    (remark,) = [line for line in method.differences(video_clip, 0) if line.startswith("masks")]
+    assert remark.endswith("those of the mouth are the native method's")
 
 
 def test_mesh_and_sources_are_theirs(exported, repository):
