@@ -34,11 +34,11 @@ from ....bench.io.images import write_png
 from ....datasets.head.arrays import region
 from ....datasets.head.subject import PosedSubject
 from ...flashavatar.config import FlashAvatarConfig
-from ...flashavatar.training import MOUTH, mouth_mask, points_of
+from ...flashavatar.method import mouth_mask
 from ...insta.warp import mouth_triangles, touching
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import SubjectMesh
-from ...shared.surface_points import SurfacePoints
+from ...shared.surface_points import SurfacePoints, spread_points
 from ..checkout import Checkout
 from ..ga.export import mark
 from ..ga.head_files import MOST_TEMPLATE, OfficialHead, pickled, read_obj
@@ -63,8 +63,9 @@ MODEL_FILE, MASKS_FILE = Path("flame/generic_model.pkl"), Path("flame/FLAME_mask
 EYELID_FILES = (Path("flame/blendshapes/l_eyelid.npy"), Path("flame/blendshapes/r_eyelid.npy"))
 BOUNDARY = "boundary"
 """The region at the lower end of the neck: their code has no splats on it, and what lies beyond it is not head."""
+MOUTH = "lips"
+"""The region by which the native method masks the mouth."""
 FULL = 255
-
 
 TEXEL_SIDE = 0.5
 """Sides of a triangle of `chart_of_points`, texels: no other texel's centre lies in it."""
@@ -119,7 +120,8 @@ def write_program(
 def native_points(identity: Subject, head: HeadAsset, samples: int, seed: int) -> SurfacePoints:
     """The splats of the native method with these settings on this identity."""
     mesh = SubjectMesh(head, identity.shape, identity.static_offset, "cpu")
-    return points_of(head, mesh, FlashAvatarConfig(samples=samples), seed)
+    vertices, chart = mesh.canonical.numpy().astype(np.float64), FlashAvatarConfig().uv_chart
+    return spread_points(head, vertices, samples, seed, chart=chart, chart_without=head.regions.get(BOUNDARY))
 
 
 def grid_of(samples: int) -> int:

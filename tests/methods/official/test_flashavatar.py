@@ -16,7 +16,7 @@ from headbench.bench.io.images import read_pixels
 from headbench.bench.process import ProgramError
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
 from headbench.methods.flashavatar.config import FlashAvatarConfig
-from headbench.methods.flashavatar.training import FlashAvatarTraining
+from headbench.methods.flashavatar.method import FlashAvatarTraining
 from headbench.methods.official import needs
 from headbench.methods.official.config import FlashAvatarOfficialConfig
 from headbench.methods.official.flashavatar import method as implementation
