@@ -194,7 +194,7 @@ def smoothed(poses: Sequence[HeadPose], seconds: float, fps: float) -> list[Head
 
 def _turn(neutral: FloatArray, angles: FloatArray) -> FloatArray:
     """Axis-angle vectors, (3 n,), of the rotations from ``neutral`` to ``angles``."""
-    origin, turned = (Rotation.from_rotvec(np.reshape(part, (-1, 3))) for part in (neutral, angles))
+    origin, turned = (Rotation.from_rotvec(np.array(part).reshape(-1, 3)) for part in (neutral, angles))
     return np.asarray((origin.inv() * turned).as_rotvec()).reshape(-1)
 
 

@@ -145,7 +145,7 @@ def fix_camera(
         poses[index] = HeadPose(
             head_model=own.head_model,
             expression=own.expression,
-            rotation=(turn * Rotation.from_rotvec(own.rotation)).as_rotvec(),
+            rotation=(turn * Rotation.from_rotvec(np.array(own.rotation))).as_rotvec(),
             neck=own.neck,
             jaw=own.jaw,
             eyes=own.eyes,

@@ -70,7 +70,8 @@ def straight_rgba(clip: Clip, key: FrameKey) -> ByteArray:
 
 def six_numbers(turns: FloatArray) -> FloatArray:
     """(6 n,) the first two rows of each rotation's matrix, of (3 n,) axis-angle vectors."""
-    matrices = Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()
+    # A copy, because SciPy refuses read-only arrays of doubles, which a refitted clip has.
+    matrices = Rotation.from_rotvec(np.array(turns, np.float64).reshape(-1, 3)).as_matrix()
     return np.asarray(matrices[:, :2].ravel(), np.float64)
 
 

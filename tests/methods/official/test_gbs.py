@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -21,6 +22,7 @@ from headbench.methods.official.checkout import Checkout
 from headbench.methods.official.config import GBSOfficialConfig
 from headbench.methods.official.gbs.export import GRIDS
 from headbench.methods.official.gbs.method import SHRINK, GBSOfficial
+from headbench.methods.official.video import six_numbers
 from headbench.methods.official.workplace import Listed, Workplace, check_export
 from headbench.methods.shared.schedule import ShuffledEpochs
 
@@ -250,3 +252,12 @@ def test_what_rendering_never_reads_is_left_out_by_their_python(official_clip, t
     assert command[:4] == ["conda", "run", "python", "-c"]
     names = [f"{name}2000.pth" for name in ("fix_chkpnt", "mouth0_chkpnt", "mouth1_chkpnt")]
     assert command[5:] == [str(tmp_path / "model" / name) for name in names]
+
+
+def test_rotations_of_a_refitted_clip_may_be_read_only():
+    turns = np.array([0.3, -0.2, 0.1, 0.0, 0.0, np.pi / 2])
+    turns.flags.writeable = False
+    found = six_numbers(turns).reshape(2, 2, 3)
+    for rows, turn in zip(found, turns.reshape(2, 3)):
+        matrix, _ = cv2.Rodrigues(turn.copy())
+        np.testing.assert_allclose(rows, matrix[:2], atol=1e-12)
