@@ -283,7 +283,8 @@ class RunSet:
         """The same runs with those subjects alone that every label has rows of."""
         cells = self.rows.subjects_of(self.methods)
         kept = frozenset.intersection(*cells.values()) if cells else frozenset()
-        if all(found == kept for found in cells.values()):
+        expected = {key.subject for own in self.keys.values() for key in own}
+        if all(found == kept for found in (*cells.values(), expected)):
             return self
         keys = {task: frozenset(k for k in own if k.subject in kept) for task, own in self.keys.items()}
         return replace(self, rows=self.rows.of_subjects(kept), keys=keys)

@@ -127,7 +127,8 @@ def _tables(read: RunSet, method: str, *, primary: bool) -> str:
             ablations[under][by_name[method]] = condition.removesuffix(f"-{under}")
     for under, named in ablations.items():
         if named:
-            sections += _ablation_sections(whole, by_condition[under][method], named, regions, tested)
+            parts_shown = tested if not under else ()
+            sections += _ablation_sections(whole, by_condition[under][method], named, regions, parts_shown)
     return "\n\n".join(sections) + "\n"
 
 

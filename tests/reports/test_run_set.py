@@ -266,3 +266,5 @@ def test_the_shared_subjects_are_those_of_every_method(make_run):
     assert runs.shared.rows.subjects == {"subject1"}
     assert {key.subject for keys in runs.shared.keys.values() for key in keys} == {"subject1"}
     assert runs.only(["toy"]).shared.rows.subjects == {"subject1", "subject2"}
+    alone = runs.only(["mirror"]).shared
+    assert {key.subject for keys in alone.keys.values() for key in keys} == {"subject1"}
