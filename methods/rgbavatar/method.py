@@ -49,14 +49,14 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
     stored_class = StoredShapes
 
     def __init__(self, clip: Clip, config: RGBAvatarConfig, device: str, seed: int):
-        keys, size = clip.splits["train"], config.batch
-        batches: Batches = GroupedBatches([key.timestep for key in keys], size, config.together, seed)
+        keys, together = clip.splits["train"], config.together
+        batches: Batches = GroupedBatches([key.timestep for key in keys], config.batch, together, seed)
         if config.online:
             order = sorted(range(len(keys)), key=lambda index: (keys[index].timestep, keys[index].camera))
-            batches = OnlineBatches(order, size, config.trained_per_arrival, seed)
+            batches = OnlineBatches(order, config.batch, config.trained_per_arrival, seed)
         super().__init__(clip, config, batches, config.inputs, device, seed, masks=True)
         self._batches, self._sampler = batches, lambda iteration: batches.batch(iteration)[0]
-        count = len(self.points.triangles)
+        count = len(self.rest)
         self.colored = torch.zeros(count, dtype=torch.bool, device=device)
         size = 1e-3 * config.initial_scale_mm * (PUBLISHED_SAMPLES / count) ** 0.5
         splats = {

@@ -17,13 +17,7 @@ from .config import RGBAvatarConfig
 
 SHAPES = {"means": "mean_shapes", "quats": "quat_shapes", "colors": "color_shapes"}
 """Attributes that blendshapes change, and the names of their blendshapes."""
-PER_SPLAT: dict[str, tuple[int, ...]] = {
-    "means": (3,),
-    "quats": (4,),
-    "colors": (3,),
-    "log_scales": (3,),
-    "opacities": (),
-}
+PER_SPLAT = {"means": (3,), "quats": (4,), "colors": (3,), "log_scales": (3,), "opacities": ()}
 """Shape of a splat's attributes. Positions are in metres along the axes of the triangle, quaternions wxyz, colours harmonics of
 degree 0, scales logarithms of metres, opacities logits."""
 WEIGHTS, BIASES = layer_names(3)
