@@ -16,7 +16,7 @@ from torch import Tensor
 from ....datasets.head.refit.identity import closest_points
 from ...ops.harmonics import sh_basis
 from ...shared.surface_points import poisson_disk
-from .meshes import load_obj, matrix_to_rotation_6d, read_obj, rotation_6d_to_matrix
+from .meshes import FILES_AND_ROTATIONS, read_obj
 from .unused import Silent
 
 FAR = 0.015
@@ -244,12 +244,7 @@ NEIGHBOURS: dict[str, Any] = {
     "getIdAndWeight": ids_and_weights,
 }
 PACKAGES: dict[str, dict[str, Any]] = {
-    "pytorch3d": {},
-    "pytorch3d.io": {"load_obj": load_obj},
-    "pytorch3d.transforms": {
-        "rotation_6d_to_matrix": rotation_6d_to_matrix,
-        "matrix_to_rotation_6d": matrix_to_rotation_6d,
-    },
+    **FILES_AND_ROTATIONS,
     "pytorch3d.structures": {"Meshes": Attributes},
     "pytorch3d.renderer": {
         **dict.fromkeys(

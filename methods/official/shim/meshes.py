@@ -160,13 +160,17 @@ def _cross(one: FloatArray, other: FloatArray) -> FloatArray:
     return one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
 
 
-PACKAGES: dict[str, dict[str, Any]] = {
+FILES_AND_ROTATIONS: dict[str, dict[str, Any]] = {
     "pytorch3d": {},
     "pytorch3d.io": {"load_obj": load_obj},
     "pytorch3d.transforms": {
         "rotation_6d_to_matrix": rotation_6d_to_matrix,
         "matrix_to_rotation_6d": matrix_to_rotation_6d,
     },
+}
+"""The part of PyTorch3D's stand-ins that all official code uses."""
+PACKAGES: dict[str, dict[str, Any]] = {
+    **FILES_AND_ROTATIONS,
     "pytorch3d.structures": {"Meshes": Mesh},
     "pytorch3d.renderer": {},
     "pytorch3d.renderer.mesh": {"rasterize_meshes": rasterize_meshes},

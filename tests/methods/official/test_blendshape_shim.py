@@ -9,6 +9,7 @@ import torch
 from headbench.datasets.head.rotations import axis_angle_to_matrix
 from headbench.methods.insta.warp import squared_distances
 from headbench.methods.official.shim import blendshapes as shim
+from headbench.methods.official.shim import meshes
 from headbench.methods.ops.harmonics import sh_basis
 
 
@@ -121,15 +122,15 @@ def test_ids_around_a_point_and_their_shares():
 
 def test_six_numbers_are_the_first_rows_of_a_rotation():
     rotations = axis_angle_to_matrix(draw(4, 3))
-    six = shim.matrix_to_rotation_6d(rotations)
+    six = meshes.matrix_to_rotation_6d(rotations)
     assert torch.allclose(six[:, 3:], rotations[:, 1])
     stretched = torch.cat([2 * six[:, :3], six[:, 3:] + 0.3 * six[:, :3]], dim=1)
-    assert torch.allclose(shim.rotation_6d_to_matrix(stretched), rotations)
+    assert torch.allclose(meshes.rotation_6d_to_matrix(stretched), rotations)
 
 
 def test_meshes_are_read_and_sampled(tmp_path):
     (tmp_path / "a.obj").write_text("# a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n")
-    vertices, faces, _ = shim.load_obj(str(tmp_path / "a.obj"))
+    vertices, faces, _ = meshes.load_obj(str(tmp_path / "a.obj"))
     assert vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
     assert faces.verts_idx.tolist() == [[0, 1, 2]]
     triangles, barycentric = shim.sample_mesh_poisson_disk(vertices.numpy(), faces.verts_idx.numpy(), 100)
