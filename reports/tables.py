@@ -18,7 +18,8 @@ from ..bench.rows import ALL, Rows
 from ..bench.specs import MetricSpec
 from .aggregate import Aggregate, subject_means, summarise, whole_images
 from .conditions import conditions, marks, measured_on, suspects
-from .statistics.comparisons import LEVEL, BestSet, best_set
+from .statistics.comparisons import BestSet, best_set
+from .statistics.paired import LEVEL
 
 
 @dataclass(frozen=True)

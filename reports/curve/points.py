@@ -6,13 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import Any
-
-from scipy.stats import t as student_t
 
 from ...bench.contracts import Budget
 from ...bench.specs import MetricSpec
+from ..statistics.paired import half_width
 
 HELD_OUT: Mapping[str, str] = {"novel_view": "camera", "self_reenactment": "timesteps"}
 """Held-out data by task."""
@@ -68,12 +67,10 @@ def mean(values: Sequence[float | None]) -> float | None:
     return fmean(known) if known and len(known) == len(values) else None
 
 
-def half_width(values: Sequence[float | None]) -> float | None:
-    """Half the width of the 95 % interval of a mean by Student's t; None for fewer than two numbers or a missing one."""
+def _half_width(values: Sequence[float | None]) -> float | None:
+    """Half the width of the interval of a mean; None for fewer than two numbers or a missing one."""
     known = [value for value in values if value is not None]
-    if len(known) < 2 or len(known) < len(values):
-        return None
-    return float(student_t.ppf(0.975, len(known) - 1)) * stdev(known) / math.sqrt(len(known))
+    return half_width(known) if 1 < len(known) == len(values) else None
 
 
 def mean_point(points: Sequence[CurvePoint]) -> CurvePoint:
@@ -91,7 +88,7 @@ def mean_point(points: Sequence[CurvePoint]) -> CurvePoint:
         pictures=pictures,
         cost={key: mean([point.cost[key] for point in points]) for key in first.cost},
         values={key: mean(values) for key, values in by_name.items()},
-        halves={key: half_width(values) for key, values in by_name.items()},
+        halves={key: _half_width(values) for key, values in by_name.items()},
     )
 
 

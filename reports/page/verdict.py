@@ -18,7 +18,8 @@ from ..cameras import SPLIT_TASK
 from ..conditions import conditions
 from ..pareto.points import SIZE, SPEED
 from ..runs import RunSet
-from ..statistics.comparisons import LEVEL, subjects_needed
+from ..statistics.comparisons import subjects_needed
+from ..statistics.paired import LEVEL
 from ..tables import Table
 from .frames import ShownFrame
 

@@ -15,9 +15,8 @@ from ...bench.engine.config import CODED
 from ...bench.errors import InputError
 from ...bench.specs import MetricSpec
 from ..aggregate import subject_means, whole_images
-from ..curve.points import half_width
 from ..runs import RunData, training_labels
-from ..statistics.bootstrap import LEAST_SUBJECTS
+from ..statistics.paired import LEAST_SUBJECTS, half_width
 from .points import SIZE, pareto_front
 
 Curve = Sequence[tuple[float, float]]

@@ -12,8 +12,8 @@ from scipy.signal import lfilter
 from ...bench.benchmarks import Row, findings
 from ...bench.contracts import FloatArray, Progress
 from ...bench.specs import CommandResult
-from .bootstrap import SequencePairs, SubjectPairs, interval
-from .comparisons import LEVEL, best_set, equivalence_p, least_p, sign_flip_p
+from .comparisons import best_set, equivalence_p, least_p, sign_flip_p
+from .paired import LEVEL, interval
 
 
 @dataclass(frozen=True)
@@ -47,22 +47,17 @@ class Population:
     seed_sd: float = 0.0
     skewed: bool = False
 
-    def draw(self, generator: np.random.Generator) -> tuple[SubjectPairs, ...]:
-        """Draw subjects; the second method's values are its seeds' deviations alone."""
+    def draw(self, generator: np.random.Generator) -> FloatArray:
+        """Draw the (subjects, sequences, timesteps) differences of frames, means over seeds."""
         shape = (self.subjects, self.sequences, self.timesteps)
         draw = generator.standard_exponential if self.skewed else generator.standard_normal
         levels = draw(shape[:1]) - (1 if self.skewed else 0)
         values = self.frame_sd * self._series(shape, generator)
         values += self.mean + self.subject_sd * levels[:, None, None]
         values += self.sequence_sd * generator.standard_normal(shape[:2])[:, :, None]
-        first, second = self.seed_sd * generator.standard_normal((2, self.subjects, self.seeds))
-        cameras = np.ones(self.timesteps)
-
-        def pairs(index: int) -> tuple[SequencePairs, ...]:
-            one, other = first[index][:, None], cameras * second[index][:, None]
-            return tuple(SequencePairs(frames + one, other, cameras) for frames in values[index])
-
-        return tuple(SubjectPairs(f"{index}", pairs(index)) for index in range(self.subjects))
+        first, second = self.seed_sd * generator.standard_normal((2, self.subjects, self.seeds)).mean(axis=-1)
+        values += (first - second)[:, None, None]
+        return values
 
     def _series(self, shape: tuple[int, ...], generator: np.random.Generator) -> FloatArray:
         """Return autoregressive series of unit variance along the last axis."""
@@ -72,7 +67,6 @@ class Population:
 
 
 TRIALS, QUICK_TRIALS = 2_000, 100
-REPLICATES = 1_000
 RANGE = (0.03, 0.07)
 """Range around 5 % of two standard errors of the simulation."""
 
@@ -160,12 +154,14 @@ def calibrate(population: Population, trials: int, seed: int = 0) -> Row:
     """
     generator = np.random.default_rng(seed)
     rejected = covered = frame_test = 0
-    for trial in range(trials):
-        subjects = population.draw(generator)
-        rejected += sign_flip_p([subject.difference for subject in subjects]) <= LEVEL
-        bounds = interval(subjects, LEVEL, REPLICATES, seed=trial)
+    for _ in range(trials):
+        frames = population.draw(generator)
+        differences = frames.mean(axis=(1, 2)).tolist()
+        rejected += sign_flip_p(differences) <= LEVEL
+        bounds = interval(differences)
         covered += bounds is not None and bounds[0] <= population.mean <= bounds[1]
-        frame_test += frame_t_test_p(subjects) <= LEVEL
+        # A paired t-test that treats frames as independent, for comparison only.
+        frame_test += float(stats.ttest_1samp(frames.ravel(), 0.0).pvalue) <= LEVEL
     testable, error = least_p(population.subjects) <= LEVEL, standard_error(trials)
     shares = [1 - covered / trials] + [rejected / trials] * (testable and population.mean == 0)
     verdict = "ok"
@@ -184,13 +180,6 @@ def calibrate(population: Population, trials: int, seed: int = 0) -> Row:
 def standard_error(trials: int) -> float:
     """Of a share that is 5 %."""
     return float(np.sqrt(LEVEL * (1 - LEVEL) / trials))
-
-
-def frame_t_test_p(subjects: tuple[SubjectPairs, ...]) -> float:
-    """P-value of a paired t-test that treats frames as independent, for comparison only."""
-    sequences = [sequence for subject in subjects for sequence in subject.sequences]
-    frames = [(each.first.mean(axis=0) - each.second.mean(axis=0)) / each.cameras for each in sequences]
-    return float(stats.ttest_1samp(np.concatenate(frames), 0.0).pvalue)
 
 
 def best_set_errors(

@@ -16,10 +16,11 @@ from itertools import chain, combinations
 import numpy as np
 
 from ...bench.contracts import BoolArray, FloatArray
+from ...bench.errors import InputError
 from ...bench.progress import counted
 from ...bench.rows import Rows
 from ..aggregate import summarise, whole_images
-from .bootstrap import differences, interval, pair
+from .paired import LEVEL, interval, paired_differences
 
 EXACT_UP_TO = 20
 """Subjects up to which every assignment is tried."""
@@ -89,9 +90,6 @@ def holm(p_values: Sequence[float]) -> list[float]:
     adjusted = np.empty_like(values)
     adjusted[order] = np.minimum(1.0, np.maximum.accumulate(values[order] * factors))
     return [float(value) for value in adjusted]
-
-
-LEVEL = 0.05
 
 
 @dataclass(frozen=True)
@@ -196,14 +194,18 @@ def compare(
         if absent:
             comparisons.append(replace(comparison, reason=" ".join(dict.fromkeys(absent))))
             continue
-        subjects, *less = (pair(*(whole_images(rows, n, metric, each) for n in names)) for each in tasks)
-        values = differences(subjects, *less)
-        low, high = interval(subjects, level, less=less[0] if less else ()) or (None, None)
+        by_subject, *less = (
+            paired_differences(*(whole_images(rows, n, metric, each) for n in names)) for each in tasks
+        )
+        for other in less:
+            by_subject = _interaction(by_subject, other)
+        values = np.array([*by_subject.values()])
+        low, high = interval(values.tolist(), level) or (None, None)
         deviation = float(values.std(ddof=1)) if len(values) > 1 else 0.0
         comparisons.append(
             replace(
                 comparison,
-                differences=tuple((s.subject, float(v)) for s, v in zip(subjects, values)),
+                differences=tuple(by_subject.items()),
                 seeds=(len(rows.seeds(names[0])), len(rows.seeds(names[1]))),
                 difference=float(values.mean()),
                 low=low,
@@ -214,6 +216,14 @@ def compare(
             )
         )
     return as_one_family(comparisons)
+
+
+def _interaction(task: Mapping[str, float], other: Mapping[str, float]) -> dict[str, float]:
+    """Differences in one task minus those in another, by subject. Raises `InputError` unless both have the same subjects."""
+    if [*task] != [*other]:
+        expected = f"the same in both tasks: {', '.join(task)}"
+        raise InputError("rows", "subjects", expected, ", ".join(other) or "none")
+    return {subject: value - other[subject] for subject, value in task.items()}
 
 
 def as_one_family(comparisons: Iterable[PairedComparison]) -> list[PairedComparison]:

@@ -8,7 +8,8 @@ from ...bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
 from ..runs import RunSet, synthetic_settings
 from ..writers import pipe_table
 from .command import equivalence_text
-from .comparisons import LEVEL, PairedComparison, as_one_family, compare
+from .comparisons import PairedComparison, as_one_family, compare
+from .paired import LEVEL
 
 PAIR = ("ours", "ga")
 PRIMARY = tuple(product(("novel_view", SEEN_CAMERAS, UNSEEN_CAMERAS), ("psnr", "lpips")))
@@ -69,8 +70,8 @@ def primary_table(runs: RunSet) -> str:
             continue
         lines.append([head, *numbers, c.verdict, equivalence_text(c, spec.unit)])
     how = (
-        "Intervals are those of a bootstrap over subjects, each for itself and not corrected; they may exclude 0 where the test of few "
-        f"subjects cannot reject. Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in found)} endpoints with values; "
+        "Intervals are those of Student's t over subjects, each for itself and not corrected; they may exclude 0 where the test does not "
+        f"reject. Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in found)} endpoints with values; "
         "equivalence by two one-sided sign-flip tests, which assume that subjects differ symmetrically about the mean, Holm over "
         f"these; level {LEVEL:.0%}."
     )

@@ -8,7 +8,8 @@ from dataclasses import replace
 from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
 from ..runs import RunSet
-from ..statistics.comparisons import LEVEL, PairedComparison, compare, subjects_needed
+from ..statistics.comparisons import PairedComparison, compare, subjects_needed
+from ..statistics.paired import LEVEL
 from ..table_report import table_of
 from ..tables import Table, TableCell, TableRow
 
