@@ -26,7 +26,16 @@ from ..bench.engine.scoring import FULL
 from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
 from ..bench.experiments.robustness import RECORD_FILE
-from ..bench.experiments.suite_settings import EQUAL, LARGE_RUN, NONE, RUN, SEEDS_RUN, TRACKED
+from ..bench.experiments.suite_settings import (
+    AS_TRACKED,
+    EQUAL,
+    LARGE_RUN,
+    LEVEL,
+    NONE,
+    RUN,
+    SEEDS_RUN,
+    TRACKED,
+)
 from ..bench.io.files import write_bytes, write_json, write_text
 from ..bench.io.images import encode_image, read_png
 from ..bench.progress import counted
@@ -34,15 +43,19 @@ from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from ..bench.specs import CommandResult
 from .aggregate import summarise
+from .papers import paper_named
 from .pareto.plot import write_rates
 from .pareto.rates import read_rates
 from .pareto.table import rate_tables
 from .protocols import USUAL, ProtocolsSettings, protocols_command
 from .runs import RunData, RunSet, joined_subjects, synthetic_settings
+from .statistics.comparisons import compare
 from .statistics.primary import primary_table
 from .suite.extremes import FOLDER as EXTREMES
 from .suite.extremes import read_extremes
 from .suite.suite import suite_report, suite_runs
+from .suite.tracked import drops_by_tracking
+from .suite.variance import variance_text
 from .table_report import Columns, table_of, table_text
 from .writers import pipe_table, to_markdown
 
@@ -50,6 +63,8 @@ GALLERY = "reports/gallery"
 PROTOCOLS = "protocols"
 SUITE = "suite"
 """Stored results of the suite in `GALLERY`."""
+DROPS = "drops"
+"""Block of the suite's drops from novel views to self-reenactment, which has no rows of its own."""
 PROFILES, FACES = "profiles", "faces"
 """Stored results of one of its subjects: by the definitions of all protocols, and by metrics of faces."""
 RATES = "rates"
@@ -62,6 +77,7 @@ PAGES = {
     "demo": "docs/explanation/results.md",
     SUITE: "README.md",
     PROTOCOLS: "docs/explanation/protocols.md",
+    DROPS: "docs/explanation/suite.md",
     PROFILES: "docs/explanation/protocols.md",
     FACES: "docs/explanation/metrics.md",
     RATES: "docs/explanation/fairness.md",
@@ -70,8 +86,21 @@ PAGES = {
 OURS = "ours"
 COMPARED = (OURS, "ga")
 """Methods of the tables of protocols."""
-CHOICES = ("pixels: face", "pixels: mouth", "pixels: hair", "pooled: 16 frames", "cameras: unseen")
-"""Those of the README; the page of protocols has all."""
+TRACKING = {
+    "": "exact tracking",
+    TRACKED: "tracked from images",
+    LEVEL.format(3): "tracking errors of level 3",
+}
+"""Conditions of the table of drops, and their titles."""
+BESIDE = (
+    (f"{OURS}+{EQUAL}", "ga"),
+    ("ours-plus", "ga"),
+    ("gbs", "ga"),
+    (f"gbs+{AS_TRACKED}", "gbs"),
+)
+"""Pairs of the README's exploratory differences."""
+PAPER = "tensorial-2025"
+"""The paper of `OURS`."""
 RATES_PICTURE = "docs/pictures/rate-distortion.png"
 RATES_TASKS = ("novel_view", "self_reenactment")
 SHOWN = ("psnr", "lpips")
@@ -99,6 +128,7 @@ def publish_suite(out: Path, root: Path) -> None:
     write_text(target / RESULTS, suite_results(target))
     write_json(root / MEASURED, measured(target))
     _write(root / PAGES[PROTOCOLS], PROTOCOLS, protocols_block(target))
+    _write(root / PAGES[DROPS], DROPS, drops_block(target))
     _write(root / PAGES[SUITE], SUITE, suite_block(root))
 
 
@@ -115,7 +145,7 @@ def publish_rates(out: Path, root: Path) -> None:
     for run in sorted(path.parent for path in out.glob("*/rows.parquet")):
         _copy(RunFolder(run), RunFolder(target / run.name))
     runs = rate_runs(target)
-    write_rates(root / RATES_PICTURE, *read_rates(runs, RATES_TASKS[0]), RATES_TASKS[0])
+    write_rates(root / RATES_PICTURE, {task: read_rates(runs, task) for task in RATES_TASKS})
     _write(root / PAGES[RATES], RATES, rates_block(runs))
 
 
@@ -161,13 +191,13 @@ def demo_block(gallery: Path) -> str:
     return f"{table_text([gallery], 'md', digits=DEMO_DIGITS).strip()}\n\n{cost}"
 
 
-def _minutes(run_folder: Path) -> list[tuple[str, float | None]]:
-    """Minutes of training of every method and subject that was trained; None of one that was interrupted.
+def _minutes(run_folder: Path, metric: str = "training_time") -> list[tuple[str, float | None]]:
+    """Values of ``metric``, by default minutes of training, of every method and subject that was trained; None of one that was interrupted.
 
     This is not the run's duration, which after a restart is that of its last part.
     """
     rows = Rows.read(RunFolder(run_folder).rows)
-    times = rows.select(method=ALL, condition=ALL, metric="training_time", task="", region=FULL, seeds=ALL)
+    times = rows.select(method=ALL, condition=ALL, metric=metric, task="", region=FULL, seeds=ALL)
     trained = times[times["condition"] != CODED]  # which is derived from a trained avatar
     ended = trained["status"] == "ok"
     return [
@@ -204,6 +234,11 @@ def protocols_block(folder: Path) -> str:
     return _worth_of_choices(suite_runs(folder))
 
 
+def drops_block(folder: Path) -> str:
+    """The drop from novel views to self-reenactment by condition of tracking, on the stored runs of the suite: Markdown."""
+    return drops_by_tracking(RunSet.read(suite_runs(folder)), TRACKING)
+
+
 @cache
 def _choices(runs: tuple[Path, ...]) -> CommandResult:
     """What the choices of an evaluation are worth for `COMPARED`; both tables of the suite's runs are made of it."""
@@ -234,23 +269,18 @@ SUBJECT_BLOCKS: dict[str, Callable[[Path], str]] = {
 """Markdown of the stored rows of a folder."""
 
 
-def choices_table(runs: Sequence[Path]) -> str:
-    """PSNR of `COMPARED` by the usual protocol, and its change by each of `CHOICES` alone: Markdown."""
+def choices_text(runs: Sequence[Path]) -> str:
+    """The range of the change of PSNR of `COMPARED` by any single choice of an evaluation, in one sentence: Markdown."""
     found = _choices(tuple(runs)).data["values"]
-    columns = list(product(("novel_view", "self_reenactment"), reversed(COMPARED)))
-    lines = [["dB", *(f"{TASK_TITLES[task].lower()}, {method}" for task, method in columns)]]
-    lines.append([":--", *("--:" for _ in columns)])
-    for choice in (USUAL, *CHOICES):
-        own, changes = found[choice], choice != USUAL
-        values = {key: own[key] - changes * found[USUAL][key] for key in own}
-        keys = [f"{method} {task} psnr" for task, method in columns]
-        lines.append(
-            [
-                choice,
-                *(f"{values[key]:{'+' if changes else ''}.2f}" if key in values else "–" for key in keys),
-            ]
-        )
-    return pipe_table(lines)
+    keys = [f"{method} {task} psnr" for method, task in product(COMPARED, ("novel_view", "self_reenactment"))]
+    changes = [
+        (own[key] - found[USUAL][key], choice)
+        for choice, own in found.items()
+        for key in keys
+        if key in own and choice != USUAL
+    ]
+    ends = " to ".join(f"{change:+.1f} dB ({choice})" for change, choice in (min(changes), max(changes)))
+    return f"Other choices of an evaluation change the mean PSNR of these avatars by {ends}: [all choices]({PAGES[PROTOCOLS]})."
 
 
 def suite_options(folder: Path) -> tuple[str, ...]:
@@ -280,29 +310,86 @@ def suite_block(root: Path) -> str:
     runs = RunSet.read(folders)
     options = " ".join(suite_options(folder))
     made = synthetic_settings(runs.runs[0].manifest.clips[0])
-    minutes = [value for each in folders for _, value in _minutes(each)]
-    seconds = [summarise(runs.rows, label, "training_processor", "").value for label in runs.ranked]
-    known = [value for value in seconds if value is not None]
-    took = (
-        f" (means of a training by method: {min(known):.0f} to {max(known):.0f} processor seconds)"
-        if known
-        else ""
+    seeds = suite_runs(folder, SEEDS_RUN)
+    conditions = [label for pair in BESIDE for label in pair if label in runs.changed]
+    shown = runs.only([*runs.ranked, *conditions]).shared
+    columns = Columns((*SHOWN, "storage", "storage_coded", "coded_change", "fps_one_thread"))
+    return "\n\n".join(
+        filter(
+            None,
+            [
+                to_markdown(table_of(shown, columns=columns)).strip(),
+                f"Primary endpoints:\n\n{primary_table(shown)} {variance_text(folders, seeds)}".strip(),
+                f"Other differences, exploratory, mean over subjects and its 95 % interval:\n\n{beside_table(shown)}",
+                (
+                    f"{_speed_text(shown)} {choices_text(folders)} SSIM, baselines, tables by region and by part of FREE, and all other "
+                    f"comparisons with tests are in [the results]({results}).".lstrip()
+                ),
+                (
+                    f"The captures are of edition {made.get('edition', 1)}, made with seed {made['seed']}, and have the options "
+                    f"`headbench run suite {options}`. {_cost_text(runs, folders, seeds)}"
+                ),
+            ],
+        )
     )
-    hours = sum(value for value in minutes if value is not None) / 60
-    interrupted = (
-        f", not counting {minutes.count(None)} that were interrupted and continued" if None in minutes else ""
+
+
+def _speed_text(runs: RunSet) -> str:
+    """Frames per second of `COMPARED` on one thread, with and without the head model, beside what the paper prints; "" if not measured."""
+    values = {
+        (name, metric): summarise(runs.rows, name, metric, "").value
+        for metric in ("fps_one_thread", "fps_without_head")
+        for name in COMPARED
+        if metric in {spec.name for spec in runs.metrics} and name in runs.methods
+    }
+    known = [value for value in values.values() if value is not None]
+    if len(known) < 2 * len(COMPARED):
+        return ""
+    whole, deformed = (
+        " and ".join(f"{value:.0f} (`{name}`)" for (name, of), value in values.items() if of == metric)
+        for metric in ("fps_one_thread", "fps_without_head")
     )
-    shown = runs.only([*runs.ranked, *runs.trivial]).shared
-    of_avatars = ("storage", "storage_coded", "coded_change", "fps", "fps_one_thread")
-    measured = {spec.name for spec in runs.metrics if "comparison" in spec.tables}
-    columns = Columns((*SHOWN, *(name for name in of_avatars if name in measured)))
+    rows = (row for table in paper_named(PAPER).tables for row in table.rows)
+    printed = {row.method: row.values["fps"] for row in rows if "fps" in row.values}
+    paper = " and ".join(f"{printed[name]} (`{name}`)" for name in COMPARED)
     return (
-        f"{to_markdown(table_of(shown, columns=columns)).strip()}\n\n"
-        f"Primary endpoints:\n\n{primary_table(shown)}\n\n"
-        f"[SSIM, tables by region and by part of FREE, all other comparisons with tests]({results}). "
-        f"The mean PSNR of the same avatars by other choices of an evaluation ([all]({PAGES[PROTOCOLS]})):\n\n{choices_table(folders)}\n\n"
-        f"The captures are of edition {made.get('edition', 1)}, made with seed {made['seed']}, and have the options `headbench run suite {options}`. "
-        f"{len(minutes)} trainings, baselines included, took {hours:.1f} hours{took}{interrupted}."
+        f"On one thread of {runs.machine} the methods draw {whole} frames per second, and {deformed} without the head model; the paper of "
+        f"`{OURS}` prints {paper}, without the hardware."
+    )
+
+
+def beside_table(runs: RunSet) -> str:
+    """Differences in PSNR of the pairs `BESIDE` with intervals: Markdown."""
+    runs = runs.by_camera
+    lines = [
+        ["PSNR, dB", *(TASK_TITLES.get(task, task) for task in runs.tasks)],
+        ["---"] * (1 + len(runs.tasks)),
+    ]
+    for pair in BESIDE:
+        row = [" - ".join(pair)]
+        for task in runs.tasks:
+            (found,) = compare(runs.rows, [pair], task=task, metric="psnr", higher_is_better=True)
+            text = "–" if found.difference is None else f"{found.difference:+.2f}"
+            if found.low is not None and found.high is not None:
+                text += f" ({found.low:+.2f}, {found.high:+.2f})"
+            row.append(text)
+        lines.append(row)
+    return pipe_table(lines)
+
+
+def _cost_text(runs: RunSet, folders: Sequence[Path], seeds: Sequence[Path]) -> str:
+    """Mean processor seconds of a training by method; number, processor hours and hours of all, the further seeds among them."""
+    means = {name: summarise(runs.rows, name, "training_processor", "").value for name in runs.ranked}
+    known = ", ".join(f"{name} {value:.0f}" for name, value in means.items() if value is not None)
+    minutes = [value for each in (*folders, *seeds) for _, value in _minutes(each)]
+    seconds = [value for each in (*folders, *seeds) for _, value in _minutes(each, "training_processor")]
+    busy = sum(value for value in seconds if value is not None) / 3600
+    hours = sum(value for value in minutes if value is not None) / 60
+    without = minutes.count(None)
+    interrupted = f", without {without} that were interrupted and continued" if without else ""
+    return (
+        f"Mean processor seconds of a training: {known}. {len(minutes) - without} trainings, baselines and further seeds included, took "
+        f"{busy:.1f} processor hours ({hours:.1f} hours){interrupted}."
     )
 
 

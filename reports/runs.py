@@ -21,7 +21,7 @@ from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, joined_protocol, miss
 from ..bench.rows import ALL, Rows
 from ..bench.source import is_outside
 from ..bench.specs import MetricSpec
-from .cameras import EXPLAINED, SPLIT_TASK, unseen_cameras
+from .cameras import SPLIT_TASK, explained, unseen_cameras
 from .coded import check_codecs, with_coded
 from .tables import AVERAGED
 
@@ -114,7 +114,7 @@ class RunData:
 
     @property
     def image_size(self) -> str:
-        """Size of the rendered images, "width x height", or the range if they differ; "" without renders."""
+        """Size of the images, "width x height", or the range if they differ: of the renders or, without them, that of the protocols."""
         from ..bench.io.images import probe_image
 
         first_of_camera = {
@@ -126,7 +126,10 @@ class RunData:
             if path := next((path for path in paths if path), None):
                 info = probe_image(path)
                 sizes.add((info.width, info.height))
-        return " to ".join(dict.fromkeys(f"{w} x {h}" for w, h in (min(sizes), max(sizes)))) if sizes else ""
+        if not sizes:
+            found = {protocol.resolution for protocol in self.manifest.protocols.values()}
+            return ", ".join(sorted(found)).replace("x", " x ")
+        return " to ".join(dict.fromkeys(f"{w} x {h}" for w, h in (min(sizes), max(sizes))))
 
     @cached_property
     def _by_frame(self) -> dict[tuple[Any, ...], float]:
@@ -275,7 +278,7 @@ class RunSet:
             rows=self.rows.split_by_camera(SPLIT_TASK, unseen, UNSEEN_CAMERAS, SEEN_CAMERAS),
             tasks=(*self.tasks[:place], *parts, *self.tasks[place + 1 :]),
             keys={task: own for task, own in self.keys.items() if task != SPLIT_TASK} | parts,
-            cameras=EXPLAINED,
+            cameras=explained(keys, unseen),
         )
 
     @property

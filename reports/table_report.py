@@ -194,10 +194,15 @@ def table_of(
     apart: Sequence[RowGroup] = (),
     claimed: Collection[tuple[str, str]] = (),
 ) -> Table:
-    """Build a table of runs that were read; ``apart`` and ``claimed`` are those of `build_table`."""
+    """Build a table of runs that were read; ``apart`` and ``claimed`` are those of `build_table`.
+
+    Metrics of avatars that other layouts have are shown where ``columns`` names them.
+    """
     runs = runs.by_camera
     columns = columns.by_camera(runs.tasks)
-    known = {metric.name: metric for metric in runs.metrics if layout in metric.tables}
+    known = {
+        m.name: m for m in runs.metrics if layout in m.tables or (m.name in columns.names and not m.per_frame)
+    }
     columns.check(known, runs.tasks if any(metric.per_frame for metric in known.values()) else ())
     metrics = tuple(known[name] for name in columns.of(known))
     metrics = tuple(map(columns.shown, metrics))

@@ -151,6 +151,8 @@ class Table:
         parts.append(f"Mean over {self.averaged}; {seeds}.")
         parts += [self.marking] if self.marking else []
         parts += self.printed
+        if any(column.metric == "coded_change" for column in self.columns):
+            parts.append("By coding: the lower of the changes of PSNR in both tasks.")
         if self.machine and self.has_speed:
             parts.append(f"Speed measured on {self.machine}.")
         return tuple(parts)
@@ -301,7 +303,12 @@ def build_table(
             shown = _cell(cell, c.digits, notes, mark)
             cells.append(shown if known or shown.status != "ok" else replace(shown, status="claimed"))
         lines.append(TableRow(method, ", ".join(rows.versions(method)), method in unranked, tuple(cells)))
-    bests = [_best(rows, lines, index, column) for index, column in enumerate(columns)]
+    # Times that were not measured under equal conditions have no ranks.
+    unequal = {metric for metric, method in marked if method not in unranked}
+    bests = [
+        None if column.metric in unequal else _best(rows, lines, index, column)
+        for index, column in enumerate(columns)
+    ]
     lines = _ranked(lines, columns, bests)
     order = [*ranked_titles, SUSPECT_TITLE, CONDITIONS_TITLE, TRIVIAL_TITLE]
     order += [group.title for group in apart if not group.ranked]
@@ -408,7 +415,10 @@ def _marking(columns: Sequence[Column], lines: Sequence[TableRow], bests: Sequen
             f" (it takes {needed})."
         )
     test = f"exact sign-flip test over {subjects}, each method against all others, Holm, {LEVEL:.0%}"
-    text = f"Bold: every method that cannot be told from the best ({test}); the others by the digits shown, {places}."
+    text = (
+        f"Bold: every method that cannot be told from the best by a test, whatever its mean ({test}); the others by the digits "
+        f"shown, {places}."
+    )
     if untested:
         names = ", ".join(f"{column.title} {column.label}" for column, _ in untested)
         text += f" Too few subjects for the test, so that the digits alone decide: {names}."

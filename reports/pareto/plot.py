@@ -9,13 +9,16 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.transforms import Bbox
 
+from ...bench.progress import counted
+from ...bench.protocol import TASK_TITLES
 from ...bench.specs import MetricSpec
-from ..plots import GREY, cost_axis, plot_file, show_missing, start_axes
+from ..plots import GREY, SMALL, cost_axis, plot_file, show_missing, start_axes
 from .points import ParetoPoint, front_of
 from .rates import RatePoint
 
 MARKER = 7.0
 """Diameter of a point, in points of 1/72 inch."""
+MARKERS = "osD^vP"
 BESIDE = ((7, -8, "left"), (-7, 3, "right"), (7, 3, "left"), (-7, -8, "right"))
 """Positions of a label: offset of its lower edge from the point, in points, and its alignment."""
 
@@ -56,30 +59,55 @@ def write_plot(
             label_points(axes, points, cost, list(itertools.chain(*fronts[cost])))
 
 
-def write_rates(path: Path, points: Sequence[RatePoint], metrics: Sequence[MetricSpec], task: str) -> None:
-    """Draw quality over megabytes for the steps of the codec, a curve for each method and a panel for each metric.
+Curves = tuple[Sequence[RatePoint], Sequence[MetricSpec]]
 
-    Sizes are on a logarithmic axis. Squares are avatars as trained.
+
+def write_rates(path: Path, curves: Mapping[str, Curves]) -> None:
+    """Draw quality over megabytes for the steps of the codec: a curve for each method, a row for each task, a panel for each metric.
+
+    Each point has its step. Sizes are on a logarithmic axis; dashed lines are the quality of avatars as trained, whose size is not
+    shown.
     """
-    note = "Lines: one codec at several steps, means over subjects; squares: as trained."
-    names = list(dict.fromkeys(point.method for point in points))
-    with plot_file(path, (6.2 * len(metrics), 4.9), 200, names, note, line="-") as (figure, colours):
-        for axes, metric in zip(figure.subplots(1, len(metrics), squeeze=False)[0], metrics):
-            unit = f", {metric.unit}" if metric.unit else ""
-            axes.set(xlabel="Size, MB")
-            start_axes(axes, f"{metric.label}{unit}, {task.replace('_', ' ')}")
-            for name, colour in colours.items():
-                own = {point.variant: point.mean(metric.name) for point in points if point.method == name}
-                trained = own.pop("", None)
-                curve = sorted(value for value in own.values() if value is not None)
-                if curve:
-                    axes.plot(*zip(*curve), "o-", color=colour, markersize=MARKER - 2, linewidth=1)
-                if trained is not None:
-                    axes.plot(*trained, "s", color=colour, markerfacecolor="white", markersize=MARKER)
-            if axes.lines:
-                cost_axis(axes)
-            else:
-                show_missing(axes, "not measured in these runs")
+    names = list(dict.fromkeys(point.method for points, _ in curves.values() for point in points))
+    subjects = {subject for points, _ in curves.values() for point in points for subject in point.megabytes}
+    note = (
+        f"Lines: one codec at several steps, multiplied by the number beside a point; dashed: as trained. "
+        f"Means over {counted(len(subjects), 'subject')}."
+    )
+    columns = max(len(metrics) for _, metrics in curves.values())
+    size = (6.2 * columns, 4.9 * len(curves))
+    with plot_file(path, size, 200, names, note, line="-") as (figure, colours):
+        rows = figure.subplots(len(curves), columns, squeeze=False)
+        markers = dict(zip(colours, itertools.cycle(MARKERS)))
+        for row, (task, (points, metrics)) in zip(rows, curves.items()):
+            for axes, metric in zip(row, metrics):
+                unit = f", {metric.unit}" if metric.unit else ""
+                axes.set(xlabel="Size, MB")
+                start_axes(axes, f"{metric.label}{unit}, {TASK_TITLES.get(task, task).lower()}")
+                for name, colour in colours.items():
+                    _draw_rates(axes, points, metric.name, name, colour, markers[name])
+                if axes.lines:
+                    cost_axis(axes)
+                else:
+                    show_missing(axes, "not measured in these runs")
+
+
+def _draw_rates(
+    axes: Axes, points: Sequence[RatePoint], metric: str, name: str, colour: str, marker: str
+) -> None:
+    """The curve of one method."""
+    own = {point.variant: point.mean(metric) for point in points if point.method == name}
+    trained = own.pop("", None)
+    curve = sorted((*value, variant) for variant, value in own.items() if value is not None)
+    if curve:
+        axes.plot(*list(zip(*curve))[:2], f"{marker}-", color=colour, markersize=MARKER - 2, linewidth=1)
+        for size, value, variant in curve:
+            step = variant.partition("-x")[2] or "1"
+            axes.annotate(
+                step, (size, value), (3, 4), textcoords="offset points", fontsize=SMALL - 2, color=colour
+            )
+    if trained is not None:
+        axes.axhline(trained[1], color=colour, linewidth=0.8, linestyle="--")
 
 
 def _draw(

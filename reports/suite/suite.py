@@ -23,6 +23,10 @@ from .variance import variance_section
 LARGE = "Images of twice the size"
 CROSSED = "novel views minus self-reenactment"
 LEVEL_START = LEVEL.partition("{")[0]
+ENDPOINTS = (
+    f"PSNR and LPIPS of `{PAIR[0]}` and `{PAIR[1]}` are primary endpoints: their verdicts are those [above](#primary-endpoints). The lines "
+    "below are corrected over the comparisons of one metric and task instead."
+)
 CONDITION_TEXTS = {
     TRACKED: (
         "Tracked from images",
@@ -101,7 +105,11 @@ def _tables(read: RunSet, method: str, *, primary: bool) -> str:
     parts |= {f"Region {region}": FrameSelection(region) for region in sorted(runs.rows.regions - {FULL})}
     parts |= {f"Sequence {name}": FrameSelection(sequences=(name,)) for name in tested}
     sections = [primary_section(runs), _machines(read)] if primary else []
-    sections += [_section(title, runs.of(part), method) for title, part in parts.items()]
+    whole_frames = ENDPOINTS if primary and {*PAIR} <= {*runs.ranked} else ""
+    sections += [
+        _section(title, runs.of(part), method, "" if runs.of(part).part else whole_frames)
+        for title, part in parts.items()
+    ]
     if equal := by_condition.get(EQUAL, {}):
         budgets = {name: whole.records[label].budget.get("iterations") for name, label in plain.items()}
         count = whole.records[next(iter(equal.values()))].budget.get("iterations")
@@ -188,11 +196,11 @@ def _title(text: str, region: str, *chosen: str) -> str:
     return ", ".join([text, *([] if region == FULL else [region]), *chosen])
 
 
-def _section(title: str, runs: RunSet, method: str) -> str:
-    """A table and, where the method is among several, their differences from it."""
+def _section(title: str, runs: RunSet, method: str, note: str = "") -> str:
+    """A table and, where the method is among several, their differences from it, below a ``note``."""
     text = f"## {title} (exploratory)\n\n{to_markdown(table_of(runs)).strip()}"
     if method not in runs.ranked or len(runs.ranked) < 2:
         return text
     folders = tuple(str(run.folder.root) for run in runs.runs)
     compared = compare_methods(runs, CompareSettings(folders, against=method))
-    return f"{text}\n\n```text\n{compared.text}\n```"
+    return "\n\n".join(filter(None, [text, note, f"```text\n{compared.text}\n```"]))

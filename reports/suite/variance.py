@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import sqrt
+from pathlib import Path
 from statistics import fmean, stdev, variance
 
 from ...bench.protocol import TASK_TITLES
 from ...bench.rows import ALL
 from ..aggregate import means_by_seed, whole_images
 from ..runs import RunSet
+from ..statistics.primary import PAIR
 from ..writers import pipe_table
 
 METRIC = "psnr"
@@ -34,11 +36,7 @@ def variance_section(runs: RunSet, pair: tuple[str, str]) -> str:
             method: means_by_seed(whole_images(runs.rows, method, METRIC, task)) for method in runs.ranked
         }
         if {*pair} <= {*values}:
-            first, second = (values[name] for name in pair)
-            values[f"{pair[0]} - {pair[1]}"] = {
-                seed: {s: first[seed][s] - second[seed][s] for s in first[seed].keys() & second[seed].keys()}
-                for seed in first.keys() & second.keys()
-            }
+            values[f"{pair[0]} - {pair[1]}"] = _difference(values, pair)
         for name, by_seed in values.items():
             if found := components(by_seed):
                 subjects, mean, between, within = found
@@ -52,6 +50,35 @@ def variance_section(runs: RunSet, pair: tuple[str, str]) -> str:
         "Both methods of a difference have the same seed."
     )
     return f"## Variance between and within subjects (exploratory)\n\n{table}\n\n{how}"
+
+
+def variance_text(runs: Sequence[Path], seeds: Sequence[Path]) -> str:
+    """The variation of the difference of `PAIR` in one sentence, of those of the ``runs`` that were repeated with other ``seeds``; "" without."""
+    names = [run.name for run in seeds]
+    repeated = [run for run in runs if run.name in names]
+    if not repeated:
+        return ""
+    read = RunSet.read([*repeated, *seeds]).only(PAIR).by_camera
+    values = {name: means_by_seed(whole_images(read.rows, name, METRIC, "novel_view")) for name in PAIR}
+    found = components(_difference(values, PAIR))
+    if found is None:
+        return ""
+    subjects, mean, between, within = found
+    return (
+        f"Trained with {len(values[PAIR[0]])} seeds on {subjects} subjects, the difference of `{PAIR[0]}` and `{PAIR[1]}` in novel views is "
+        f"{mean:+.2f} dB; its standard deviation is {between:.2f} dB between subjects and {within:.2f} dB between the seeds of a subject."
+    )
+
+
+def _difference(
+    values: Mapping[str, Mapping[int, Mapping[str, float]]], pair: tuple[str, str]
+) -> dict[int, dict[str, float]]:
+    """First minus second of a pair by seed and subject."""
+    first, second = (values[name] for name in pair)
+    return {
+        seed: {s: first[seed][s] - second[seed][s] for s in first[seed].keys() & second[seed].keys()}
+        for seed in first.keys() & second.keys()
+    }
 
 
 def components(by_seed: Mapping[int, Mapping[str, float]]) -> tuple[int, float, float, float] | None:

@@ -74,8 +74,8 @@ def test_what_does_not_compare_has_a_note(conditions, notes, machine):
 
 
 MARKS = {
-    "md": "10.0**<sup>1</sup>",
-    "latex": r"10.0}\textsuperscript{1}",
+    "md": "10.0<sup>1</sup>",
+    "latex": r"10.0\textsuperscript{1}",
     "html": '10.0</span><sup><a href="#note-1">1</a></sup>',
     "csv": "Measured under load",
     "json": '"note": 0',
@@ -88,3 +88,12 @@ def test_the_mark_stands_in_every_format(form):
     assert MARKS[form] in text
     assert "Measured under load" in text
     assert MARKS[form] not in WRITERS[form][1](made(a=IDLE, b=IDLE))
+
+
+def test_times_under_load_have_no_ranks():
+    ranks = {
+        name: [row.cells[0].rank for row in made(a=IDLE, b=last).rows]
+        for name, last in {"idle": IDLE, "busy": BUSY}.items()
+    }
+    assert ranks["busy"] == [None, None]
+    assert None not in ranks["idle"]

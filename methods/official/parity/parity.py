@@ -347,7 +347,7 @@ def _equivalence(differences: Sequence[Difference], margin: float) -> list[str]:
             task = each.task.replace("_", " ")
             lines += [
                 "",
-                f"PSNR of {task}: {verdict} within {margin:g} dB (two one-sided t-tests, p = {p:.4f}).",
+                f"PSNR of {task}: {verdict} within {margin:g} dB over the orders of these captures (two one-sided t-tests, p = {p:.4f}).",
             ]
     return lines
 
