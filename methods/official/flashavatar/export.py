@@ -80,38 +80,35 @@ def has_their_topology(head: HeadAsset, folder: Path) -> bool:
 
 
 def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout, *, own_chart: bool) -> FlameSubject:
-    """The head model and one identity. Raises `InputError` without regions, and for another topology than FLAME's.
+    """The head model, with its teeth if it has a chart of its own, and one identity.
 
-    With ``own_chart``, another topology has a chart of its own instead; its head model keeps its teeth.
+    Raises `InputError` without regions, and without ``own_chart`` for another topology than FLAME's.
     """
     for name in (BOUNDARY, MOUTH):
         region(head, name)
-    if not own_chart or has_their_topology(head, checkout.folder):
+    if not own_chart:
         vertices, _ = read_obj(checkout.folder / MESH_FILE)
         return FlameSubject.of(head, subject, vertices, MESH_FILE)
     whole = OfficialHead(head, np.arange(len(head.template)), np.asarray(head.faces))
     return FlameSubject(whole, subject, PosedSubject(head, subject.shape, subject.static_offset))
 
 
-def write_program(
-    identity: Subject, head: HeadAsset, work: Workplace, *, own_chart: bool = False
-) -> FlameSubject:
+def write_program(identity: Subject, head: HeadAsset, work: Workplace, *, own_chart: bool) -> FlameSubject:
     """Write their program and the files that it opens relative to its working directory or beside itself.
 
-    With ``own_chart``, the mesh file of another topology is left to `write_points`. Returns the identity on the head model;
-    raises the errors of `flame_subject`.
+    With ``own_chart``, the mesh file is left to `write_points`. Returns the identity on the head model; raises the errors of
+    `flame_subject`.
     """
     checkout, folder = work.checkout, work.program
     subject = flame_subject(identity, head, checkout, own_chart=own_chart)
-    theirs = not own_chart or has_their_topology(head, checkout.folder)
     paths = [path for pattern in SOURCES for path in sorted(checkout.folder.glob(pattern))]
-    unchanged = [name for name in UNCHANGED if theirs or name != MESH_FILE]
+    unchanged = [name for name in UNCHANGED if not (own_chart and name == MESH_FILE)]
     for path in (*paths, *(checkout.folder / name for name in unchanged)):
         content = read_bytes(path, "a file of the program", MOST_TEMPLATE)
         write_bytes(folder / path.relative_to(checkout.folder), content)
     write_bytes(folder / MODEL_FILE, pickled(subject.model()))
     # Splats of a chart of their own are those of the native method, of which none is left out.
-    border = subject.official.region(BOUNDARY) if theirs else np.zeros(0, np.int64)
+    border = np.zeros(0, np.int64) if own_chart else subject.official.region(BOUNDARY)
     write_bytes(folder / MASKS_FILE, pickled({BOUNDARY: border}))
     subject.official.write_eyelids(*(folder / name for name in EYELID_FILES))
     return subject
@@ -129,12 +126,12 @@ def grid_of(samples: int) -> int:
     return int(np.ceil(np.sqrt(1.25 * samples)))
 
 
-def write_points(head: HeadAsset, points: SurfacePoints, samples: int, work: Workplace) -> None:
-    """Write the mesh file of `chart_of_points`."""
+def write_points(identity: Subject, head: HeadAsset, samples: int, seed: int, work: Workplace) -> None:
+    """Write the mesh file of `chart_of_points` of the `native_points`."""
+    points = native_points(identity, head, samples, seed)
     vertices, faces = np.asarray(head.template), np.asarray(head.faces)[points.triangles]
-    write_text(
-        work.program / MESH_FILE, chart_of_points(vertices, faces, points.barycentric, grid_of(samples))
-    )
+    chart = chart_of_points(vertices, faces, points.barycentric, grid_of(samples))
+    write_text(work.program / MESH_FILE, chart)
 
 
 def chart_of_points(vertices: FloatArray, faces: IntArray, barycentric: FloatArray, grid: int) -> str:

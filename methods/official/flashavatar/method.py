@@ -33,7 +33,6 @@ from .export import (
     flame_subject,
     grid_of,
     has_their_topology,
-    native_points,
     write_list,
     write_points,
     write_program,
@@ -136,7 +135,8 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
         if len(clip.splits["train"]) > most:
             expected = f"at most {most} training frames, as many as their loader reads"
             raise InputError(where, "train", expected, f"{len(clip.splits['train'])}")
-        flame_subject(Subject.of(clip), clip.head, checkout, own_chart=self._shim)
+        own_chart = self._has_own_chart(clip.head, checkout.folder)
+        flame_subject(Subject.of(clip), clip.head, checkout, own_chart=own_chart)
 
     def check_length(self, iterations: int, checkout: Checkout) -> None:
         """Refuse a run with the CPU shim in which their perceptual loss is used."""
@@ -154,7 +154,8 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
 
     def export(self, clip: Clip, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
         """Write the training frames as an identity, and their program with the files that it opens."""
-        subject = write_program(Subject.of(clip), clip.head, work, own_chart=self._shim)
+        own_chart = self._has_own_chart(clip.head, work.checkout.folder)
+        subject = write_program(Subject.of(clip), clip.head, work, own_chart=own_chart)
         native_masks = self.config.masks == "native"
         return write_training(clip, subject, NAME, work, progress, native_masks=native_masks)
 
@@ -163,18 +164,13 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
         link = work.program / "dataset" / NAME / LOG
         link.unlink(missing_ok=True)
         link.symlink_to(Path("../../..") / work.model.name)
-        self._write_points(Subject.of(fit.clip), fit.clip.head, fit.seed, work)
+        if self._has_own_chart(fit.clip.head, work.checkout.folder):  # The chart depends on the seed.
+            write_points(Subject.of(fit.clip), fit.clip.head, self.config.samples, fit.seed, work)
         camera = inside(check_one_camera(fit.clip)).camera
         options = ["--idname", NAME, "--image_res", str(camera.width), "--seed", str(fit.seed)]
         options += ["--iterations", str(fit.budget.iterations)]
         ground = _flags(_white(fit.clip.background, f"clip {fit.clip.subject}"))
         return [*work.checkout.python, str(work.program / "train.py"), *options, *ground]
-
-    def _write_points(self, identity: Subject, head: HeadAsset, seed: int, work: Workplace) -> None:
-        """Write the mesh file of another topology, which depends on the seed."""
-        if self._has_own_chart(head, work.checkout.folder):
-            samples = self.config.samples
-            write_points(head, native_points(identity, head, samples, seed), samples, work)
 
     def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
         """Numbers of vertices and texels for another topology."""
@@ -215,8 +211,10 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
         for frame in frames:
             check_square_pixels(frame.camera, "render")
         identity, head = read_identity(folder)
-        subject = write_program(identity, head, work, own_chart=self._shim)
-        self._write_points(identity, head, trained.get("seed", 0), work)
+        own_chart = self._has_own_chart(head, work.checkout.folder)
+        subject = write_program(identity, head, work, own_chart=own_chart)
+        if own_chart:
+            write_points(identity, head, self.config.samples, trained.get("seed", 0), work)
         script = [*work.checkout.python, str(work.program / "test.py")]
         patches = [*RENDERING_CHANGES, *self.render_patches(folder, work.checkout)]
         command = self.launched(script, work, patches)

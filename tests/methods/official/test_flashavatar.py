@@ -273,10 +273,10 @@ def test_a_chart_of_points_has_them_as_its_texels(video_clip):
 def test_flame_s_topology_keeps_their_chart(method, repository, video_clip, tmp_path):
     (repository[0] / "torch.py").unlink()
     shimmed = type(method)(replace(method.config, device="cpu-shim"))
-    fit(shimmed, video_clip, tmp_path / "a")
+    rendered(fit(shimmed, video_clip, tmp_path / "a"), views(video_clip, "novel_view"))
     border = len(video_clip.head.regions["boundary"])
-    log = (tmp_path / "a" / TRAINING_LOG).read_text()
-    assert f"chart of 128 for 0 triangles without {border} of" in log
+    for log in (TRAINING_LOG, RENDERING_LOG):
+        assert f"chart of 128 for 0 triangles without {border} of" in (tmp_path / "a" / log).read_text()
 
 
 def test_runs_with_their_perceptual_loss_are_refused_on_a_cpu(shimmed, video_clip):
