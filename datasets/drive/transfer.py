@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import savgol_filter
-from scipy.spatial.transform import Rotation
 
 from ...bench.contracts import FloatArray, FrameKey, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
@@ -18,6 +17,7 @@ from ..head.arrays import HeadArrays
 from ..head.refit.identity import match
 from ..head.refit.refit import BlockFitter, refit
 from ..head.refit.settings import RefitSettings
+from ..head.rotations import rotation_of
 from ..head.subject import PosedSubject, resting
 from ..head.teeth import with_teeth_where_possible
 from .signal import NO_EYELIDS, DrivingSignal
@@ -194,7 +194,7 @@ def smoothed(poses: Sequence[HeadPose], seconds: float, fps: float) -> list[Head
 
 def _turn(neutral: FloatArray, angles: FloatArray) -> FloatArray:
     """Axis-angle vectors, (3 n,), of the rotations from ``neutral`` to ``angles``."""
-    origin, turned = (Rotation.from_rotvec(np.array(part).reshape(-1, 3)) for part in (neutral, angles))
+    origin, turned = (rotation_of(part.reshape(-1, 3)) for part in (neutral, angles))
     return np.asarray((origin.inv() * turned).as_rotvec()).reshape(-1)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -49,6 +50,14 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
     cross = skew(axis_angle)
     identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
     return identity + _sinc(squared) * cross + _versine(squared) * (cross @ cross)
+
+
+def rotation_of(axis_angle: FloatArray) -> Rotation:
+    """SciPy's rotation of axis-angle vectors, (3,) or (N, 3).
+
+    They are copied, because SciPy refuses read-only arrays of doubles, which methods are given.
+    """
+    return Rotation.from_rotvec(np.array(axis_angle, np.float64))
 
 
 def axis_angle_to_quaternion(axis_angle: Tensor) -> Tensor:

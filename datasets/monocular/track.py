@@ -19,6 +19,7 @@ from ...bench.contracts import Camera, FloatArray, HeadPose
 from ...bench.errors import InputError
 from ..head.arrays import HeadArrays
 from ..head.model import HeadModel
+from ..head.rotations import rotation_of
 
 VIDEO = "video"
 """Name of the sequence where a layout names none."""
@@ -145,7 +146,7 @@ def fix_camera(
         poses[index] = HeadPose(
             head_model=own.head_model,
             expression=own.expression,
-            rotation=(turn * Rotation.from_rotvec(np.array(own.rotation))).as_rotvec(),
+            rotation=(turn * rotation_of(own.rotation)).as_rotvec(),
             neck=own.neck,
             jaw=own.jaw,
             eyes=own.eyes,

@@ -22,6 +22,7 @@ from ...bench.io.video import write_video
 from ..clip import CaptureClip
 from ..ga.validate import require_full_grid
 from ..ga.writer import pose_to_parameters, save_npz
+from ..head.rotations import rotation_of
 from ..images import write_image
 from .names import BACKGROUND, FPS, FULL_SIZE, is_subject
 from .recording import CAMERA_FILE, SEQUENCES_FILE, read_calibration
@@ -114,7 +115,7 @@ def _turned_pose(clip: CaptureClip, pose: HeadPose, turn: FloatArray) -> HeadPos
     head = clip.head
     shaped = head.template + head.shape_basis @ clip.shape + head.expression_basis @ pose.expression
     root = head.joint_regressor[0] @ (shaped + clip.static_offset)
-    rotation = Rotation.from_matrix(turn) * Rotation.from_rotvec(np.asarray(pose.rotation, np.float64))
+    rotation = Rotation.from_matrix(turn) * rotation_of(pose.rotation)
     translation = turn @ (root + pose.translation) - root
     return replace(pose, rotation=rotation.as_rotvec(), translation=translation)
 

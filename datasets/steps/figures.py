@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from ...bench.contracts import ByteArray, Clip, FloatArray, FrameKey, HeadPose, Progress, no_progress
 from ..clip import CaptureClip
 from ..figures import HELD_OUT, LEAK, MUTED, TRAIN, bands, new_figure, pixels, shortened, show
+from ..head.rotations import rotation_of
 from ..head.subject import PosedSubject, pose_in_head_frame
 from ..mesh_pictures import draw_mesh, portrait_camera
 from .clusters import ExpressionClusters
@@ -175,7 +176,7 @@ def draw_strips(axes: Axes, sequences: Mapping[str, Sequence[int]]) -> None:
 def frontal_key(clip: CaptureClip, timestep: int) -> FrameKey:
     """Training frame of a timestep from the most frontal camera."""
     pose = clip.poses[timestep]
-    facing = Rotation.from_rotvec(np.asarray(pose.rotation, dtype=np.float64)).apply([0.0, 0.0, 1.0])
+    facing = rotation_of(pose.rotation).apply([0.0, 0.0, 1.0])
 
     def directness(key: FrameKey) -> float:
         towards = clip.cameras[key.camera].center - pose.translation

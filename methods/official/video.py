@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from ...bench.contracts import (
     ByteArray,
@@ -28,6 +27,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import atomic_path, grouped_writes
 from ...bench.io.images import read_pixels
 from ...datasets.head.loaders import FLAME_IDENTITY_SIZE
+from ...datasets.head.rotations import rotation_of
 from ...datasets.head.subject import BATCH, PosedSubject, camera_in_head_frame
 from ...datasets.images import write_image
 from ...datasets.steps.masks import recomposite
@@ -70,8 +70,7 @@ def straight_rgba(clip: Clip, key: FrameKey) -> ByteArray:
 
 def six_numbers(turns: FloatArray) -> FloatArray:
     """(6 n,) the first two rows of each rotation's matrix, of (3 n,) axis-angle vectors."""
-    # A copy, because SciPy refuses read-only arrays of doubles, which a refitted clip has.
-    matrices = Rotation.from_rotvec(np.array(turns, np.float64).reshape(-1, 3)).as_matrix()
+    matrices = rotation_of(turns.reshape(-1, 3)).as_matrix()
     return np.asarray(matrices[:, :2].ravel(), np.float64)
 
 
