@@ -89,6 +89,10 @@ class PosedSubject:
             ]
         )
 
+    def translations(self, poses: Sequence[HeadPose], motions: FloatArray) -> FloatArray:
+        """(T, 3) translations, metres, with which poses that have none and the rotations of (T, 4, 4) ``motions`` move like these."""
+        return np.asarray(motions[:, :3, 3] - self.motions(poses)[:, :3, 3])
+
     def _arguments(self, poses: Sequence[HeadPose], size: int) -> Iterator[dict[str, torch.Tensor]]:
         for start in range(0, max(len(poses), 1), size):  # without poses the model raises an error
             yield self._model.pose_arguments(poses[start : start + size])

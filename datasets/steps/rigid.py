@@ -23,11 +23,8 @@ def as_rigid_head(clip: Clip, config: RunConfig) -> CaptureClip:
     poses = list(source.poses.values())
     motions = subject.motions(poses)
     turned = [_turned(pose, motion) for pose, motion in zip(poses, motions)]
-    turns = subject.motions(turned)
-    moved = [
-        replace(pose, translation=(wanted[:3, 3] - found[:3, 3]).astype(np.float32))
-        for pose, wanted, found in zip(turned, motions, turns)
-    ]
+    translations = subject.translations(turned, motions).astype(np.float32)
+    moved = [replace(pose, translation=each) for pose, each in zip(turned, translations)]
     return source.derive("as_rigid_head", {}, poses=dict(zip(source.poses, moved)))
 
 

@@ -202,7 +202,7 @@ class BlockFitter:
             "translation": np.zeros((len(poses), 3)),
         }
         turned = [self.pose(pose, None, columns, row) for row, pose in enumerate(poses)]
-        columns["translation"] = motions[:, :3, 3] - self._subject.motions(turned)[:, :3, 3]
+        columns["translation"] = self._subject.translations(turned, motions)
         return columns | self._residuals(poses, columns, counterparts)
 
     def fit_once(self, poses: Sequence[HeadPose], folder: Path | None, index: int) -> dict[str, FloatArray]:
