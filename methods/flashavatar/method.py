@@ -36,6 +36,10 @@ from .hyper_gaussians import initial_gaussians
 from .model import INPUTS, TrainedSplats, changed, layer_of_points, network_outputs, network_sizes
 from .spec import FLASHAVATAR as SPEC
 
+BOUNDARY = "boundary"
+"""The region at the lower end of the neck, where the mesh ends: there is no texel of the authors' chart, and no splat."""
+MOUTH = "lips"
+"""The region of the mask of the mouth."""
 HUBER = 0.1
 """Difference of colours up to which the loss is quadratic."""
 
@@ -47,10 +51,9 @@ class FlashAvatarTraining(SurfaceTrainer[FlashAvatarConfig]):
 
     def __init__(self, clip: Clip, config: FlashAvatarConfig, device: str, seed: int):
         sampler = ShuffledEpochs(len(clip.splits["train"]), seed)
-        # Where the mesh ends there is no texel of the chart, as in the authors' program.
-        super().__init__(clip, config, sampler, INPUTS, device, seed, border="boundary")
+        super().__init__(clip, config, sampler, INPUTS, device, seed, border=BOUNDARY)
         self._encoded = encode(self._surface.rest, config.frequencies)
-        lips = clip.head.regions.get("lips", ()) if config.mouth_weight else ()
+        lips = clip.head.regions.get(MOUTH, ()) if config.mouth_weight else ()
         self._mouth = np.asarray(lips, np.int64)
         pixels = max(camera.width * camera.height for camera in self.cameras.values())
         self._masks = BoundedCache(self._mask, config.mesh_cache_mb * 2**19 // pixels)

@@ -34,7 +34,7 @@ from ....bench.io.images import write_png
 from ....datasets.head.arrays import region
 from ....datasets.head.subject import PosedSubject
 from ...flashavatar.config import FlashAvatarConfig
-from ...flashavatar.method import mouth_mask
+from ...flashavatar.method import BOUNDARY, MOUTH, mouth_mask
 from ...insta.warp import mouth_triangles, touching
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import SubjectMesh
@@ -61,10 +61,6 @@ UNCHANGED = (
 )
 MODEL_FILE, MASKS_FILE = Path("flame/generic_model.pkl"), Path("flame/FLAME_masks/FLAME_masks.pkl")
 EYELID_FILES = (Path("flame/blendshapes/l_eyelid.npy"), Path("flame/blendshapes/r_eyelid.npy"))
-BOUNDARY = "boundary"
-"""The region at the lower end of the neck: their code has no splats on it, and what lies beyond it is not head."""
-MOUTH = "lips"
-"""The region by which the native method masks the mouth."""
 FULL = 255
 
 TEXEL_SIDE = 0.5
