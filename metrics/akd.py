@@ -43,36 +43,32 @@ class _Akd(FaceMetric):
 class AkdMediaPipe(_Akd):
     """AKD of 468 landmarks by MediaPipe; the image is searched around the landmarks of the ground truth first, then everywhere."""
 
-    def network(self) -> LandmarkNetwork:
+    @staticmethod
+    def network() -> LandmarkNetwork:
         """The network of the file that the variable names."""
-        return _mediapipe()
+        from ..bench.landmark_network import LandmarkNetwork
+
+        return LandmarkNetwork(named_file("AKD", VARIABLE, REMEDY))
 
 
 class AkdDlib(_Akd):
     """AKD of 68 landmarks by dlib, each image searched by itself."""
 
-    def network(self) -> DlibLandmarks:
-        """dlib's landmarks."""
-        return DlibLandmarks()
+    network = DlibLandmarks
 
 
 class AkdPipNet(_Akd):
     """AKD of 98 landmarks by PIPNet, each image searched by itself."""
 
-    def network(self) -> AtLandmarks:
+    @staticmethod
+    def network() -> AtLandmarks:
         """The network of the file that the variable names, at dlib's landmarks."""
         return AtLandmarks(_pipnet)
 
 
-def _mediapipe() -> LandmarkNetwork:
-    from ..bench.landmark_network import LandmarkNetwork
-
-    return LandmarkNetwork(named_file("AKD", VARIABLE, REMEDY))
-
-
 def mediapipe_needs(config: object, device: str) -> Iterator[Need]:
     """The file of the network, and what reads it."""
-    yield network_need("landmark network, for AKD", VARIABLE, REMEDY, _mediapipe)
+    yield network_need("landmark network, for AKD", VARIABLE, REMEDY, AkdMediaPipe.network)
 
 
 def _pipnet() -> PipNet:

@@ -36,15 +36,14 @@ class _Csim(FaceMetric):
 class CsimDlib(_Csim):
     """Cosine similarity of the 128 numbers by which dlib recognises people."""
 
-    def network(self) -> DlibIdentity:
-        """dlib's network."""
-        return DlibIdentity()
+    network = DlibIdentity
 
 
 class CsimArcFace(_Csim):
     """Cosine similarity of the 512 numbers by which ArcFace recognises people."""
 
-    def network(self) -> AtLandmarks:
+    @staticmethod
+    def network() -> AtLandmarks:
         """The network of the file that the variable names, at dlib's landmarks."""
         return AtLandmarks(_arcface)
 

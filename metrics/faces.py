@@ -48,8 +48,9 @@ class FaceMetric(ABC):
         truth = self._find(target, "ground truth")
         return self.score(self._find(image, "render", truth), truth)
 
+    @staticmethod
     @abstractmethod
-    def network(self) -> FaceNetwork:
+    def network() -> FaceNetwork:
         """A new network. Raises `UnavailableError`."""
 
     @abstractmethod

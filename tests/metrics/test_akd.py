@@ -28,7 +28,7 @@ class Network:
 @pytest.fixture
 def network(monkeypatch):
     found = Network()
-    monkeypatch.setattr(akd, "_mediapipe", lambda: found)
+    monkeypatch.setattr(akd.AkdMediaPipe, "network", lambda self: found)
     return found
 
 
