@@ -15,7 +15,7 @@ from ..monocular.clip import check_subject, subject_of
 from ..tracker_files.command import import_tracking
 from ..tracker_files.settings import ImportTrackingSettings
 from ..video.decode import is_video, probe_video
-from .programs import LOG, Work, check_program, export_of, run_steps
+from .programs import LOG, WorkingFolder, check_program, export_folder, run_steps
 
 CAPTURE = "capture"
 """Folder of the capture, beside that of the program."""
@@ -48,13 +48,13 @@ def track_with_program(settings: TrackSettings, progress: Progress) -> CommandRe
     program, interpreter = check_program(name, checkout, settings.python)
     folder = Path(settings.out).absolute() / name
     folder.mkdir(parents=True, exist_ok=True)
-    work = Work(folder, folder / f"{subject}.mp4")
+    work = WorkingFolder(folder, folder / f"{subject}.mp4")
     link_or_copy(source.resolve(), work.video)
     run_steps(name, program, checkout, interpreter, work, progress)
-    said = f"{name} has finished; its output is in {folder / LOG}."
+    message = f"{name} has finished; its output is in {folder / LOG}."
     if name == "vhap":
-        capture = export_of(work)
-        text = f"{said}\nThen: headbench lint {capture} --head {settings.head}\nCapture: {capture}"
+        capture = export_folder(work)
+        text = f"{message}\nThen: headbench lint {capture} --head {settings.head}\nCapture: {capture}"
         return CommandResult(text, {"capture": capture.as_posix()})
     (tracked,) = sorted(folder.glob(f"tracking/{subject}_nV1*"))[:1]
     given = ImportTrackingSettings(
@@ -67,4 +67,4 @@ def track_with_program(settings: TrackSettings, progress: Progress) -> CommandRe
         held_out_frames=settings.held_out_frames,
     )
     found = import_tracking(given, progress)
-    return CommandResult(f"{said}\n{found.text}", found.data)
+    return CommandResult(f"{message}\n{found.text}", found.data)

@@ -16,13 +16,13 @@ from ...bench.io.documents import read_json
 from ...bench.io.files import digest, digest_file, write_json
 from ...bench.process import described, environment, run_program
 
-IMPORTING_S = 300.0
+IMPORT_TIMEOUT_S = 300.0
 """Time limit for an interpreter to import the modules of a program, seconds."""
 STEPS, LOG = "steps.json", "program.log"
 
 
 @dataclass(frozen=True)
-class Work:
+class WorkingFolder:
     """Where a program works.
 
     Attributes
@@ -52,14 +52,14 @@ class Step:
         For messages.
     arguments : Callable
         Arguments of the interpreter, in the checkout's folder: a script, and what it is given.
-    made : str
+    output : str
         Pattern of files in the working folder of which one exists afterwards; programs may fail with exit code 0. It contains
         ``{name}`` for the name of the video.
     """
 
     name: str
-    arguments: Callable[[Work], list[str]]
-    made: str
+    arguments: Callable[[WorkingFolder], list[str]]
+    output: str
 
 
 @dataclass(frozen=True)
@@ -85,17 +85,17 @@ class TrackingProgram:
     url: str
     commit: str
     steps: tuple[Step, ...]
-    variables: Callable[[Path, Work], Mapping[str, str]]
+    variables: Callable[[Path, WorkingFolder], Mapping[str, str]]
     modules: tuple[str, ...]
     files: tuple[str, ...]
     remedy: str
 
 
-def _nothing(checkout: Path, work: Work) -> Mapping[str, str]:
+def _no_variables(checkout: Path, work: WorkingFolder) -> Mapping[str, str]:
     return {}
 
 
-def _paths_of_pixel3dmm(checkout: Path, work: Work) -> Mapping[str, str]:
+def _pixel3dmm_paths(checkout: Path, work: WorkingFolder) -> Mapping[str, str]:
     return {
         "PIXEL3DMM_CODE_BASE": str(checkout),
         "PIXEL3DMM_PREPROCESSED_DATA": str(work.folder / "preprocessed"),
@@ -139,12 +139,12 @@ VHAP = TrackingProgram(
             "export",
             lambda work: [
                 *("vhap/export_as_nerf_dataset.py", "--src_folder", str(work.folder / "output")),
-                *("--tgt_folder", str(export_of(work)), "--background-color", "white"),
+                *("--tgt_folder", str(export_folder(work)), "--background-color", "white"),
             ],
             "export/*/transforms*.json",
         ),
     ),
-    variables=_nothing,
+    variables=_no_variables,
     modules=("torch", "nvdiffrast", "tyro"),
     files=("asset/flame/flame2023.pkl", "asset/flame/FLAME_masks.pkl"),
     remedy="Put FLAME 2023 and its masks there, as the page of VHAP says.",
@@ -167,7 +167,7 @@ PIXEL3DMM = TrackingProgram(
             "tracking/{name}_nV1*/checkpoint/*.frame",
         ),
     ),
-    variables=_paths_of_pixel3dmm,
+    variables=_pixel3dmm_paths,
     modules=("torch", "nvdiffrast", "pixel3dmm"),
     files=("pretrained_weights/uv.ckpt", "pretrained_weights/normals.ckpt"),
     remedy="Run ./install_preprocessing_pipeline.sh in the checkout, which downloads them.",
@@ -176,7 +176,7 @@ PIXEL3DMM = TrackingProgram(
 PROGRAMS: Mapping[str, TrackingProgram] = {"vhap": VHAP, "pixel3dmm": PIXEL3DMM}
 
 
-def export_of(work: Work) -> Path:
+def export_folder(work: WorkingFolder) -> Path:
     """Folder of VHAP's export, named as its page names it."""
     return work.folder / "export" / f"{work.name}_whiteBg_staticOffset_maskBelowLine"
 
@@ -193,7 +193,7 @@ def check_program(name: str, checkout: Path, python: str) -> tuple[TrackingProgr
 def check_checkout(name: str, checkout: Path) -> None:
     """Raise `InputError` for a script or a file of a program that is missing."""
     program = PROGRAMS[name]
-    scripts = [step.arguments(Work(Path("/"), Path("/video.mp4")))[0] for step in program.steps]
+    scripts = [step.arguments(WorkingFolder(Path("/"), Path("/video.mp4")))[0] for step in program.steps]
     for script in scripts:
         if not (checkout / script).is_file():
             remedy = f"git clone --recursive {program.url}; the commands are of commit {program.commit[:10]}."
@@ -224,19 +224,24 @@ def check_interpreter(name: str, python: str, option: str = "--python") -> Path:
                 env=environment(),
                 capture_output=True,
                 text=True,
-                timeout=IMPORTING_S,
+                timeout=IMPORT_TIMEOUT_S,
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            raise InputError(path, "", expected, f"none within {IMPORTING_S:g} s", remedy) from None
+            raise InputError(path, "", expected, f"none within {IMPORT_TIMEOUT_S:g} s", remedy) from None
     if found.returncode:
-        said = found.stderr.strip().splitlines()[-1:] or [described(found.returncode)]
-        raise InputError(path, "", expected, said[0], remedy)
+        message = found.stderr.strip().splitlines()[-1:] or [described(found.returncode)]
+        raise InputError(path, "", expected, message[0], remedy)
     return path
 
 
 def run_steps(
-    name: str, program: TrackingProgram, checkout: Path, interpreter: Path, work: Work, progress: Progress
+    name: str,
+    program: TrackingProgram,
+    checkout: Path,
+    interpreter: Path,
+    work: WorkingFolder,
+    progress: Progress,
 ) -> None:
     """Run the steps of a program that have not been finished for this video and checkout.
 
@@ -250,26 +255,26 @@ def run_steps(
     path = os.pathsep.join([str(interpreter.parent), os.environ.get("PATH", "")])
     variables = {"PATH": path, **program.variables(checkout, work)}
     video = digest_file(work.video)
-    same = True  # a step is repeated if one before it was
+    unchanged = True  # a step is repeated if one before it was
     for number, step in enumerate(program.steps):
         command = [str(interpreter), *step.arguments(work)]
         state = digest(command, str(checkout), video)
-        pattern = step.made.format(name=work.name)
-        same = same and finished.get(step.name) == state and any(work.folder.glob(pattern))
-        if same:
+        pattern = step.output.format(name=work.name)
+        unchanged = unchanged and finished.get(step.name) == state and any(work.folder.glob(pattern))
+        if unchanged:
             continue
         for old in [*work.folder.glob(pattern)]:  # which would hide that the step writes nothing
             shutil.rmtree(old) if old.is_dir() else old.unlink()
         note = f"{name}, {step.name}"
 
-        def shown(line: str, number: int = number, note: str = note) -> None:
+        def show(line: str, number: int = number, note: str = note) -> None:
             progress(number, len(program.steps), f"{note}: {line[:60]}" if line else note)
 
-        shown("")
-        ended = run_program(command, checkout, work.folder / LOG, shown, variables=variables)
-        if ended.code:
-            raise ended.error(f"{name}: {step.name} {described(ended.code)}")
+        show("")
+        result = run_program(command, checkout, work.folder / LOG, show, variables=variables)
+        if result.code:
+            raise result.error(f"{name}: {step.name} {described(result.code)}")
         if not any(work.folder.glob(pattern)):
-            raise ended.error(f"{name}: {step.name} wrote no {pattern} in {work.folder}")
+            raise result.error(f"{name}: {step.name} wrote no {pattern} in {work.folder}")
         finished[step.name] = state
         write_json(record, finished)
