@@ -86,8 +86,7 @@ _EMBEDDED = {
 ARKIT = tuple(sorted({*JOINTS, *_EMBEDDED, *NOT_DRIVEN}))
 """The 52 names."""
 
-_NEUTRAL = "_neutral"
-_OTHERS = re.compile(
+_OTHER_COLUMNS = re.compile(
     r"(head|(left|right)eye)(yaw|pitch|roll)|time.*|frame.*|blendshapecount|_neutral", re.IGNORECASE
 )
 """Other columns of the exports of MediaPipe and of Live Link Face."""
@@ -111,7 +110,7 @@ def read_blendshapes(request: SignalRequest) -> DrivingSignal:
     unused = {}
     for name in table.columns:
         if not known[name]:
-            if not _OTHERS.fullmatch(name):
+            if not _OTHER_COLUMNS.fullmatch(name):
                 expected = "ARKit's names of blendshapes, and times"
                 raise InputError(
                     table.path, "columns", expected, repr(name), "Use a map of columns: --map FILE.yaml."
@@ -129,11 +128,11 @@ def read_blendshapes(request: SignalRequest) -> DrivingSignal:
         if np.abs(values).max() > RANGE:
             expected = f"values of blendshapes, from {-RANGE:g} to {RANGE:g}"
             raise InputError(table.path, name, expected, f"{values[np.abs(values).argmax()]:g}")
-    signal = perform(request, channels)
+    signal = apply_blendshapes(request, channels)
     return DrivingSignal(signal.form, signal.head, signal.poses, {**unused, **signal.unused})
 
 
-def perform(request: SignalRequest, channels: Mapping[str, FloatArray]) -> DrivingSignal:
+def apply_blendshapes(request: SignalRequest, channels: Mapping[str, FloatArray]) -> DrivingSignal:
     """Poses of the head that performs the blendshapes: the one given, else the embedded one.
 
     Parameters

@@ -15,7 +15,7 @@ from .names import IDENTITY, NAMES
 from .signal import NO_EYELIDS, DrivingSignal, SignalRequest, make_poses
 from .table import SignalTable
 
-USUAL_HEAD = "flame2020"
+DEFAULT_HEAD = "flame2020"
 """Head model of all four."""
 
 
@@ -27,7 +27,7 @@ def is_coefficients(table: SignalTable) -> bool:
 def read_coefficients(request: SignalRequest) -> DrivingSignal:
     """Coefficients of each frame. Identity stays behind."""
     table = request.columns
-    head = request.head(USUAL_HEAD)
+    head = request.head(DEFAULT_HEAD)
     found = {part: next((n for n in names if n in table.columns), "") for part, names in NAMES.items()}
     if not found["expression"]:
         expected = f"expression coefficients: {', '.join(NAMES['expression'])}"

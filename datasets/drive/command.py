@@ -22,10 +22,10 @@ from ..head.subject import resting
 from ..video.decode import SUFFIXES
 from .formats import read_signal
 from .measure import DrivenMeasures
-from .output import REST, Renderer, canonical, write_driven_capture, write_movie
+from .output import REST, Renderer, canonical, write_driven_capture, write_driven_video
+from .scene import SEQUENCE, AvatarScene, make_scene
 from .settings import DriveSettings
 from .signal import DrivingSignal, SignalRequest
-from .stage import SEQUENCE, Stage, make_stage
 from .transfer import Transferred, head_motion, smoothed, transfer, window_length
 
 RESULT_FILE = "drive.json"
@@ -51,8 +51,8 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
             check_kind(out, "captures")
             stack.enter_context(locked(out))
         stored = open_avatar(Path(settings.avatar), settings.method)
-        stage = make_stage(settings, stored, progress)
-        sizes = {(camera.width, camera.height) for camera in stage.clip.cameras.values()}
+        scene = make_scene(settings, stored, progress)
+        sizes = {(camera.width, camera.height) for camera in scene.clip.cameras.values()}
         if is_video and any(side % 2 for size in sizes for side in size):
             remedy = "Write a folder, or leave out --capture."
             shown = " and ".join(f"{width}x{height}" for width, height in sizes)
@@ -60,7 +60,7 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
         start = time.perf_counter()
         request = SignalRequest(
             Path(settings.signal),
-            stage.head,
+            scene.head,
             signal_head=settings.signal_head,
             map=settings.map,
             sequence=settings.sequence,
@@ -69,17 +69,17 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
         )
         signal = read_signal(request, settings.form)
         window_length(len(signal.poses), settings.smooth, settings.fps)
-        found = transfer(signal, stage.head, settings.neutral, progress)
+        found = transfer(signal, scene.head, settings.neutral, progress)
         moving = head_motion(found.poses, settings.still_head)
         driven = smoothed(moving, settings.smooth, settings.fps)
         transfer_ms = 1e3 * (time.perf_counter() - start) / len(driven)
-        data = measured(settings, stage, signal, found, (moving, driven))
+        data = measured(settings, scene, signal, found, (moving, driven))
         data["transfer_ms"] = round(transfer_ms, 2)
-        poses = dict(enumerate(stage.placed([*driven, canonical(stage.head)])))
+        poses = dict(enumerate(scene.placed([*driven, canonical(scene.head)])))
         sequences = dict.fromkeys(poses, SEQUENCE) | {len(driven): REST}
         if is_video:
             poses.pop(len(driven))
-        clip = stage.driven(poses, sequences)
+        clip = scene.driven(poses, sequences)
         needs = MethodNeeds.of(stored.method.spec)
         adaptation = plan(clip, needs, stored.heads)
         avatar = stored.load(settings.device)
@@ -88,7 +88,7 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
         renderer = Renderer(avatar, clip, form, progress)
         written = out
         if is_video:
-            write_movie(out, renderer, clip, settings.fps)
+            write_driven_video(out, renderer, clip, settings.fps)
         else:
             written = write_driven_capture(out, renderer, clip)
         data |= {
@@ -101,21 +101,25 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
 
 
 def measured(
-    settings: DriveSettings, stage: Stage, signal: DrivingSignal, found: Transferred, motion: tuple[Any, Any]
+    settings: DriveSettings,
+    scene: AvatarScene,
+    signal: DrivingSignal,
+    found: Transferred,
+    motion: tuple[Any, Any],
 ) -> dict[str, Any]:
     """Measures of the driven poses as plain values, and the channels of the signal that drive nothing.
 
     ``motion`` has the poses before and after smoothing.
     """
-    measures = DrivenMeasures(stage.head, stage.clip.shape, stage.clip.static_offset)
+    measures = DrivenMeasures(scene.head, scene.clip.shape, scene.clip.static_offset)
     before, after = motion
     reference = settings.neutral or 0
-    gaps = measures.lip_distances_mm([resting(stage.head), *after])
+    gaps = measures.lip_distances_mm([resting(scene.head), *after])
     return {
         "signal": settings.signal,
         "format": signal.form,
         "frames": len(after),
-        "head_models": [signal.head.version, stage.head.version],
+        "head_models": [signal.head.version, scene.head.version],
         "refit_residual_mm": _rounded(found.residual_mm),
         "jitter_mm": {
             "before": _rounded(measures.jitter_mm(before)),

@@ -13,7 +13,7 @@ from ...bench.errors import InputError
 from ...bench.io.documents import checked, read_yaml
 from ...bench.registry import unknown
 from ..head.arrays import HeadArrays
-from .blendshapes import ARKIT, perform
+from .blendshapes import ARKIT, apply_blendshapes
 from .signal import POSE_PARTS, DrivingSignal, SignalRequest, make_poses
 
 _COMPONENT = re.compile(r"([a-z]+)\.(\d+)")
@@ -45,7 +45,7 @@ def read_mapped(request: SignalRequest) -> DrivingSignal:
         for name, weight in entry.items():
             sums[name] += weight * values[column]
     if blendshapes:
-        signal = perform(request, sums)
+        signal = apply_blendshapes(request, sums)
         return DrivingSignal("mapped", signal.head, signal.poses, {**unused, **signal.unused})
     head = request.head()
     return DrivingSignal("mapped", head, make_poses(table.path, head, _parts(source, head, sums)), unused)

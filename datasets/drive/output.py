@@ -41,24 +41,24 @@ class Renderer:
         Time of each rendered frame.
     """
 
-    def __init__(self, avatar: Avatar, clip: CaptureClip, form: AdaptedClip, progress: Progress):
-        self._avatar, self._clip, self._form, self._progress = avatar, clip, form, progress
+    def __init__(self, avatar: Avatar, clip: CaptureClip, adapted: AdaptedClip, progress: Progress):
+        self._avatar, self._clip, self._adapted, self._progress = avatar, clip, adapted, progress
         self.seconds: list[float] = []
 
     def frames(self, keys: Sequence[FrameKey]) -> Iterator[ByteArray]:
         """(H, W, 3) 8-bit images of frames, in order."""
         background = [float(value) for value in self._clip.background]
         for number, key in enumerate(keys, 1):
-            seen = self._form.key(key)
-            camera, pose = self._form.clip.cameras[seen.camera], self._form.clip.poses[seen.timestep]
+            seen = self._adapted.key(key)
+            camera, pose = self._adapted.clip.cameras[seen.camera], self._adapted.clip.poses[seen.timestep]
             start = time.perf_counter()
             rgb: FloatArray = self._avatar.render(camera, pose, background).rgb
             self.seconds.append(time.perf_counter() - start)
             self._progress(number, len(keys), str(key))
-            yield quantise(self._form.restore(key, rgb))
+            yield quantise(self._adapted.restore(key, rgb))
 
 
-def write_movie(path: Path, renderer: Renderer, clip: CaptureClip, fps: float) -> None:
+def write_driven_video(path: Path, renderer: Renderer, clip: CaptureClip, fps: float) -> None:
     """Write the driven sequence of a clip as a video."""
     keys = [key for key in clip.splits["self_reenactment"] if key.sequence != REST]
     write_browser_video(path, renderer.frames(keys), fps, RENDER)

@@ -77,17 +77,17 @@ class SignalRequest:
             raise InputError(self.path, "", "a table of numbers, or files of each frame", "a capture")
         return self.table
 
-    def head(self, usual: str = "") -> HeadArrays:
-        """Head model of the signal's coefficients: the one given, or the avatar's if that is ``usual`` ("" for any).
+    def head(self, default: str = "") -> HeadArrays:
+        """Head model of the signal's coefficients: the one given, or the avatar's if that is ``default`` ("" for any).
 
         Raises `InputError` if it is not given and has to be.
         """
         if self.signal_head and self.signal_head != AVATAR:
             return _loaded(self.signal_head)
-        if self.signal_head == AVATAR or usual in ("", self.target.version):
+        if self.signal_head == AVATAR or default in ("", self.target.version):
             return self.target
         expected = f"the head model of the signal, as the avatar's is {self.target.version}"
-        remedy = f"Signals of this format usually are of {usual}. Name its file, or `{AVATAR}` if they are of the avatar's."
+        remedy = f"Signals of this format usually are of {default}. Name its file, or `{AVATAR}` if they are of the avatar's."
         raise InputError("command line", "--signal-head", expected, "none", remedy)
 
 

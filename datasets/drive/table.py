@@ -215,7 +215,7 @@ def _joined(path: Path, places: Sequence[str], frames: Sequence[Mapping[str, Any
 
 def _folder(path: Path) -> SignalTable:
     """A folder of files, each a frame; of folders, each a frame with an npy file for each array; or of npy files of all frames."""
-    folders = sorted((p for p in path.iterdir() if p.is_dir() and any(p.glob("*.npy"))), key=in_order)
+    folders = sorted((p for p in path.iterdir() if p.is_dir() and any(p.glob("*.npy"))), key=natural_order)
     if folders:
         frames = [{file.stem: read_npy(file) for file in user_files(p, "*.npy")} for p in folders]
         return _joined(path, [folder.name for folder in folders], frames)
@@ -224,13 +224,13 @@ def _folder(path: Path) -> SignalTable:
         return _columns(path, arrays)
     readers: dict[str, Callable[[Path], Mapping[str, Any]]] = {"*.npz": read_npz, "*.json": read_json}
     for pattern, read in readers.items():
-        files = sorted(user_files(path, pattern), key=in_order)
+        files = sorted(user_files(path, pattern), key=natural_order)
         if files:
             return _joined(path, [file.name for file in files], [read(file) for file in files])
     raise InputError(path, "", "files npz, npy or json of a signal's frames, or a capture", "none")
 
 
-def in_order(path: Path) -> list[tuple[bool, int | str]]:
+def natural_order(path: Path) -> list[tuple[bool, int | str]]:
     """Key that sorts names by their numbers: 2 before 10."""
     return [(part.isdigit(), int(part) if part.isdigit() else part) for part in re.split(r"(\d+)", path.stem)]
 

@@ -8,9 +8,9 @@ from ...bench.errors import InputError
 from ..ga.layout import Declaration
 from ..ga.tracking import POSE_SIZES, find_head, read_animation, read_tracking
 from .signal import AVATAR, DrivingSignal, SignalRequest
-from .table import SignalTable, in_order
+from .table import SignalTable, natural_order
 
-USUAL_HEAD = "flame2023"
+DEFAULT_HEAD = "flame2023"
 """Head model of VHAP."""
 
 IDENTITY_UNUSED = {"shape": "identity", "static_offset": "identity"}
@@ -30,9 +30,9 @@ def read_flame_parameters(request: SignalRequest) -> DrivingSignal:
     """
     path = request.path
     declaration = Declaration.read(path.parent) if path.is_dir() and not request.signal_head else None
-    head = find_head(path.parent, declaration, None) if declaration else request.head(USUAL_HEAD)
+    head = find_head(path.parent, declaration, None) if declaration else request.head(DEFAULT_HEAD)
     if path.is_dir():
-        files = dict(enumerate(sorted(path.glob("*.npz"), key=in_order)))
+        files = dict(enumerate(sorted(path.glob("*.npz"), key=natural_order)))
         tracking = read_tracking(files, head, "")
     else:
         tracking = read_animation(path, head)

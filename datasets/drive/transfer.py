@@ -64,16 +64,20 @@ def transfer(
         lost = target.eyelid_basis is None and any(
             pose.eyelids is not None and np.any(pose.eyelids) for pose in poses
         )
-        read = [replace(p, eyelids=_lids(p, target)) for p in poses]
+        read = [replace(p, eyelids=_eyelids(p, target)) for p in poses]
         origin = None if neutral is None else read[neutral]
-        return Transferred(read, relative(read, origin), None, {"eyelids": NO_EYELIDS} if lost else {})
+        return Transferred(
+            read, relative_to_neutral(read, origin), None, {"eyelids": NO_EYELIDS} if lost else {}
+        )
     source = with_teeth_of(target, signal.head)
     moving = {t: replace(pose, timestep=t) for t, pose in enumerate([*poses, resting(source)])}
-    refitted = refit(poses_alone(source, moving), target, KEEP_NECK, progress=progress)
+    refitted = refit(clip_of_poses(source, moving), target, KEEP_NECK, progress=progress)
     found = [refitted.clip.poses[t] for t in sorted(moving)]
     read, rest = found[:-1], found[-1]
     residual = float(np.mean([frame.mean_mm for frame in refitted.report.frames[:-1]]))
-    return Transferred(read, relative(read, rest if neutral is None else read[neutral]), residual, {})
+    return Transferred(
+        read, relative_to_neutral(read, rest if neutral is None else read[neutral]), residual, {}
+    )
 
 
 class FrameTransfer:
@@ -89,7 +93,7 @@ class FrameTransfer:
         self._target, self._fitter = target, None
         if not same_basis(source, target):
             source = with_teeth_of(target, source)
-            clip = poses_alone(source, {0: resting(source)})
+            clip = clip_of_poses(source, {0: resting(source)})
             matching = match(source, PosedSubject.of(clip).neutral, target, KEEP_NECK)
             self._fitter = BlockFitter(clip, target, matching, np.zeros(target.template.shape), KEEP_NECK)
             self._rest = self._fitted(self._fitter, resting(source))
@@ -97,15 +101,15 @@ class FrameTransfer:
     def __call__(self, pose: HeadPose) -> HeadPose:
         """The pose on the target, relative to the neutral face of the source."""
         if self._fitter is None:
-            return replace(pose, eyelids=_lids(pose, self._target))
-        return relative([self._fitted(self._fitter, pose)], self._rest)[0]
+            return replace(pose, eyelids=_eyelids(pose, self._target))
+        return relative_to_neutral([self._fitted(self._fitter, pose)], self._rest)[0]
 
     @staticmethod
     def _fitted(fitter: BlockFitter, pose: HeadPose) -> HeadPose:
         return fitter.pose(pose, None, fitter.fit([pose]), 0)
 
 
-def poses_alone(head: HeadArrays, poses: Mapping[int, HeadPose]) -> CaptureClip:
+def clip_of_poses(head: HeadArrays, poses: Mapping[int, HeadPose]) -> CaptureClip:
     """A clip of the mean head in poses, without images."""
     keys = {FrameKey("signal", "signal", t, "none"): FrameFiles(None, None) for t in poses}
     return CaptureClip(
@@ -130,7 +134,7 @@ def same_basis(one: HeadArrays, other: HeadArrays) -> bool:
     return one.version == other.version and one.expression_basis.shape[2] == other.expression_basis.shape[2]
 
 
-def relative(poses: Sequence[HeadPose], neutral: HeadPose | None) -> list[HeadPose]:
+def relative_to_neutral(poses: Sequence[HeadPose], neutral: HeadPose | None) -> list[HeadPose]:
     """Poses as seen from a neutral face: differences of coefficients, turns of jaw and eyes from the neutral ones."""
     if neutral is None:
         return list(poses)
@@ -138,8 +142,8 @@ def relative(poses: Sequence[HeadPose], neutral: HeadPose | None) -> list[HeadPo
         replace(
             pose,
             expression=pose.expression - neutral.expression,
-            jaw=_turn(neutral.jaw, pose.jaw),
-            eyes=_turn(neutral.eyes, pose.eyes),
+            jaw=_relative_rotation(neutral.jaw, pose.jaw),
+            eyes=_relative_rotation(neutral.eyes, pose.eyes),
             eyelids=None
             if pose.eyelids is None or neutral.eyelids is None
             else pose.eyelids - neutral.eyelids,
@@ -192,13 +196,13 @@ def smoothed(poses: Sequence[HeadPose], seconds: float, fps: float) -> list[Head
     ]
 
 
-def _turn(neutral: FloatArray, angles: FloatArray) -> FloatArray:
+def _relative_rotation(neutral: FloatArray, angles: FloatArray) -> FloatArray:
     """Axis-angle vectors, (3 n,), of the rotations from ``neutral`` to ``angles``."""
-    origin, turned = (rotation_of(part.reshape(-1, 3)) for part in (neutral, angles))
-    return np.asarray((origin.inv() * turned).as_rotvec()).reshape(-1)
+    reference, rotation = (rotation_of(part.reshape(-1, 3)) for part in (neutral, angles))
+    return np.asarray((reference.inv() * rotation).as_rotvec()).reshape(-1)
 
 
-def _lids(pose: HeadPose, target: HeadArrays) -> FloatArray | None:
+def _eyelids(pose: HeadPose, target: HeadArrays) -> FloatArray | None:
     """Eyelids of a pose as the target has them."""
     if target.eyelid_basis is None:
         return None

@@ -1,4 +1,4 @@
-"""What an avatar is driven on: its head and identity, a camera, and where the head rests."""
+"""The scene of a driven avatar: its head and identity, a camera, and where the head rests."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SEQUENCE = "drive"
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class AvatarScene:
     """An avatar's subject before a camera.
 
     Attributes
@@ -61,8 +61,8 @@ class Stage:
         )
 
 
-def make_stage(settings: DriveSettings, stored: StoredAvatar, progress: Progress) -> Stage:
-    """The stage of the settings: in the capture that is named, else in front of the avatar's own head.
+def make_scene(settings: DriveSettings, stored: StoredAvatar, progress: Progress) -> AvatarScene:
+    """The scene of the settings: in the capture that is named, else in front of the avatar's own head.
 
     Raises `InputError` for an avatar that has no head model file and no capture, and for a capture of another subject.
     """
@@ -71,7 +71,7 @@ def make_stage(settings: DriveSettings, stored: StoredAvatar, progress: Progress
         stored.check_subject(clip)
         camera = view_camera(clip, settings.camera or None)
         seen = replace(clip, cameras={camera.id: camera}, excluded={})
-        return Stage(seen, RigidMean.of(training_poses(clip)))
+        return AvatarScene(seen, RigidMean.of(training_poses(clip)))
     path = stored.folder / HEAD_FILE
     if not path.is_file():
         remedy = "Name the capture that the avatar was trained on: --capture."
@@ -82,7 +82,7 @@ def make_stage(settings: DriveSettings, stored: StoredAvatar, progress: Progress
     camera = portrait_camera(neutral, settings.size, settings.size)
     fields = without_images(head, {}) | {"static_offset": offset, "cameras": {camera.id: camera}}
     subject = str(stored.record["subject"])
-    return Stage(CaptureClip(subject=subject, shape=shape, splits={}, files={}, **fields), AT_ORIGIN)
+    return AvatarScene(CaptureClip(subject=subject, shape=shape, splits={}, files={}, **fields), AT_ORIGIN)
 
 
 def _identity(stored: StoredAvatar, head: HeadArrays) -> tuple[FloatArray, FloatArray]:
