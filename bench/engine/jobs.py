@@ -180,9 +180,7 @@ def check_programs(folder: RunFolder, methods: Sequence[MethodSpec], *, trust: b
         raise InputError(folder.manifest, "configuration.settings", expected, ", ".join(programs), remedy)
 
 
-def trained(
-    run: Path, methods: Sequence[str], options: RunOptions, out: Path, only: int | None = None
-) -> tuple[RunConfig, list[Job]]:
+def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -> tuple[RunConfig, list[Job]]:
     """Return the settings of a run and its cells whose avatar is trained; `load` reads one.
 
     Parameters
@@ -195,8 +193,6 @@ def trained(
         Current locations of the run's files.
     out : Path
         Locked folder for adapted clips; replaces ``out`` of the settings.
-    only : int | None
-        See `open_clips`.
 
     Raises
     ------
@@ -214,7 +210,7 @@ def trained(
     if not wanted:
         raise InputError(folder.manifest, "methods", "a method that is no trivial baseline", ", ".join(names))
     check_programs(folder, [method.spec for method, _ in wanted], trust=options.trust)
-    config, clips = open_run_clips(run, options, out=out, only=only)
+    config, clips = open_run_clips(run, options, out=out)
     jobs = make_jobs(config, wanted, clips, {}, folder, out)
     for job in jobs:
         state = job.cell.step("fit")

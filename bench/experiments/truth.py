@@ -143,8 +143,7 @@ class TruthPair(NamedTuple):
 class TruthJudge:
     """Measures frames against the truth, each with its limit. A metric that is not available is missing, with the reason."""
 
-    def __init__(self, device: str = "cpu", limits: TruthLimits = TRUTH_LIMITS) -> None:
-        self._limits = limits
+    def __init__(self, device: str = "cpu") -> None:
         self._psnr, self._lpips, self._flicker = (
             make_metric(get("metrics", name), device) for name in ("psnr", "lpips", "flicker")
         )
@@ -153,7 +152,7 @@ class TruthJudge:
         """PSNR and LPIPS of frame and face, overlap of alpha and mask, colour of the face."""
         if frame is None:
             return [_absent(name, region, NOT_FINITE) for name, region in APPEARANCE]
-        truth, limits = frame.truth, self._limits
+        truth, limits = frame.truth, TRUTH_LIMITS
         sigma = len(truth.rgb) * (limits.blur_beyond if extrapolated else limits.blur)
         blurred = np.asarray(cv2.GaussianBlur(truth.rgb, (0, 0), sigma), np.uint8)
         bounds = self._scores(blurred, truth)
@@ -181,7 +180,7 @@ class TruthJudge:
             return _absent("response", FULL, "the truth hardly changes in this view")
         shown = _difference(frame.picture, reference.picture)[face]
         slope = float((shown * wanted).sum() / np.square(wanted).sum())
-        return LimitCheck("response", slope, self._limits.response, math.inf)
+        return LimitCheck("response", slope, TRUTH_LIMITS.response, math.inf)
 
     def flicker(self, frame: TruthPair | None, before: TruthPair | None) -> LimitCheck:
         """The metric `flicker` of two neighbours in time."""
@@ -189,7 +188,7 @@ class TruthJudge:
             return _absent("flicker", FULL, NOT_FINITE)
         value = self._flicker(frame.picture, frame.truth.rgb, before.picture, before.truth.rgb)
         change = max(LEAST_CHANGE, _rms(_difference(frame.truth.rgb, before.truth.rgb)))
-        return LimitCheck("flicker", value, 0.0, self._limits.flicker * change)
+        return LimitCheck("flicker", value, 0.0, TRUTH_LIMITS.flicker * change)
 
     def _scores(self, picture: ByteArray, truth: TrueFrame) -> dict[tuple[str, str], float | str]:
         """Values of PSNR and LPIPS by metric and region, or the reason for a missing one."""
@@ -212,14 +211,14 @@ class TruthJudge:
         true = frame.truth.mask / 255.0
         union = float(np.maximum(frame.alpha, true).sum())
         value = float(np.minimum(frame.alpha, true).sum()) / union if union else 1.0
-        return LimitCheck("iou", value, self._limits.iou, math.inf)
+        return LimitCheck("iou", value, TRUTH_LIMITS.iou, math.inf)
 
     def _colour(self, frame: TruthPair) -> LimitCheck:
         """CIEDE2000 difference of the face's mean colours."""
         if not frame.truth.face.any():
             return _absent("colour", FULL, NO_FACE)
         means = [_lab(image)[frame.truth.face].mean(axis=0) for image in (frame.picture, frame.truth.rgb)]
-        return LimitCheck("colour", float(deltaE_ciede2000(*means)), 0.0, self._limits.colour)
+        return LimitCheck("colour", float(deltaE_ciede2000(*means)), 0.0, TRUTH_LIMITS.colour)
 
 
 APPEARANCE = (

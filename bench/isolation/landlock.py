@@ -52,15 +52,13 @@ def landlock_version() -> int:
     return max(0, int(_libc().syscall(_CREATE, None, ctypes.c_size_t(0), ctypes.c_uint32(1))))
 
 
-def restrict(read: Iterable[str | Path], write: Iterable[str | Path], *, network: bool = False) -> int:
+def restrict(read: Iterable[str | Path], write: Iterable[str | Path]) -> int:
     """Restrict this process and all that it starts, for good.
 
     Parameters
     ----------
     read, write : Iterable[str | Path]
         Files and folders that can be read and executed, and those that can be changed, too. Missing ones are skipped.
-    network : bool
-        Whether TCP connections stay possible.
 
     Returns
     -------
@@ -73,9 +71,7 @@ def restrict(read: Iterable[str | Path], write: Iterable[str | Path], *, network
         return 0
     libc = _libc()
     rights = _RIGHTS[max(known for known in _RIGHTS if known <= version)]
-    attributes = struct.pack(
-        "=QQQ", rights, 0 if network or version < 4 else _NETWORK, 0 if version < 6 else _SCOPES
-    )
+    attributes = struct.pack("=QQQ", rights, 0 if version < 4 else _NETWORK, 0 if version < 6 else _SCOPES)
     size = 24 if version >= 6 else 16 if version >= 4 else 8
     ruleset = _checked(libc.syscall(_CREATE, attributes, ctypes.c_size_t(size), ctypes.c_uint32(0)))
     for paths, allowed in ((read, _READ), (write, rights)):

@@ -235,11 +235,9 @@ def _array(values: Tensor) -> np.ndarray:
 
 
 @torch.no_grad()
-def canonical_surface(
-    head: HeadAsset, mesh: SubjectMesh, config: InstaConfig, backend: Backend = "auto"
-) -> CanonicalSurface:
+def canonical_surface(head: HeadAsset, mesh: SubjectMesh, config: InstaConfig) -> CanonicalSurface:
     """The canonical surface of a subject; ``mesh`` is on the CPU."""
     still, jaw = np.zeros(3), np.array([config.jaw_opening, 0, 0])
     pose = HeadPose(mesh.version, np.zeros(mesh.model.expression_size), still, still, jaw, np.zeros(6), still)
     vertices = mesh.posed(mesh.arguments([pose]))
-    return CanonicalSurface(head, vertices, config.warp_variant, backend)
+    return CanonicalSurface(head, vertices, config.warp_variant)

@@ -234,9 +234,9 @@ def write_record(fit: Fit, summary: TrainingSummary, **more: Any) -> None:
     )
 
 
-def thinned(losses: Sequence[tuple[int, float]], count: int = RECORDED_LOSSES) -> list[tuple[int, float]]:
-    """At most ``count`` pairs of a last iteration and the mean loss up to it, over equal numbers of pairs."""
-    size = -(-len(losses) // count)
+def thinned(losses: Sequence[tuple[int, float]]) -> list[tuple[int, float]]:
+    """At most `RECORDED_LOSSES` pairs of a last iteration and the mean loss up to it, over equal numbers of pairs."""
+    size = -(-len(losses) // RECORDED_LOSSES)
     groups = [losses[start : start + size] for start in range(0, len(losses), size)]
     return [(group[-1][0], sum(value for _, value in group) / len(group)) for group in groups]
 

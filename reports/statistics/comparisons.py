@@ -288,30 +288,28 @@ class PairwiseTests:
             better[row, column], better[column, row] = mean > 0, mean < 0
         return cls(methods, p, better, len(subjects))
 
-    def best_set(self, among: Sequence[str], level: float = LEVEL) -> BestSet:
+    def best_set(self, among: Sequence[str]) -> BestSet:
         """The best of the methods ``among`` all, see `best_set`; Holm's correction is over these alone."""
         chosen = [self.methods.index(method) for method in among]
         rivals = len(chosen) - 1
-        needed = subjects_needed(level, rivals)
-        if rivals * least_p(self.subjects) > level:
+        needed = subjects_needed(LEVEL, rivals)
+        if rivals * least_p(self.subjects) > LEVEL:
             return BestSet(None, self.subjects, needed)
         kept = []
         for index in chosen:
             others = [other for other in chosen if other != index]
             adjusted = holm([float(self.p[index, other]) for other in others])
-            if not any(p <= level and self.better[index, other] for p, other in zip(adjusted, others)):
+            if not any(p <= LEVEL and self.better[index, other] for p, other in zip(adjusted, others)):
                 kept.append(self.methods[index])
         return BestSet(frozenset(kept), self.subjects, needed)
 
 
-def best_set(
-    means: Mapping[str, Mapping[str, float]], *, higher_is_better: bool, level: float = LEVEL
-) -> BestSet:
+def best_set(means: Mapping[str, Mapping[str, float]], *, higher_is_better: bool) -> BestSet:
     """Find every method that does not differ significantly from the best.
 
     Each method is compared with all others by the sign-flip test, Holm over these comparisons; it is left out if
     one of them is better. Whichever method is truly the best is therefore left out with a probability of at most
-    ``level``, however it was chosen: a confidence set of the best (J. Hsu, Multiple Comparisons, 1996, chapter 4).
+    `LEVEL`, however it was chosen: a confidence set of the best (J. Hsu, Multiple Comparisons, 1996, chapter 4).
     ``means`` has by method (at least one) its mean of each subject; the same subjects for all.
     """
-    return PairwiseTests.of(means, higher_is_better=higher_is_better).best_set(list(means), level)
+    return PairwiseTests.of(means, higher_is_better=higher_is_better).best_set(list(means))

@@ -247,8 +247,8 @@ class Session:
             self._tasks.append(task)
         self._changed.set()
 
-    def _say(self, text: str, title: str = "Not done") -> None:
-        self._client.add_notification(title=title, body=text, auto_close_seconds=20)
+    def _say(self, text: str) -> None:
+        self._client.add_notification(title="Not done", body=text, auto_close_seconds=20)
 
     def _screenshot(self) -> None:
         with self._lock:
