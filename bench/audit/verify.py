@@ -475,15 +475,7 @@ def _protocols(opened: _Opened) -> Iterator[Mismatch]:
 
 def _verify_cell(job: Job, opened: _Opened) -> Findings:
     method, found = job.method.spec, Findings()
-    own = opened.rows.select(
-        method=method.name,
-        condition=job.condition.name,
-        metric=ALL,
-        task=ALL,
-        region=ALL,
-        seeds=(job.seed,),
-        subject=job.clip.subject,
-    )
+    own = job.rows_of(opened.rows)
     if len(own) and (own["status"] == "failed").all():
         found.unverified[f"the failure of {job.name}"] = "as it was recorded"
         return found

@@ -11,6 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from ..condition import PLAIN, Condition, label_of
 from ..contracts import CheckedMethod, Clip, FrameKey, Progress
 from ..errors import InputError
@@ -19,6 +21,7 @@ from ..io.files import digest, refuse_links
 from ..isolation.parent import IsolatedMethod
 from ..progress import RunProgress, duration, progress
 from ..protocol import Protocol
+from ..rows import ALL, Rows
 from ..source import is_outside
 from .adaptation import AdaptedClip
 from .config import ResolvedMethod, RunConfig
@@ -66,6 +69,18 @@ class Job:
             made = IsolatedMethod(self.method, self.cell.avatar, self.hidden or ()) if own else None
             self.created.append(made or self.method.create())
         return self.created[0]
+
+    def rows_of(self, rows: Rows) -> pd.DataFrame:
+        """The rows of this cell among those of a run."""
+        return rows.select(
+            method=self.method.spec.name,
+            condition=self.condition.name,
+            metric=ALL,
+            task=ALL,
+            region=ALL,
+            seeds=(self.seed,),
+            subject=self.clip.subject,
+        )
 
     def check_unchanged(self) -> None:
         """Raise `ChangedInputError` if the clip in memory differs from when it was first given to a method."""

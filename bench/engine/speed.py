@@ -169,16 +169,7 @@ def _cells(table: pd.DataFrame) -> list[tuple[str, str, int]]:
 
 def _failed(rows: Rows, job: Job) -> bool:
     """Whether the run has failed rows of a cell."""
-    own = rows.select(
-        method=job.method.spec.name,
-        condition=job.condition.name,
-        metric=ALL,
-        task=ALL,
-        region=ALL,
-        seeds=(job.seed,),
-        subject=job.clip.subject,
-    )
-    return bool((own["status"] == "failed").any())
+    return bool((job.rows_of(rows)["status"] == "failed").any())
 
 
 def _check_avatar(job: Job) -> None:

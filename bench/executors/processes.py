@@ -28,6 +28,14 @@ class _Process:
     connection: Connection
     task: Task | None = None
 
+    def stop(self) -> None:
+        """Close the connection, at which the worker ends, and kill it if it has not ended after `STOP_S`."""
+        self.connection.close()
+        self.process.join(STOP_S)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
+
 
 class Processes:
     """Workers that execute tasks one after another; a killed worker is replaced.
@@ -70,11 +78,7 @@ class Processes:
         for process in self._processes:
             process.process.terminate()
         for process in self._processes:
-            process.process.join(STOP_S)
-            if process.process.is_alive():
-                process.process.kill()
-                process.process.join()
-            process.connection.close()
+            process.stop()
         self._processes = []
 
     def _fill(self) -> None:
@@ -99,17 +103,9 @@ class Processes:
             raise error
         outcome = read_outcome(task.folder)
         if task.device != "cpu" and outcome is not None and outcome["status"] == "failed":
-            self._replace(process)
+            self._processes.remove(process)  # After a CUDA error, all further CUDA calls of its process fail.
+            process.stop()
         return TaskResult(task)
-
-    def _replace(self, process: _Process) -> None:
-        """Terminate a worker: after a CUDA error, all further CUDA calls of its process fail."""
-        self._processes.remove(process)
-        process.connection.close()
-        process.process.join(STOP_S)
-        if process.process.is_alive():
-            process.process.kill()
-            process.process.join()
 
     def _start(self) -> _Process:
         ours, theirs = multiprocessing.Pipe()
