@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,8 +16,8 @@ from ...bench.native.dispatch import to_device
 from ..ops.photometric import photometric_loss
 from ..ops.splats import unturned
 from ..shared.loop import TrainingImages
-from ..shared.optimisation import Optimiser, logit
-from ..shared.schedule import Sampler, Timeline, log_linear, torch_generator
+from ..shared.optimisation import Optimiser, OptimiserState, logit
+from ..shared.schedule import Sampler, Timeline, torch_generator
 from .config import GHAConfig
 from .driving import POSE_SIZE, Signal, TrainingScene, mouth_box
 from .gaussian_head import FeatureImage, GaussianHead, feature_background
@@ -37,7 +37,7 @@ ALMOST_ONE = 1 - 1e-6
 """Features of the mesh are clamped to this, so that their inverse tanh is finite."""
 
 
-class GaussianTraining:
+class GaussianTraining(OptimiserState):
     """A `Trainable` that starts from a trained mesh head; ``mesh`` has its network tensors and landmarks."""
 
     def __init__(
@@ -70,18 +70,13 @@ class GaussianTraining:
             "code_high": scene.code_high,
         }
         self._motion = TrackedMotion.of(scene, config) if config.motion_weight else None
-        self._optimiser = Optimiser({name: nn.Parameter(v) for name, v in initial.items()}, self._rates)
-
-    @property
-    def optimiser(self) -> Optimiser:
-        """Adam over everything trained."""
-        return self._optimiser
+        self.optimiser = Optimiser({name: nn.Parameter(v) for name, v in initial.items()}, self._rates)
 
     def tensors(self) -> dict[str, Tensor]:
         """Tensors of the avatar: points, networks and landmarks."""
         names = [name for name in self._rates if name != "corrections"]
         landmarks = self._fixed["landmarks"]
-        return {**{name: self._optimiser[name].detach() for name in names}, "landmarks": landmarks}
+        return {**{name: self.optimiser[name].detach() for name in names}, "landmarks": landmarks}
 
     def begin(self, timeline: Timeline) -> None:
         """Scale schedules to the length of the run."""
@@ -94,9 +89,9 @@ class GaussianTraining:
         row = scene.row[key.timestep]
         view = scene.views[key.camera]
         target = self._images.get(iteration, index)
-        tensors = {**{name: self._optimiser[name] for name in self._rates}, **self._fixed}
+        tensors = {**{name: self.optimiser[name] for name in self._rates}, **self._fixed}
         signal = scene.signals[row]
-        motion = scene.driver.motion(signal, self._optimiser["corrections"][row])
+        motion = scene.driver.motion(signal, self.optimiser["corrections"][row])
         splats = head.splats(tensors, signal, motion, self._noise(signal, iteration))
         drawn = head.draw(splats, view.camera, scene.background)
         padded = _padded(target, view.camera, config.upscale, scene.background)
@@ -127,23 +122,13 @@ class GaussianTraining:
 
     def after_backward(self, iteration: int) -> None:
         """Learning rates over the last half of a short run."""
-        if self._config.final_rate < 1:
-            late = max(0.0, 2 * self._timeline.fraction(iteration) - 1)
-            decay = log_linear(1.0, self._config.final_rate, late)
-            for name, rate in self._rates.items():
-                self._optimiser.set_learning_rate(name, decay * rate)
-
-    def state(self) -> dict[str, Any]:
-        """Parameters and moments."""
-        return {"optimiser": self._optimiser.state()}
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Restore what `state` returned."""
-        self._optimiser.load_state(state["optimiser"])
+        decay = self._timeline.decay(iteration, self._config.final_rate)
+        for name, rate in self._rates.items():
+            self.optimiser.set_learning_rate(name, decay * rate)
 
     def note(self) -> str:
         """Number of Gaussians."""
-        return f"{len(self._optimiser['points'])} Gaussians"
+        return f"{len(self.optimiser['points'])} Gaussians"
 
     def close(self) -> None:
         """Stop background work."""

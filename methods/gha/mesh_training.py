@@ -16,7 +16,7 @@ from ...bench.contracts import FrameKey
 from ...bench.native.dispatch import to_device
 from ..shared.checkpoint import load_checkpoint, save_checkpoint
 from ..shared.loop import CHECKPOINT, Fit, recomposited, train
-from ..shared.optimisation import Optimiser
+from ..shared.optimisation import Optimiser, OptimiserState
 from ..shared.rendering import View, rasterize_view, view_of
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
 from .config import GHAConfig
@@ -41,7 +41,7 @@ NEAR, FAR = 0.1, 0.3
 """Canonical units: distance of most of those points from the mesh, and their maximum distance."""
 
 
-class MeshTraining:
+class MeshTraining(OptimiserState):
     """A `Trainable`; one iteration uses several views of one timestep.
 
     Parameters
@@ -67,24 +67,19 @@ class MeshTraining:
         rates = dict.fromkeys(initial, self._config.mesh_lr) | {"landmarks": self._config.landmark_lr}
         rows = torch.as_tensor(scene.landmark_rows, device=scene.device)
         initial["landmarks"] = scene.rest.index_select(0, rows)
-        self._optimiser = Optimiser({name: nn.Parameter(value) for name, value in initial.items()}, rates)
+        self.optimiser = Optimiser({name: nn.Parameter(value) for name, value in initial.items()}, rates)
         self._tracked_landmarks = scene.driver.unposed(scene.tracked).index_select(1, rows)
         self._cameras_of: dict[int, list[FrameKey]] = {}
         for key in scene.keys:
             self._cameras_of.setdefault(key.timestep, []).append(key)
         self._note = ""
 
-    @property
-    def optimiser(self) -> Optimiser:
-        """Adam over networks and landmarks."""
-        return self._optimiser
-
     def begin(self, timeline: Timeline) -> None:
         """This phase has no schedules."""
 
     def loss(self, iteration: int, index: int) -> Tensor:
         """Loss of some views of the timestep that training image ``index`` belongs to."""
-        scene, head, weights = self._scene, self._head, self._optimiser
+        scene, head, weights = self._scene, self._head, self.optimiser
         key = scene.keys[index]
         row = scene.row[key.timestep]
         signal = scene.signals[row]
@@ -122,14 +117,6 @@ class MeshTraining:
     def after_backward(self, iteration: int) -> None:
         """Nothing to do."""
 
-    def state(self) -> dict[str, Any]:
-        """Parameters and moments."""
-        return {"optimiser": self._optimiser.state()}
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Restore what `state` returned."""
-        self._optimiser.load_state(state["optimiser"])
-
     def note(self) -> str:
         """Number of vertices."""
         return self._note
@@ -137,7 +124,7 @@ class MeshTraining:
     def _landmark_error(self, landmarks: Tensor, offset: Tensor, row: int) -> Tensor:
         """Mean squared component of the difference between moved and tracked landmarks of a timestep."""
         signal = self._scene.signals[row]
-        expressed = self._head.expressed(self._optimiser, landmarks, signal.expression) + offset
+        expressed = self._head.expressed(self.optimiser, landmarks, signal.expression) + offset
         return F.mse_loss(expressed, self._tracked_landmarks[row])
 
     def _timesteps(self, iteration: int, row: int) -> list[int]:

@@ -13,7 +13,7 @@ from ...bench.contracts import Clip, FrameKey
 from ...bench.errors import InputError
 from ..shared.loop import recomposited
 from ..shared.optimisation import Optimiser
-from ..shared.schedule import Timeline, log_linear, numpy_generator
+from ..shared.schedule import Timeline, numpy_generator
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, pose_key
 from .config import InstaConfig
 from .field import Architecture, Prior, RadianceField
@@ -137,7 +137,7 @@ class InstaTraining:
                     value.grad.add_(value, alpha=config.weight_decay)
                 self._mean[name].lerp_(value, 1 - config.ema)
         self._steps += 1
-        decay = log_linear(1.0, config.final_rate, max(0.0, 2 * self._timeline.fraction(iteration) - 1))
+        decay = self._timeline.decay(iteration, config.final_rate)
         for name in self._names:
             self._optimiser.set_learning_rate(name, decay * config.learning_rate)
         wanted = self._rays * config.samples_per_iteration / max(self._seen, 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,15 +11,15 @@ from torch import Tensor, nn
 from ...bench.contracts import Clip, FrameKey
 from .config import SplatSettings
 from .loop import Fit, TrainingImages, TrainingSummary, train
-from .optimisation import Optimiser
+from .optimisation import Optimiser, OptimiserState
 from .rendering import view_of
-from .schedule import Sampler, Timeline, log_linear
+from .schedule import Sampler, Timeline
 
 Initial = Mapping[str, tuple[Tensor, float]]
 """Initial tensors with their learning rates, by name."""
 
 
-class ImageTrainer:
+class ImageTrainer(OptimiserState):
     """A `Trainable` except for its loss. A derived class calls `_optimise` in its initialiser.
 
     Parameters
@@ -34,7 +33,6 @@ class ImageTrainer:
         The training frames, in the order of the sampler's indices, and their cameras by name.
     """
 
-    optimiser: Optimiser
     cost_growth: float = 1.0
     """Cost of a late step relative to an early one with the same parts, to turn a time into iterations."""
 
@@ -69,7 +67,7 @@ class ImageTrainer:
         final = self._settings.final_rate
         if final == 1:
             return
-        decay = log_linear(1.0, final, max(0.0, 2 * self._timeline.fraction(iteration) - 1))
+        decay = self._timeline.decay(iteration, final)
         for name, rate in self._rates.items():
             if name not in apart:
                 self.optimiser.set_learning_rate(name, decay * rate)
@@ -85,14 +83,6 @@ class ImageTrainer:
     def after_backward(self, iteration: int) -> None:
         """Set the learning rates; called between gradients and step."""
         self._decay_rates(iteration)
-
-    def state(self) -> dict[str, Any]:
-        """Parameters and moments."""
-        return {"optimiser": self.optimiser.state()}
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Restore what `state` returned."""
-        self.optimiser.load_state(state["optimiser"])
 
     def note(self) -> str:
         """Short description of the state of training."""

@@ -17,6 +17,20 @@ from .schedule import DensifySchedule, torch_generator
 EPS = 1e-15
 
 
+class OptimiserState:
+    """State of a `Trainable` that changes nothing but the tensors of its optimiser."""
+
+    optimiser: Optimiser
+
+    def state(self) -> dict[str, Any]:
+        """Parameters and moments."""
+        return {"optimiser": self.optimiser.state()}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Restore what `state` returned."""
+        self.optimiser.load_state(state["optimiser"])
+
+
 class Optimiser:
     """One Adam (eps 1e-15, dense) over named parameters.
 

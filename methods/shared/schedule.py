@@ -42,6 +42,10 @@ class Timeline:
         """Relative position of an iteration in the run, in (0, 1]."""
         return iteration / self.total
 
+    def decay(self, iteration: int, final: float) -> float:
+        """Factor of a learning rate that falls from 1 to ``final``, log-linear over the last half of the run."""
+        return log_linear(1.0, final, 2 * self.fraction(iteration) - 1)
+
     def sh_degree(self, settings: HarmonicsTraining, iteration: int) -> int:
         """Degree of the spherical harmonics in an iteration."""
         return min(settings.sh_degree, iteration // self.every(settings.sh_every, settings.min_sh_every))
