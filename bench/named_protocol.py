@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from .configuration import build_file, build_folder
+from .configuration import build_folder
 from .contracts import Clip, TaskName
 from .errors import InputError
 from .registry import unknown
@@ -99,11 +99,6 @@ class NamedProtocol:
             raise ValueError("tasks: at least one; found none")
         if self.pooled is not None and self.pooled < 1:
             raise ValueError(f"pooled: at least 1, or null; found {self.pooled}")
-
-
-def read_protocol(path: Path) -> NamedProtocol:
-    """Read the file of a protocol. Raises `InputError` for keys or values that it cannot have."""
-    return build_file(NamedProtocol, path)
 
 
 @cache

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..bench.configuration import build_file, build_folder
+from ..bench.configuration import build_folder
 from ..bench.errors import InputError
 from ..bench.registry import unknown
 
@@ -162,11 +162,6 @@ class Paper:
         """Title, venue where it is known, and number."""
         venue = [] if self.venue == "arXiv" or self.venue.startswith("not stated") else [self.venue]
         return ", ".join([self.title, *venue, *([f"arXiv {self.arxiv}"] if self.arxiv is not None else [])])
-
-
-def read_paper(path: Path) -> Paper:
-    """Read the file of a paper. Raises `InputError` for keys, values or tables that the schema does not have."""
-    return build_file(Paper, path)
 
 
 @cache

@@ -5,9 +5,10 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
+from headbench.bench.configuration import build_file
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
-from headbench.bench.named_protocol import FOLDER, check_capture, named_protocols, needed, read_protocol
+from headbench.bench.named_protocol import FOLDER, NamedProtocol, check_capture, named_protocols, needed
 from headbench.bench.registry import discover
 
 
@@ -39,7 +40,7 @@ def test_a_file_with_a_wrong_key_or_value_is_refused(tmp_path, change, message):
     change(content)
     (tmp_path / "p.yaml").write_text(yaml.safe_dump(content))
     with pytest.raises(InputError, match=message):
-        read_protocol(tmp_path / "p.yaml")
+        build_file(NamedProtocol, tmp_path / "p.yaml")
 
 
 def test_a_run_measures_what_a_protocol_selects():

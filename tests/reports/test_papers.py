@@ -5,10 +5,11 @@ import json
 import pytest
 import yaml
 
+from headbench.bench.configuration import build_file
 from headbench.bench.errors import InputError
 from headbench.bench.registry import discover
 from headbench.reports import papers as module
-from headbench.reports.papers import FOLDER, counts, papers, printed_tables, read_paper
+from headbench.reports.papers import FOLDER, Paper, counts, papers, printed_tables
 from headbench.reports.printed import as_printed
 from headbench.reports.runs import RunSet
 from headbench.reports.table_report import table_text
@@ -70,7 +71,7 @@ def test_printed_metrics_that_a_run_lacks_are_missing(write_run, tmp_path, monke
     paper = yaml.safe_load((FOLDER / f"{PAPER}.yaml").read_text())
     paper["tables"][0]["rows"][0]["values"] = {"novel_view/csim": "0.91", "cross_reenactment/csim": "0.6"}
     (tmp_path / "other.yaml").write_text(yaml.safe_dump(paper))
-    monkeypatch.setattr(module, "papers", lambda: {"other": read_paper(tmp_path / "other.yaml")})
+    monkeypatch.setattr(module, "papers", lambda: {"other": build_file(Paper, tmp_path / "other.yaml")})
     (printed,) = printed_tables("other", "3")
     table = as_printed(RunSet.read([write_run("a", {"ga": 30.0})]), "other", printed)
     csim = [column.metric for column in table.columns].index("csim")
@@ -147,7 +148,7 @@ def test_a_file_with_a_wrong_key_or_value_is_refused(tmp_path, change, message):
     change(paper)
     (tmp_path / "paper.yaml").write_text(yaml.safe_dump(paper))
     with pytest.raises(InputError, match=message):
-        read_paper(tmp_path / "paper.yaml")
+        build_file(Paper, tmp_path / "paper.yaml")
 
 
 def test_the_listing_has_every_paper_with_its_tables(capsys):
