@@ -49,13 +49,15 @@ class MemoryClip:
         """None: there are no masks."""
 
 
-def untrained(count: int, width: int, height: int) -> tuple[MemoryClip, OursAvatar]:
+def untrained(
+    count: int, width: int, height: int, *, version: str = "2020", cameras: int = 4, timesteps: int = 8
+) -> tuple[MemoryClip, OursAvatar]:
     """A capture without images of the procedural head, and an avatar of `ours` with ``count`` splats on it."""
-    head = procedural_head("2020")
-    rig = {camera.id: camera for camera in cameras_around(head, 4, width, height)}
+    head = procedural_head(version)
+    rig = {camera.id: camera for camera in cameras_around(head, cameras, width, height)}
     poses = {
         number: replace(pose, timestep=number, subject="untrained")
-        for number, pose in enumerate(random_poses(head, 8))
+        for number, pose in enumerate(random_poses(head, timesteps))
     }
     keys = tuple(FrameKey("untrained", "EMO-1", timestep, camera) for timestep in poses for camera in rig)
     shape, offset = np.zeros(head.shape_basis.shape[2], np.float32), np.zeros(head.template.shape, np.float32)
