@@ -25,7 +25,9 @@ def write_contact_sheet(run_folder: Path, frames_per_task: int = FRAMES_PER_TASK
     """Draw some frames of each task, evenly spaced over its sorted keys; return the file written."""
     data = RunData.read(run_folder)
     frames = [
-        _compared(data, task, key) for task in data.tasks for key in evenly(data.keys(task), frames_per_task)
+        compared_frame(data, task, key, data.methods)
+        for task in data.tasks
+        for key in evenly(data.keys(task), frames_per_task)
     ]
     protocols = ", ".join(f"{p.id} ({p.hash})" for p in data.manifest.protocols.values())
     subjects = dict.fromkeys(key.subject for task in data.tasks for key in data.keys(task))
@@ -133,18 +135,22 @@ def contact_sheet(
     )
 
 
-def _compared(data: RunData, task: str, key: FrameKey) -> ComparedFrame:
+def compared_frame(
+    data: RunData, task: str, key: FrameKey, methods: Sequence[str], width: int = PANEL_WIDTH
+) -> ComparedFrame:
+    """One frame of a run with the renders of some ``methods``, and their values of the run's first metric of frames."""
     metric = next((m for m in data.metrics if m.per_frame), None)
     renders: dict[str, ByteArray | str] = {}
     captions: dict[str, str] = {}
-    for method in data.methods:
+    for method in methods:
         render = data.render(method, task, key)
         renders[method] = data.reason(method, task, key) if render is None else render
         value = data.value(metric.name, method, task, key) if metric else None
         if metric and value is not None:
             captions[method] = f"{metric.label} {value:.{metric.digits}f} {metric.unit}".rstrip()
     labels = (key.sequence, f"subject {key.subject}", f"timestep {key.timestep}", f"camera {key.camera}")
-    return ComparedFrame.of(TASK_TITLES.get(task, task), labels, data.ground_truth(key), renders, captions)
+    section = TASK_TITLES.get(task, task)
+    return ComparedFrame.of(section, labels, data.ground_truth(key), renders, captions, width)
 
 
 def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:

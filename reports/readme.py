@@ -5,6 +5,7 @@ python -m headbench.reports.readme suite suite-output .
 python -m headbench.reports.readme profiles run-of-one-subject .
 python -m headbench.reports.readme faces run-of-one-subject .
 python -m headbench.reports.readme rates folder-of-sweeps .
+python -m headbench.reports.readme subjects suite-output .
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections.abc import Callable, Sequence
 from functools import cache, partial
 from itertools import chain, product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -39,10 +41,12 @@ from ..bench.experiments.suite_settings import (
 from ..bench.io.files import write_bytes, write_json, write_text
 from ..bench.io.images import encode_image, read_png
 from ..bench.progress import counted
-from ..bench.protocol import TASK_TITLES
+from ..bench.protocol import TASK_TITLES, evenly
 from ..bench.rows import ALL, Rows
 from ..bench.specs import CommandResult
 from .aggregate import summarise
+from .cameras import SPLIT_TASK, unseen_cameras
+from .contact_sheet import compared_frame, contact_sheet
 from .papers import paper_named
 from .pareto.plot import write_rates
 from .pareto.rates import read_rates
@@ -69,7 +73,11 @@ PROFILES, FACES = "profiles", "faces"
 """Stored results of one of its subjects: by the definitions of all protocols, and by metrics of faces."""
 RATES = "rates"
 """Stored sweeps over steps of the codec, one for each of some of its subjects."""
+OURS = "ours"
 PICTURE = "contact_sheet.jpg"
+SUBJECTS = "subjects.jpg"
+"""The README's picture: a frame of each subject whose renders are there, with the methods `SHOWN_METHODS`."""
+SHOWN_METHODS, PANEL = ("ga", "gbs", OURS), 150
 RESULTS = "results.md"
 MEASURED = "reports/measured.json"
 """Figures of the suite for cards of methods (`method_cards`)."""
@@ -83,7 +91,6 @@ PAGES = {
     RATES: "docs/explanation/fairness.md",
 }
 """The page of each block, in the repository."""
-OURS = "ours"
 COMPARED = (OURS, "ga")
 """Methods of the tables of protocols."""
 TRACKING = {
@@ -130,6 +137,23 @@ def publish_suite(out: Path, root: Path) -> None:
     _write(root / PAGES[PROTOCOLS], PROTOCOLS, protocols_block(target))
     _write(root / PAGES[DROPS], DROPS, drops_block(target))
     _write(root / PAGES[SUITE], SUITE, suite_block(root))
+
+
+def publish_picture(out: Path, root: Path) -> None:
+    """Draw a frame of self-reenactment at the unseen camera for each subject of a suite that was run here, as the README's picture."""
+    frames = []
+    for folder in suite_runs(out):
+        data = RunData.read(folder)
+        keys = data.keys(SPLIT_TASK)
+        unseen, _ = unseen_cameras([data.manifest], keys)
+        (key,) = evenly([key for key in keys if (key.subject, key.camera) in unseen], 1)
+        frames.append(compared_frame(data, SPLIT_TASK, key, SHOWN_METHODS, PANEL))
+    path = root / GALLERY / SUBJECTS
+    with TemporaryDirectory() as temporary:
+        sheet = Path(temporary) / "sheet.png"
+        contact_sheet(frames, SHOWN_METHODS, sheet, title="Subjects of the suite, unseen camera")
+        picture = read_png(sheet)
+    write_bytes(path, encode_image(picture, path.suffix, (cv2.IMWRITE_JPEG_QUALITY, 90), place=path))
 
 
 def publish_subject(name: str, out: Path, root: Path) -> None:
@@ -397,6 +421,7 @@ PUBLISH: dict[str, Callable[[Path, Path], None]] = {
     "demo": publish_demo,
     SUITE: publish_suite,
     RATES: publish_rates,
+    "subjects": publish_picture,
     **{name: partial(publish_subject, name) for name in SUBJECT_BLOCKS},
 }
 

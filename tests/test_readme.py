@@ -91,7 +91,7 @@ def test_a_release_names_its_address_and_has_absolute_links(tmp_path):
     links = re.findall(r"\]\(([^)#]+)\)", readme)
     assert links
     assert [link for link in links if "://" not in link] == []
-    assert "/raw/HEAD/reports/gallery/report.jpg" in readme
+    assert "/raw/HEAD/reports/gallery/subjects.jpg" in readme
     assert tomllib.loads(project)["project"]["urls"]["Repository"] == "https://example.org/me/headbench"
 
 

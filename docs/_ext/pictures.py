@@ -1,4 +1,4 @@
-"""``make pictures``: the page of an avatar of a finished demo, the README's picture, and thirty synthetic people.
+"""``make pictures``: the page of an avatar of a finished demo, a report, and thirty synthetic people.
 
 The page is ``docs/pictures/avatar.webp``; a report, for example of a subject of the suite, ``reports/gallery/report.jpg``. These need
 Chromium. The people are ``docs/pictures/people.webp``.
@@ -65,7 +65,7 @@ def people() -> Image.Image:
 
 
 def main(demo: Path, report: Path) -> None:
-    """Take the pictures of a demo's folder, and the README's of a file ``report.html``."""
+    """Take the pictures of a demo's folder, and of a report, the file ``report.html``."""
     pictures = ROOT / "docs" / "pictures"
     people().save(pictures / "people.webp", quality=80)
     names = ("chromium", "chromium-browser", "google-chrome")
