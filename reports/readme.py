@@ -41,9 +41,10 @@ from ..bench.experiments.suite_settings import (
 from ..bench.io.files import write_bytes, write_json, write_text
 from ..bench.io.images import encode_image, read_png
 from ..bench.progress import counted
-from ..bench.protocol import TASK_TITLES, evenly
+from ..bench.protocol import SEEN_CAMERAS, TASK_TITLES, evenly
+from ..bench.registry import discover
 from ..bench.rows import ALL, Rows
-from ..bench.specs import CommandResult
+from ..bench.specs import CommandResult, MethodSpec
 from .aggregate import summarise
 from .cameras import SPLIT_TASK, unseen_cameras
 from .contact_sheet import compared_frame, contact_sheet
@@ -52,7 +53,7 @@ from .pareto.plot import write_rates
 from .pareto.rates import read_rates
 from .pareto.table import rate_tables
 from .protocols import USUAL, ProtocolsSettings, protocols_command
-from .runs import RunData, RunSet, joined_subjects, synthetic_settings
+from .runs import FrameSelection, RunData, RunSet, joined_subjects, synthetic_settings
 from .statistics.comparisons import compare
 from .statistics.primary import primary_table
 from .suite.extremes import FOLDER as EXTREMES
@@ -67,8 +68,8 @@ GALLERY = "reports/gallery"
 PROTOCOLS = "protocols"
 SUITE = "suite"
 """Stored results of the suite in `GALLERY`."""
-DROPS = "drops"
-"""Block of the suite's drops from novel views to self-reenactment, which has no rows of its own."""
+DROPS, ABLATIONS = "drops", "ablations"
+"""Blocks of the suite's drops from novel views to self-reenactment, and of its ablations."""
 PROFILES, FACES = "profiles", "faces"
 """Stored results of one of its subjects: by the definitions of all protocols, and by metrics of faces."""
 RATES = "rates"
@@ -86,6 +87,7 @@ PAGES = {
     SUITE: "README.md",
     PROTOCOLS: "docs/explanation/protocols.md",
     DROPS: "docs/explanation/suite.md",
+    ABLATIONS: "docs/explanation/methods/ours.md",
     PROFILES: "docs/explanation/protocols.md",
     FACES: "docs/explanation/metrics.md",
     RATES: "docs/explanation/fairness.md",
@@ -136,6 +138,7 @@ def publish_suite(out: Path, root: Path) -> None:
     write_json(root / MEASURED, measured(target))
     _write(root / PAGES[PROTOCOLS], PROTOCOLS, protocols_block(target))
     _write(root / PAGES[DROPS], DROPS, drops_block(target))
+    _write(root / PAGES[ABLATIONS], ABLATIONS, ablations_block(target))
     _write(root / PAGES[SUITE], SUITE, suite_block(root))
 
 
@@ -256,6 +259,36 @@ def measured(folder: Path) -> dict[str, Any]:
 def protocols_block(folder: Path) -> str:
     """What the choices of an evaluation are worth on stored runs of the suite, for two methods: Markdown."""
     return _worth_of_choices(suite_runs(folder))
+
+
+def ablations_block(folder: Path) -> str:
+    """Differences of the ablations of `OURS` from it, on those stored runs of the suite that have them: Markdown."""
+    runs = RunSet.read(suite_runs(folder))
+    spec = discover("methods")[OURS].spec
+    assert isinstance(spec, MethodSpec)
+    names = {name: f"{OURS}+{name}" for name in spec.ablations if f"{OURS}+{name}" in runs.methods}
+    runs = runs.only([OURS, *names.values()]).shared.by_camera
+    parts = {"": runs, "face, ": runs.of(FrameSelection("face"))}
+    columns = [(title, task) for title in parts for task in ("novel_view", SEEN_CAMERAS)]
+    lines = [
+        ["", *(f"{title}{TASK_TITLES[task].lower()}" for title, task in columns), "MB"],
+        ["---"] * (2 + len(columns)),
+    ]
+    for name, label in names.items():
+        found = [_difference(parts[title], (label, OURS), task, "psnr", 2) for title, task in columns]
+        lines.append([f"`{name}`", *found, _difference(runs, (label, OURS), "", "storage", 1)])
+    subjects = ", ".join(sorted(runs.rows.subjects))
+    return f"Subjects {subjects}, PSNR in dB:\n\n{pipe_table(lines)}"
+
+
+def _difference(runs: RunSet, pair: tuple[str, str], task: str, metric: str, digits: int) -> str:
+    """First minus second of a pair with its interval."""
+    (spec,) = (spec for spec in runs.metrics if spec.name == metric)
+    (found,) = compare(runs.rows, [pair], task=task, metric=metric, higher_is_better=spec.higher_is_better)
+    text = "–" if found.difference is None else f"{found.difference:+.{digits}f}"
+    if found.low is not None and found.high is not None and task:
+        text += f" ({found.low:+.{digits}f}, {found.high:+.{digits}f})"
+    return text
 
 
 def drops_block(folder: Path) -> str:
@@ -390,14 +423,7 @@ def beside_table(runs: RunSet) -> str:
         ["---"] * (1 + len(runs.tasks)),
     ]
     for pair in BESIDE:
-        row = [" - ".join(pair)]
-        for task in runs.tasks:
-            (found,) = compare(runs.rows, [pair], task=task, metric="psnr", higher_is_better=True)
-            text = "–" if found.difference is None else f"{found.difference:+.2f}"
-            if found.low is not None and found.high is not None:
-                text += f" ({found.low:+.2f}, {found.high:+.2f})"
-            row.append(text)
-        lines.append(row)
+        lines.append([" - ".join(pair), *(_difference(runs, pair, task, "psnr", 2) for task in runs.tasks)])
     return pipe_table(lines)
 
 

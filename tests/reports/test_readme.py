@@ -7,13 +7,14 @@ from headbench.reports import readme
 
 def test_the_run_of_a_suite_is_published_without_folders(write_run, tmp_path, monkeypatch):
     page = tmp_path / "public" / "README.md"
-    for name in (readme.SUITE, readme.PROTOCOLS, readme.DROPS):
+    for name in (readme.SUITE, readme.PROTOCOLS, readme.DROPS, readme.ABLATIONS):
         written = page.parent / readme.PAGES[name]
         written.parent.mkdir(parents=True, exist_ok=True)
         written.write_text("\n".join(readme.marks(name)))
     write_run("run", {"ga": 30.0, "ours": 31.0})
     monkeypatch.setattr(readme, "suite_results", lambda folder: "tables")
     monkeypatch.setattr(readme, "drops_block", lambda folder: "block")
+    monkeypatch.setattr(readme, "ablations_block", lambda folder: "block")
     monkeypatch.setattr(readme, "suite_block", lambda root: "block")
     readme.publish_suite(tmp_path, page.parent)
     target = page.parent / readme.GALLERY / readme.SUITE
