@@ -15,14 +15,14 @@ SPLIT_TASK = "self_reenactment"
 
 
 def explained(keys: Collection[FrameKey], unseen: Collection[tuple[str, str]]) -> str:
-    """What seen and unseen cameras of the frames ``keys`` are, and how many of each a subject has, if all have as many."""
+    """What seen and unseen cameras of the frames ``keys`` are, and how many of each are scored, if as many for every subject."""
     cameras = {(key.subject, key.camera) for key in keys}
     subjects = {subject for subject, _ in cameras}
     counts = {
         tuple(sum(name == subject for name, _ in group) for group in (cameras - {*unseen}, unseen))
         for subject in subjects
     }
-    seen, held_out = (f" ({count})" for count in counts.pop()) if len(counts) == 1 else ("", "")
+    seen, held_out = (f" ({count} scored)" for count in counts.pop()) if len(counts) == 1 else ("", "")
     return f"Seen cameras{seen} have training frames in the capture, of other timesteps; unseen cameras{held_out} have none."
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -127,9 +128,9 @@ class RunData:
                 info = probe_image(path)
                 sizes.add((info.width, info.height))
         if not sizes:
-            found = {protocol.resolution for protocol in self.manifest.protocols.values()}
-            return ", ".join(sorted(found)).replace("x", " x ")
-        return " to ".join(dict.fromkeys(f"{w} x {h}" for w, h in (min(sizes), max(sizes))))
+            texts = ", ".join(protocol.resolution for protocol in self.manifest.protocols.values())
+            sizes = {(int(w), int(h)) for w, h in re.findall(r"(\d+)x(\d+)", texts)}
+        return " to ".join(dict.fromkeys(f"{w} x {h}" for w, h in (min(sizes), max(sizes)))) if sizes else ""
 
     @cached_property
     def _by_frame(self) -> dict[tuple[Any, ...], float]:

@@ -152,7 +152,7 @@ class Table:
         parts += [self.marking] if self.marking else []
         parts += self.printed
         if any(column.metric == "coded_change" for column in self.columns):
-            parts.append("By coding: the lower of the changes of PSNR in both tasks.")
+            parts.append("By coding: change of PSNR, the lower one of the tasks.")
         if self.machine and self.has_speed:
             parts.append(f"Speed measured on {self.machine}.")
         return tuple(parts)

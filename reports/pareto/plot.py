@@ -80,13 +80,17 @@ def write_rates(path: Path, curves: Mapping[str, Curves]) -> None:
         rows = figure.subplots(len(curves), columns, squeeze=False)
         markers = dict(zip(colours, itertools.cycle(MARKERS)))
         for row, (task, (points, metrics)) in zip(rows, curves.items()):
+            for axes in row[len(metrics) :]:
+                axes.set_visible(False)
             for axes, metric in zip(row, metrics):
                 unit = f", {metric.unit}" if metric.unit else ""
                 axes.set(xlabel="Size, MB")
                 start_axes(axes, f"{metric.label}{unit}, {TASK_TITLES.get(task, task).lower()}")
-                for name, colour in colours.items():
+                drawn = [
                     _draw_rates(axes, points, metric.name, name, colour, markers[name])
-                if axes.lines:
+                    for name, colour in colours.items()
+                ]
+                if any(drawn):
                     cost_axis(axes)
                 else:
                     show_missing(axes, "not measured in these runs")
@@ -94,8 +98,8 @@ def write_rates(path: Path, curves: Mapping[str, Curves]) -> None:
 
 def _draw_rates(
     axes: Axes, points: Sequence[RatePoint], metric: str, name: str, colour: str, marker: str
-) -> None:
-    """The curve of one method."""
+) -> bool:
+    """Draw the curve of one method; return whether there is one."""
     own = {point.variant: point.mean(metric) for point in points if point.method == name}
     trained = own.pop("", None)
     curve = sorted((*value, variant) for variant, value in own.items() if value is not None)
@@ -106,8 +110,9 @@ def _draw_rates(
             axes.annotate(
                 step, (size, value), (3, 4), textcoords="offset points", fontsize=SMALL - 2, color=colour
             )
-    if trained is not None:
+    if curve and trained is not None:
         axes.axhline(trained[1], color=colour, linewidth=0.8, linestyle="--")
+    return bool(curve)
 
 
 def _draw(

@@ -66,7 +66,7 @@ def condition_table(runs: RunSet, changed: Mapping[str, str], title: str) -> Tab
 def drops_by_tracking(runs: RunSet, titles: Mapping[str, str]) -> str:
     """PSNR of novel views minus that of self-reenactment as a Markdown table, a row for each condition of tracking and task.
 
-    Means and intervals are over those subjects that all methods under all conditions have.
+    Means and intervals are over those subjects that all methods under all conditions have; "" where no method has a condition.
 
     Parameters
     ----------
@@ -81,18 +81,27 @@ def drops_by_tracking(runs: RunSet, titles: Mapping[str, str]) -> str:
         }
         for condition in titles
     }
-    methods = [name for name in labels[""] if all(name in own for own in labels.values())]
+    labels = {condition: own for condition, own in labels.items() if own}
+    methods = [name for name in labels.get("", {}) if all(name in own for own in labels.values())]
+    if not methods or len(labels) < 2:
+        return ""
     shared = runs.only([own[name] for own in labels.values() for name in methods]).shared.by_camera
     lines = [["drop of PSNR, dB", *(f"`{name}`" for name in methods)], ["---", *["---:"] * len(methods)]]
     for task in (task for task in shared.tasks if task != NOVEL):
-        for condition, title in titles.items():
+        for condition, title in ((name, titles[name]) for name in labels):
             row = [f"{TASK_TITLES.get(task, task)}, {title}"]
             for name in methods:
-                novel, other = (
-                    subject_means(whole_images(shared.rows, labels[condition][name], METRIC, each))
+                means = [
+                    subject_means(found[found["status"] == "ok"])
                     for each in (NOVEL, task)
-                )
-                values = [value - other[subject] for subject, value in novel.items()]
+                    for found in [whole_images(shared.rows, labels[condition][name], METRIC, each)]
+                ]
+                values = [
+                    value - means[1][subject] for subject, value in means[0].items() if subject in means[1]
+                ]
+                if not values or len(values) < len(shared.rows.subjects):
+                    row.append("–")
+                    continue
                 bounds = interval(values)
                 text = f" ({bounds[0]:.1f}, {bounds[1]:.1f})" if bounds else ""
                 row.append(f"{fmean(values):.2f}{text}")

@@ -60,13 +60,15 @@ def variance_text(runs: Sequence[Path], seeds: Sequence[Path]) -> str:
         return ""
     read = RunSet.read([*repeated, *seeds]).only(PAIR).by_camera
     values = {name: means_by_seed(whole_images(read.rows, name, METRIC, "novel_view")) for name in PAIR}
-    found = components(_difference(values, PAIR))
+    by_seed = _difference(values, PAIR)
+    found = components(by_seed)
     if found is None:
         return ""
     subjects, mean, between, within = found
     return (
-        f"Trained with {len(values[PAIR[0]])} seeds on {subjects} subjects, the difference of `{PAIR[0]}` and `{PAIR[1]}` in novel views is "
-        f"{mean:+.2f} dB; its standard deviation is {between:.2f} dB between subjects and {within:.2f} dB between the seeds of a subject."
+        f"Trained with {len(by_seed)} seeds on {subjects} of the subjects, the difference of `{PAIR[0]}` and `{PAIR[1]}` in novel views is "
+        f"{mean:+.2f} dB; its standard deviation is {within:.2f} dB between the seeds of a subject, and {between:.2f} dB between the subjects' "
+        "means over seeds."
     )
 
 

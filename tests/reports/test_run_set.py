@@ -190,8 +190,8 @@ def test_seen_and_unseen_cameras_are_two_tasks(make_run):
     assert [task.frames for task in table.tasks[1:]] == [2, 2]
     assert {task.protocol_hash for task in table.tasks[1:]} == {*rows["protocol"]}
     for caption in (table.caption, table.short_caption):
-        assert "Seen cameras (1) have" in caption
-        assert "unseen cameras (1) have none" in caption
+        assert "Seen cameras (1 scored) have" in caption
+        assert "unseen cameras (1 scored) have none" in caption
 
 
 def forget_cameras(manifest):
