@@ -6,7 +6,7 @@ import logging
 import math
 import os
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from enum import Enum
 from functools import cached_property
@@ -271,18 +271,19 @@ class Rows:
 
     def renamed(self, labels: Mapping[str, str]) -> Rows:
         """The same rows, every method under another name."""
-        return Rows(self._table.assign(method=[labels[str(name)] for name in self._table["method"]]))
+        return Rows(self._table.assign(method=_mapped(self._table["method"], labels.__getitem__)))
 
     def of_protocols(self, hashes: Mapping[str, str]) -> Rows:
         """The same rows with other protocols, by their hashes; those that are not named keep theirs."""
-        return Rows(
-            self._table.assign(protocol=[hashes.get(str(h), str(h)) for h in self._table["protocol"]])
-        )
+        protocol = _mapped(self._table["protocol"], lambda found: hashes.get(found, found))
+        return Rows(self._table.assign(protocol=protocol))
 
     def labelled(self) -> Rows:
         """The same rows with `label_of` of method and condition as the method: each label is an entry of a table."""
         table = self._table
-        labels = [label_of(str(m), str(c)) for m, c in zip(table["method"], table["condition"])]
+        (method, methods), (condition, conditions) = (pd.factorize(table[n]) for n in ("method", "condition"))
+        labels = np.array([[label_of(str(m), str(c)) for c in conditions] for m in methods], dtype=object)
+        labels = labels.reshape(len(methods), len(conditions))[method, condition]  # of no rows, too
         return Rows(table.assign(method=pd.Series(labels, table.index, dtype="str"), condition=""))
 
     def split(self, labels: Mapping[str, tuple[str, str]]) -> Rows:
@@ -578,7 +579,7 @@ def _checked(table: pa.Table, path: Path) -> pd.DataFrame:
             raise InputError(path, name, f"{expected} in every row", f"{column.null_count} empty entries")
         columns[name] = _texts(column, path, name) if name in TEXTS else column.to_numpy(zero_copy_only=False)
     frame = pd.DataFrame(columns).astype(TYPES)
-    strange = sorted(set(frame["status"]) - set(STATUSES))
+    strange = sorted({*frame["status"].unique()} - {*STATUSES})
     if strange:
         raise InputError(path, "status", f"one of {', '.join(STATUSES)}", ", ".join(map(repr, strange)))
     undefined = frame[(frame["status"] == "ok") & ~(frame["value"].abs() <= MAX_VALUE)]
@@ -591,6 +592,13 @@ def _checked(table: pa.Table, path: Path) -> pd.DataFrame:
         if len(wrong):
             raise InputError(path, name, "a number from 0", str(wrong.iloc[0]))
     return frame
+
+
+def _mapped(words: pd.Series[str], change: Callable[[str], str]) -> pd.Series[str]:
+    """Every word changed; each distinct one once."""
+    place, known = pd.factorize(words)
+    changed = np.array([change(str(word)) for word in known], dtype=object)[place]
+    return pd.Series(changed, words.index, dtype="str")
 
 
 def _is_text(kind: pa.DataType) -> bool:

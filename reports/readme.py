@@ -5,6 +5,7 @@ python -m headbench.reports.readme suite suite-output .
 python -m headbench.reports.readme profiles run-of-one-subject .
 python -m headbench.reports.readme faces run-of-one-subject .
 python -m headbench.reports.readme rates folder-of-sweeps .
+python -m headbench.reports.readme further folder-of-runs .
 python -m headbench.reports.readme subjects suite-output .
 """
 
@@ -75,6 +76,8 @@ PROFILES, FACES = "profiles", "faces"
 RATES = "rates"
 """Stored sweeps over steps of the codec, one for each of some of its subjects."""
 OURS = "ours"
+FURTHER = "further"
+"""Stored runs of methods that the plan of the suite does not have, on some of its subjects; each named as that subject's run."""
 PICTURE = "contact_sheet.jpg"
 SUBJECTS = "subjects.jpg"
 """The README's picture: a frame of each subject of a suite that was run here, with the methods `SHOWN_METHODS`."""
@@ -91,6 +94,7 @@ PAGES = {
     PROFILES: "docs/explanation/protocols.md",
     FACES: "docs/explanation/metrics.md",
     RATES: "docs/explanation/fairness.md",
+    FURTHER: "docs/explanation/methods/rgbavatar.md",
 }
 """The page of each block, in the repository."""
 COMPARED = (OURS, "ga")
@@ -166,11 +170,21 @@ def publish_subject(name: str, out: Path, root: Path) -> None:
     _write(root / PAGES[name], name, SUBJECT_BLOCKS[name](target))
 
 
+def publish_further(out: Path, root: Path) -> None:
+    """Copy manifests and rows of the runs in a folder to the repository ``root``, and write the block that compares them with the suite."""
+    _copy_all(out, root / GALLERY / FURTHER)
+    _write(root / PAGES[FURTHER], FURTHER, further_block(root / GALLERY))
+
+
+def _copy_all(out: Path, target: Path) -> None:
+    for run in sorted(path.parent for path in out.glob("*/rows.parquet")):
+        _copy(RunFolder(run), RunFolder(target / run.name))
+
+
 def publish_rates(out: Path, root: Path) -> None:
     """Copy manifests and rows of the sweeps in a folder to the repository ``root``, and write their block and its plot."""
     target = root / GALLERY / RATES
-    for run in sorted(path.parent for path in out.glob("*/rows.parquet")):
-        _copy(RunFolder(run), RunFolder(target / run.name))
+    _copy_all(out, target)
     runs = rate_runs(target)
     write_rates(root / RATES_PICTURE, {task: read_rates(runs, task) for task in RATES_TASKS})
     _write(root / PAGES[RATES], RATES, rates_block(runs))
@@ -259,6 +273,25 @@ def measured(folder: Path) -> dict[str, Any]:
 def protocols_block(folder: Path) -> str:
     """What the choices of an evaluation are worth on stored runs of the suite, for two methods: Markdown."""
     return _worth_of_choices(suite_runs(folder))
+
+
+def further_block(gallery: Path) -> str:
+    """The methods of the runs in `FURTHER` beside those of the suite on the same subjects: Markdown."""
+    further = suite_runs(gallery, FURTHER)
+    names = {run.name for run in further}
+    runs = RunSet.read([*further, *(run for run in suite_runs(gallery / SUITE) if run.name in names)])
+    runs = runs.only([*runs.ranked]).shared.by_camera
+    methods = [record.name for run in further for record in RunFolder(run).read_manifest().methods]
+    columns = Columns((*SHOWN, "storage", "training_processor", "fps_one_thread"))
+    lines = [
+        ["PSNR, dB", *(TASK_TITLES.get(task, task) for task in runs.tasks)],
+        ["---"] * (1 + len(runs.tasks)),
+    ]
+    for method in dict.fromkeys(methods):
+        pair = (method, COMPARED[1])
+        lines.append([" - ".join(pair), *(_difference(runs, pair, task, "psnr", 2) for task in runs.tasks)])
+    table = to_markdown(table_of(runs, columns=columns)).strip()
+    return f"{table}\n\nDifferences, means over subjects and 95 % intervals:\n\n{pipe_table(lines)}"
 
 
 def ablations_block(folder: Path) -> str:
@@ -455,6 +488,7 @@ PUBLISH: dict[str, Callable[[Path, Path], None]] = {
     "demo": publish_demo,
     SUITE: publish_suite,
     RATES: publish_rates,
+    FURTHER: publish_further,
     "subjects": publish_picture,
     **{name: partial(publish_subject, name) for name in SUBJECT_BLOCKS},
 }

@@ -190,6 +190,7 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
     blocks = {
         "demo": readme.demo_block(ROOT / readme.GALLERY),
         readme.SUITE: readme.suite_block(ROOT),
+        readme.FURTHER: readme.further_block(ROOT / readme.GALLERY),
         readme.ABLATIONS: readme.ablations_block(ROOT / readme.GALLERY / readme.SUITE),
         readme.DROPS: readme.drops_block(ROOT / readme.GALLERY / readme.SUITE),
         readme.PROTOCOLS: readme.protocols_block(ROOT / readme.GALLERY / readme.SUITE),
