@@ -80,6 +80,9 @@ COMMANDS = (
     "render run/901/ours/seed-0/avatar --capture colmap --reader colmap --frames train --out rendered",
     f"import ga run/901/ga/seed-0/avatar/point_cloud.ply --capture capture {GIVEN} --out imported",
     f"prepare tongue capture {GIVEN} --out tongue",
+    f"track capture {GIVEN} --out tracked",
+    f"drive run/901/ga/seed-0/avatar --capture capture --signal capture {GIVEN} --sequence FREE --out driven",
+    "drive run/901/gbs/seed-0/avatar --signal driven --sequence drive --size 32 --out other",
 )
 
 
