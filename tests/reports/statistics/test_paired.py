@@ -21,7 +21,7 @@ def rows(make_rows):
     return of("a", (0, 1, 2)), of("b", (7,))
 
 
-def test_differences_are_of_means_over_frames_sequences_and_seeds(rows):
+def test_differences_are_of_the_means_of_subjects(rows):
     shuffled = [table.sample(frac=1, random_state=1) for table in rows]
     # Independent of the table's code: nested means by pandas.
     means = [
