@@ -343,11 +343,12 @@ def _equivalence(differences: Sequence[Difference], margin: float) -> list[str]:
     for each in differences:
         p = each.equivalence_p(margin) if each.metric == "psnr" else None
         if p is not None:
+            small = f"p = {p:.4f}" if p >= 0.0001 else "p < 0.0001"
             verdict = "equivalent" if p <= 1 - CONFIDENCE else "equivalence not shown"
             task = each.task.replace("_", " ")
             lines += [
                 "",
-                f"PSNR of {task}: {verdict} within {margin:g} dB over the orders of these captures (two one-sided t-tests, p = {p:.4f}).",
+                f"PSNR of {task}: {verdict} within {margin:g} dB over the orders of these captures (two one-sided t-tests, {small}).",
             ]
     return lines
 
