@@ -218,7 +218,7 @@ class Budget:
     """Limit of the training cost: iterations, seconds, or both (whichever ends first).
 
     Schedules are fractions of the budget, so that a short run follows the course of a long one. With only a
-    limit in seconds, the method estimates its iterations from the first steps and reports the estimate.
+    limit in seconds, the method estimates its iterations, again during the training, and reports the estimate.
 
     Attributes
     ----------

@@ -28,6 +28,8 @@ from .threads import torch_on_one_thread
 CHECKPOINT = "checkpoint.safetensors"
 TIMED_STEPS = 5  # steps timed to turn seconds into iterations
 COST_GROWTH = 1.6  # estimated cost of a late step relative to an early one, because there are more splats
+ESTIMATED_AGAIN = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4)
+"""Parts of a budget in seconds after which the iterations are estimated again: the first steps also read images and fill caches."""
 REPORT_EVERY = 10  # iterations between reads of the loss, each of which waits for the device
 
 
@@ -121,7 +123,7 @@ def train(
         training time; by default counting begins here.
     cost_growth : float
         Estimated cost of a late step relative to an early one, to turn a budget in seconds into iterations; 1 for a
-        constant number of splats.
+        constant number of splats. The estimate is repeated after the parts `ESTIMATED_AGAIN` of the seconds.
 
     Raises
     ------
@@ -157,8 +159,30 @@ def train(
         return spent + clock() - started
 
     last_save = clock()
+    timed_from = iteration, seconds()
+    moments = (
+        [part * budget.seconds for part in ESTIMATED_AGAIN]
+        if budget.seconds and not budget.iterations
+        else []
+    )
+    moments = [moment for moment in moments if moment > timed_from[1]]
     with torch_on_one_thread(compiled):
-        while iteration < total and (budget.seconds is None or seconds() < budget.seconds):
+        while iteration < total:
+            if budget.seconds is not None:
+                now = seconds()
+                if now >= budget.seconds:
+                    break
+                if moments and now >= moments[0] and iteration > timed_from[0]:
+                    wait()
+                    now = seconds()
+                    moments = [moment for moment in moments if moment > now]
+                    pace = max((now - timed_from[1]) / (iteration - timed_from[0]), 1e-6)
+                    # What is left of the growth, and so less than the whole growth of a step made now.
+                    left = max(budget.seconds - now, 0.0)
+                    more = left / (pace * cost_growth ** (left / budget.seconds))
+                    total, timed_from = iteration + max(1, int(more)), (iteration, now)
+                    trainable.begin(Timeline(total, published_length))
+                    estimated = f"{total} iterations estimated; "
             iteration += 1
             loss = trainable.loss(iteration, sampler(iteration))
             loss.backward()

