@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache, partial
 from itertools import chain, product
 from pathlib import Path
@@ -253,7 +254,7 @@ def suite_results(folder: Path) -> str:
 
 def measured(folder: Path) -> dict[str, Any]:
     """Means of the stored runs of the suite, as `method_cards.MeasuredFigures` has them; over all cameras, as papers print them."""
-    runs = RunSet.read(suite_runs(folder))
+    runs = _read(*suite_runs(folder))
     specs = {spec.name: spec for spec in runs.metrics}
     keys = [(task, name) for task in runs.tasks for name in specs if specs[name].per_frame]
     keys += [("", name) for name in ("storage", "storage_coded", "fps") if name in specs]
@@ -296,7 +297,7 @@ def further_block(gallery: Path) -> str:
 
 def ablations_block(folder: Path) -> str:
     """Differences of the ablations of `OURS` from it, on those stored runs of the suite that have them: Markdown."""
-    runs = RunSet.read(suite_runs(folder))
+    runs = _read(*suite_runs(folder))
     spec = discover("methods")[OURS].spec
     assert isinstance(spec, MethodSpec)
     names = {name: f"{OURS}+{name}" for name in spec.ablations if f"{OURS}+{name}" in runs.methods}
@@ -318,15 +319,19 @@ def _difference(runs: RunSet, pair: tuple[str, str], task: str, metric: str, dig
     """First minus second of a pair with its interval."""
     (spec,) = (spec for spec in runs.metrics if spec.name == metric)
     (found,) = compare(runs.rows, [pair], task=task, metric=metric, higher_is_better=spec.higher_is_better)
-    text = "–" if found.difference is None else f"{found.difference:+.{digits}f}"
-    if found.low is not None and found.high is not None and task:
-        text += f" ({found.low:+.{digits}f}, {found.high:+.{digits}f})"
-    return text
+    # Sizes differ by nearly the same for all subjects.
+    return (found if task else replace(found, low=None)).text(digits)
 
 
 def drops_block(folder: Path) -> str:
     """The drop from novel views to self-reenactment by condition of tracking, on the stored runs of the suite: Markdown."""
-    return drops_by_tracking(RunSet.read(suite_runs(folder)), TRACKING)
+    return drops_by_tracking(_read(*suite_runs(folder)), TRACKING)
+
+
+@cache
+def _read(*runs: Path) -> RunSet:
+    """Stored runs, which several blocks are made of."""
+    return RunSet.read(runs)
 
 
 @cache
@@ -336,7 +341,7 @@ def _choices(runs: tuple[Path, ...]) -> CommandResult:
 
 
 def _worth_of_choices(runs: Sequence[Path]) -> str:
-    subjects = counted(len(RunSet.read(runs).rows.subjects), "subject")
+    subjects = counted(len(_read(*runs).rows.subjects), "subject")
     found = _choices(tuple(runs))
     return f"`{'` and `'.join(COMPARED)}`, {subjects} of the suite:\n\n{found.text}"
 
@@ -397,7 +402,7 @@ def suite_block(root: Path) -> str:
     folder = root / GALLERY / SUITE
     results = os.path.relpath(folder / RESULTS, (root / PAGES[SUITE]).parent)
     folders = suite_runs(folder)
-    runs = RunSet.read(folders)
+    runs = _read(*folders)
     options = " ".join(suite_options(folder))
     made = synthetic_settings(runs.runs[0].manifest.clips[0])
     seeds = suite_runs(folder, SEEDS_RUN)

@@ -17,6 +17,7 @@ from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
 from ..bench.specs import MetricSpec
 from .aggregate import Aggregate, subject_means, summarise, whole_images
+from .coded import CODED_CHANGE
 from .conditions import conditions, marks, measured_on, suspects
 from .statistics.comparisons import BestSet, best_set
 from .statistics.paired import LEVEL
@@ -151,7 +152,7 @@ class Table:
         parts.append(f"Mean over {self.averaged}; {seeds}.")
         parts += [self.marking] if self.marking else []
         parts += self.printed
-        if any(column.metric == "coded_change" for column in self.columns):
+        if any(column.metric == CODED_CHANGE.name for column in self.columns):
             parts.append("By coding: change of PSNR, the lower one of the tasks.")
         if self.machine and self.has_speed:
             parts.append(f"Speed measured on {self.machine}.")

@@ -160,12 +160,8 @@ def train(
 
     last_save = clock()
     timed_from = iteration, seconds()
-    moments = (
-        [part * budget.seconds for part in ESTIMATED_AGAIN]
-        if budget.seconds and not budget.iterations
-        else []
-    )
-    moments = [moment for moment in moments if moment > timed_from[1]]
+    limit = 0.0 if budget.iterations else budget.seconds or 0.0
+    moments = [moment for part in ESTIMATED_AGAIN if (moment := part * limit) > timed_from[1]]
     with torch_on_one_thread(compiled):
         while iteration < total:
             if budget.seconds is not None:
@@ -176,11 +172,11 @@ def train(
                     wait()
                     now = seconds()
                     moments = [moment for moment in moments if moment > now]
-                    pace = max((now - timed_from[1]) / (iteration - timed_from[0]), 1e-6)
-                    # What is left of the growth, and so less than the whole growth of a step made now.
+                    pace = (now - timed_from[1]) / (iteration - timed_from[0])
                     left = max(budget.seconds - now, 0.0)
-                    more = left / (pace * cost_growth ** (left / budget.seconds))
-                    total, timed_from = iteration + max(1, int(more)), (iteration, now)
+                    # What is left of the growth, and so less than that over a whole run.
+                    more = _in_seconds(left, pace * cost_growth ** (left / budget.seconds))
+                    total, timed_from = iteration + more, (iteration, now)
                     trainable.begin(Timeline(total, published_length))
                     estimated = f"{total} iterations estimated; "
             iteration += 1
@@ -245,7 +241,12 @@ def _estimate(
         durations.append(clock() - before)
     # The first step pays for lazy initialisation; the median of the rest is robust to an outlier.
     typical = sorted(durations[1:])[TIMED_STEPS // 2]
-    return max(1, int(seconds / max(typical * cost_growth, 1e-6)))
+    return _in_seconds(seconds, typical * cost_growth)
+
+
+def _in_seconds(seconds: float, cost: float) -> int:
+    """Number of iterations of a ``cost`` in seconds, at least one."""
+    return max(1, int(seconds / max(cost, 1e-6)))
 
 
 class TrainingImages:

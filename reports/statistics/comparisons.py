@@ -141,6 +141,17 @@ class PairedComparison:
         sign = 1 if self.higher_is_better else -1
         return sum(sign * value > 0 for _, value in self.differences)
 
+    def text(self, digits: int) -> str:
+        """The difference, and its interval in brackets where there is one; "–" without a difference."""
+        if self.difference is None:
+            return "–"
+        interval = (
+            ""
+            if self.low is None or self.high is None
+            else f" ({self.low:+.{digits}f}, {self.high:+.{digits}f})"
+        )
+        return f"{self.difference:+.{digits}f}{interval}"
+
     @property
     def testable(self) -> bool:
         """Whether a corrected p-value at the level is possible with this number of subjects."""

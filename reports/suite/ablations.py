@@ -113,8 +113,6 @@ def _cell(found: PairedComparison, digits: int) -> TableCell:
     if found.difference is None:
         return TableCell("missing", None, found.reason)
     # A digit more than the table: differences are smaller than values.
-    text = f"{found.difference:+.{digits + 1}f}"
-    if found.low is not None and found.high is not None:
-        text += f" ({found.low:+.{digits + 1}f}, {found.high:+.{digits + 1}f})"
+    text = found.text(digits + 1)
     differs = found.p_holm is not None and found.p_holm <= LEVEL
     return TableCell("ok", found.difference, text, rank=1 if differs else None)

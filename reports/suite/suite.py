@@ -10,7 +10,7 @@ from ...bench.engine.scoring import FULL
 from ...bench.engine.store import RunFolder
 from ...bench.experiments.suite_settings import AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, RUN, SEEDS_RUN, TRACKED
 from ...bench.rows import ALL
-from ..runs import FrameSelection, RunSet
+from ..runs import WHOLE, FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
 from ..statistics.primary import PAIR, primary_section
 from ..table_report import Columns, table_of
@@ -107,7 +107,7 @@ def _tables(read: RunSet, method: str, *, primary: bool) -> str:
     sections = [primary_section(runs), _machines(read)] if primary else []
     whole_frames = ENDPOINTS if primary and {*PAIR} <= {*runs.ranked} else ""
     sections += [
-        _section(title, runs.of(part), method, "" if runs.of(part).part else whole_frames)
+        _section(title, runs.of(part), method, whole_frames if part == WHOLE else "")
         for title, part in parts.items()
     ]
     if equal := by_condition.get(EQUAL, {}):
