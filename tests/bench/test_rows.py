@@ -26,6 +26,30 @@ def rows():
     )
 
 
+def test_words_of_every_row_are_changed():
+    cells = [("b", ""), ("a", "less"), ("a", ""), ("b", "less"), ("a", "less")]
+    rows = Rows.of(
+        Row(m, "1", 0, "", "s", "", -1, "", "full", "storage", float(i), f"hash-{m}", condition=c)
+        for i, (m, c) in enumerate(cells)
+    )
+
+    def found(changed, column):
+        return changed.select(**NAMED, condition=ALL).sort_values("value")[column].tolist()
+
+    assert found(rows.labelled(), "method") == ["b", "a+less", "a", "b+less", "a+less"]
+    assert found(rows.labelled(), "condition") == [""] * 5
+    assert found(rows.renamed({"a": "x", "b": "y"}), "method") == ["y", "x", "x", "y", "x"]
+    assert found(rows.of_protocols({"hash-a": "new"}), "protocol") == [
+        "hash-b",
+        "new",
+        "new",
+        "hash-b",
+        "new",
+    ]
+    for changed in (Rows.of([]).labelled(), Rows.of([]).renamed({}), Rows.of([]).of_protocols({})):
+        assert len(changed) == 0
+
+
 @pytest.mark.parametrize("forgotten", NAMED)
 def test_a_query_that_forgets_a_name_is_refused(rows, forgotten):
     named = {name: value for name, value in NAMED.items() if name != forgotten}
