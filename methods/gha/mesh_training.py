@@ -261,7 +261,6 @@ def remove_mesh_phase(out: Path) -> None:
 
 
 def _trained(scene: TrainingScene, head: MeshHead, fit: Fit) -> dict[str, Any]:
-    began = fit.clock()
     training = MeshTraining(scene, head, fitted=not (fit.out / CHECKPOINT).exists())
     config = head.config
     outcome = train(
@@ -270,7 +269,6 @@ def _trained(scene: TrainingScene, head: MeshHead, fit: Fit) -> dict[str, Any]:
         fit,
         published_length=max(1, round(config.schedule_length * config.mesh_fraction)),
         checkpoint_every_s=config.checkpoint_every_s,
-        began=began,
     )
     names = [*(name for network in head.networks for name in network.shapes()), "landmarks"]
     tensors = {name: training.optimiser[name].detach() for name in names}

@@ -69,6 +69,9 @@ class Fit:
         Digest of everything that affects training; a checkpoint with another digest is refused.
     clock : Callable
         Clock in seconds with any origin, for budgets in seconds.
+    began : float | None
+        Reading of the clock before anything was prepared for the training, so that the preparation counts as training
+        time; by default counting begins with the first iteration.
     capacity : Mapping[str, Any] | None
         The planned sizes, for the record.
     """
@@ -81,6 +84,7 @@ class Fit:
     progress: Progress
     run: str
     clock: Callable[[], float] = time.monotonic
+    began: float | None = None
     capacity: Mapping[str, Any] | None = None
 
 
@@ -104,7 +108,6 @@ def train(
     *,
     published_length: int,
     checkpoint_every_s: float,
-    began: float | None = None,
     cost_growth: float = COST_GROWTH,
 ) -> TrainingSummary:
     """Train until the budget is spent; continue from the checkpoint in ``fit.out`` if it is of the same run.
@@ -118,9 +121,6 @@ def train(
     ----------
     published_length : int
         Iterations of the published run (`Timeline`).
-    began : float | None
-        Reading of the clock before ``trainable`` was prepared, so that the preparation counts as
-        training time; by default counting begins here.
     cost_growth : float
         Estimated cost of a late step relative to an early one, to turn a budget in seconds into iterations; 1 for a
         constant number of splats. The estimate is repeated after the parts `ESTIMATED_AGAIN` of the seconds.
@@ -136,14 +136,14 @@ def train(
     path, compiled = fit.out / CHECKPOINT, bool(instruction_sets())
     wait = synchroniser(fit.device)
     saved = load_checkpoint(path, fit.run, fit.device)
-    started = clock() if began is None else began
+    started = clock() if fit.began is None else fit.began
     losses: list[tuple[int, float]] = []
     if saved is None:
         iteration, spent = 0, 0.0
         total = budget.iterations
         if total is None:
             assert budget.seconds is not None
-            left = budget.seconds if began is None else budget.seconds - (clock() - began)
+            left = budget.seconds - (clock() - started)
             with torch_on_one_thread(compiled):
                 total = _estimate(trainable, sampler, left, published_length, cost_growth, clock, wait)
         trainable.begin(Timeline(total, published_length))
@@ -166,7 +166,7 @@ def train(
         while iteration < total:
             if budget.seconds is not None:
                 now = seconds()
-                if now >= budget.seconds:
+                if now >= budget.seconds and iteration > 0:
                     break
                 if moments and now >= moments[0] and iteration > timed_from[0]:
                     wait()

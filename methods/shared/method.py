@@ -48,6 +48,7 @@ class TrainedMethod(Generic[Config, Avatar]):
         check_budget(budget)
         check_training_split(clip)
         self.prepare(device)
+        began = self._clock()
         config, settings = self._resolved(clip, device)
         run = run_digest(self.name, self.version, settings, clip, budget, seed)
         if not is_finished(out, run):
@@ -55,7 +56,9 @@ class TrainedMethod(Generic[Config, Avatar]):
             if plan is not None:
                 log.info("%s", plan.summary())
             record = None if plan is None else plan.record()
-            self._train(Fit(clip, out, budget, device, seed, progress, run, self._clock, record), config)
+            self._train(
+                Fit(clip, out, budget, device, seed, progress, run, self._clock, began, record), config
+            )
         self._remove_training_files(out)
         return self.load(out, device=device)
 

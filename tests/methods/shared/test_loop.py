@@ -52,9 +52,9 @@ class Clock:
 def run(
     model, folder, budget, progress=no_progress, clock=None, every=1e9, name="run", began=None, device="cpu"
 ):
-    fit = Fit(None, folder, budget, device, 0, progress, name, clock or Clock())
+    fit = Fit(None, folder, budget, device, 0, progress, name, clock or Clock(), began)
     sampler = lambda iteration: iteration % 3
-    return train(model, sampler, fit, published_length=100, checkpoint_every_s=every, began=began)
+    return train(model, sampler, fit, published_length=100, checkpoint_every_s=every)
 
 
 def killing(at):
