@@ -31,6 +31,9 @@ COSTS = {
 }
 """Metric of each cost, and its factor."""
 COST_TITLES = {"seconds": "Training time", "megabytes": "Size", "milliseconds": "Frame time"}
+OVERRUN = 1.05
+"""A training with a limit of seconds counts with that limit if it took at most this many times as long: its last iteration and
+the files of the avatar come on top."""
 UNITS = {"seconds": "s of training", "megabytes": "MB", "milliseconds": "ms a frame"}
 
 
@@ -197,13 +200,11 @@ def read_choices(
             derived = condition is not None and condition.derive.name
             for cost, (name, factor) in COSTS.items():
                 source = record.name if derived and cost == "seconds" else own
-                found = _costs(run.rows, source, name)
-                if cost == "seconds" and not found:
-                    found = {
-                        subject: value / factor for subject, value in _recorded_seconds(run, source).items()
-                    }
-                known_costs = costs.setdefault(label, {}).setdefault(cost, {})
-                known_costs.update({subject: factor * value for subject, value in found.items()})
+                found = {subject: factor * value for subject, value in _costs(run.rows, source, name).items()}
+                if cost == "seconds":
+                    limit = None if record.budget.get("iterations") else record.budget.get("seconds")
+                    found = _within(found or _recorded_seconds(run, source), limit)
+                costs.setdefault(label, {}).setdefault(cost, {}).update(found)
     choices, without = {}, []
     for label, values in quality.items():
         if set(values) != everybody:
@@ -324,6 +325,12 @@ def _costs(rows: Rows, label: str, metric: str) -> dict[str, float]:
         for subject, own in found.groupby("subject")
         if (own["status"] == "ok").all()
     }
+
+
+def _within(seconds: Mapping[str, float], limit: float | None) -> dict[str, float]:
+    """Training times by subject; the limit of the training where that was exceeded by at most `OVERRUN`."""
+    most = 0.0 if limit is None else OVERRUN * limit
+    return {s: min(value, limit) if limit and value <= most else value for s, value in seconds.items()}
 
 
 def _recorded_seconds(run: RunData, label: str) -> dict[str, float]:

@@ -124,6 +124,15 @@ REPORT_COMMAND = CommandSpec(
     function="headbench.reports.page.report:write_report",
 )
 
+CURVES = CommandSpec(
+    name="report curve",
+    group="inspect",
+    summary="Join runs of `headbench run curve`: means over subjects, and which method is best for how much.",
+    settings="headbench.reports.curve.settings:CurveReportSettings",
+    function="headbench.reports.curve.curve:curve_runs",
+    writes="out",
+)
+
 PARETO = CommandSpec(
     name="report pareto",
     group="inspect",

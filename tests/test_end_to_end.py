@@ -313,6 +313,9 @@ CASES = {
             *(r"(?m)^ga +1/8", "curve/curve.csv", "curve/curve.png"),
         )
     ],
+    "report curve": [
+        case("report curve curve --out joined", "`ga` from", "joined/curve.csv", "joined/curve.png"),
+    ],
     "run extremes": [
         case(
             "run extremes {demo} --out extremes --views 2 --dimensions 1 --samples 1 --path 2",

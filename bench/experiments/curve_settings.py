@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import tyro
 
@@ -18,6 +18,7 @@ MOST_TRACKING_ERROR = 4.0
 FRACTIONS = ("1/16", "1/8", "1/4", "1/2", "1")
 LEVELS = (0.0, 1.0, 2.0)
 SECONDS, PICTURES = (5.0, 30.0, 120.0), (1, 4, 16)
+Over: TypeAlias = Literal["budget", "seconds", "cameras", "timesteps", "pictures", "tracking_error"]
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class CurveSettings(RunOptions, ExecutionOptions):
     methods: tuple[str, ...] = ()
     """Methods to train; default: all but the trivial baselines."""
 
-    over: Literal["budget", "seconds", "cameras", "timesteps", "pictures", "tracking_error"] = "budget"
+    over: Over = "budget"
     """What to take parts of (budget, cameras, timesteps) or a number of (seconds of training, pictures); or the error of tracking, of
     a synthetic capture, whose pictures stay."""
 

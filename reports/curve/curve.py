@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from fractions import Fraction
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from ...bench.condition import Condition
-from ...bench.contracts import Budget
+from ...bench.contracts import Budget, FrameKey, Progress, no_progress
 from ...bench.engine.scoring import FULL
+from ...bench.errors import InputError
 from ...bench.experiments.tracking import tracking_error
 from ...bench.io.files import write_text
 from ...bench.manifest import ClipRecord, MethodRecord
@@ -17,12 +21,15 @@ from ...bench.rows import ALL, Rows
 from ...bench.specs import CommandResult, MetricSpec
 from ..aggregate import subject_means
 from ..runs import RunData
-from ..writers import csv_text
+from ..writers import csv_text, pipe_table
+from .leaders import Leader, leaders
 from .plot import CurvePanel, write_plot
 from .points import HELD_OUT, MEASURED, CurvePoint, column, mean, mean_point, points_text
+from .settings import CurveReportSettings
 
 TIMED = ("budget", "seconds")
-"""Quantities whose axis is the measured training time."""
+"""Quantities whose axis in the plot is the measured training time."""
+LIMIT = "limit of training time"
 AXES = {
     "cameras": "Training cameras",
     "timesteps": "Training timesteps",
@@ -32,10 +39,23 @@ AXES = {
 
 
 def curve_report(out: Path, over: str) -> CommandResult:
-    """Write ``curve.csv`` and ``curve.png`` of the run in ``out``; return its points and a table of their means.
+    """Write ``curve.csv`` and ``curve.png`` of the run in ``out``; see `joined_curve`."""
+    return joined_curve([RunData.read(out)], over, out)
+
+
+def curve_runs(settings: CurveReportSettings, progress: Progress = no_progress) -> CommandResult:
+    """Join the runs of curves; see the settings, and `joined_curve` for errors."""
+    runs, out = [RunData.read(Path(run)) for run in settings.runs], Path(settings.out)
+    return joined_curve(runs, settings.over, out)
+
+
+def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult:
+    """Write ``curve.csv`` and ``curve.png`` of runs; return points, a table of their means, and the best method by what it takes.
 
     Parameters
     ----------
+    runs : Sequence[RunData]
+        Runs of one kind of curve: several methods of a subject, or several subjects.
     over : str
         Quantity that varies between the trainings: "budget", "seconds", "cameras", "timesteps", "pictures" or
         "tracking_error".
@@ -43,34 +63,34 @@ def curve_report(out: Path, over: str) -> CommandResult:
     Raises
     ------
     InputError
-        The folder is not the run of a curve.
+        A folder is not the run of such a curve, two have the same training, or they do not have the same metrics, device and
+        held-out frames.
     """
-    run = RunData.read(out)
-    config = run.manifest.configuration
-    conditions = {condition.name: condition for condition in config.conditions}
-    tasks, metrics = run.tasks, run.metrics
-    points = [
-        _point(run, record, conditions[record.condition], clip)
-        for record in run.manifest.methods
-        for clip in run.manifest.clips
-        if conditions[record.condition].clip.name == ("" if over in TIMED else over.replace("_", "-"))
-    ]
+    first = runs[0].manifest.configuration
+    points = [point for run in runs for point in _points(run, over)]
+    _check_together(runs, points)
+    tasks, metrics = runs[0].tasks, runs[0].metrics
     names = list(dict.fromkeys(point.method for point in points))
-    order = [clip.subject for clip in run.manifest.clips]
+    order = list(dict.fromkeys(point.subject for point in points))
     points.sort(key=lambda p: (names.index(p.method), p.place, order.index(p.subject)))
     groups: dict[tuple[str, tuple[float, ...]], list[CurvePoint]] = {}
     for point in points:
         groups.setdefault((point.method, point.place), []).append(point)
     means = [mean_point(group) for group in groups.values()]
     missing = {
-        spec.label: _reason(run.rows, spec) for spec in metrics if spec.per_frame and _reason(run.rows, spec)
+        spec.label: reason
+        for run in runs
+        for spec in metrics
+        if spec.per_frame and (reason := _reason(run.rows, spec))
     }
+    out.mkdir(parents=True, exist_ok=True)
     write_text(out / "curve.csv", csv_text(_lines(points)))
-    clock = "processor_seconds" if config.device == "cpu" else "seconds"
-    every = config.clip.parameters["every"]
+    clock = "processor_seconds" if first.device == "cpu" else "seconds"
+    every = first.clip.parameters["every"]
     where = f"{every}th training timestep" if every > 2 else "second training timestep"
     axis = f"{'Processor seconds' if clock == MEASURED[0] else 'Seconds'} of training"
     axis = axis if over in TIMED else AXES[over]
+    best = _leaders(points, metrics, tasks, {"budget": clock, "seconds": LIMIT}.get(over, over))
     write_plot(
         out / "curve.png",
         [
@@ -85,16 +105,102 @@ def curve_report(out: Path, over: str) -> CommandResult:
         f"Held out of every training: a training camera, every {where}. No test frame was looked at."
         + (f" Bars: 95 % intervals of the mean over {len(order)} subjects." if len(order) > 1 else ""),
     )
-    held = {clip.subject: _step(clip.steps, "hold_out") for clip in run.manifest.clips}
-    failed = run.rows.failed
+    held = {clip.subject: _step(clip.steps, "hold_out") for run in runs for clip in run.manifest.clips}
+    failed = [name for run in runs for name in run.rows.failed]
     data = {
         "out": out,
         "held_out": held,
         "points": [point.flat() for point in points],
+        "best": [
+            {"metric": metric, "held_out": HELD_OUT[task], **asdict(leader)}
+            for (metric, task), found in best.items()
+            for leader in found
+        ],
         "missing": missing,
         "failed": failed,
     }
-    return CommandResult(points_text(means, metrics, tasks, held, missing, failed), data, not failed)
+    text = points_text(means, metrics, tasks, held, missing, failed)
+    taken = "the limit of seconds" if over == "seconds" else axis.lower()
+    text += f"\n\nBest method by {taken}, with 95 % intervals of the crossing:\n\n{leaders_table(best, metrics, tasks)}"
+    return CommandResult(text, data, not failed)
+
+
+def _points(run: RunData, over: str) -> list[CurvePoint]:
+    """The trainings of a run that differ in ``over``. Raises `InputError` where there are none."""
+    config = run.manifest.configuration
+    conditions = {condition.name: condition for condition in config.conditions}
+    kind = "" if over in TIMED else over.replace("_", "-"), over == "seconds"
+    chosen = [
+        name for name, each in conditions.items() if (each.clip.name, each.budget.endswith(" s")) == kind
+    ]
+    points = [
+        _point(run, record, conditions[record.condition], clip)
+        for record in run.manifest.methods
+        for clip in run.manifest.clips
+        if "every" in config.clip.parameters and record.condition in chosen
+    ]
+    if not points:
+        expected = f"trainings of `headbench run curve --over {over}`"
+        raise InputError(run.folder.manifest, "configuration", expected, "none")
+    return points
+
+
+def _check_together(runs: Sequence[RunData], points: Sequence[CurvePoint]) -> None:
+    """Raise `InputError` for runs whose trainings cannot be compared."""
+    first = runs[0].manifest
+    frames: dict[tuple[str, str], set[FrameKey]] = {}
+    for run in runs:
+        place, other = run.folder.manifest, run.manifest
+        if other.configuration.device != first.configuration.device:
+            raise InputError(place, "device", first.configuration.device, other.configuration.device)
+        if other.metrics != first.metrics:
+            raise InputError(place, "metrics", f"those of {runs[0].folder.root}", "others")
+        if run.tasks != runs[0].tasks:
+            raise InputError(place, "tasks", ", ".join(runs[0].tasks), ", ".join(run.tasks))
+        for task, subject in product(run.tasks, run.rows.subjects):
+            own = {key for key in run.keys(task) if key.subject == subject}
+            if own != frames.setdefault((task, subject), own):
+                expected = f"the held-out frames of {subject} in the other runs"
+                raise InputError(place, f"protocol of {task}", expected, "others")
+    trained = Counter((point.method, point.subject, point.place) for point in points)
+    (method, subject, _), count = trained.most_common(1)[0]
+    if count > 1:
+        expected = f"each training of {method} on {subject} once"
+        raise InputError(runs[-1].folder.manifest, "methods", expected, f"one of them {count} times")
+
+
+def _cost(point: CurvePoint, axis: str) -> float | None:
+    """What a training took: a measured cost, the `LIMIT` of its time, or a field of the point."""
+    if axis == LIMIT:
+        return point.budget.seconds
+    return point.cost[axis] if axis in point.cost else getattr(point, axis)
+
+
+def _leaders(
+    points: Sequence[CurvePoint], metrics: Sequence[MetricSpec], tasks: Sequence[str], axis: str
+) -> dict[tuple[str, str], list[Leader]]:
+    """The best method by what a training takes, by name of a metric of frames and task."""
+    found = {}
+    for spec, task in product((spec for spec in metrics if spec.per_frame), tasks):
+        lines: dict[str, dict[str, list[tuple[float, float]]]] = {}
+        for point in points:
+            cost, value = _cost(point, axis), point.values[column(spec, task)]
+            if cost is not None and value is not None:
+                lines.setdefault(point.method, {}).setdefault(point.subject, []).append((cost, value))
+        found[spec.name, task] = leaders(lines, higher_is_better=spec.higher_is_better)
+    return found
+
+
+def leaders_table(
+    found: Mapping[tuple[str, str], Sequence[Leader]], metrics: Sequence[MetricSpec], tasks: Sequence[str]
+) -> str:
+    """The results of `leaders` by metric and held-out data: Markdown."""
+    lines = [["", *(f"held-out {HELD_OUT[task]}" for task in tasks)], ["---"] * (1 + len(tasks))]
+    for spec in metrics:
+        if spec.per_frame:
+            cells = ["; ".join(leader.text() for leader in found[spec.name, task]) or "–" for task in tasks]
+            lines.append([spec.label, *cells])
+    return pipe_table(lines)
 
 
 def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipRecord) -> CurvePoint:
@@ -155,7 +261,7 @@ def _panel(
     """Quality over the horizontal axis: a field of `CurvePoint` or a cost."""
     lines: dict[str, list[tuple[float, float, float]]] = {}
     for point in points:
-        cost = point.cost[axis] if axis in point.cost else getattr(point, axis)
+        cost = _cost(point, axis)
         value, half = point.values[column(spec, task)], point.halves[column(spec, task)]
         line = lines.setdefault(point.method, [])
         if cost is not None and value is not None:

@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -252,3 +253,22 @@ def test_frame_times_of_several_machines_have_a_note(tmp_path, write_manifest, m
     result = recommend(RecommendSettings(tuple(str(f.root) for f in folders), task="novel_view"))
     assert result.data["notes"] == [says] * bool(says)
     assert says in result.text
+
+
+@pytest.mark.parametrize(("minutes", "fits"), [(2.0 * 1.04, True), (2.0 * 1.06, False)])
+def test_a_training_with_a_limit_of_seconds_counts_with_it(tmp_path, write_manifest, minutes, fits):
+    folder = RunFolder(tmp_path / "run")
+    frame = ("timed", "1", 0, "novel_view", "s0", "EMO", 0, "a", "full")
+    avatar = ("timed", "1", 0, "", "s0", "", -1, "", "full")
+    rows = [Row(*frame, "psnr", 30.0, "p"), Row(*avatar, "training_time", minutes, "")]
+    Rows.of(rows).write(folder.rows)
+    write_manifest(folder, METRICS, {"timed": None}, {"novel_view": "p"})
+    manifest = folder.read_manifest()
+    (record,) = manifest.methods
+    limited = replace(record, budget={"iterations": None, "seconds": 120.0})
+    replace(manifest, methods=(limited,)).write(folder.manifest)
+    if fits:
+        assert asked(str(folder.root), seconds=120.0).data["costs"]["seconds"] == 120.0
+        return
+    with pytest.raises(InputError, match="timed nearest, with 127 s"):
+        asked(str(folder.root), seconds=120.0)

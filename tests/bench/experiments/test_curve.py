@@ -4,6 +4,7 @@ import csv
 import importlib
 import json
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import pandas as pd
@@ -20,7 +21,9 @@ from headbench.bench.experiments.curve import curve_run
 from headbench.bench.experiments.curve_settings import CurveSettings
 from headbench.bench.experiments.held_out import hold_out
 from headbench.datasets.synthetic.capture import synthesize
+from headbench.reports.curve.curve import curve_runs
 from headbench.reports.curve.points import MEASURED
+from headbench.reports.curve.settings import CurveReportSettings
 
 from ...datasets.flat_renderer import flat_pictures
 from ...datasets.tiny_capture import write_tiny_capture
@@ -367,3 +370,41 @@ def test_ga_learns_more_with_more_of_its_budget(tiny_run, capsys):
     assert last["processor_seconds"] > first["processor_seconds"] > 0
     assert last["psnr_camera"] > first["psnr_camera"]
     assert cli.main(["run", "curve", str(run), "--fractions", "2"]) == ExitCode.BAD_INPUT
+
+
+def test_curves_of_several_subjects_and_methods_are_joined(make_run, tmp_path, monkeypatch):
+    run = make_run("curve_plugin:METHOD", "curve_plugin:TIMED", subjects=("ball-a", "ball-bee"))
+    whole = curve_run(settings(run, fractions=("1", "1/4")))
+    parts = []
+    for subject, method in product(("ball-a", "ball-bee"), ("noting", "timed")):
+        one = run_on(
+            tmp_path / subject,
+            tmp_path / f"run-{subject}",
+            "curve_plugin:METHOD",
+            "curve_plugin:TIMED",
+            subjects=(subject,),
+            reader="ball_plugin:READER",
+        )
+        out = tmp_path / f"{subject}-{method}"
+        curve_run(settings(one.root, out=str(out), fractions=("1", "1/4"), methods=(method,)))
+        parts.append(str(out))
+    joined = curve_runs(CurveReportSettings(tuple(parts), str(tmp_path / "joined")))
+    costs = set(MEASURED)
+    shown = [
+        [{k: v for k, v in p.items() if k not in costs} for p in found.data["points"]]
+        for found in (joined, whole)
+    ]
+    assert shown[0] == shown[1]
+    assert {entry["metric"] for entry in joined.data["best"]} == {"psnr"}
+    assert (tmp_path / "joined" / "curve.png").is_file()
+    with pytest.raises(InputError, match="each training of noting on ball-a once"):
+        curve_runs(CurveReportSettings((parts[0], parts[0]), str(tmp_path / "twice")))
+    with pytest.raises(InputError, match="run curve --over seconds`, found none"):
+        curve_runs(CurveReportSettings(tuple(parts), str(tmp_path / "other"), "seconds"))
+    other = tmp_path / "camera"
+    curve_run(
+        settings(tmp_path / "run-ball-a", out=str(other), fractions=("1",), camera="4", methods=("timed",))
+    )
+    with pytest.raises(InputError, match="the held-out frames of ball-a"):
+        curve_runs(CurveReportSettings((parts[0], str(other)), str(tmp_path / "frames")))
+    assert [name for name in ("twice", "other", "frames") if (tmp_path / name).exists()] == []

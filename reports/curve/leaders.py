@@ -1,0 +1,91 @@
+"""Which method of a curve is best at which cost, and between which costs two methods change places."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from ...bench.contracts import FloatArray
+from ..statistics.paired import interval
+
+Lines: TypeAlias = Mapping[str, Mapping[str, Sequence[tuple[float, float]]]]
+"""Pairs of cost and quality by method and subject."""
+GRID = 600
+"""Costs at which curves are compared, evenly spaced on the axis of the plot."""
+
+
+@dataclass(frozen=True)
+class Leader:
+    """The method with the best mean from a cost on.
+
+    Attributes
+    ----------
+    start : float
+        The cost from which on the method is best: where its curve crosses that of the leader before.
+    interval : tuple[float | None, float | None] | None
+        Costs around ``start`` at which the 95 % interval of the paired difference of both methods contains 0; None at an end
+        that lies beyond the measured costs, or in all for the first leader and with too few subjects for an interval.
+    """
+
+    method: str
+    start: float
+    interval: tuple[float | None, float | None] | None = None
+
+    def text(self) -> str:
+        """Method, cost and interval, such as "`ga` from 11 [8.2, above]"."""
+        if self.interval is None:
+            return f"`{self.method}` from {self.start:.3g}"
+        low, high = (f"{end:.3g}" if end is not None else "" for end in self.interval)
+        return f"`{self.method}` from {self.start:.3g} [{low or 'below'}, {high or 'above'}]"
+
+
+def leaders(lines: Lines, *, higher_is_better: bool) -> list[Leader]:
+    """The best method by rising cost, from means over the subjects that all methods have.
+
+    Quality is interpolated linearly between measured trainings, over the logarithm of the cost if all costs are above 0. A
+    method takes part from its lowest cost on, and keeps the quality of its highest: that training fits a larger budget too.
+    """
+    subjects = sorted(set.intersection(*(set(own) for own in lines.values()))) if lines else []
+    if not subjects:
+        return []
+    costs = [cost for own in lines.values() for subject in subjects for cost, _ in own[subject]]
+    spaced = np.geomspace if min(costs) > 0 else np.linspace
+    grid = spaced(min(costs), max(costs), GRID)
+    sign = 1.0 if higher_is_better else -1.0
+    values = {name: sign * _values(own, subjects, grid) for name, own in lines.items()}
+    means = np.stack([each.mean(0) for each in values.values()])
+    names = list(values)
+    best = np.where(np.isnan(means), -np.inf, means).argmax(0)
+    known = np.isfinite(means).any(0)
+    found: list[Leader] = []
+    for place in range(GRID):
+        name = names[best[place]]
+        if not known[place] or (found and found[-1].method == name):
+            continue
+        around = _around(values[name] - values[found[-1].method], place, grid) if found else None
+        found.append(Leader(name, float(grid[place]), around))
+    return found
+
+
+def _values(
+    own: Mapping[str, Sequence[tuple[float, float]]], subjects: Sequence[str], grid: FloatArray
+) -> FloatArray:
+    """(S, G) qualities of the subjects at the costs of the grid; NaN below the lowest cost of any."""
+    scale = np.log if grid[0] > 0 else np.positive
+    pairs = [np.array(sorted(own[subject])).T for subject in subjects]
+    return np.stack([np.interp(scale(grid), scale(cost), value, left=np.nan) for cost, value in pairs])
+
+
+def _around(change: FloatArray, place: int, grid: FloatArray) -> tuple[float | None, float | None] | None:
+    """Costs between which the interval of the mean ``change``, (S, G), contains 0, around a place of the grid."""
+    bounds = [interval(each.tolist()) for each in change.T]
+    if bounds[place] is None:
+        return None
+    # Not so where a method has no value yet, whose bounds are NaN.
+    apart = [each is not None and (each[0] > 0 or each[1] < 0) for each in bounds]
+    low = next((float(grid[i]) for i in range(place - 1, -1, -1) if apart[i]), None)
+    high = next((float(grid[i]) for i in range(place, len(grid)) if apart[i]), None)
+    return low, high
