@@ -203,7 +203,7 @@ def read_choices(
                 found = {subject: factor * value for subject, value in _costs(run.rows, source, name).items()}
                 if cost == "seconds":
                     limit = None if record.budget.get("iterations") else record.budget.get("seconds")
-                    found = _within(found or _recorded_seconds(run, source), limit)
+                    found = _within(found, limit)
                 costs.setdefault(label, {}).setdefault(cost, {}).update(found)
     choices, without = {}, []
     for label, values in quality.items():
@@ -331,18 +331,6 @@ def _within(seconds: Mapping[str, float], limit: float | None) -> dict[str, floa
     """Training times by subject; the limit of the training where that was exceeded by at most `OVERRUN`."""
     most = 0.0 if limit is None else OVERRUN * limit
     return {s: min(value, limit) if limit and value <= most else value for s, value in seconds.items()}
-
-
-def _recorded_seconds(run: RunData, label: str) -> dict[str, float]:
-    """Largest training time of each subject over the seeds, from the records of the trainings, where the rows have none (a curve)."""
-    found = {}
-    for subject in sorted(run.rows.subjects):
-        cells = [run.folder.cell(subject, label, seed) for seed in run.manifest.configuration.seeds]
-        records = [record for cell in cells if (record := cell.step("fit")) is not None]
-        known = [record["seconds"] for record in records if "seconds" in record]
-        if known and len(known) == len(cells):
-            found[subject] = max(known)
-    return found
 
 
 def _time_notes(rows: Rows, metrics: Sequence[MetricSpec], labels: Sequence[str]) -> list[str]:

@@ -27,6 +27,8 @@ from .held_out import CAMERA, TIMESTEPS, count_of
 log = logging.getLogger(__name__)
 METRICS: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "primitives")
 """Metrics of a curve, independent of the run's, as defined by the canonical profile."""
+COSTS = ("training_processor", "training_time", "training_memory")
+"""What the trainings took, measured besides."""
 
 
 def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> CommandResult:
@@ -59,7 +61,7 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
             with_methods(config, _names(wanted)),
             clip=held,
             frames_per_task=settings.frames,
-            metrics=METRICS,
+            metrics=(*METRICS, *COSTS),
             metric_profiles=("canonical",),
             regions=(),
             source="",

@@ -24,7 +24,7 @@ from ..runs import RunData
 from ..writers import csv_text, pipe_table
 from .leaders import Leader, leaders
 from .plot import CurvePanel, write_plot
-from .points import HELD_OUT, MEASURED, CurvePoint, column, mean, mean_point, points_text
+from .points import HELD_OUT, MEASURED, CurvePoint, column, mean_point, points_text
 from .settings import CurveReportSettings
 
 TIMED = ("budget", "seconds")
@@ -88,7 +88,7 @@ def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult
     clock = "processor_seconds" if first.device == "cpu" else "seconds"
     every = first.clip.parameters["every"]
     where = f"{every}th training timestep" if every > 2 else "second training timestep"
-    axis = f"{'Processor seconds' if clock == MEASURED[0] else 'Seconds'} of training"
+    axis = f"{'Processor seconds' if first.device == 'cpu' else 'Seconds'} of training"
     axis = axis if over in TIMED else AXES[over]
     best = _leaders(points, metrics, tasks, {"budget": clock, "seconds": LIMIT}.get(over, over))
     write_plot(
@@ -204,10 +204,6 @@ def leaders_table(
 
 
 def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipRecord) -> CurvePoint:
-    seeds = run.manifest.configuration.seeds
-    cells = [run.folder.cell(clip.subject, record.label, seed) for seed in seeds]
-    records: list[Mapping[str, Any]] = [cell.step("fit") or {} for cell in cells]
-    cost = {key: mean([_number(each.get(key)) for each in records]) for key in MEASURED}
     values: dict[str, float | None] = {}
     for spec in run.metrics:
         for task in run.tasks if spec.per_frame else ("",):
@@ -216,6 +212,8 @@ def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipR
             )
             whole = len(chosen) and (chosen["status"] == "ok").all()
             values[column(spec, task)] = subject_means(chosen)[clip.subject] if whole else None
+    known = {key: (values.pop(metric, None), factor) for key, (metric, factor) in MEASURED.items()}
+    cost = {key: None if value is None else factor * value for key, (value, factor) in known.items()}
     added = next(
         (a.steps for a in run.manifest.adapted if (a.subject, a.method) == (clip.subject, record.label)), []
     )
@@ -242,10 +240,6 @@ def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipR
 def _step(steps: Sequence[Mapping[str, Any]], name: str) -> Mapping[str, Any]:
     """Parameters of a processing step, empty if it was not applied."""
     return next((step["parameters"] for step in steps if step["name"] == name), {})
-
-
-def _number(value: object) -> float | None:
-    return float(value) if isinstance(value, (int, float)) else None
 
 
 def _reason(rows: Rows, spec: MetricSpec) -> str:

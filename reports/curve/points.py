@@ -15,8 +15,12 @@ from ..statistics.paired import half_width
 
 HELD_OUT: Mapping[str, str] = {"novel_view": "camera", "self_reenactment": "timesteps"}
 """Held-out data by task."""
-MEASURED = ("processor_seconds", "seconds", "peak_memory_bytes")
-"""Costs in the record of a training."""
+MEASURED: Mapping[str, tuple[str, float]] = {
+    "processor_seconds": ("training_processor", 1.0),
+    "seconds": ("training_time", 60.0),
+    "peak_memory_bytes": ("training_memory", 1e9),
+}
+"""Metric of each cost of a training, and its factor."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,8 @@ def points_text(
     """Means over subjects as a table, with the held-out data and the missing values."""
     wide = max(8, *(len(point.method) + 2 for point in points))
     frame = [spec for spec in metrics if spec.per_frame]
-    avatar = [spec for spec in metrics if not spec.per_frame]
+    costs = {name for name, _ in MEASURED.values()}
+    avatar = [spec for spec in metrics if not spec.per_frame and spec.name not in costs]
     tracked = any(point.tracking_error is not None for point in points)
     group = 9 * len(frame)
     head = "".join(f"{'held-out ' + HELD_OUT[task]:>{group}}" for task in tasks)
@@ -122,7 +127,7 @@ def points_text(
         budget = point.budget
         cells = [_shown(point.values[column(spec, task)], spec.digits, 9) for task in tasks for spec in frame]
         cells += [_shown(point.values[spec.name], spec.digits, 12) for spec in avatar]
-        cost = [_shown(point.cost[key], 1, 10) for key in MEASURED[:2]]
+        cost = [_shown(point.cost[key], 1, 10) for key in ("processor_seconds", "seconds")]
         size = f"{budget.seconds:g} s" if budget.iterations is None else f"{budget.iterations}"
         given = f"{point.part!s:>7}{size:>10}{point.cameras:>8g}{point.timesteps:>11g}{point.pictures:>10g}"
         given += _shown(point.tracking_error, 2, 10) if tracked else ""

@@ -215,19 +215,6 @@ def test_choices_without_a_measured_cost_are_named(tmp_path, write_manifest):
     assert "Left out: unknown: no measured seconds of 1 subject." in result.text
 
 
-def test_training_times_of_a_curve_are_those_of_its_records(tmp_path, write_manifest):
-    """Curves measure no training time in rows, since rows can be computed again and times cannot."""
-    folder, rows = RunFolder(tmp_path / "run"), []
-    for method, psnr, seconds in (("short", 29.0, 10.0), ("long", 31.0, 50.0)):
-        for subject in SUBJECTS:
-            rows.append(Row(method, "1", 0, "novel_view", subject, "EMO", 0, "a", "full", "psnr", psnr, "p"))
-            folder.cell(subject, method, 0).finish("fit", "x", seconds=seconds)
-    Rows.of(rows).write(folder.rows)
-    write_manifest(folder, METRICS[:1], {"short": None, "long": None}, {"novel_view": "p"})
-    assert asked(str(folder.root), seconds=60.0).data["recommended"] == "long"
-    assert asked(str(folder.root), seconds=20.0).data["recommended"] == "short"
-
-
 @pytest.mark.parametrize(
     ("machines", "says"),
     [
