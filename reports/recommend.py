@@ -160,9 +160,13 @@ def recommend(settings: RecommendSettings, progress: Progress = no_progress) -> 
         "held_out": trials,
         "against_always": always,
         "without": read.without,
+        "conclusions": [
+            verdict_text(found, [best, *(name for name in fitting if name != best)]),
+            *outcome_on_left_out(trials, always, best, metric),
+        ],
         "notes": read.notes,
     }
-    return CommandResult(_text(data, fitting, found, metric), data)
+    return CommandResult(_text(data, fitting, found.subjects, metric), data)
 
 
 def read_choices(
@@ -363,7 +367,7 @@ def _nearest(choices: Mapping[str, Choice], limits: Mapping[str, float]) -> str:
     return f"{label} nearest, with {needs}"
 
 
-def _text(data: Mapping[str, Any], fitting: Mapping[str, Choice], found: BestSet, metric: MetricSpec) -> str:
+def _text(data: Mapping[str, Any], fitting: Mapping[str, Choice], subjects: int, metric: MetricSpec) -> str:
     unit = f" {metric.unit}" if metric.unit else ""
     limits, best = data["limits"], data["recommended"]
     task = str(data["task"]).replace("_", " ")
@@ -374,7 +378,7 @@ def _text(data: Mapping[str, Any], fitting: Mapping[str, Choice], found: BestSet
         shown = [cost_text(max(costs[cost].values())) if cost in costs else "–" for cost in COSTS]
         lines.append([name, f"{fmean(fitting[name].quality.values()):.{metric.digits}f}", *shown])
     parts = [
-        f"Recommended for {_limits(limits)}: {best}. Mean over {counted(found.subjects, 'subject')}, {task}; costs are the largest of a subject.",
+        f"Recommended for {_limits(limits)}: {best}. Mean over {counted(subjects, 'subject')}, {task}; costs are the largest of a subject.",
         pipe_table(lines),
     ]
     by_cost = data["by_cost"]
@@ -383,9 +387,7 @@ def _text(data: Mapping[str, Any], fitting: Mapping[str, Choice], found: BestSet
         for cost, steps in by_cost.items()
         if steps
     ]
-    parts.append(verdict_text(found, [best, *(name for name in fitting if name != best)]))
-    parts += outcome_on_left_out(data["held_out"], data["against_always"], best, metric)
-    parts += data["notes"]
+    parts += [*data["conclusions"], *data["notes"]]
     without = data["without"]
     return "\n\n".join([*parts, *(f"Left out: {each}." for each in without)])
 

@@ -57,18 +57,23 @@ def log_linear(start: float, end: float, fraction: float) -> float:
     return math.exp((1 - fraction) * math.log(start) + fraction * math.log(end))
 
 
+RECOVERY = 1_000
+"""Iterations that a shorter run than the published one has at least after a reset: opacities take several hundred to recover."""
+
+
 @dataclass(frozen=True)
 class DensifySchedule:
     """Rounds of densification and opacity reset in one run.
 
     With the published 600,000 iterations: rounds at 12,000, 14,000, ... 598,000; resets at 10,000, 60,000,
     120,000, ... 540,000. A shorter run keeps the fractions until an interval would fall below its minimum; a run
-    shorter than the minimum reset interval has no reset at all.
+    shorter than the minimum reset interval has no reset at all, and the last `RECOVERY` iterations have none.
     """
 
     start: int
     every: int
     stop: int  # first iteration without rounds or resets
+    reset_stop: int  # first iteration without resets
     reset_every: int | None
     first_reset: int | None
     prune_extent_from: int
@@ -77,12 +82,15 @@ class DensifySchedule:
     def of(cls, settings: DensifiedTraining, timeline: Timeline, *, white: bool) -> DensifySchedule:
         """Scale the published schedule to a run; ``white`` is whether splats are trained on a white background."""
         long_enough = timeline.total > settings.min_reset_every
-        settle = 1 if timeline.total >= settings.schedule_length else settings.min_settle
+        whole = timeline.total >= settings.schedule_length
+        settle, recovery = (1, 1) if whole else (settings.min_settle, RECOVERY)
         start = timeline.at(settings.densify_from)
+        stop = min(timeline.at(settings.densify_until), timeline.total - settle + 1)
         return cls(
             start=start,
             every=timeline.every(settings.densify_every, settings.min_densify_every),
-            stop=min(timeline.at(settings.densify_until), timeline.total - settle + 1),
+            stop=stop,
+            reset_stop=min(stop, timeline.total - recovery + 1),
             reset_every=settings.reset_every
             and timeline.every(settings.reset_every, settings.min_reset_every),
             first_reset=start if settings.reset_at_start and white and long_enough else None,
@@ -99,7 +107,7 @@ class DensifySchedule:
 
     def is_reset(self, iteration: int) -> bool:
         """Whether this iteration resets opacities."""
-        if iteration >= self.stop:
+        if iteration >= self.reset_stop:
             return False
         regular = self.reset_every is not None and iteration % self.reset_every == 0
         return regular or iteration == self.first_reset

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from fractions import Fraction
 from itertools import product
 from pathlib import Path
@@ -21,6 +21,7 @@ from ...bench.rows import ALL, Rows
 from ...bench.specs import CommandResult, MetricSpec
 from ..aggregate import subject_means
 from ..runs import RunData
+from ..statistics.paired import LEAST_SUBJECTS
 from ..writers import csv_text, pipe_table
 from .leaders import Leader, leaders
 from .plot import CurvePanel, write_plot
@@ -52,6 +53,80 @@ def curve_runs(settings: CurveReportSettings, progress: Progress = no_progress) 
 def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult:
     """Write ``curve.csv`` and ``curve.png`` of runs; return points, a table of their means, and the best method by what it takes.
 
+    Raises `InputError` as `read_curve` does.
+    """
+    curve = read_curve(runs, over)
+    out.mkdir(parents=True, exist_ok=True)
+    write_text(out / "curve.csv", csv_text(_lines(curve.points)))
+    write_curve(out / "curve.png", curve)
+    failed = [name for run in runs for name in run.rows.failed]
+    data = {
+        "out": out,
+        "held_out": curve.held_out,
+        "points": [point.flat() for point in curve.points],
+        "best": [
+            {"metric": metric, "held_out": HELD_OUT[task], **asdict(leader)}
+            for (metric, task), found in curve.best.items()
+            for leader in found
+        ],
+        "missing": curve.missing,
+        "failed": failed,
+    }
+    text = points_text(curve.means, curve.metrics, curve.tasks, curve.held_out, curve.missing, failed)
+    return CommandResult(f"{text}\n\n{leaders_text(curve)}", data, not failed)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Trainings that differ in one quantity.
+
+    Attributes
+    ----------
+    points, means : Sequence[CurvePoint]
+        All trainings, by method, quantity and subject; and the means over subjects.
+    clock : str
+        The cost in `MEASURED` that is the time of a training on the device.
+    best : Mapping[tuple[str, str], Sequence[Leader]]
+        The result of `leaders` by name of a metric of frames and task.
+    every : int
+        Number of consecutive training timesteps of which one is held out.
+    held_out : Mapping[str, Mapping[str, Any]]
+        Camera, timesteps and what is left to train with, by subject.
+    missing : Mapping[str, str]
+        Reasons by label of a metric that was not measured.
+    """
+
+    over: str
+    points: Sequence[CurvePoint]
+    means: Sequence[CurvePoint]
+    metrics: Sequence[MetricSpec]
+    tasks: Sequence[str]
+    clock: str
+    best: Mapping[tuple[str, str], Sequence[Leader]]
+    every: int
+    held_out: Mapping[str, Mapping[str, Any]]
+    missing: Mapping[str, str]
+
+    @property
+    def subjects(self) -> list[str]:
+        """The subjects of the trainings."""
+        return list(dict.fromkeys(point.subject for point in self.points))
+
+    @property
+    def of_frames(self) -> list[MetricSpec]:
+        """The metrics of frames."""
+        return [spec for spec in self.metrics if spec.per_frame]
+
+    @property
+    def axis(self) -> str:
+        """Name of what is varied, as measured."""
+        measured = f"{'Processor seconds' if self.clock == 'processor_seconds' else 'Seconds'} of training"
+        return measured if self.over in TIMED else AXES[self.over]
+
+
+def read_curve(runs: Sequence[RunData], over: str) -> Curve:
+    """The trainings of runs that differ in one quantity.
+
     Parameters
     ----------
     runs : Sequence[RunData]
@@ -66,7 +141,6 @@ def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult
         A folder is not the run of such a curve, two have the same training, or they do not have the same metrics, device and
         held-out frames.
     """
-    first = runs[0].manifest.configuration
     points = [point for run in runs for point in _points(run, over)]
     _check_together(runs, points)
     tasks, metrics = runs[0].tasks, runs[0].metrics
@@ -76,53 +150,38 @@ def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult
     groups: dict[tuple[str, tuple[float, ...]], list[CurvePoint]] = {}
     for point in points:
         groups.setdefault((point.method, point.place), []).append(point)
-    means = [mean_point(group) for group in groups.values()]
-    missing = {
-        spec.label: reason
-        for run in runs
-        for spec in metrics
-        if spec.per_frame and (reason := _reason(run.rows, spec))
-    }
-    out.mkdir(parents=True, exist_ok=True)
-    write_text(out / "curve.csv", csv_text(_lines(points)))
-    clock = "processor_seconds" if first.device == "cpu" else "seconds"
-    every = first.clip.parameters["every"]
-    where = f"{every}th training timestep" if every > 2 else "second training timestep"
-    axis = f"{'Processor seconds' if first.device == 'cpu' else 'Seconds'} of training"
-    axis = axis if over in TIMED else AXES[over]
-    best = _leaders(points, metrics, tasks, {"budget": clock, "seconds": LIMIT}.get(over, over))
-    write_plot(
-        out / "curve.png",
-        [
-            [
-                _panel(means, spec, task, clock if over in TIMED else over, missing)
-                for spec in metrics
-                if spec.per_frame
-            ]
-            for task in tasks
-        ],
-        axis,
-        f"Held out of every training: a training camera, every {where}. No test frame was looked at."
-        + (f" Bars: 95 % intervals of the mean over {len(order)} subjects." if len(order) > 1 else ""),
+    clock = "processor_seconds" if runs[0].manifest.configuration.device == "cpu" else "seconds"
+    return Curve(
+        over,
+        points,
+        [mean_point(group) for group in groups.values()],
+        metrics,
+        tasks,
+        clock,
+        _leaders(points, metrics, tasks, {"budget": clock, "seconds": LIMIT}.get(over, over)),
+        runs[0].manifest.configuration.clip.parameters["every"],
+        {clip.subject: _step(clip.steps, "hold_out") for run in runs for clip in run.manifest.clips},
+        {
+            spec.label: reason
+            for run in runs
+            for spec in metrics
+            if spec.per_frame and (reason := _reason(run.rows, spec))
+        },
     )
-    held = {clip.subject: _step(clip.steps, "hold_out") for run in runs for clip in run.manifest.clips}
-    failed = [name for run in runs for name in run.rows.failed]
-    data = {
-        "out": out,
-        "held_out": held,
-        "points": [point.flat() for point in points],
-        "best": [
-            {"metric": metric, "held_out": HELD_OUT[task], **asdict(leader)}
-            for (metric, task), found in best.items()
-            for leader in found
-        ],
-        "missing": missing,
-        "failed": failed,
-    }
-    text = points_text(means, metrics, tasks, held, missing, failed)
-    taken = "the limit of seconds" if over == "seconds" else axis.lower()
-    text += f"\n\nBest method by {taken}, with 95 % intervals of the crossing:\n\n{leaders_table(best, metrics, tasks)}"
-    return CommandResult(text, data, not failed)
+
+
+def write_curve(path: Path, curve: Curve) -> None:
+    """Draw the means as a PNG: a row of plots for each task, a plot for each metric of frames."""
+    axis = curve.clock if curve.over in TIMED else curve.over
+    rows = [
+        [_panel(curve.means, spec, task, axis, curve.missing) for spec in curve.of_frames]
+        for task in curve.tasks
+    ]
+    where = f"{curve.every}th training timestep" if curve.every > 2 else "second training timestep"
+    note = f"Held out of every training: a training camera, every {where}. No test frame was looked at."
+    if len(curve.subjects) > 1:
+        note += f" Bars: 95 % intervals of the mean over {len(curve.subjects)} subjects."
+    write_plot(path, rows, curve.axis, note)
 
 
 def _points(run: RunData, over: str) -> list[CurvePoint]:
@@ -191,16 +250,22 @@ def _leaders(
     return found
 
 
-def leaders_table(
-    found: Mapping[tuple[str, str], Sequence[Leader]], metrics: Sequence[MetricSpec], tasks: Sequence[str]
-) -> str:
-    """The results of `leaders` by metric and held-out data: Markdown."""
-    lines = [["", *(f"held-out {HELD_OUT[task]}" for task in tasks)], ["---"] * (1 + len(tasks))]
-    for spec in metrics:
-        if spec.per_frame:
-            cells = ["; ".join(leader.text() for leader in found[spec.name, task]) or "–" for task in tasks]
-            lines.append([spec.label, *cells])
-    return pipe_table(lines)
+def leaders_text(curve: Curve) -> str:
+    """The best methods by metric and held-out data, in a sentence and a table: Markdown."""
+    lines = [
+        ["", *(f"held-out {HELD_OUT[task]}" for task in curve.tasks)],
+        ["---"] * (1 + len(curve.tasks)),
+    ]
+    for spec in curve.of_frames:
+        cells = ("; ".join(leader.text() for leader in curve.best[spec.name, task]) for task in curve.tasks)
+        lines.append([spec.label, *(cell or "–" for cell in cells)])
+    taken = "the limit of seconds" if curve.over == "seconds" else curve.axis.lower()
+    crossings = (
+        "95 % intervals of the crossings in brackets"
+        if len(curve.subjects) >= LEAST_SUBJECTS
+        else f"without intervals, which take {LEAST_SUBJECTS} subjects"
+    )
+    return f"Best method by {taken}, {crossings}:\n\n{pipe_table(lines)}"
 
 
 def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipRecord) -> CurvePoint:

@@ -14,7 +14,7 @@ from headbench.methods.shared.optimisation import SHRINK, Densifier, Optimiser, 
 from headbench.methods.shared.schedule import DensifySchedule
 
 NAMES = ("means", "log_scales", "quats", "opacities", "extra")
-ALWAYS = DensifySchedule(0, 1, 10**9, 10**9, None, prune_extent_from=100)
+ALWAYS = DensifySchedule(0, 1, 10**9, 10**9, 10**9, None, prune_extent_from=100)
 EXTENT = 1.0
 PUBLISHED = SplatTraining()
 

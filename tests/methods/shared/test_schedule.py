@@ -13,6 +13,7 @@ from scipy.stats import chisquare
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.schedule import (
     BLOCK,
+    RECOVERY,
     DensifySchedule,
     GroupedBatches,
     ShuffledEpochs,
@@ -58,9 +59,9 @@ def test_short_runs_keep_the_minimum_intervals(total):
     assert all(b - a >= PUBLISHED.min_densify_every for a, b in pairwise(rounds))
     assert all(total - i >= PUBLISHED.min_settle for i in rounds)
     resets = [i for i in range(1, total + 1) if short.is_reset(i)]
+    assert all(total - i >= RECOVERY for i in resets)
     if total <= PUBLISHED.min_reset_every:
         assert resets == []
-    assert all(total - i >= PUBLISHED.min_settle for i in resets)
 
 
 def test_log_linear_ends_and_middle():
