@@ -6,6 +6,7 @@ python -m headbench.reports.readme profiles run-of-one-subject .
 python -m headbench.reports.readme faces run-of-one-subject .
 python -m headbench.reports.readme rates folder-of-sweeps .
 python -m headbench.reports.readme further folder-of-runs .
+python -m headbench.reports.readme curves folder-of-seconds-and-pictures .
 python -m headbench.reports.readme subjects suite-output .
 """
 
@@ -50,6 +51,9 @@ from ..bench.specs import CommandResult, MethodSpec
 from .aggregate import summarise
 from .cameras import SPLIT_TASK, unseen_cameras
 from .contact_sheet import compared_frame, contact_sheet
+from .curve.blocks import UNITS as CURVE_UNITS
+from .curve.blocks import curve_block
+from .curve.curve import read_curve, write_curve
 from .papers import paper_named
 from .pareto.plot import write_rates
 from .pareto.rates import read_rates
@@ -79,6 +83,9 @@ RATES = "rates"
 OURS = "ours"
 FURTHER = "further"
 """Stored runs of methods that the plan of the suite does not have, on some of its subjects; each named as that subject's run."""
+CURVES = "curves"
+"""Stored curves on some subjects of the suite, in a folder for each quantity of `CURVE_UNITS`."""
+CURVE_PICTURE = "docs/pictures/curve-{}.png"
 PICTURE = "contact_sheet.jpg"
 SUBJECTS = "subjects.jpg"
 """The README's picture: a frame of each subject of a suite that was run here, with the methods `SHOWN_METHODS`."""
@@ -96,6 +103,7 @@ PAGES = {
     FACES: "docs/explanation/metrics.md",
     RATES: "docs/explanation/fairness.md",
     FURTHER: "docs/explanation/methods/rgbavatar.md",
+    **{f"{CURVES}-{over}": "docs/explanation/budgets.md" for over in CURVE_UNITS},
 }
 """The page of each block, in the repository."""
 COMPARED = (OURS, "ga")
@@ -175,6 +183,21 @@ def publish_further(out: Path, root: Path) -> None:
     """Copy manifests and rows of the runs in a folder to the repository ``root``, and write the block that compares them with the suite."""
     _copy_all(out, root / GALLERY / FURTHER)
     _write(root / PAGES[FURTHER], FURTHER, further_block(root / GALLERY))
+
+
+def publish_curves(out: Path, root: Path) -> None:
+    """Copy manifests and rows of curves to the repository ``root``, and write their blocks and plots."""
+    for over in CURVE_UNITS:
+        target = root / GALLERY / CURVES / over
+        _copy_all(out / over, target)
+        runs = stored_curves(root / GALLERY, over)
+        write_curve(root / CURVE_PICTURE.format(over), read_curve([RunData.read(run) for run in runs], over))
+        _write(root / PAGES[f"{CURVES}-{over}"], f"{CURVES}-{over}", curve_block(runs, over))
+
+
+def stored_curves(gallery: Path, over: str) -> list[Path]:
+    """Folders of the stored curves over a quantity."""
+    return suite_runs(gallery / CURVES, over)
 
 
 def _copy_all(out: Path, target: Path) -> None:
@@ -494,6 +517,7 @@ PUBLISH: dict[str, Callable[[Path, Path], None]] = {
     SUITE: publish_suite,
     RATES: publish_rates,
     FURTHER: publish_further,
+    CURVES: publish_curves,
     "subjects": publish_picture,
     **{name: partial(publish_subject, name) for name in SUBJECT_BLOCKS},
 }

@@ -186,6 +186,7 @@ def test_ci_runs_the_test_command_of_the_readme():
 
 def test_tables_are_generated_from_the_stored_rows_never_typed():
     from headbench.reports import readme
+    from headbench.reports.curve.blocks import curve_block
 
     blocks = {
         "demo": readme.demo_block(ROOT / readme.GALLERY),
@@ -195,6 +196,10 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
         readme.DROPS: readme.drops_block(ROOT / readme.GALLERY / readme.SUITE),
         readme.PROTOCOLS: readme.protocols_block(ROOT / readme.GALLERY / readme.SUITE),
         readme.RATES: readme.rates_block(readme.rate_runs(ROOT / readme.GALLERY / readme.RATES)),
+        **{
+            f"{readme.CURVES}-{over}": curve_block(readme.stored_curves(ROOT / readme.GALLERY, over), over)
+            for over in readme.CURVE_UNITS
+        },
         **{name: block(ROOT / readme.GALLERY / name) for name, block in readme.SUBJECT_BLOCKS.items()},
     }
     for name, block in blocks.items():

@@ -9,7 +9,7 @@ from ...bench.progress import counted
 from ..recommend import RecommendSettings, recommend
 from ..runs import RunData
 from ..writers import pipe_table
-from .curve import Curve, leaders_text, read_curve
+from .curve import CurveData, leaders_text, read_curve
 from .points import HELD_OUT, column
 
 UNITS = {"seconds": " s", "pictures": ""}
@@ -28,7 +28,7 @@ def curve_block(runs: Sequence[Path], over: str) -> str:
     return "\n\n".join(parts)
 
 
-def _table(curve: Curve) -> str:
+def _table(curve: CurveData) -> str:
     """PSNR of both kinds of held-out frames by method and quantity, and the size of the avatar."""
     (psnr,) = (spec for spec in curve.metrics if spec.name == "psnr")
     amounts = sorted({_amount(curve.over, point.place) for point in curve.means})

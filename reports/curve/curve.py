@@ -77,7 +77,7 @@ def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult
 
 
 @dataclass(frozen=True)
-class Curve:
+class CurveData:
     """Trainings that differ in one quantity.
 
     Attributes
@@ -124,7 +124,7 @@ class Curve:
         return measured if self.over in TIMED else AXES[self.over]
 
 
-def read_curve(runs: Sequence[RunData], over: str) -> Curve:
+def read_curve(runs: Sequence[RunData], over: str) -> CurveData:
     """The trainings of runs that differ in one quantity.
 
     Parameters
@@ -151,7 +151,7 @@ def read_curve(runs: Sequence[RunData], over: str) -> Curve:
     for point in points:
         groups.setdefault((point.method, point.place), []).append(point)
     clock = "processor_seconds" if runs[0].manifest.configuration.device == "cpu" else "seconds"
-    return Curve(
+    return CurveData(
         over,
         points,
         [mean_point(group) for group in groups.values()],
@@ -170,7 +170,7 @@ def read_curve(runs: Sequence[RunData], over: str) -> Curve:
     )
 
 
-def write_curve(path: Path, curve: Curve) -> None:
+def write_curve(path: Path, curve: CurveData) -> None:
     """Draw the means as a PNG: a row of plots for each task, a plot for each metric of frames."""
     axis = curve.clock if curve.over in TIMED else curve.over
     rows = [
@@ -250,7 +250,7 @@ def _leaders(
     return found
 
 
-def leaders_text(curve: Curve) -> str:
+def leaders_text(curve: CurveData) -> str:
     """The best methods by metric and held-out data, in a sentence and a table: Markdown."""
     lines = [
         ["", *(f"held-out {HELD_OUT[task]}" for task in curve.tasks)],
