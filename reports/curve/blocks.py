@@ -24,7 +24,7 @@ def curve_block(runs: Sequence[Path], over: str) -> str:
     parts = [_table(curve), leaders_text(curve)]
     if over == "seconds":
         limits = sorted({point.budget.seconds or 0.0 for point in curve.points})
-        parts += [_recommended(runs, limit) for limit in limits]
+        parts += _recommended(runs, limits)
     return "\n\n".join(parts)
 
 
@@ -55,8 +55,15 @@ def _amount(over: str, place: Sequence[float]) -> float:
     return place[1 if over == "seconds" else 2]
 
 
-def _recommended(runs: Sequence[Path], limit: float) -> str:
-    """What `headbench recommend` says for a limit of seconds, without its table."""
-    found = recommend(RecommendSettings(tuple(map(str, runs)), seconds=limit, task=TASK)).data
-    named = str(found["recommended"]).replace("+", "` with `")
-    return f"**{limit:g} s:** `{named}`. {' '.join(found['conclusions'])}"
+def _recommended(runs: Sequence[Path], limits: Sequence[float]) -> list[str]:
+    """What `headbench recommend` says for limits of seconds, without its tables; what it says for all of them, once."""
+    found = [
+        recommend(RecommendSettings(tuple(map(str, runs)), seconds=limit, task=TASK)).data for limit in limits
+    ]
+    common = [text for text in found[0]["conclusions"] if all(text in each["conclusions"] for each in found)]
+    lines = []
+    for limit, each in zip(limits, found):
+        named = str(each["recommended"]).removesuffix(f"+seconds-{limit:g}").replace("+", "` with `")
+        own = " ".join(text for text in each["conclusions"] if text not in common)
+        lines.append(f"- Up to {limit:g} s: `{named}`. {own}".strip())
+    return ["Recommended by `headbench recommend` for held-out timesteps:", "\n".join(lines), *common]
