@@ -10,14 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cached_property, partial
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
-from ...bench.contracts import BoolArray, Camera, Clip, FloatArray, HeadPose
-from ...datasets.head.geometry import project
+from ...bench.contracts import Clip, FloatArray, HeadPose
 from ..avatars.compact.offsets import read_offsets
 from ..avatars.harmonics import turn_harmonics
 from ..ops.harmonics import coefficient_count, turned_colors
@@ -28,7 +26,7 @@ from ..shared.networks import initial_network, layer_names, tracked_inputs
 from ..shared.rendering import PlacedSplats, rasterize_view
 from ..shared.schedule import ShuffledEpochs
 from ..shared.splat_training import initial_shapes
-from ..shared.subject_mesh import BoundedCache
+from ..shared.subject_mesh import BoundedCache, mouth_mask
 from ..shared.surface_points import spacing
 from ..shared.surface_splats import SurfaceAvatar, SurfaceMethod, SurfaceTrainer
 from .config import FlashAvatarConfig
@@ -105,20 +103,6 @@ def image_loss(image: Tensor, truth: Tensor, mouth: Tensor | None, config: Flash
     if config.ssim_weight:
         loss = loss + config.ssim_weight * photometric_loss(image, truth, 1.0)
     return loss
-
-
-def mouth_mask(camera: Camera, mouth: FloatArray, middle: FloatArray) -> BoolArray:
-    """(H, W) mask of the pixels within the convex hull of the (M, 3) projected points of the mouth.
-
-    Empty if the mouth faces away, seen from the ``middle`` (3,) of the head, or is not in front of the camera.
-    """
-    mask, center = np.zeros((camera.height, camera.width), np.uint8), mouth.mean(0)
-    depths = mouth @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
-    if depths.min() > 0 and (center - middle) @ (camera.center - center) > 0:
-        # cv2 counts from the centre of the first pixel, cameras from its corner.
-        corners = np.round(project(mouth, camera) - 0.5).clip(-(2**15), 2**15).astype(np.int32)
-        cv2.fillConvexPoly(mask, cv2.convexHull(corners), 1)
-    return mask.astype(bool)
 
 
 class FlashAvatarAvatar(SurfaceAvatar[TrainedSplats]):

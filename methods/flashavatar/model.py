@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import cached_property
 from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn.functional import linear, normalize
+from torch.nn.functional import linear
 
 from ...bench.contracts import HeadAsset
-from ...datasets.head.rotations import axis_angle_to_quaternion, quaternion_to_matrix
 from ..ops.harmonics import coefficient_count
 from ..ops.splats import apply_matrices, left_products
 from ..shared.avatar_files import settings_of_text, settings_text
 from ..shared.networks import input_count, layer_names, layer_shapes, outputs_of
-from ..shared.surface_splats import PointSurface, SurfaceSplats
+from ..shared.surface_splats import HeadSurface, SurfaceSplats
 from ..shared.tensor_files import check_sizes
 from .config import FlashAvatarConfig
 from .hyper_gaussians import WIDTHS, check_diagonals, conditional_means, gaussian_shapes
@@ -74,27 +72,6 @@ def changed(splats: Mapping[str, Tensor], outputs: Tensor, config: FlashAvatarCo
     sizes = splats["log_scales"]
     log_scales = sizes * scale.exp() if config.scale_variant == "official" else sizes + scale
     return {"means": config.offset_m * offset, "log_scales": log_scales, "quats": quats}
-
-
-class HeadSurface(PointSurface):
-    """Points on the mesh of a subject with the axes of the head at each.
-
-    The authors' program moves the camera around a head without rotation, neck and translation. Here these move the mesh, and the axes
-    turn with them: with root and neck as far as the surface follows the neck, by the skinning weights, and with the root
-    alone elsewhere. They do not turn with jaw and eyes, whose effect the network learns, as in that program.
-    """
-
-    @cached_property
-    def _of_root(self) -> Tensor:
-        """(N, 1) skinning weights of the root."""
-        return self._at_points(self.mesh.model.skinning_weights[:, :1])
-
-    def _axes(self, arguments: Mapping[str, Tensor], vertices: Tensor) -> tuple[Tensor, Tensor]:
-        root, neck = (axis_angle_to_quaternion(arguments[name]) for name in ("rotation", "neck"))
-        head = apply_matrices(left_products(root).flatten(1), neck)
-        # The shorter way from one to the other, as the real part of their quotient, the neck's, is not negative.
-        turns = normalize(head + self._of_root * (root - head), dim=1)
-        return quaternion_to_matrix(turns), turns
 
 
 class TrainedSplats(SurfaceSplats[FlashAvatarConfig]):

@@ -6,12 +6,14 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Generic, Protocol, TypeVar
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Clip, FloatArray, HeadAsset, HeadPose
+from ...bench.contracts import BoolArray, Camera, Clip, FloatArray, HeadAsset, HeadPose
 from ...datasets.head.arrays import check_size
+from ...datasets.head.geometry import project
 from ...datasets.head.model import HeadModel
 from ..ops.mesh import TriangleFrames, triangle_frames
 
@@ -172,3 +174,17 @@ def pose_key(pose: HeadPose) -> bytes:
         values = getattr(pose, name)
         parts.append(b"-" if values is None else np.asarray(values, np.float64).tobytes())
     return b"|".join(parts)
+
+
+def mouth_mask(camera: Camera, mouth: FloatArray, middle: FloatArray) -> BoolArray:
+    """(H, W) mask of the pixels within the convex hull of the (M, 3) projected points of the mouth.
+
+    Empty if the mouth faces away, seen from the ``middle`` (3,) of the head, or is not in front of the camera.
+    """
+    mask, center = np.zeros((camera.height, camera.width), np.uint8), mouth.mean(0)
+    depths = mouth @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+    if depths.min() > 0 and (center - middle) @ (camera.center - center) > 0:
+        # cv2 counts from the centre of the first pixel, cameras from its corner.
+        corners = np.round(project(mouth, camera) - 0.5).clip(-(2**15), 2**15).astype(np.int32)
+        cv2.fillConvexPoly(mask, cv2.convexHull(corners), 1)
+    return mask.astype(bool)

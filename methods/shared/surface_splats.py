@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from ...bench.contracts import Clip, HeadAsset, HeadPose
 from ...bench.io.arrays import Member
+from ...datasets.head.rotations import axis_angle_to_quaternion, quaternion_to_matrix
 from ..ops.mesh import TriangleFrames
-from ..ops.splats import WorldSplats, to_world
+from ..ops.splats import WorldSplats, apply_matrices, left_products, to_world
 from .avatar_files import AVATAR_FILE, Subject, clip_mesh, finish_fit, read_stored
 from .config import SurfaceSettings
 from .image_training import ImageTrainer
@@ -63,6 +65,27 @@ class PointSurface:
         """(N, 3, 3) rotations and their (N, 4) quaternions, for one timestep's arguments and (V, 3) vertices."""
         frames, triangles = self.mesh.frames(vertices), self._at_points.triangles
         return frames.rotation[triangles], frames.quaternion[triangles]
+
+
+class HeadSurface(PointSurface):
+    """Points on the mesh of a subject with the axes of the head at each.
+
+    FlashAvatar's authors move the camera around a head without rotation, neck and translation. Here these move the mesh, and the
+    axes turn with them: with root and neck as far as the surface follows the neck, by the skinning weights, and with the root
+    alone elsewhere. They do not turn with jaw and eyes, whose effect the network learns, as in the authors' program.
+    """
+
+    @cached_property
+    def _of_root(self) -> Tensor:
+        """(N, 1) skinning weights of the root."""
+        return self._at_points(self.mesh.model.skinning_weights[:, :1])
+
+    def _axes(self, arguments: Mapping[str, Tensor], vertices: Tensor) -> tuple[Tensor, Tensor]:
+        root, neck = (axis_angle_to_quaternion(arguments[name]) for name in ("rotation", "neck"))
+        head = apply_matrices(left_products(root).flatten(1), neck)
+        # The shorter way from one to the other, as the real part of their quotient, the neck's, is not negative.
+        turns = normalize(head + self._of_root * (root - head), dim=1)
+        return quaternion_to_matrix(turns), turns
 
 
 @dataclass(frozen=True, eq=False)

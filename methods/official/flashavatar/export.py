@@ -34,10 +34,10 @@ from ....bench.io.images import write_png
 from ....datasets.head.arrays import region
 from ....datasets.head.subject import PosedSubject
 from ...flashavatar.config import FlashAvatarConfig
-from ...flashavatar.method import BOUNDARY, MOUTH, mouth_mask
+from ...flashavatar.method import BOUNDARY, MOUTH
 from ...insta.warp import mouth_triangles, touching
 from ...shared.avatar_files import Subject
-from ...shared.subject_mesh import SubjectMesh
+from ...shared.subject_mesh import SubjectMesh, mouth_mask
 from ...shared.surface_points import SurfacePoints, spread_points
 from ..checkout import Checkout
 from ..ga.export import mark

@@ -1,12 +1,16 @@
-"""One subject's mesh against the head model it is built on; and the bounded cache."""
+"""One subject's mesh against the head model it is built on; the mask of the mouth; and the bounded cache."""
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.model import HeadModel
-from headbench.methods.shared.subject_mesh import BoundedCache, SubjectMesh
+from headbench.methods.shared.avatar_files import clip_mesh
+from headbench.methods.shared.subject_mesh import BoundedCache, SubjectMesh, mouth_mask
+
+from ..toy_clip import first_view, look_at
 
 
 def test_posed_vertices_are_the_head_models(clip, head):
@@ -37,6 +41,23 @@ def test_a_neutral_pose_is_canonical(clip, head):
     mesh = SubjectMesh(head, clip.shape, clip.static_offset, "cpu")
     neutral = {name: torch.zeros_like(v) for name, v in mesh.arguments([clip.poses[0]]).items()}
     np.testing.assert_allclose(mesh.posed(neutral), mesh.canonical, atol=1e-7)
+
+
+def test_the_mask_is_the_outline_of_the_lips(clip):
+    camera, pose = first_view(clip)
+    camera, mesh = camera.resized(280, 360), clip_mesh(clip, "cpu")
+    vertices = mesh.posed(mesh.arguments([pose])).numpy()
+    lips, middle = vertices[clip.head.regions["lips"]], vertices.mean(0)
+    mask = mouth_mask(camera, lips, middle)
+    projected = (camera.K @ (camera.world_to_camera @ np.c_[lips, np.ones(len(lips))].T)[:3]).T
+    hull = ConvexHull(projected[:, :2] / projected[:, 2:]).equations
+    pixels = np.stack(np.meshgrid(np.arange(280) + 0.5, np.arange(360) + 0.5), axis=-1)
+    outside = (pixels @ hull[:, :2].T + hull[:, 2]).max(-1)
+    assert mask[outside < -1].all()
+    assert not mask[outside > 1].any()
+    assert (outside < -1).sum() > 200
+    behind = look_at(np.array([0.0, 0.0, -0.5]), np.zeros(3), "behind", 280, 360)
+    assert not mouth_mask(behind, lips, middle).any()
 
 
 def test_the_cache_computes_once_and_stays_bounded():
