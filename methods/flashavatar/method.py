@@ -40,6 +40,8 @@ MOUTH = "lips"
 """The region of the mask of the mouth."""
 HUBER = 0.1
 """Difference of colours up to which the loss is quadratic."""
+NETWORK_EPSILON = 1e-8
+"""Epsilon of the network's Adam, as in the authors' program: the default of PyTorch. That of the splats is 3DGS's."""
 
 
 class FlashAvatarTraining(SurfaceTrainer[FlashAvatarConfig]):
@@ -66,7 +68,8 @@ class FlashAvatarTraining(SurfaceTrainer[FlashAvatarConfig]):
             for names in layer_names(config.layers + 1):
                 network[names[-1]].zero_()
         network |= initial_gaussians(count, config.hyper_gaussians)
-        self._optimise(splats | {name: (value, config.network_lr) for name, value in network.items()})
+        initial = splats | {name: (value, config.network_lr) for name, value in network.items()}
+        self._optimise(initial, dict.fromkeys(network, NETWORK_EPSILON))
 
     def loss(self, iteration: int, index: int) -> Tensor:
         """Loss of one image, see `image_loss`."""

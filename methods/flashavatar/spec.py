@@ -32,7 +32,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 FLASHAVATAR = MethodSpec(
     name="flashavatar",
-    version="1",
+    version="2",
     summary="FlashAvatar: splats on the mesh, moved, turned and scaled by a network of the tracked parameters.",
     implementation="headbench.methods.flashavatar.method:FlashAvatar",
     config="headbench.methods.flashavatar.config:FlashAvatarConfig",

@@ -151,11 +151,16 @@ class FlashAvatarOfficialConfig(OfficialConfig):
     masks : Literal['parts', 'native']
         "parts": masks of head with neck and of the visible mouth, in place of those of the authors' network. "native": nothing that
         a mask of the capture covers is left out, and the mouth is that of the native method, so that both have the same loss.
+    start : Literal['published', 'native']
+        "native": the network starts as that of the native method with this seed, and sizes with the distances on the
+        neutral mesh, as there. "published": a network drawn by the program, and distances in the first frame drawn, where this network has
+        already moved the splats.
     """
 
     commit: str = "2d4cb25ca9166b795c03692aec12114d595eff15"
     samples: int = 13_500
     masks: Literal["parts", "native"] = "parts"
+    start: Literal["published", "native"] = "published"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -69,7 +69,7 @@ class OfficialMethod(ABC, Generic[Config]):
     """Kind of code for `shim`; "" if it does not support the repository."""
     variables: ClassVar[Mapping[str, str]] = {}
     """Environment variables of the authors' programs besides `process.environment`."""
-    changes: ClassVar[tuple[Patch, ...]] = ()
+    changes: tuple[Patch, ...] = ()
     """Texts in their sources that every training replaces in memory, for what no option of theirs allows."""
     order_changes: ClassVar[tuple[Patch, ...]] = ()
     """Texts replaced for a given order of the images, in code that draws images without a loader."""

@@ -47,11 +47,12 @@ class ImageTrainer(OptimiserState):
         self._views = {name: view_of(camera, device) for name, camera in self.cameras.items()}
         self._background = torch.tensor(np.asarray(clip.background), dtype=torch.float32, device=device)
 
-    def _optimise(self, initial: Initial) -> None:
-        """Set the initial tensors, on the device of the training."""
+    def _optimise(self, initial: Initial, epsilons: Mapping[str, float] = {}) -> None:
+        """Set the initial tensors, on the device of the training; ``epsilons`` as for `Optimiser`."""
         self.optimiser = Optimiser(
             {name: nn.Parameter(value.to(self._device)) for name, (value, _) in initial.items()},
             {name: rate for name, (_, rate) in initial.items()},
+            epsilons=epsilons,
         )
         self._rates = {name: rate for name, (_, rate) in initial.items()}
 

@@ -32,7 +32,7 @@ class OptimiserState:
 
 
 class Optimiser:
-    """One Adam (eps 1e-15, dense) over named parameters.
+    """One Adam (dense) over named parameters.
 
     Densification replaces per-splat parameters by longer or shorter ones; `select` and `append` keep the moments, with
     zeros for new rows. A replaced parameter has no gradient, so it is not changed by the following step, as in the
@@ -42,6 +42,8 @@ class Optimiser:
     ----------
     betas : tuple[float, float]
         Decay of the two moments.
+    epsilons : Mapping[str, float]
+        Epsilon by name; `EPS`, that of 3DGS, for all others.
     """
 
     def __init__(
@@ -49,9 +51,13 @@ class Optimiser:
         parameters: Mapping[str, nn.Parameter],
         learning_rates: Mapping[str, float],
         betas: tuple[float, float] = (0.9, 0.999),
+        epsilons: Mapping[str, float] = {},
     ):
-        groups = [{"params": [p], "lr": learning_rates[name], "name": name} for name, p in parameters.items()]
-        self._adam = torch.optim.Adam(groups, betas=betas, eps=EPS, fused=True)
+        groups = [
+            {"params": [p], "lr": learning_rates[name], "eps": epsilons.get(name, EPS), "name": name}
+            for name, p in parameters.items()
+        ]
+        self._adam = torch.optim.Adam(groups, betas=betas, fused=True)
         self._groups: dict[str, dict[str, Any]] = {g["name"]: g for g in self._adam.param_groups}
 
     def __getitem__(self, name: str) -> nn.Parameter:

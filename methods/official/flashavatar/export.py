@@ -15,7 +15,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from scipy.spatial import KDTree
+from torch import Tensor
+from torch.nn.functional import pad
 
 from ....bench.contracts import (
     ByteArray,
@@ -35,13 +38,15 @@ from ....datasets.head.arrays import region
 from ....datasets.head.subject import PosedSubject
 from ...flashavatar.config import FlashAvatarConfig
 from ...flashavatar.method import BOUNDARY, MOUTH
+from ...flashavatar.model import INPUTS, network_sizes
 from ...insta.warp import mouth_triangles, touching
 from ...shared.avatar_files import Subject
+from ...shared.networks import initial_network, input_count, layer_names
 from ...shared.subject_mesh import SubjectMesh, mouth_mask
 from ...shared.surface_points import SurfacePoints, spread_points
 from ..checkout import Checkout
 from ..ga.export import mark
-from ..ga.head_files import MOST_TEMPLATE, OfficialHead, pickled, read_obj
+from ..ga.head_files import EXPRESSION_SIZE, MOST_TEMPLATE, OfficialHead, pickled, read_obj
 from ..ga.windows import around, inside
 from ..surface import VisibleMesh
 from ..video import FlameSubject, at_rest, frame_name, straight_rgba, training_frames, write_torch
@@ -62,6 +67,8 @@ UNCHANGED = (
 MODEL_FILE, MASKS_FILE = Path("flame/generic_model.pkl"), Path("flame/FLAME_masks/FLAME_masks.pkl")
 EYELID_FILES = (Path("flame/blendshapes/l_eyelid.npy"), Path("flame/blendshapes/r_eyelid.npy"))
 FULL = 255
+TURNS_AND_LIDS = 20
+"""Inputs of their network for jaw, eyes and eyelids."""
 
 TEXEL_SIDE = 0.5
 """Sides of a triangle of `chart_of_points`, texels: no other texel's centre lies in it."""
@@ -115,6 +122,24 @@ def native_points(identity: Subject, head: HeadAsset, samples: int, seed: int) -
     mesh = SubjectMesh(head, identity.shape, identity.static_offset, "cpu")
     vertices, chart = mesh.canonical.numpy().astype(np.float64), FlashAvatarConfig().uv_chart
     return spread_points(head, vertices, samples, seed, chart=chart, chart_without=head.regions.get(BOUNDARY))
+
+
+def native_network(head: HeadAsset, seed: int) -> dict[str, Tensor]:
+    """The native method's published network at the start, by the names of their layers.
+
+    Their network has `EXPRESSION_SIZE` inputs for expressions, and two for eyelids. Those that the head model lacks have weights of 0.
+    """
+    config, size, inputs = FlashAvatarConfig(), head.expression_basis.shape[2], input_count(head, INPUTS)
+    network = initial_network(network_sizes(config, inputs), seed)
+    weights, biases = layer_names(config.layers + 1)
+    split = [network[weights[0]].shape[1] - inputs + size, inputs - size]
+    until, after = network[weights[0]].split(split, dim=1)
+    network[weights[0]] = torch.cat(
+        [pad(until, (0, EXPRESSION_SIZE - size)), pad(after, (0, TURNS_AND_LIDS - after.shape[1]))], 1
+    )
+    layers = [*(f"fcs.{layer}" for layer in range(config.layers)), "output_linear"]
+    of_weights = {f"{layer}.weight": network[name] for layer, name in zip(layers, weights)}
+    return of_weights | {f"{layer}.bias": network[name] for layer, name in zip(layers, biases)}
 
 
 def grid_of(samples: int) -> int:

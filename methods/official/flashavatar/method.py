@@ -25,7 +25,7 @@ from ..ga.windows import around, cameras_of, check_square_pixels, inside
 from ..in_parts import PartsMethod, RenderCall, in_parts, same_intrinsics
 from ..method import read_identity
 from ..spec import FLASHAVATAR_OFFICIAL
-from ..video import check_masks, check_one_camera
+from ..video import check_masks, check_one_camera, write_torch
 from ..workplace import Listed, Patch, Workplace, copy_file, is_white, opaque, read_sized
 from .export import (
     EYELID_FILES,
@@ -33,6 +33,7 @@ from .export import (
     flame_subject,
     grid_of,
     has_their_topology,
+    native_network,
     write_list,
     write_points,
     write_program,
@@ -72,6 +73,20 @@ ORDER: Patch = (
     "scene.getCameras()[int(images_in_order[iteration - 1])]",
 )
 """They draw a frame at random; it is replaced by the next of the given order."""
+NETWORK_FILE = "network.pth"
+START: tuple[Patch, ...] = (
+    (
+        "train.py",
+        "DeformModel.training_setup()",
+        f"DeformModel.training_setup(); DeformModel.deformNet.load_state_dict(torch.load({NETWORK_FILE!r}))",
+    ),
+    (
+        "train.py",
+        "gaussians.create_from_verts(verts_final[0])",
+        "gaussians.create_from_verts(DeformModel.uv_vertices_shape[0, DeformModel.uv_head_idx])",
+    ),
+)
+"""With ``start=native``: their network is read from a file, and sizes are taken on the neutral mesh."""
 NUMBERS = {
     "range": (r"range\((\d+)\)", "range({})"),
     "uv_size": (r"self\.uv_size = (\d+)", "self.uv_size = {}"),
@@ -122,6 +137,11 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
     # Frames and checkpoints contain more than tensors, which newer versions of torch read only if requested.
     variables: ClassVar[Mapping[str, str]] = {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}
 
+    def __init__(self, config: FlashAvatarOfficialConfig | None = None):
+        super().__init__(config)
+        if self.config.start == "native":
+            self.changes = (*CHANGES, *START)
+
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
         """Refuse a clip without masks, on another background, of several intrinsics or too many frames, and a head that lacks
         regions or, without the CPU shim, is not FLAME's."""
@@ -166,6 +186,8 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
         link.symlink_to(Path("../../..") / work.model.name)
         if self._has_own_chart(fit.clip.head, work.checkout.folder):  # The chart depends on the seed.
             write_points(Subject.of(fit.clip), fit.clip.head, self.config.samples, fit.seed, work)
+        if self.config.start == "native":
+            write_torch(work.program / NETWORK_FILE, native_network(fit.clip.head, fit.seed))
         camera = inside(check_one_camera(fit.clip)).camera
         options = ["--idname", NAME, "--image_res", str(camera.width), "--seed", str(fit.seed)]
         options += ["--iterations", str(fit.budget.iterations)]
@@ -255,6 +277,10 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
             "whatever the length of the run, their perceptual loss begins at iteration 15,000 and a degree of the harmonics "
             + "is added every 500 iterations",
         ]
+        if self.config.start == "native":
+            differences.append(
+                "the network starts as the native method's with this seed, and sizes with the distances on the neutral mesh"
+            )
         if (window.width, window.height) != (camera.width, camera.height):
             differences.append(
                 "their code assumes the principal point in the middle of the image: images are cropped accordingly"

@@ -215,6 +215,19 @@ def test_defaults_are_the_published_values():
     assert (config.network_lr, config.initial_opacity, config.sh_degree) == (1e-4, 0.1, 3)
 
 
+def test_the_network_has_the_epsilon_of_pytorch_s_adam(clip):
+    """Its gradients are small, so that a step shows the epsilon."""
+    training = FlashAvatarTraining(clip, CONFIG, "cpu", 0)
+    training.close()
+    for name, epsilon in (("network_weight_0", 1e-8), ("log_scales", 1e-15)):
+        tensor = training.optimiser[name]
+        tensor.grad, before = torch.full_like(tensor, 1e-8), tensor.detach().clone()
+        training.optimiser.step()
+        training.optimiser.zero_grad()
+        expected = before - training._rates[name] * 1e-8 / (1e-8 + epsilon)
+        torch.testing.assert_close(tensor.detach(), expected)
+
+
 @pytest.mark.parametrize(
     "change",
     [

@@ -17,6 +17,7 @@ from headbench.bench.process import ProgramError
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
 from headbench.methods.flashavatar.config import FlashAvatarConfig
 from headbench.methods.flashavatar.method import FlashAvatarTraining
+from headbench.methods.flashavatar.model import layer_of_points, network_outputs
 from headbench.methods.official import needs
 from headbench.methods.official.config import FlashAvatarOfficialConfig
 from headbench.methods.official.flashavatar import method as implementation
@@ -26,6 +27,7 @@ from headbench.methods.official.flashavatar.export import (
     flame_subject,
     grid_of,
     image_names,
+    native_network,
     native_points,
 )
 from headbench.methods.official.flashavatar.method import FLASHAVATAR_REPOSITORY, SHRINK, SPLATS
@@ -240,6 +242,38 @@ def test_another_topology_has_a_chart_of_its_own(shimmed, repository, video_clip
     wanted = views(video_clip, "novel_view")
     rendered(avatar, wanted)
     assert f"for {count} triangles" in (tmp_path / "a" / RENDERING_LOG).read_text()
+
+
+def test_the_start_is_the_programs_or_the_native_methods(shimmed, video_clip, tmp_path):
+    fit(shimmed, video_clip, tmp_path / "a")
+    native = type(shimmed)(replace(shimmed.config, start="native"))
+    fit(native, video_clip, tmp_path / "b")
+    published, found = ((tmp_path / name / TRAINING_LOG).read_text() for name in "ab")
+    assert "sizes on the first frame" in published
+    assert "starts with" not in published
+    assert "sizes on the neutral mesh" in found
+    layers = [*(f"fcs.{layer}" for layer in range(6)), "output_linear"]
+    names = [f"{layer}.{part}" for part in ("weight", "bias") for layer in layers]
+    assert f"starts with {' '.join(names)} [256, 171]" in found
+    assert "network starts as the native" in " ".join(read_json(tmp_path / "b/training.json")["differences"])
+
+
+def test_their_network_at_the_start_is_the_native_one(method, video_clip):
+    """By a plain network of their layers, with the inputs that are exported for a frame."""
+    training = FlashAvatarTraining(video_clip, FlashAvatarConfig(samples=100), "cpu", 3)
+    subject = flame_subject(Subject.of(video_clip), video_clip.head, method.inspect(), own_chart=False)
+    frame = training_frames(video_clip, subject.posed)[-1]
+    flame = subject.frame(frame.camera, frame.pose)["flame"]
+    tracked = [torch.from_numpy(flame[name]).float() for name in ("exp", "jaw", "eyes", "eyelids")]
+    values = torch.cat([training._encoded, torch.cat(tracked, 1).expand(len(training._encoded), -1)], 1)
+    state = native_network(video_clip.head, 3)
+    for layer in range(6):
+        values = (values @ state[f"fcs.{layer}.weight"].T + state[f"fcs.{layer}.bias"]).relu()
+    values = (values @ state["output_linear.weight"].T + state["output_linear.bias"]).tanh()
+    tensors, config = training.tensors(), training._config
+    inputs = training._inputs[training._tracked.row[frame.key.timestep]]
+    expected = network_outputs(tensors, layer_of_points(tensors, training._encoded), inputs, config)
+    torch.testing.assert_close(values, expected.detach(), atol=1e-5, rtol=1e-4)
 
 
 def test_a_chart_of_points_has_them_as_its_texels(video_clip):

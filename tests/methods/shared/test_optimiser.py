@@ -7,20 +7,21 @@ from torch import nn
 from headbench.methods.shared.optimisation import Optimiser
 
 
-def textbook(values, gradients, rate):
-    """Kingma and Ba 2015, algorithm 1, in float64; eps 1e-15."""
+def textbook(values, gradients, rate, epsilon=1e-15):
+    """Kingma and Ba 2015, algorithm 1, in float64."""
     m = v = np.zeros_like(values)
     for t, g in enumerate(gradients, 1):
         m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
-        values = values - rate * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-15)
+        values = values - rate * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + epsilon)
     return values
 
 
-def make(rows=4):
+def make(rows=4, **options):
     values = torch.arange(rows * 3, dtype=torch.float64).reshape(rows, 3)
     optimiser = Optimiser(
         {"a": nn.Parameter(values.clone()), "b": nn.Parameter(torch.zeros(2, dtype=torch.float64))},
         {"a": 0.1, "b": 0.2},
+        **options,
     )
     return optimiser, values.numpy()
 
@@ -38,6 +39,17 @@ def test_steps_are_adams():
         step(optimiser, gradient)
     np.testing.assert_allclose(optimiser["a"].detach(), textbook(start, gradients, 0.1), rtol=1e-12)
     assert (optimiser["b"] == 0).all()  # no gradient, no step
+
+
+def test_a_parameter_may_have_an_epsilon_of_its_own():
+    optimiser, start = make(epsilons={"a": 0.3})
+    gradients = np.random.default_rng(0).normal(size=(3, 4, 3))
+    for gradient in gradients:
+        optimiser["b"].grad = torch.full_like(optimiser["b"], 1e-9)
+        step(optimiser, gradient)
+    np.testing.assert_allclose(optimiser["a"].detach(), textbook(start, gradients, 0.1, 0.3), rtol=1e-12)
+    expected = textbook(np.zeros(2), np.full((3, 2), 1e-9), 0.2)
+    np.testing.assert_allclose(optimiser["b"].detach(), expected, rtol=1e-12)
 
 
 def test_select_keeps_rows_with_their_moments():
