@@ -59,7 +59,6 @@ _RIGID: dict[str, Any] = {
 CAUSES = {
     "flashavatar": (
         "rounding: a training that differs in the last digit ends with another PSNR",
-        "the official code takes no step in the last iteration",
         "splats nearer than 0.2 m are left out by theirs, than 0.01 m by ours",
     ),
     "ga": (

@@ -145,6 +145,8 @@ for iteration in range(1, opt.iterations + 1):
         save_image[:, :args.image_res, :] = image.transpose(1, 2, 0)
     if iteration % 5 == 0:
         print("step: %d, huber: %.5f" % (iteration, 0.5))
+    if iteration < opt.iterations :
+        print("a step")
     if behaviour == "crash" and iteration == 5:
         raise RuntimeError("CUDA out of memory")
     if behaviour == "hang" and iteration == 5:
