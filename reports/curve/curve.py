@@ -72,7 +72,8 @@ def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult
         "missing": curve.missing,
         "failed": failed,
     }
-    text = points_text(curve.means, curve.metrics, curve.tasks, curve.held_out, curve.missing, failed)
+    held_out = {subject: curve.held_out[subject] for subject in curve.subjects}
+    text = points_text(curve.means, curve.metrics, curve.tasks, held_out, curve.missing, failed)
     return CommandResult(f"{text}\n\n{leaders_text(curve)}", data, not failed)
 
 
@@ -82,6 +83,8 @@ class CurveData:
 
     Attributes
     ----------
+    subjects : Sequence[str]
+        The subjects that all methods have, of which the means are.
     points, means : Sequence[CurvePoint]
         All trainings, by method, quantity and subject; and the means over subjects.
     clock : str
@@ -97,6 +100,7 @@ class CurveData:
     """
 
     over: str
+    subjects: Sequence[str]
     points: Sequence[CurvePoint]
     means: Sequence[CurvePoint]
     metrics: Sequence[MetricSpec]
@@ -106,11 +110,6 @@ class CurveData:
     every: int
     held_out: Mapping[str, Mapping[str, Any]]
     missing: Mapping[str, str]
-
-    @property
-    def subjects(self) -> list[str]:
-        """The subjects of the trainings."""
-        return list(dict.fromkeys(point.subject for point in self.points))
 
     @property
     def of_frames(self) -> list[MetricSpec]:
@@ -138,21 +137,27 @@ def read_curve(runs: Sequence[RunData], over: str) -> CurveData:
     Raises
     ------
     InputError
-        A folder is not the run of such a curve, two have the same training, or they do not have the same metrics, device and
-        held-out frames.
+        A folder is not the run of such a curve, two have the same training, they do not have the same metrics, device and
+        held-out frames, or no subject has all methods.
     """
     points = [point for run in runs for point in _points(run, over)]
     _check_together(runs, points)
     tasks, metrics = runs[0].tasks, runs[0].metrics
     names = list(dict.fromkeys(point.method for point in points))
     order = list(dict.fromkeys(point.subject for point in points))
+    trained = {(point.method, point.subject) for point in points}
+    shared = [subject for subject in order if all((name, subject) in trained for name in names)]
+    if not shared:
+        expected = "a subject that all methods were trained on"
+        raise InputError(runs[0].folder.manifest, "subjects", expected, "none in these runs")
     points.sort(key=lambda p: (names.index(p.method), p.place, order.index(p.subject)))
     groups: dict[tuple[str, tuple[float, ...]], list[CurvePoint]] = {}
-    for point in points:
+    for point in (point for point in points if point.subject in shared):
         groups.setdefault((point.method, point.place), []).append(point)
     clock = "processor_seconds" if runs[0].manifest.configuration.device == "cpu" else "seconds"
     return CurveData(
         over,
+        shared,
         points,
         [mean_point(group) for group in groups.values()],
         metrics,

@@ -397,6 +397,13 @@ def test_curves_of_several_subjects_and_methods_are_joined(make_run, tmp_path, m
         for found in (joined, whole)
     ]
     assert shown[0] == shown[1]
+    # The mean of a method on fewer subjects is not beside that of the others.
+    fewer = curve_runs(CurveReportSettings(tuple(parts[:3]), str(tmp_path / "fewer")))
+    assert len(fewer.data["points"]) == 6
+    one = curve_runs(CurveReportSettings(tuple(parts[:2]), str(tmp_path / "one")))
+    assert fewer.text == one.text
+    with pytest.raises(InputError, match="a subject that all methods were trained on"):
+        curve_runs(CurveReportSettings((parts[0], parts[3]), str(tmp_path / "none")))
     assert {entry["metric"] for entry in joined.data["best"]} == {"psnr"}
     assert (tmp_path / "joined" / "curve.png").is_file()
     with pytest.raises(InputError, match="each training of noting on ball-a once"):
