@@ -16,8 +16,10 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from ..bench.io.files import atomic_path
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Colours by Okabe and Ito, distinguishable with colour vision deficiency."""
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999933")
+"""Colours by Okabe and Ito, distinguishable with colour vision deficiency, and an olive by Tol in place of their yellow."""
+MARKERS = "osD^vPX"
+"""Shapes of points by method, of another number than the colours, so that more methods differ in one of the two."""
 GREY, LIGHT_GREY = "#6e6e6e", "#cdcdcd"
 SMALL = 8
 """Size of text next to plots, in points."""
@@ -32,18 +34,19 @@ def plot_file(
     note: str,
     *,
     line: Literal["-", ""],
-) -> Iterator[tuple[Figure, dict[str, str]]]:
-    """A figure of ``size`` inches with a legend of ``names`` and their colours; written as a PNG at the end, atomically.
+    markers: str = "o",
+) -> Iterator[tuple[Figure, dict[str, tuple[str, str]]]]:
+    """A figure of ``size`` inches with a legend of ``names``, their colours and markers; written as a PNG at the end, atomically.
 
-    ``line`` is matplotlib's style of the lines in the legend.
+    ``line`` is matplotlib's style of the lines in the legend, ``markers`` are the shapes that methods have in turn.
     """
     with style.context(["default", {"text.parse_math": False, "font.size": 10}]):
         figure = Figure(figsize=size, dpi=dpi, layout="constrained")
         figure.supxlabel(note, x=0.01, ha="left", fontsize=SMALL, color=GREY)
-        colours = dict(zip(dict.fromkeys(names), itertools.cycle(COLOURS)))
-        handles = [Line2D([], [], marker="o", linestyle=line, color=c, label=n) for n, c in colours.items()]
+        looks = dict(zip(dict.fromkeys(names), zip(itertools.cycle(COLOURS), itertools.cycle(markers))))
+        handles = [Line2D([], [], marker=m, linestyle=line, color=c, label=n) for n, (c, m) in looks.items()]
         figure.legend(handles=handles, loc="outside upper left", ncols=8, fontsize=SMALL, frameon=False)
-        yield figure, colours
+        yield figure, looks
         with atomic_path(path) as temporary:
             figure.savefig(temporary, format="png")
 

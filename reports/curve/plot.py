@@ -10,7 +10,7 @@ from pathlib import Path
 
 from matplotlib.axes import Axes
 
-from ..plots import SMALL, cost_axis, plot_file, show_missing, start_axes
+from ..plots import MARKERS, SMALL, cost_axis, plot_file, show_missing, start_axes
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,13 @@ def write_plot(path: Path, rows: Sequence[Sequence[CurvePanel]], cost: str, note
     """Draw rows of panels of equal number and write a PNG, atomically; costs on a logarithmic axis if all are above 0."""
     names = (name for row in rows for panel in row for name in panel.lines)
     size = (4.2 * len(rows[0]), 3.2 * len(rows) + 0.8)
-    with plot_file(path, size, 150, names, note, line="-") as (figure, colours):
+    with plot_file(path, size, 150, names, note, line="-", markers=MARKERS) as (figure, looks):
         grid = figure.subplots(len(rows), len(rows[0]), squeeze=False)
         for axes, panel in zip(grid.ravel(), itertools.chain(*rows)):
-            _draw(axes, panel, cost, colours)
+            _draw(axes, panel, cost, looks)
 
 
-def _draw(axes: Axes, panel: CurvePanel, cost: str, colours: Mapping[str, str]) -> None:
+def _draw(axes: Axes, panel: CurvePanel, cost: str, looks: Mapping[str, tuple[str, str]]) -> None:
     start_axes(axes, panel.title)
     axes.set_xlabel(cost, fontsize=SMALL)
     if not any(panel.lines.values()):
@@ -42,6 +42,7 @@ def _draw(axes: Axes, panel: CurvePanel, cost: str, colours: Mapping[str, str]) 
         if points:
             costs, values, halves = zip(*points)
             bars = halves if any(halves) else None
-            line = axes.errorbar(costs, values, bars, color=colours[name], linewidth=1.2, capsize=2)
-            line.lines[0].set(marker="o", markersize=4)
+            colour, marker = looks[name]
+            line = axes.errorbar(costs, values, bars, color=colour, linewidth=1.2, capsize=2)
+            line.lines[0].set(marker=marker, markersize=4)
     cost_axis(axes, logarithmic=all(cost > 0 for line in panel.lines.values() for cost, _, _ in line))

@@ -12,13 +12,12 @@ from matplotlib.transforms import Bbox
 from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
 from ...bench.specs import MetricSpec
-from ..plots import GREY, SMALL, cost_axis, plot_file, show_missing, start_axes
+from ..plots import GREY, MARKERS, SMALL, cost_axis, plot_file, show_missing, start_axes
 from .points import ParetoPoint, front_of
 from .rates import RatePoint
 
 MARKER = 7.0
 """Diameter of a point, in points of 1/72 inch."""
-MARKERS = "osD^vP"
 BESIDE = ((7, -8, "left"), (-7, 3, "right"), (7, 3, "left"), (-7, -8, "right"))
 """Positions of a label: offset of its lower edge from the point, in points, and its alignment."""
 
@@ -43,7 +42,8 @@ def write_plot(
     note = f"Lines: Pareto front of each method; filled: of all.{shapes} Measured on {machines}."
     size = (6.2 * len(costs), 4.9)
     names = [point.series for point in points]
-    with plot_file(path, size, 200, names, note, line="") as (figure, colours):
+    with plot_file(path, size, 200, names, note, line="") as (figure, looks):
+        colours = {name: colour for name, (colour, _) in looks.items()}
         plots = list(zip(figure.subplots(1, len(costs), squeeze=False)[0], costs))
         fronts = {}
         for axes, cost in plots:
@@ -76,9 +76,8 @@ def write_rates(path: Path, curves: Mapping[str, Curves]) -> None:
     )
     columns = max(len(metrics) for _, metrics in curves.values())
     size = (6.2 * columns, 4.9 * len(curves))
-    with plot_file(path, size, 200, names, note, line="-") as (figure, colours):
+    with plot_file(path, size, 200, names, note, line="-", markers=MARKERS) as (figure, looks):
         rows = figure.subplots(len(curves), columns, squeeze=False)
-        markers = dict(zip(colours, itertools.cycle(MARKERS)))
         for row, (task, (points, metrics)) in zip(rows, curves.items()):
             for axes in row[len(metrics) :]:
                 axes.set_visible(False)
@@ -86,10 +85,7 @@ def write_rates(path: Path, curves: Mapping[str, Curves]) -> None:
                 unit = f", {metric.unit}" if metric.unit else ""
                 axes.set(xlabel="Size, MB")
                 start_axes(axes, f"{metric.label}{unit}, {TASK_TITLES.get(task, task).lower()}")
-                drawn = [
-                    _draw_rates(axes, points, metric.name, name, colour, markers[name])
-                    for name, colour in colours.items()
-                ]
+                drawn = [_draw_rates(axes, points, metric.name, name, *look) for name, look in looks.items()]
                 if any(drawn):
                     cost_axis(axes)
                 else:
