@@ -15,6 +15,8 @@ from ..ops.harmonics import coefficient_count
 from ..ops.splats import apply_matrices, left_products
 from ..shared.avatar_files import settings_of_text, settings_text
 from ..shared.networks import input_count, layer_names, layer_shapes, outputs_of
+from ..shared.subject_mesh import SubjectMesh
+from ..shared.surface_points import SurfacePoints
 from ..shared.surface_splats import HeadSurface, SurfaceSplats
 from ..shared.tensor_files import check_sizes
 from .config import FlashAvatarConfig
@@ -81,7 +83,14 @@ class TrainedSplats(SurfaceSplats[FlashAvatarConfig]):
     degree 0, and with ``hyper_gaussians`` of L another 128 + 52 L.
     """
 
-    KEY, surface_class = "settings", HeadSurface
+    KEY = "settings"
+
+    @classmethod
+    def surface(
+        cls, mesh: SubjectMesh, points: SurfacePoints, head: HeadAsset, settings: FlashAvatarConfig
+    ) -> HeadSurface:
+        """The points with the axes of the head at each."""
+        return HeadSurface(mesh, points)
 
     def shapes(self, head: HeadAsset) -> dict[str, tuple[int | str, ...]]:
         """Shapes of the tensors by name, for N splats."""

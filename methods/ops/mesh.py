@@ -119,6 +119,24 @@ class _TurnsBetween(torch.autograd.Function):
         return by_turns @ origin, by_turns.mT @ to
 
 
+def chart_axes(corners: Tensor, uv_edges: Tensor) -> Tensor:
+    """(F, 3, 3) axes of triangles along their texture coordinates, as columns: tangent, bitangent and normal.
+
+    Each has unit length, but tangent and bitangent are in general not orthogonal (``face_tbn.cu`` of the authors' program of RGBAvatar).
+
+    Parameters
+    ----------
+    corners : Tensor
+        (F, 3, 3) positions of the corners (v0, v1, v2), metres.
+    uv_edges : Tensor
+        (F, 2, 2) texture coordinates of v1 and v2 minus those of v0, as rows; not singular.
+    """
+    edges = corners[:, 1:] - corners[:, :1]
+    along = torch.linalg.solve(uv_edges, edges)
+    normal = torch.linalg.cross(edges[:, 0], edges[:, 1])
+    return torch.nn.functional.normalize(torch.stack([*along.unbind(1), normal], dim=2), dim=1)
+
+
 def _cross(a: Tensor, b: Tensor) -> Tensor:
     """Cross products of (3, F) vectors."""
     (ax, ay, az), (bx, by, bz) = a.unbind(0), b.unbind(0)

@@ -7,11 +7,14 @@ each over a batch; the program counts images, ten for each step.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from ..shared.config import SurfaceSettings, check_at_least_one
 
 INPUTS = ("expression", "neck", "jaw", "eyes", "eyelids", "translation")
 """Tracked parameters that the weights may depend on."""
+OFFICIAL_LEAST = 0.1
+"""Weight of a splat in a pixel above which the pixel counts for its initial colour in the authors' program."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,14 @@ class RGBAvatarConfig(SurfaceSettings):
         add up to more than this; 0 disables it.
     color_every : int
         Steps between searches for splats without a colour, each of which costs as much as the step.
+    frame_variant : Literal['orthonormal', 'official']
+        Axes of positions and rotations of a splat. "orthonormal": an edge of its triangle, the normal, and their cross product.
+        "official": tangent, bitangent and normal along the texture coordinates, which the head model must have; of unit
+        length and not orthogonal, as in the authors' program.
+    color_init_variant : Literal['paper', 'official']
+        Initial colours. "paper": means over all foreground pixels, set before the step of the optimiser and not changed by it.
+        "official": only pixels in which a splat's weight is above `OFFICIAL_LEAST` count, colours are set after the step with the
+        moments kept, and splats without a colour are removed at the end, as in the authors' program.
     """
 
     schedule_length: int = 5_000
@@ -82,6 +93,8 @@ class RGBAvatarConfig(SurfaceSettings):
     color_share: float = 0.5
     color_weight: float = 0.1
     color_every: int = 1
+    frame_variant: Literal["orthonormal", "official"] = "orthonormal"
+    color_init_variant: Literal["paper", "official"] = "paper"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -91,6 +104,12 @@ class RGBAvatarConfig(SurfaceSettings):
         for name in ("initial_scale_mm", "position_lr", "position_lr_final"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be above 0, found {getattr(self, name)}")
+        if self.frame_variant == "official" and not self.uv_chart:
+            raise ValueError("uv_chart must be true with frame_variant=official, whose axes follow the chart")
+        if self.color_init_variant == "official" and not self.color_weight > 0:
+            raise ValueError(
+                f"color_weight must be above 0 with color_init_variant=official, found {self.color_weight}"
+            )
         if self.online and self.together != 1:
             raise ValueError(f"together must be 1 with online, found {self.together}")
         if not 0 <= self.ssim_weight <= 1:

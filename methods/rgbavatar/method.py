@@ -28,7 +28,7 @@ from ..shared.rendering import PlacedSplats, View, pixel_sums, rasterize_view
 from ..shared.schedule import Batches, GroupedBatches, log_linear, numpy_generator
 from ..shared.splat_training import initial_shapes
 from ..shared.surface_splats import SurfaceAvatar, SurfaceMethod, SurfaceTrainer
-from .config import RGBAvatarConfig
+from .config import OFFICIAL_LEAST, RGBAvatarConfig
 from .model import PER_SPLAT, SHAPES, StoredShapes, blend_weights, blended, seen_colors
 from .online import OnlineBatches
 from .spec import RGBAVATAR as SPEC
@@ -58,6 +58,8 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         self._batches, self._sampler = batches, lambda iteration: batches.batch(iteration)[0]
         count = len(self.rest)
         self.colored = torch.zeros(count, dtype=torch.bool, device=device)
+        self._official = config.color_init_variant == "official"
+        self._seen: list[tuple[WorldSplats, Tensor, View, Tensor]] = []
         size = 1e-3 * config.initial_scale_mm * (PUBLISHED_SAMPLES / count) ** 0.5
         splats = {
             "means": (torch.zeros(count, 3), config.position_lr),
@@ -74,7 +76,7 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
 
     def loss(self, iteration: int, index: int) -> Tensor:
         """Mean loss of the images of a batch; ``index`` is that of the first."""
-        self._seen: list[tuple[WorldSplats, Tensor, View, Tensor]] = []
+        self._finish_step()
         images, splats = self._batches.positions(iteration), self.tensors()
         rows = sorted({self._tracked.row[self.keys[image].timestep] for _, image in images})
         posed = [splats] * len(rows)
@@ -100,8 +102,10 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         """Give colours to splats that are seen for the first time; set the learning rates."""
         config = self._config
         due = config.color_weight > 0 and (iteration - 1) % config.color_every == 0
-        if due and not bool(self.colored.all()):
-            self._take_colors()
+        if not due or bool(self.colored.all()):
+            self._seen = []
+        if not self._official:
+            self._still(self._take_colors())
         # While images arrive, time is counted from the first one, whatever the length of the run.
         settles = config.position_settles if config.online else self._timeline.at(config.position_settles)
         rate = log_linear(config.position_lr, config.position_lr_final, iteration / max(settles, 1))
@@ -111,6 +115,7 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
 
     def state(self) -> dict[str, Any]:
         """Parameters, moments, and which splats have a colour."""
+        self._finish_step()
         return {**super().state(), "colored": self.colored}
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -119,16 +124,17 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         self.colored = state["colored"]
 
     def result(self) -> StoredShapes:
-        """The trained avatar, without splats that never had a gradient: no image has shown them."""
+        """The trained avatar, without splats that no image has shown: that never had a gradient, or never got a colour (official)."""
+        self._finish_step()
         moments = self.optimiser.moments("colors")
-        kept = torch.ones_like(self.colored)
-        if moments and not self._config.online:
-            shown = self.colored | (moments["exp_avg_sq"] > 0).any(1)
-            kept = shown if bool(shown.any()) else kept
+        shown = self.colored
+        if not self._official:
+            shown = shown | (moments["exp_avg_sq"] > 0).any(1) if moments else torch.ones_like(shown)
+        kept = torch.ones_like(shown) if self._config.online or not bool(shown.any()) else shown
         tensors = self.tensors()
         tensors |= {name: tensors[name][kept] for name in PER_SPLAT}
         tensors |= {name: tensors[name][:, kept] for name in SHAPES.values()}
-        return StoredShapes(tensors, self.points.rows(kept.cpu().numpy()), self._config.inputs)
+        return StoredShapes(tensors, self.points.rows(kept.cpu().numpy()), self._config)
 
     def _on_background(self, pixels: Tensor, iteration: int, image: int) -> tuple[Tensor, Tensor]:
         """(H, W, 3) colours, on a random background if there are masks, and that background."""
@@ -138,28 +144,37 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         background = to_device(torch.from_numpy(random.astype(np.float32)), self._background.device)
         return recomposited(pixels[:, :, :3], pixels[:, :, 3:], self._background, background), background
 
-    def _take_colors(self) -> None:
-        """Set colours of splats whose weights over the batch's foreground add up to enough for the first time.
+    def _finish_step(self) -> None:
+        """Set the colours that the last step found, if they are set after it."""
+        if self._official:
+            self._take_colors()
+
+    def _take_colors(self) -> Tensor:
+        """Set colours of splats whose weights over the batch's foreground add up to enough for the first time; return their rows.
 
         The colour is the mean of the images' colours, weighted by what the splat contributes to each pixel.
         """
+        seen, self._seen = self._seen, []
         sums = torch.zeros(len(self.colored), 4, device=self.colored.device)
-        for world, opacities, view, pixels in self._seen:
+        for world, opacities, view, pixels in seen:
             truth = torch.cat([pixels[:, :, :3], torch.ones_like(pixels[:, :, :1])], dim=2)
             if self._masked:
                 truth = truth * (pixels[:, :, 3:] > 0.5)
-            sums += pixel_sums(world, opacities, view, truth)
+            sums += pixel_sums(world, opacities, view, truth, OFFICIAL_LEAST if self._official else 0.0)
         new = (sums[:, 3] > self._config.color_weight) & ~self.colored
         rows = new.nonzero().squeeze(1)
-        parameter = self.optimiser["colors"]
-        parameter.data[rows] = (sums[rows, :3] / sums[rows, 3:] - 0.5) / C0
-        # The step that follows does not move them.
-        if parameter.grad is not None:
-            parameter.grad[rows] = 0
+        self.optimiser["colors"].data[rows] = (sums[rows, :3] / sums[rows, 3:] - 0.5) / C0
+        self.colored = self.colored | new
+        return rows
+
+    def _still(self, rows: Tensor) -> None:
+        """Keep the step that follows from moving the colours of some splats."""
+        gradient = self.optimiser["colors"].grad
+        if gradient is not None:
+            gradient[rows] = 0
         moments = self.optimiser.moments("colors")
         if moments:
             moments["exp_avg"][rows] = 0
-        self.colored = self.colored | new
 
 
 class RGBAvatarAvatar(SurfaceAvatar[StoredShapes]):
@@ -174,7 +189,7 @@ class RGBAvatarAvatar(SurfaceAvatar[StoredShapes]):
         return colors, np.zeros((*colors.shape, coefficient_count(DEGREE) - 1), np.float32)
 
     def _blended(self, arguments: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        inputs = tracked_inputs(arguments, self.stored.settings)
+        inputs = tracked_inputs(arguments, self.stored.settings.inputs)
         return blended(self.stored.tensors, blend_weights(self.stored.tensors, inputs))[0]
 
     def _placed(self, frames: TriangleFrames, arguments: Mapping[str, Tensor]) -> PlacedSplats:

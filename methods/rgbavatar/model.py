@@ -12,7 +12,9 @@ from ...bench.configuration import build
 from ...bench.contracts import HeadAsset
 from ..ops.harmonics import C0
 from ..shared.networks import input_count, layer_names, layer_shapes, outputs_of
-from ..shared.surface_splats import SurfaceSplats
+from ..shared.subject_mesh import SubjectMesh
+from ..shared.surface_points import SurfacePoints
+from ..shared.surface_splats import ChartSurface, PointSurface, SurfaceSplats
 from .config import RGBAvatarConfig
 
 SHAPES = {"means": "mean_shapes", "quats": "quat_shapes", "colors": "color_shapes"}
@@ -21,6 +23,8 @@ PER_SPLAT = {"means": (3,), "quats": (4,), "colors": (3,), "log_scales": (3,), "
 """Shape of a splat's attributes. Positions are in metres along the axes of the triangle, quaternions wxyz, colours harmonics of
 degree 0, scales logarithms of metres, opacities logits."""
 WEIGHTS, BIASES = layer_names(3)
+FRAMES = ";frame_variant="
+"""Between the inputs and the variant of the axes in an avatar's file."""
 
 
 def blend_weights(network: Mapping[str, Tensor], inputs: Tensor) -> Tensor:
@@ -44,26 +48,38 @@ def seen_colors(values: Tensor) -> Tensor:
     return (0.5 + C0 * values).relu()
 
 
-class StoredShapes(SurfaceSplats[tuple[str, ...]]):
+class StoredShapes(SurfaceSplats[RGBAvatarConfig]):
     """Content of an avatar's file: neutral splats by the names of `PER_SPLAT`, blendshapes by those of `SHAPES`, and the network.
 
-    A splat takes 68 bytes, and 40 for each of its blendshapes. The settings are the tracked parameters that the network takes.
+    A splat takes 68 bytes, and 40 for each of its blendshapes. Of the settings, the file has the tracked parameters that the network
+    takes and the variant of the axes.
     """
 
     KEY = "inputs"
+
+    @classmethod
+    def surface(
+        cls, mesh: SubjectMesh, points: SurfacePoints, head: HeadAsset, settings: RGBAvatarConfig
+    ) -> PointSurface:
+        """The points with the axes of their triangles. Raises the errors of `ChartSurface` for axes along a chart."""
+        official = settings.frame_variant == "official"
+        return ChartSurface(mesh, points, head) if official else PointSurface(mesh, points)
 
     def shapes(self, head: HeadAsset) -> dict[str, tuple[int | str, ...]]:
         """Shapes of the tensors by name, for N splats and K blendshapes."""
         splats: dict[str, tuple[int | str, ...]] = {name: ("N", *width) for name, width in PER_SPLAT.items()}
         blendshapes = {shapes: ("K", *splats[name]) for name, shapes in SHAPES.items()}
-        network = layer_shapes((input_count(head, self.settings), "hidden", "hidden 2", "K"))
+        network = layer_shapes((input_count(head, self.settings.inputs), "hidden", "hidden 2", "K"))
         return {**splats, **blendshapes, **network}
 
     def text(self) -> str:
-        """The names of the inputs, with commas between them."""
-        return ",".join(self.settings)
+        """The names of the inputs, with commas between them, and the variant of the axes unless it is the default."""
+        variant = self.settings.frame_variant
+        return ",".join(self.settings.inputs) + (f"{FRAMES}{variant}" if variant != "orthonormal" else "")
 
     @classmethod
-    def settings_of(cls, path: Path, text: str) -> tuple[str, ...]:
-        """The names of a `text`. Raises `InputError`, naming ``path``, for others than `INPUTS`."""
-        return build(RGBAvatarConfig, {cls.KEY: text.split(",")}, str(path)).inputs
+    def settings_of(cls, path: Path, text: str) -> RGBAvatarConfig:
+        """Settings of a `text`. Raises `InputError`, naming ``path``, for other text."""
+        inputs, _, variant = text.partition(FRAMES)
+        values = {cls.KEY: inputs.split(","), "frame_variant": variant or "orthonormal"}
+        return build(RGBAvatarConfig, values, str(path))

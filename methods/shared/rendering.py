@@ -15,7 +15,7 @@ from ...bench.contracts import Camera, FloatArray, Frame, HeadPose, no_stage
 from ...bench.native.dispatch import is_cuda, on_host, to_device
 from ..avatars.compact.container import codec_of
 from ..ops.splats import WorldSplats
-from ..splats import Rendering, rasterize
+from ..splats import Rendering, pixel_weights, rasterize
 from ..splats.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from .avatar_files import HEAD_FILE
 from .subject_mesh import pose_key
@@ -106,11 +106,23 @@ def rasterize_view(
     )
 
 
-def pixel_sums(world: WorldSplats, opacities: Tensor, view: View, targets: Tensor) -> Tensor:
+def pixel_sums(
+    world: WorldSplats, opacities: Tensor, view: View, targets: Tensor, least: float = 0.0
+) -> Tensor:
     """(N, C) sums over pixels of (H, W, C) targets times the weight of each splat, its alpha times the transmittance before it.
 
-    They are the derivatives of the sum of a rendering times the targets by the splats' colours.
+    They are the derivatives of the sum of a rendering times the targets by the splats' colours. With ``least`` above 0 only weights
+    above it count, which takes several times as long.
     """
+    if least:
+        sums = targets.new_zeros(len(opacities), targets.shape[2])
+        width, height = view.camera.width, view.camera.height
+        splats, pixels, weights = pixel_weights(
+            *world, opacities, view.world_to_camera, view.K, width, height
+        )
+        counted = weights > least
+        values = weights[counted, None] * targets.flatten(0, 1)[pixels[counted]]
+        return sums.index_add_(0, splats[counted], values)
     colors = opacities.new_zeros(len(opacities), targets.shape[2]).requires_grad_()
     still = WorldSplats(*(part.detach() for part in world))
     rendering = rasterize_view(still, opacities.detach(), colors, view)

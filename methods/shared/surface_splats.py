@@ -14,9 +14,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from ...bench.contracts import Clip, HeadAsset, HeadPose
+from ...bench.errors import InputError
 from ...bench.io.arrays import Member
-from ...datasets.head.rotations import axis_angle_to_quaternion, quaternion_to_matrix
-from ..ops.mesh import TriangleFrames
+from ...datasets.head.rotations import axis_angle_to_quaternion, matrix_to_quaternion, quaternion_to_matrix
+from ..ops.mesh import TriangleFrames, chart_axes
 from ..ops.splats import WorldSplats, apply_matrices, left_products, to_world
 from .avatar_files import AVATAR_FILE, Subject, clip_mesh, finish_fit, read_stored
 from .config import SurfaceSettings
@@ -54,15 +55,15 @@ class PointSurface:
     def posed(self, arguments: Mapping[str, Tensor]) -> TriangleFrames:
         """Axes at the points for the arguments of one timestep, each centred on its point, in metres."""
         vertices = self.mesh.posed(arguments)
-        rotation, quaternion = self._axes(arguments, vertices)
+        rotation, quaternion = self.axes(arguments, vertices)
         return TriangleFrames(rotation, self._at_points(vertices), self._unit, quaternion)
 
     def place(self, frames: TriangleFrames, splats: Mapping[str, Tensor]) -> WorldSplats:
         """Splats in the world: ``means`` and ``quats`` are along the axes at their points, positions and ``log_scales`` in metres."""
         return to_world(frames, self._each, splats["means"], splats["log_scales"], splats["quats"])
 
-    def _axes(self, arguments: Mapping[str, Tensor], vertices: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 3, 3) rotations and their (N, 4) quaternions, for one timestep's arguments and (V, 3) vertices."""
+    def axes(self, arguments: Mapping[str, Tensor], vertices: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 3, 3) axes as columns and their (N, 4) quaternions, for one timestep's arguments and (V, 3) vertices."""
         frames, triangles = self.mesh.frames(vertices), self._at_points.triangles
         return frames.rotation[triangles], frames.quaternion[triangles]
 
@@ -80,12 +81,41 @@ class HeadSurface(PointSurface):
         """(N, 1) skinning weights of the root."""
         return self._at_points(self.mesh.model.skinning_weights[:, :1])
 
-    def _axes(self, arguments: Mapping[str, Tensor], vertices: Tensor) -> tuple[Tensor, Tensor]:
+    def axes(self, arguments: Mapping[str, Tensor], vertices: Tensor) -> tuple[Tensor, Tensor]:
+        """See `PointSurface.axes`."""
         root, neck = (axis_angle_to_quaternion(arguments[name]) for name in ("rotation", "neck"))
         head = apply_matrices(left_products(root).flatten(1), neck)
         # The shorter way from one to the other, as the real part of their quotient, the neck's, is not negative.
         turns = normalize(head + self._of_root * (root - head), dim=1)
         return quaternion_to_matrix(turns), turns
+
+
+class ChartSurface(PointSurface):
+    """Points on the mesh of a subject with the `chart_axes` of their triangles, which turn only approximately with the head.
+
+    Raises
+    ------
+    InputError
+        The head model has no texture coordinates, or a point is on a triangle without area in the chart.
+    """
+
+    def __init__(self, mesh: SubjectMesh, points: SurfacePoints, head: HeadAsset):
+        super().__init__(mesh, points)
+        where, uv = f"head model {head.version!r}", getattr(head, "uv", None)
+        if uv is None:
+            remedy = "Use the orthonormal axes of the triangles, or a head model with texture coordinates."
+            raise InputError(where, "uv", "texture coordinates, along which the axes are", "none", remedy)
+        corners = np.asarray(uv, np.float64)[points.triangles]
+        edges = corners[:, 1:] - corners[:, :1]
+        if not np.linalg.det(edges).all():
+            raise InputError(where, "uv", "an area in the chart for every splat's triangle", "none for some")
+        self._uv_edges = torch.from_numpy(edges).to(self.rest)
+        self._vertices = mesh.faces[self._at_points.triangles]
+
+    def axes(self, arguments: Mapping[str, Tensor], vertices: Tensor) -> tuple[Tensor, Tensor]:
+        """See `PointSurface.axes`; the quaternion is that of the authors' program, also where the axes are not a rotation."""
+        axes = chart_axes(vertices[self._vertices], self._uv_edges)
+        return axes, matrix_to_quaternion(axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +138,13 @@ class SurfaceSplats(Generic[Settings]):
 
     KEY: ClassVar[str]
     """Key of the settings in the file's metadata."""
-    surface_class: ClassVar[type[PointSurface]] = PointSurface
+
+    @classmethod
+    def surface(
+        cls, mesh: SubjectMesh, points: SurfacePoints, head: HeadAsset, settings: Settings
+    ) -> PointSurface:
+        """The points on the mesh of a subject, with axes at each."""
+        return PointSurface(mesh, points)
 
     def shapes(self, head: HeadAsset) -> Mapping[str, tuple[int | str, ...]]:
         """Shapes of the float32 tensors by name; "N" is the number of splats, and other names stand for any size."""
@@ -161,7 +197,7 @@ class SurfaceAvatar(StoredSplatAvatar, Generic[Stored]):
         super().__init__(files, LastPose(self._posed), device)
         self.mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
         self.subject, self.stored = subject, stored
-        self.surface = stored.surface_class(self.mesh, stored.points)
+        self.surface = stored.surface(self.mesh, stored.points, head, stored.settings)
 
     @classmethod
     def read(cls, folder: Path, device: str) -> Self:
@@ -218,7 +254,7 @@ class SurfaceTrainer(ImageTrainer, Generic[Config]):
             *(clip.head, vertices, config.samples, seed), chart=config.uv_chart, chart_without=without
         )
         self.rest = self.points.positions(vertices, np.asarray(clip.head.faces))
-        self._surface = self.stored_class.surface_class(self._mesh, self.points)
+        self._surface = self.stored_class.surface(self._mesh, self.points, clip.head, config)
         self._tracked = TrainingPoses(clip, self._mesh)
         self._inputs = tracked_inputs(self._tracked.arguments, inputs)
         entries = config.mesh_cache_mb * 2**20 // (4 * 17 * len(self.rest))

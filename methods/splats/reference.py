@@ -71,6 +71,59 @@ def _draw(request: Request, view: CameraInputs) -> tuple[Tensor, Tensor, Tensor]
     return image_and_alpha[..., :-1], image_and_alpha[..., -1], radii
 
 
+@torch.no_grad()
+def pixel_weights(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    near: float = 0.01,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Weight of each splat in each pixel that it contributes to; the arguments are those of `rasterize`.
+
+    Returns (P,) int64 splats, (P,) int64 pixels, counted row by row, and the (P,) weight of each pair: alpha times the transmittance
+    before the splat. The colour of a pixel is the sum of weights times colours, plus the rest times the background.
+    """
+    request = Request(
+        *(means, quats, scales, opacities, means[:, :1], viewmat[None], K[None]),
+        *(means.new_zeros(1, 1), width, height),
+        near=near,
+    )
+    view = request.view(0)
+    drawn, extents, _ = _find_drawn(request, view)
+    footprints = project(request, view, drawn)
+    means, depths = footprints.means, footprints.depths
+    size = torch.tensor([request.width, request.height], device=means.device)
+    # Pixels in the bounding box of each splat, which is extended by a pixel for rounding.
+    first = torch.minimum((means - extents - 1).floor().clamp(min=0), size).long()
+    sides = (torch.minimum((means + extents + 1).ceil(), size).long() - first).clamp(min=0)
+    count = sides.prod(1)
+    row = torch.repeat_interleave(torch.arange(len(drawn), device=means.device), count)
+    within = torch.arange(len(row), device=means.device) - (count.cumsum(0) - count)[row]
+    x, y = first[row, 0] + within % sides[row, 0], first[row, 1] + within // sides[row, 0]
+    _, xy, yy = footprints.covariances[row].unbind(1)
+    dx, dy = x + 0.5 - means[row, 0], y + 0.5 - means[row, 1]
+    distance = yy / footprints.determinants[row] * (dx - xy / yy * dy) ** 2 + dy * dy / yy
+    alpha = (footprints.opacities[row] * torch.exp(-0.5 * distance)).clamp(max=ALPHA_MAX)
+    kept = alpha >= request.alpha_min
+    row, pixel, alpha = row[kept], (y * request.width + x)[kept], alpha[kept].double()
+    # Front to back in every pixel; sums of logarithms are differences of running sums over all pixels.
+    rank = torch.argsort(torch.argsort(depths, stable=True))
+    order = torch.argsort(pixel * len(drawn) + rank[row])
+    row, pixel, alpha = row[order], pixel[order], alpha[order]
+    dimmed = torch.log1p(-alpha)
+    before = dimmed.cumsum(0) - dimmed
+    starts = torch.searchsorted(pixel, pixel)
+    light = torch.exp(before - before[starts])
+    shown = light * (1 - alpha) > request.transmittance_min
+    weights = (alpha * light)[shown].to(means.dtype)
+    return drawn[row[shown]], pixel[shown], weights
+
+
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Convert quaternions (N, 4), wxyz of any length, to rotation matrices (N, 3, 3); zero gives the identity.
 

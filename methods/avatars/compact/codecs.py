@@ -146,7 +146,7 @@ def _encode_rgbavatar(
 ) -> Content:
     moments = None
     if clip is not None:
-        inputs = tracked_inputs(avatar.mesh.arguments(training_poses(clip)), avatar.stored.settings)
+        inputs = tracked_inputs(avatar.mesh.arguments(training_poses(clip)), avatar.stored.settings.inputs)
         found = blend_weights(avatar.stored.tensors, inputs).double().cpu().numpy()
         moments = found.T @ found / len(found)
     return encode_reduced(avatar.stored, avatar.subject, head, precision, weights_of(avatar, clip), moments)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +65,7 @@ def encode_reduced(
     classes = visibility_classes(own, len(order))
     exact_points = stored.points.rows(order)
     on_surface = encode_points(exact_points, precision)
-    moved = _moved(exact_points, points_as_read(on_surface, head), subject, head)
+    moved = _moved(replace(stored, points=exact_points), points_as_read(on_surface, head), subject, head)
     shapes, steps = encode_shapes(
         *(neutral["means"] + moved, neutral["log_scales"], neutral["quats"], neutral["opacities"]),
         *(precision, classes),
@@ -98,7 +99,7 @@ def read_reduced(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Sto
     """Subject and splats of a file of `encode_reduced`. Raises `InputError` for anything else."""
     arrays = Arrays(path, read_content(path))
     subject = decode_subject(arrays, head)
-    inputs = StoredShapes.settings_of(path, arrays.text.get(StoredShapes.KEY, ""))
+    settings = StoredShapes.settings_of(path, arrays.text.get(StoredShapes.KEY, ""))
     points = decode_points(arrays, head)
     classes = read_classes(arrays, "classes", len(points.triangles))
     shapes = decode_shapes(arrays, classes, FLOOR, turned=True)
@@ -120,16 +121,16 @@ def read_reduced(path: Path, head: HeadAsset, device: str) -> tuple[Subject, Sto
         table = vectors.reshape(len(classes), count, CHANGES).swapaxes(0, 1) * units
     tensors |= dict(zip(SHAPES.values(), np.split(table, (3, 7), axis=2)))
     content = {name: torch.from_numpy(np.array(values, np.float32)) for name, values in tensors.items()}
-    return subject, StoredShapes(content, points, inputs).checked(path, head, device)
+    return subject, StoredShapes(content, points, settings).checked(path, head, device)
 
 
-def _moved(points: SurfacePoints, as_read: SurfacePoints, subject: Subject, head: HeadAsset) -> FloatArray:
-    """(N, 3) differences of two sets of points along the axes of their triangles, on the neutral mesh, metres."""
-    mesh = SubjectMesh(head, subject.shape, subject.static_offset, "cpu")
+def _moved(stored: StoredShapes, as_read: SurfacePoints, subject: Subject, head: HeadAsset) -> FloatArray:
+    """(N, 3) differences of two sets of points along the axes at the points, on the neutral mesh, metres."""
+    mesh, points = SubjectMesh(head, subject.shape, subject.static_offset, "cpu"), stored.points
     vertices, faces = mesh.canonical.double().numpy(), mesh.faces.numpy()
-    axes = mesh.frames(mesh.canonical).rotation.double().numpy()[points.triangles]
+    axes = stored.surface(mesh, points, head, stored.settings).axes({}, mesh.canonical)[0].double().numpy()
     apart = points.positions(vertices, faces) - as_read.positions(vertices, faces)
-    return np.asarray(np.einsum("nji,nj->ni", axes, apart), np.float32)
+    return np.asarray(np.linalg.solve(axes, apart[..., None])[..., 0], np.float32)
 
 
 def _units(precision: Precision, size: FloatArray) -> FloatArray:

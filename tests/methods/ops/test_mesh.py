@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from headbench.methods.ops.mesh import triangle_frames
+from headbench.datasets.head.rotations import matrix_to_quaternion
+from headbench.methods.ops.mesh import chart_axes, triangle_frames
 from headbench.methods.ops.splats import to_world
 
 
@@ -93,3 +94,41 @@ def test_gradients_reach_vertices_and_local_parameters():
         return to_world(triangle_frames(vertices, triangles), binding, means, log_scales, quats)
 
     assert torch.autograd.gradcheck(world, inputs)
+
+
+def test_axes_of_a_unit_triangle_with_its_own_chart():
+    corners = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
+    axes = chart_axes(corners, corners[:, 1:, :2] - corners[:, :1, :2])
+    torch.testing.assert_close(axes[0], torch.eye(3))
+
+
+def test_axes_along_a_chart_follow_its_coordinates():
+    """Tangent and bitangent are the directions in which one coordinate rises and the other stays; also of mirrored charts."""
+    rng = np.random.default_rng(0)
+    corners, uv = rng.normal(size=(20, 3, 3)), rng.normal(size=(20, 3, 2))
+    found = chart_axes(torch.from_numpy(corners), torch.from_numpy(uv[:, 1:] - uv[:, :1])).numpy()
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1)
+    for axes, (v0, v1, v2), place in zip(found, corners, uv):
+        across = np.cross(v1 - v0, v2 - v0)
+        np.testing.assert_allclose(axes[:, 2], across / np.linalg.norm(across))
+        # The affine map from the triangle's plane to the chart, of which the axes are the two columns of the inverse.
+        plane = np.linalg.lstsq(np.stack([v1 - v0, v2 - v0, across]), np.eye(3), rcond=None)[0]
+        gradients = plane[:, :2] @ (place[1:] - place[0])
+        values = axes[:, :2].T @ gradients
+        assert (np.diag(values) > 0).all()
+        np.testing.assert_allclose(values - np.diag(np.diag(values)), 0, atol=1e-9)
+
+
+def test_quaternions_of_other_matrices_are_the_programs():
+    """The rule of the authors' program of RGBAvatar by the largest of diagonal and trace, a matrix at a time."""
+    matrices = np.random.default_rng(0).normal(size=(50, 3, 3))
+    for m, found in zip(matrices, matrix_to_quaternion(torch.from_numpy(matrices)).numpy()):
+        choice = int(np.argmax([*np.diag(m), np.trace(m)]))
+        q = np.zeros(4)
+        if choice == 3:
+            q[:] = 1 + np.trace(m), m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+        else:
+            i, j, k = choice, (choice + 1) % 3, (choice + 2) % 3
+            q[0], q[i + 1] = m[k, j] - m[j, k], 1 - np.trace(m) + 2 * m[i, i]
+            q[j + 1], q[k + 1] = m[j, i] + m[i, j], m[k, i] + m[i, k]
+        np.testing.assert_allclose(found * np.sign(found @ q), q / np.linalg.norm(q), atol=1e-12)

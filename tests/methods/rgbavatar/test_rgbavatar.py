@@ -5,20 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
+from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.datasets.head.rotations import axis_angle_to_matrix
+from headbench.methods.avatars.compact.codecs import write_coded
+from headbench.methods.avatars.compact.precision import EXACT
 from headbench.methods.ops.harmonics import C0
 from headbench.methods.rgbavatar.config import INPUTS, RGBAvatarConfig
-from headbench.methods.rgbavatar.method import RGBAvatarTraining
+from headbench.methods.rgbavatar.method import RGBAvatar, RGBAvatarTraining
 from headbench.methods.rgbavatar.model import SHAPES, StoredShapes, blend_weights, blended, seen_colors
 from headbench.methods.shared.avatar_files import AVATAR_FILE
 from headbench.methods.shared.networks import initial_network, input_count, tracked_inputs
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.subject_mesh import SubjectMesh
-from headbench.methods.shared.surface_points import poisson_disk
-from headbench.methods.shared.surface_splats import PointSurface
-from headbench.methods.splats import rasterize
+from headbench.methods.shared.surface_points import point_tensors, poisson_disk
+from headbench.methods.shared.tensor_files import write_tensors
+from headbench.methods.splats import pixel_weights, rasterize
 
 SMALL = {"samples": 400, "hidden": 8, "blendshapes": 3, "schedule_length": 40, "join": 4}
 
@@ -85,11 +89,20 @@ def test_inputs_are_coefficients_and_two_rows_of_each_rotation(clip, head):
     assert len(found) == input_count(head, INPUTS)
 
 
-def test_splats_sit_on_the_surface_and_turn_with_the_head(clip, head):
+def charted(head):
+    """The head with a chart in which every triangle has its own place and another shape than on the head."""
+    uv = np.random.default_rng(0).random((len(head.faces), 3, 2)).astype(np.float32)
+    return replace(head, uv=uv)
+
+
+@pytest.mark.parametrize("variant", ["orthonormal", "official"])
+def test_splats_sit_on_the_surface_and_turn_with_the_head(clip, head, variant):
+    """Means turn exactly with the head, and covariances if the axes are orthonormal."""
+    head, settings = charted(head), RGBAvatarConfig(frame_variant=variant)
     mesh = SubjectMesh(head, clip.shape, clip.static_offset, "cpu")
     vertices, faces = mesh.canonical.double().numpy(), np.asarray(head.faces)
     points = poisson_disk(vertices, faces, np.arange(len(faces)), 200, 0)
-    surface, count = PointSurface(mesh, points), len(points.triangles)
+    surface, count = StoredShapes.surface(mesh, points, head, settings), len(points.triangles)
     generator = torch.Generator().manual_seed(0)
     splats = {
         "means": 0.01 * torch.randn(count, 3, generator=generator),
@@ -120,7 +133,38 @@ def test_splats_sit_on_the_surface_and_turn_with_the_head(clip, head):
         axes = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
         return axes @ torch.diag_embed(world.scales**2) @ axes.mT
 
-    np.testing.assert_allclose(covariance(other), turn @ covariance(one) @ turn.t(), atol=1e-5)
+    turned = turn @ covariance(one) @ turn.t()
+    assert np.allclose(covariance(other), turned, atol=1e-5) == (variant == "orthonormal")
+
+
+def test_axes_along_a_chart_need_one(clip):
+    with pytest.raises(InputError, match=r"uv: expected texture coordinates.*orthonormal"):
+        make(clip, frame_variant="official")
+    with pytest.raises(ValueError, match="uv_chart"):
+        RGBAvatarConfig(frame_variant="official", uv_chart=False)
+    flat = replace(clip.head, uv=np.zeros((len(clip.head.faces), 3, 2), np.float32))
+    mesh = SubjectMesh(flat, clip.shape, clip.static_offset, "cpu")
+    points = poisson_disk(mesh.canonical.numpy(), flat.faces, np.arange(len(flat.faces)), 50, 0)
+    with pytest.raises(InputError, match="uv: expected an area"):
+        StoredShapes.surface(mesh, points, flat, RGBAvatarConfig(frame_variant="official"))
+
+
+def test_files_tell_the_axes_of_their_splats(clip, tmp_path):
+    """An avatar and its coded file are drawn with the axes of the training."""
+    clip = replace(clip, head=charted(clip.head))
+    method = RGBAvatar(RGBAvatarConfig(**{**SMALL, "frame_variant": "official"}))
+    avatar = method.fit(clip, tmp_path, Budget(8), device="cpu", seed=0, progress=no_progress)
+    assert avatar.stored.text().endswith("translation;frame_variant=official")
+    coded = tmp_path / "coded"
+    write_coded(avatar, clip.head, coded, EXACT, None, tmp_path / "driving.npz")
+    means = avatar.splats(clip.poses[1]).means
+    for other in (method.load(tmp_path, device="cpu"), method.load(coded, device="cpu")):
+        assert other.stored.settings.frame_variant == "official"
+        assert cKDTree(other.splats(clip.poses[1]).means).query(means)[0].max() < 1e-6
+    orthonormal = replace(
+        avatar.stored, settings=replace(avatar.stored.settings, frame_variant="orthonormal")
+    )
+    assert orthonormal.text() == ",".join(INPUTS)
 
 
 def test_a_batch_has_the_mean_gradient_of_its_images(clip):
@@ -265,21 +309,55 @@ def test_files_that_do_not_fit_are_refused(clip, head, tmp_path):
         "triangles": replace(
             stored, points=stored.points._replace(triangles=stored.points.triangles + 10**6)
         ),
-        "inputs": replace(stored, settings=("expression", "smile")),
-        "network_weight_0": replace(stored, settings=("neck",)),
+        "network_weight_0": replace(stored, settings=replace(stored.settings, inputs=("neck",))),
         "color_shapes": replace(
             stored, tensors={**stored.tensors, "color_shapes": stored.tensors["color_shapes"][:-1]}
         ),
     }
+    for text in ("expression,smile", "expression;frame_variant=skewed"):
+        write_tensors(path, stored.tensors | point_tensors(stored.points), {"inputs": text})
+        with pytest.raises(InputError, match="inputs|frame_variant"):
+            StoredShapes.read(path, head, "cpu")
     for name, each in broken.items():
         each.write(path)
         with pytest.raises(InputError, match=name):
             StoredShapes.read(path, head, "cpu")
 
 
+def test_official_colours_are_set_after_the_step(clip):
+    """Only pixels in which the weight is above 0.1 count; the moments stay; what has no colour is removed."""
+    official = {"color_init_variant": "official", "random_background": False, "batch": 1, "samples": 60}
+    training = make(clip, **official)
+    training.loss(1, 0).backward()
+    (world, opacities, view, pixels), *_ = training._seen
+    camera = view.world_to_camera, view.K, view.camera.width, view.camera.height
+    splats, places, weights = (part.numpy() for part in pixel_weights(*world, opacities, *camera))
+    sums, values = np.zeros((len(opacities), 4)), pixels.double().numpy().reshape(-1, pixels.shape[2])
+    for splat, place, weight in zip(splats, places, weights):
+        if weight > 0.1 and values[place, 3] > 0.5:
+            sums[splat] += weight * np.array([*values[place, :3], 1])
+    found = sums[:, 3] > 0.1
+    assert 0 < found.sum() < len(found)
+    gradient = training.optimiser["colors"].grad.clone()
+    training.after_backward(1)
+    assert not training.colored.any()
+    training.optimiser.step()
+    training.optimiser.zero_grad()
+    state = training.state()
+    np.testing.assert_array_equal(training.colored, found)
+    colors = seen_colors(training.optimiser["colors"].detach()).numpy()
+    np.testing.assert_allclose(colors[found], sums[found, :3] / sums[found, 3:], atol=1e-5)
+    moments = state["optimiser"]["colors"]["moments"]["exp_avg"]
+    assert moments[found].abs().max() > 0
+    torch.testing.assert_close(moments, 0.1 * gradient)
+    assert len(training.result().points.triangles) == found.sum()
+    training.close()
+
+
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
+        ({"color_init_variant": "official", "color_weight": 0.0}, "color_weight"),
         ({"samples": 0}, "samples"),
         ({"inputs": ()}, "inputs"),
         ({"inputs": ("smile",)}, "inputs"),

@@ -17,7 +17,7 @@ from headbench.methods.benchmarks.scenes import (
     relative_error,
     render_with_gradients,
 )
-from headbench.methods.splats import rasterize
+from headbench.methods.splats import pixel_weights, rasterize
 from headbench.methods.splats.reference import rotation_matrices
 
 from .dense import render_dense
@@ -213,3 +213,26 @@ def test_moving_splats_and_camera_together_changes_nothing(seed, angle, shift):
     safe = render_dense(scene).safe
     one, two = (rasterize(*s[:9], background=s.background) for s in (scene, moved))
     torch.testing.assert_close(one.image[safe], two.image[safe], rtol=0, atol=1e-9)
+
+
+def test_weights_of_two_stacked_splats():
+    """The first has its alpha, the second its own times what the first lets through."""
+    scene = on_axis([2.0, 2.5], [0.1, 0.1], [0.6, 0.5], [[0.0], [0.0]])
+    splats, pixels, weights = pixel_weights(*scene[:4], *scene[5:])
+    middle = pixels == SIZE * (SIZE // 2) + SIZE // 2
+    assert splats[middle].tolist() == [0, 1]
+    torch.testing.assert_close(weights[middle], torch.tensor([0.6, 0.4 * 0.5], dtype=F64), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_weights_times_colours_are_the_image(seed):
+    """Against a brute-force renderer, with splats behind each other, opaque ones, and ones beyond the border."""
+    scene = cloud(300, 40, 30, seed=seed)
+    values = (part.double() if isinstance(part, torch.Tensor) else part for part in scene)
+    scene = SplatScene(*values)._replace(background=torch.zeros(3, dtype=F64))
+    drawn = render_dense(scene)
+    splats, pixels, weights = pixel_weights(*scene[:4], *scene[5:9])
+    image = torch.zeros(30 * 40, 3, dtype=F64).index_add_(0, pixels, weights[:, None] * scene.colors[splats])
+    torch.testing.assert_close(image.view(30, 40, 3), drawn.image, atol=1e-9, rtol=0)
+    alpha = torch.zeros(30 * 40, dtype=F64).index_add_(0, pixels, weights)
+    torch.testing.assert_close(alpha.view(30, 40), drawn.alpha, atol=1e-9, rtol=0)
