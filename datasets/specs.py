@@ -135,6 +135,13 @@ RIGID_HEAD = ConditionSpec(
     implementation="headbench.datasets.steps.rigid:as_rigid_head",
 )
 
+PACKED_CHART = ConditionSpec(
+    name="packed-chart",
+    summary="Clip: texture coordinates for a head model without, in which every triangle has its own place.",
+    kind="clip",
+    implementation="headbench.datasets.steps.charted:with_packed_chart",
+)
+
 IMPORT_TRACKING = CommandSpec(
     name="import tracking",
     group="data",

@@ -134,9 +134,31 @@ class INSTAOfficialConfig(OfficialConfig):
 
 @dataclass(frozen=True)
 class RGBAvatarOfficialConfig(OfficialConfig):
-    """RGBAvatar by its authors' code; the default commit is the one that the adapter was written for."""
+    """RGBAvatar by its authors' code; the default commit is the one that the adapter was written for.
+
+    Attributes
+    ----------
+    samples : int
+        With ``device=cpu-shim``, number of splats, about, on a head of another topology than FLAME's: they are those of the
+        native method with this setting. On FLAME's topology the authors' chart of 256 x 256 texels is used.
+    motion : Literal['neck', 'root']
+        "neck": the motion of the head is moved into the neck joint, as published. "root": it stays that of the whole head.
+    values : tuple[str, ...]
+        Other values for entries of their configuration, as ``NAME=VALUE``.
+    """
 
     commit: str = "54a960cd947d236a65f43e0c4b13ce54631a2290"
+    samples: int = 60_000
+    motion: Literal["neck", "root"] = "neck"
+    values: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.samples < 1:
+            raise ValueError(f"samples must be at least 1, found {self.samples}")
+        for each in self.values:
+            if "=" not in each:
+                raise ValueError(f"values must be NAME=VALUE, found {each!r}")
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ class OfficialMethod(ABC, Generic[Config]):
     version: ClassVar[str]
     config_class: ClassVar[Any]
     repository: ClassVar[Repository]
-    shimmed: ClassVar[Literal["", "bound splats", "blendshapes", "charted splats"]] = ""
+    shimmed: ClassVar[Literal["", "bound splats", "blendshapes", "charted splats", "blended splats"]] = ""
     """Kind of code for `shim`; "" if it does not support the repository."""
     variables: ClassVar[Mapping[str, str]] = {}
     """Environment variables of the authors' programs besides `process.environment`."""
@@ -180,14 +180,19 @@ class OfficialMethod(ABC, Generic[Config]):
         return [*command[:count], *write_launcher(LAUNCHER, plan, work), *command[count:]]
 
     def _order(self, fit: Fit, work: Workplace) -> list[str]:
-        """Names of the images in the order of the native method with this seed, one for each iteration; empty for their order."""
+        """Names of the images of each iteration in the order of the native method with this seed, with spaces between them; empty for
+        their order."""
         if self.config.order == "published":
             return []
         images = read_json(work.root / EXPORTED)["images"]
         names = {FrameKey(*key): self.image_name(path) for path, key in images.items()}
         keys = fit.clip.splits["train"]
-        sampler = ShuffledEpochs(len(keys), fit.seed)
-        return [names[keys[sampler(i)]] for i in range(1, (fit.budget.iterations or 0) + 1)]
+        return [" ".join(names[keys[index]] for index in batch) for batch in self.batches(fit)]
+
+    def batches(self, fit: Fit) -> Iterator[Sequence[int]]:
+        """Indices of the training frames of each iteration of the native method."""
+        sampler = ShuffledEpochs(len(fit.clip.splits["train"]), fit.seed)
+        return ([sampler(iteration)] for iteration in range(1, (fit.budget.iterations or 0) + 1))
 
     def _of_launch(self, patches: Sequence[Patch]) -> list[str]:
         """Changes by the launcher, for the record."""

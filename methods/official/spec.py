@@ -132,6 +132,7 @@ RGBAVATAR_OFFICIAL = MethodSpec(
     presets=_lengths_of(RGBAVATAR),
     head_models=("flame2020",),
     monocular=True,
+    conversion="published",
     **_paper_of(RGBAVATAR),
 )
 

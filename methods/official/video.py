@@ -183,6 +183,12 @@ class FlameSubject:
             raise InputError(where, "template", expected, str(len(official.order)), remedy)
         return cls(official, subject, PosedSubject(head, subject.shape, subject.static_offset))
 
+    @classmethod
+    def whole(cls, head: HeadAsset, subject: Subject) -> FlameSubject:
+        """A head of another topology, with its teeth and its own numbers of vertices."""
+        official = OfficialHead(head, np.arange(len(head.template)), np.asarray(head.faces))
+        return cls(official, subject, PosedSubject(head, subject.shape, subject.static_offset))
+
     def model(self) -> dict[str, np.ndarray]:
         """Arrays of FLAME's file, with the static offset in the template."""
         return self.official.model(self.identity.static_offset)

@@ -13,6 +13,8 @@ from ..shared.config import SurfaceSettings, check_at_least_one
 
 INPUTS = ("expression", "neck", "jaw", "eyes", "eyelids", "translation")
 """Tracked parameters that the weights may depend on."""
+PUBLISHED_SAMPLES = 60_000
+"""Number of splats for which the published size at the start is given: texels of 256 x 256 that show FLAME, rounded."""
 OFFICIAL_LEAST = 0.1
 """Weight of a splat in a pixel above which the pixel counts for its initial colour in the authors' program."""
 
@@ -114,3 +116,7 @@ class RGBAvatarConfig(SurfaceSettings):
             raise ValueError(f"together must be 1 with online, found {self.together}")
         if not 0 <= self.ssim_weight <= 1:
             raise ValueError(f"ssim_weight must lie in [0, 1], found {self.ssim_weight}")
+
+    def initial_scale(self, count: int) -> float:
+        """Size of each of ``count`` splats at the start, metres."""
+        return float(1e-3 * self.initial_scale_mm * (PUBLISHED_SAMPLES / count) ** 0.5)

@@ -33,9 +33,6 @@ from .model import PER_SPLAT, SHAPES, StoredShapes, blend_weights, blended, seen
 from .online import OnlineBatches
 from .spec import RGBAVATAR as SPEC
 
-PUBLISHED_SAMPLES = 60_000
-"""Number of splats for which the published size at the start is given: texels of 256 x 256 that show FLAME, rounded."""
-
 
 class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
     """A `Trainable`: neutral splats, grey and of equal size at first, their blendshapes, and the network of the weights.
@@ -60,11 +57,10 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         self.colored = torch.zeros(count, dtype=torch.bool, device=device)
         self._official = config.color_init_variant == "official"
         self._seen: list[tuple[WorldSplats, Tensor, View, Tensor]] = []
-        size = 1e-3 * config.initial_scale_mm * (PUBLISHED_SAMPLES / count) ** 0.5
         splats = {
             "means": (torch.zeros(count, 3), config.position_lr),
             "colors": (torch.zeros(count, 3), config.color_lr),
-            **initial_shapes(np.full(count, size), config),
+            **initial_shapes(np.full(count, config.initial_scale(count)), config),
         }
         shares = config.position_share, config.rotation_share, config.color_share
         for (name, shapes), share in zip(SHAPES.items(), shares):

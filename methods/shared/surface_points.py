@@ -137,6 +137,13 @@ def spread_points(
     return texel_points(np.asarray(uv, np.float64), np.flatnonzero(left), count)
 
 
+def chart_resolution(uv: FloatArray, count: int) -> int:
+    """Texels R of a side, so that about ``count`` of R x R lie in triangles with (F, 3, 2) texture coordinates; 0 if that is too many."""
+    a, b, c = np.moveaxis(uv, 1, 0)
+    area = 0.5 * float(np.abs(_cross(b - a, c - a)).sum())
+    return round(np.sqrt(count / area)) if area * _MOST_ACROSS**2 > count else 0
+
+
 def texel_points(uv: FloatArray, triangles: IntArray, count: int) -> SurfacePoints:
     """The centres of the texels of a chart, by triangle: a square of R x R texels, with R so that there are about ``count``.
 
@@ -156,8 +163,7 @@ def texel_points(uv: FloatArray, triangles: IntArray, count: int) -> SurfacePoin
     """
     a, b, c = np.moveaxis(uv[triangles], 1, 0)
     doubled = _cross(b - a, c - a)
-    area = 0.5 * float(np.abs(doubled).sum())
-    resolution = round(np.sqrt(count / area)) if area * _MOST_ACROSS**2 > count else 0
+    area, resolution = 0.5 * float(np.abs(doubled).sum()), chart_resolution(uv[triangles], count)
     expected = f"triangles that cover a part of the square, for {count} texels"
     found = f"an area of {area:.3g} in {len(triangles)} triangles"
     refused = InputError("head model", "uv", expected, found)

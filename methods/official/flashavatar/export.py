@@ -35,7 +35,6 @@ from ....bench.errors import InputError
 from ....bench.io.files import grouped_writes, read_bytes, write_bytes, write_text
 from ....bench.io.images import write_png
 from ....datasets.head.arrays import region
-from ....datasets.head.subject import PosedSubject
 from ...flashavatar.config import FlashAvatarConfig
 from ...flashavatar.method import BOUNDARY, MOUTH
 from ...flashavatar.model import INPUTS, network_sizes
@@ -92,8 +91,7 @@ def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout, *, own_
     if not own_chart:
         vertices, _ = read_obj(checkout.folder / MESH_FILE)
         return FlameSubject.of(head, subject, vertices, MESH_FILE)
-    whole = OfficialHead(head, np.arange(len(head.template)), np.asarray(head.faces))
-    return FlameSubject(whole, subject, PosedSubject(head, subject.shape, subject.static_offset))
+    return FlameSubject.whole(head, subject)
 
 
 def write_program(identity: Subject, head: HeadAsset, work: Workplace, *, own_chart: bool) -> FlameSubject:

@@ -32,10 +32,12 @@ from ....bench.rows import Rows
 from ....bench.specs import CommandResult
 from ....bench.streams import on_terminal
 from ...flashavatar.config import FlashAvatarConfig
+from ...rgbavatar.config import RGBAvatarConfig
 from ...shared.config import PAPER_ITERATIONS, SplatTraining
 from ...shared.schedule import DensifySchedule, Timeline
 from ..flashavatar.method import SPLATS
 from ..method import TRAINING_LOG
+from ..rgbavatar.method import PLY_FILE
 from .settings import ParitySettings
 
 OFFICIAL = {
@@ -43,19 +45,27 @@ OFFICIAL = {
     "ga": "ga-official",
     "gbs": "gbs-official",
     "ours": "tga-official",
+    "rgbavatar": "rgbavatar-official",
 }
-SAMPLES = {"flashavatar": FlashAvatarConfig().samples, "gbs": 5_000}
+SAMPLES = {"flashavatar": FlashAvatarConfig().samples, "gbs": 5_000, "rgbavatar": RGBAvatarConfig().samples}
 """Default numbers of splats."""
 METRICS = {"psnr": "dB", "ssim": ""}
 TASKS = ("novel_view", "self_reenactment")
 CONFIDENCE = 0.95
 _VERTICES = re.compile(rb"element vertex (\d+)")
 
-_RIGID: dict[str, Any] = {
-    "clip": Named("rigid-head"),
-    "conditions": (Condition("as-tracked", as_tracked=True),),
+_ON_TEXELS: dict[str, tuple[Condition, ...]] = {
+    "flashavatar": (Condition("as-tracked", as_tracked=True),),
+    "rgbavatar": (Condition("as-tracked", as_tracked=True, clip=Named("packed-chart")),),
 }
-"""Both get the capture's head model and views, and poses without rotation of the neck, which the official code does not have."""
+"""Both get the capture's head model and views, for rgbavatar with a chart if it has none. Their poses have no rotation of the neck
+(`rigid-head`), which the official code does not have."""
+RGBAVATAR_VALUES = (
+    *("use_pose_weight=False", "num_basis_in=100"),
+    *("random_bg_color=False", "bg_color=[1.0, 1.0, 1.0]"),
+)
+"""Entries of the official configuration of rgbavatar: weights depend on the expression alone, since the motion of the head would include
+that of the camera, and the background is white."""
 CAUSES = {
     "flashavatar": (
         "rounding: a training that differs in the last digit ends with another PSNR",
@@ -73,6 +83,12 @@ CAUSES = {
     ),
     "ours": (
         "random numbers besides the order: initial values of planes, lines and networks, children of split splats",
+        "splats nearer than 0.2 m are left out by theirs, than 0.01 m by ours",
+    ),
+    "rgbavatar": (
+        "random numbers besides the order: the network at the start, which has 100 inputs in the official code",
+        "the official code takes the last step of the optimiser and decays the positions' rate from its second step",
+        "initial colours of partly covered pixels: official without the background, native with it",
         "splats nearer than 0.2 m are left out by theirs, than 0.01 m by ours",
     ),
 }
@@ -176,6 +192,8 @@ def run_config(settings: ParitySettings, out: Path) -> RunConfig:
         of_theirs["arguments"] = ("--init_face_point_number", str(samples))
     if settings.method == "flashavatar":
         of_theirs |= {"samples": samples, "masks": "native", "start": "native"}
+    if settings.method == "rgbavatar":
+        of_theirs |= {"samples": samples, "motion": "root", "values": RGBAVATAR_VALUES}
     of_both = {"budget": {"iterations": settings.iterations}}
     values = {
         "data": settings.data or str(_capture(out)),
@@ -189,7 +207,8 @@ def run_config(settings: ParitySettings, out: Path) -> RunConfig:
         "frames_per_task": settings.frames,
         "device": "cuda" if settings.device == "cuda" else "cpu",
         "reader_settings": {} if settings.head is None else {"head": settings.head},
-        **(_RIGID if settings.method == "flashavatar" else {}),
+        "clip": Named("rigid-head" if settings.method in _ON_TEXELS else ""),
+        "conditions": _ON_TEXELS.get(settings.method, ()),
         "settings": {
             settings.method: {**of_both, **as_theirs(settings.method, settings.iterations, samples)},
             official: {**of_both, **of_theirs},
@@ -201,10 +220,13 @@ def run_config(settings: ParitySettings, out: Path) -> RunConfig:
 def as_theirs(native: str, iterations: int, samples: int) -> dict[str, Any]:
     """Settings that make a native run of any length equivalent to the run of the authors' program.
 
-    ``samples`` is the initial number of splats of gbs, and that of flashavatar. The authors' program raises the harmonics' degree
+    ``samples`` is the initial number of splats of gbs, and that of flashavatar and rgbavatar. The authors' program raises the harmonics' degree
     every 1,000 iterations regardless of the length (flashavatar: 500), removes large splats from the first regular reset of opacities, has lines in
     the whole head (those of ours), and here uses all images equally often.
     """
+    if native == "rgbavatar":
+        variants = {"frame_variant": "official", "color_init_variant": "official"}
+        return {"samples": samples, "inputs": ("expression",), "random_background": False, **variants}
     if native == "flashavatar":
         return {"min_sh_every": FlashAvatarConfig().sh_every, "samples": samples}
     if native == "gbs":
@@ -294,9 +316,10 @@ def _cells(run_folder: RunFolder, rows: Rows, method: str, orders: Sequence[int]
 
 
 def _splats(folder: Path) -> int | None:
-    """Number of splats in an avatar's GaussianAvatars file, or as FlashAvatar's log tells it; None without both."""
-    path, log = folder / "point_cloud.ply", folder / TRAINING_LOG
-    if not path.is_file():
+    """Number of splats in an avatar's PLY file, or as FlashAvatar's log tells it; None without both."""
+    plys, log = [folder / name for name in ("point_cloud.ply", PLY_FILE)], folder / TRAINING_LOG
+    path = next((ply for ply in plys if ply.is_file()), None)
+    if path is None:
         told = SPLATS.search(log.read_text(errors="replace")) if log.is_file() else None
         return None if told is None else int(told[1])
     with path.open("rb") as stream:

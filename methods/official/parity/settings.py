@@ -24,7 +24,7 @@ class ParitySettings(ExecutionOptions):
     orders, or a training failed.
     """
 
-    method: tyro.conf.Positional[Literal["flashavatar", "ga", "gbs", "ours"]]
+    method: tyro.conf.Positional[Literal["flashavatar", "ga", "gbs", "ours", "rgbavatar"]]
     """The native method. The authors' code of method ours is TensorialGaussianAvatar (`tga-official`)."""
 
     checkout: str
@@ -41,7 +41,7 @@ class ParitySettings(ExecutionOptions):
     """Head model of captures that do not contain one: FLAME pickle or npz."""
 
     iterations: int = 1_000
-    """Length of each training."""
+    """Length of each training; with rgbavatar, steps of ten images."""
 
     orders: int = 5
     """Number of orders of the images, each with one training of either method. A single order on one capture gives no interval."""
@@ -64,7 +64,8 @@ class ParitySettings(ExecutionOptions):
 
     samples: int | None = None
     """Number of splats on the head. gbs: initial number, 5,000 by default; published: 50,000, whose differences for each expression
-    take gigabytes. flashavatar: 13,500 by default, as published; others only on heads of another topology than FLAME's."""
+    take gigabytes. flashavatar: 13,500 by default, as published; others only on heads of another topology than FLAME's.
+    rgbavatar: the same, 60,000 by default."""
 
     subjects: int = 2
     """Heads of the synthetic capture; both methods are trained on each with every order."""
@@ -80,7 +81,7 @@ class ParitySettings(ExecutionOptions):
 
     dependent = (
         DependentOptions(("subjects", "size", "cameras", "timesteps"), "data", False),
-        DependentOptions(("samples",), "method", ("flashavatar", "gbs")),
+        DependentOptions(("samples",), "method", ("flashavatar", "gbs", "rgbavatar")),
     )
 
     def __post_init__(self) -> None:

@@ -7,6 +7,7 @@ camera, and of frame 0 K and the image size too: all frames share them. It moves
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from ....bench.contracts import HeadAsset
+from ....bench.contracts import FloatArray, HeadAsset
 from ....bench.errors import InputError
 from ....bench.io.arrays import read_npy, read_npz
 from ....bench.io.files import grouped_writes, read_bytes, write_bytes, write_text
 from ...shared.avatar_files import Subject
 from ..checkout import Checkout
-from ..ga.head_files import MOST_TEMPLATE, SparseMatrix, pickled
+from ..ga.head_files import MOST_TEMPLATE, OfficialHead, SparseMatrix, pickled
 from ..video import FlameSubject, at_rest, frame_name, image_name, write_torch
 from ..workplace import Listed, Workplace, write_placeholder
 
@@ -31,8 +32,32 @@ CONFIG = Path("config/offline.yaml")
 MOST_CONFIG = 1 << 16
 
 
-def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout) -> FlameSubject:
-    """The head model and one identity. Raises `InputError` unless its triangles are those of the checkout's texture chart."""
+def has_their_topology(head: HeadAsset, checkout: Checkout) -> bool:
+    """Whether a head without its teeth has as many vertices as an eyelid basis of a checkout."""
+    return len(OfficialHead.numbered(head).order) == len(read_npy(checkout.folder / EYELID_FILES[0]))
+
+
+def chart_of(head: HeadAsset) -> FloatArray:
+    """(F, 3, 2) float64 texture coordinates of a head. Raises `InputError` if it has none."""
+    uv = getattr(head, "uv", None)
+    if uv is None:
+        remedy = (
+            "Refit the capture to FLAME 2020 (headbench prepare refit), or use the condition packed-chart."
+        )
+        expected = "texture coordinates, or FLAME's topology"
+        raise InputError(f"head model {head.version!r}", "uv", expected, "none", remedy)
+    return np.asarray(uv, np.float64)
+
+
+def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout, *, own_chart: bool) -> FlameSubject:
+    """The head model, with its teeth if its own chart is used, and one identity.
+
+    Raises `InputError` for a head without a chart of its own, or without ``own_chart`` unless its triangles are those of the checkout's
+    texture chart.
+    """
+    if own_chart:
+        chart_of(head)
+        return FlameSubject.whole(head, subject)
     lid = EYELID_FILES[0]
     found = FlameSubject.of(head, subject, len(read_npy(checkout.folder / lid)), lid)
     chart = read_npz(checkout.folder / CHART_FILE)
@@ -44,18 +69,25 @@ def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout) -> Flam
     return found
 
 
-def write_program(identity: Subject, head: HeadAsset, work: Workplace) -> FlameSubject:
+def write_program(identity: Subject, head: HeadAsset, work: Workplace, *, own_chart: bool) -> FlameSubject:
     """Write the files that the program opens relative to its working directory: head model, chart and eyelids.
 
     Returns the identity on the head model; raises the errors of `flame_subject`.
     """
-    subject, folder = flame_subject(identity, head, work.checkout), work.program
+    subject, folder = flame_subject(identity, head, work.checkout, own_chart=own_chart), work.program
     model = subject.model()
     sparse = SparseMatrix(model["J_regressor"])
     write_bytes(folder / MODEL_FILE, pickled({**model, "J_regressor": sparse}))
     subject.official.write_eyelids(*(folder / name for name in EYELID_FILES))
-    chart = read_bytes(work.checkout.folder / CHART_FILE, "a texture chart", MOST_TEMPLATE)
-    write_bytes(folder / CHART_FILE, chart)
+    if own_chart:
+        uv = chart_of(head)
+        corners = np.arange(3 * len(uv)).reshape(-1, 3)
+        content = io.BytesIO()
+        np.savez(content, vt=uv.reshape(-1, 2), ft=corners)
+        write_bytes(folder / CHART_FILE, content.getvalue())
+    else:
+        chart = read_bytes(work.checkout.folder / CHART_FILE, "a texture chart", MOST_TEMPLATE)
+        write_bytes(folder / CHART_FILE, chart)
     return subject
 
 

@@ -6,16 +6,19 @@ for videos of one camera is run.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from ....bench.contracts import Clip, FrameKey, Progress
+import numpy as np
+
+from ....bench.contracts import Clip, FrameKey, HeadAsset, Progress
 from ....bench.errors import InputError
 from ...rgbavatar.config import RGBAvatarConfig
-from ...shared.avatar_files import SUBJECT_FILE, Subject
+from ...shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head
 from ...shared.loop import Fit
-from ...shared.schedule import Timeline
+from ...shared.schedule import GroupedBatches, Timeline
+from ...shared.surface_points import chart_resolution, texel_points
 from ..checkout import Checkout, Repository
 from ..config import RGBAvatarOfficialConfig
 from ..ga.head_files import padding_remarks
@@ -29,7 +32,9 @@ from .export import (
     CHART_FILE,
     CONFIG,
     EYELID_FILES,
+    chart_of,
     flame_subject,
+    has_their_topology,
     write_config,
     write_list,
     write_program,
@@ -46,6 +51,58 @@ BATCH = RGBAvatarConfig().batch
 """Images of a step. Their numbers of iterations count images; here an iteration is a step, as in the native method."""
 CLIPPED: Patch = ("render.py", "* 255.0).to(dtype=torch.uint8", "* 255.0).clamp(0, 255).to(dtype=torch.uint8")
 """Their renderer converts colours to 8 bits without limits, so that values above 1 are not defined."""
+ORDER: tuple[Patch, ...] = (
+    (
+        "dataset/dataloader.py",
+        "np.random.choice(range(len(self.dataset)), self.batch_size, replace=False).tolist()",
+        "[int(index) for index in images_in_order.pop(0).split()]",
+    ),
+    ("model/reconstruction.py", "self.iteration += batch_size", "self.iteration += self.batch_size"),
+)
+"""They draw the frames of a step at random; they are replaced by the next of the given order. Steps of fewer frames count as
+whole ones in their schedule, as in the native method."""
+IN_TORCH: tuple[Patch, ...] = (
+    (
+        "model/binding.py",
+        "from diff_gaussian_rasterization import matrix_to_quaternion, quaternion_multiply, compute_face_tbn, fast_forward, mesh_binding",
+        "from utils import matrix_to_quaternion, quaternion_multiply",
+    ),
+    (
+        "model/binding.py",
+        "gs = self.get_batch_attributes(batch_size",
+        "gs = self.get_batch_attributes_torch(batch_size",
+    ),
+    (
+        "model/gaussian.py",
+        "from diff_gaussian_rasterization import linear_blending",
+        "linear_blending = None",
+    ),
+)
+TRAINING_IN_TORCH: tuple[Patch, ...] = (
+    *IN_TORCH,
+    ("model/reconstruction.py", "model.gaussian_deform_batch(", "model.gaussian_deform_batch_torch("),
+    ("model/reconstruction.py", "model.fast_forward(", "model.fast_forward_torch("),
+)
+RENDERING_IN_TORCH: tuple[Patch, ...] = (
+    *IN_TORCH,
+    ("render.py", "model.gaussian_deform_batch(", "model.gaussian_deform_batch_torch("),
+)
+"""For the CPU shim: axes, binding, blending and initial colours by the PyTorch functions that their code has beside its kernels."""
+OWN_CHART: tuple[Patch, ...] = (
+    ("submodules/flame/config.py", "add_mouth = True", "add_mouth = False"),
+    (
+        "model/gaussian.py",
+        "assert linear_module.shape[0] <= num_gs",
+        "f_rest.ravel()[:len(linear_module)] = linear_module[:, 0]; linear_module = linear_module[:num_gs]",
+    ),
+    (
+        "model/gaussian.py",
+        'linear_module = np.asarray(plydata.elements[0]["weight_module"], dtype=np.float32)',
+        'linear_module = np.stack([plydata.elements[0]["f_rest_%d" % i] for i in range(45)], axis=1).ravel()',
+    ),
+)
+"""For heads of another topology. Their teeth are attached to vertices of FLAME; such a head has its own. Their file has a number of
+the network in each splat, which are too few; here the network is in the 45 numbers of each splat that are 0 otherwise."""
 _RENDERED = r"Rendering:.*?(\d+)/\d+ \["
 
 RGBAVATAR_REPOSITORY = Repository(
@@ -69,13 +126,15 @@ class RGBAvatarOfficial(PartsMethod[RGBAvatarOfficialConfig]):
 
     name, version = RGBAVATAR_OFFICIAL.name, RGBAVATAR_OFFICIAL.version
     config_class, repository = RGBAvatarOfficialConfig, RGBAVATAR_REPOSITORY
+    shimmed, order_changes = "blended splats", ORDER
     iteration_line = r"Training:.*?(\d+)/\d+ \["
     avatar_files = (PLY_FILE, CONFIG_FILE, SUBJECT_FILE)
     # Other commits read frames, which contain more than tensors, without asking newer versions of torch for it.
     variables: ClassVar[Mapping[str, str]] = {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}
 
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
-        """Refuse a clip without masks, of several intrinsics or too few frames, and a head that is not FLAME's."""
+        """Refuse a clip without masks, of several intrinsics or too few frames, and a head that is not FLAME's or, with the CPU shim, has
+        no chart either."""
         check_masks(clip)
         check_one_camera(clip)
         for camera in cameras_of(clip).values():
@@ -84,11 +143,16 @@ class RGBAvatarOfficial(PartsMethod[RGBAvatarOfficialConfig]):
         if frames < BATCH:
             expected = f"{BATCH} training frames or more, which one step draws without repetition"
             raise InputError(f"clip {clip.subject}", "train", expected, f"{frames}")
-        flame_subject(Subject.of(clip), clip.head, checkout)
+        own_chart = self._has_own_chart(clip.head, checkout)
+        flame_subject(Subject.of(clip), clip.head, checkout, own_chart=own_chart)
+
+    def _has_own_chart(self, head: HeadAsset, checkout: Checkout) -> bool:
+        return self.config.device != "cuda" and not has_their_topology(head, checkout)
 
     def export(self, clip: Clip, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
         """Write the training frames as a tracked video, and the head model where the program opens it."""
-        subject = write_program(Subject.of(clip), clip.head, work)
+        own_chart = self._has_own_chart(clip.head, work.checkout)
+        subject = write_program(Subject.of(clip), clip.head, work, own_chart=own_chart)
         images, _ = write_video(clip, subject.posed, work.input / SUBJECT, subject.frame, progress)
         return {f"input/{SUBJECT}/{name}": key for name, key in images.items()}
 
@@ -105,10 +169,38 @@ class RGBAvatarOfficial(PartsMethod[RGBAvatarOfficialConfig]):
             "blend_start_iter": BATCH * timeline.at(published.join),
             "position_lr_max_steps": max(1, BATCH * timeline.at(published.position_settles)),
         }
+        if self.config.motion == "root":
+            changes["dataset"] = (
+                "\n  retarget_neck: False"  # an argument of their loader that the published file leaves out
+            )
+        if self._has_own_chart(fit.clip.head, work.checkout):
+            changes |= _as_native(fit.clip.head, self.config.samples)
+        changes |= dict(each.split("=", 1) for each in self.config.values)
         write_config(work.program / CONFIG_FILE, work.checkout, changes)
         script = str(work.checkout.folder / "train_offline.py")
         options = ["--subject", SUBJECT, "--work_name", WORK, "--config", CONFIG_FILE, "--split", "all"]
         return [*work.checkout.python, script, *options, "--preload"]
+
+    def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
+        """PyTorch in place of their kernels, and the changes for another topology."""
+        return [*TRAINING_IN_TORCH, *self._of_head(head, checkout)]
+
+    def patches_to_render(self, folder: Path, checkout: Checkout) -> list[Patch]:
+        """The same."""
+        return [*RENDERING_IN_TORCH, *self._of_head(read_shared_head(folder), checkout)]
+
+    def _of_head(self, head: HeadAsset, checkout: Checkout) -> list[Patch]:
+        return [*OWN_CHART] if self._has_own_chart(head, checkout) else []
+
+    def image_name(self, path: str) -> str:
+        """The index of a frame in their loader."""
+        return str(int(Path(path).stem))
+
+    def batches(self, fit: Fit) -> Iterator[Sequence[int]]:
+        """Indices of the training frames of each step of the native method, and of one more, since their loader reads ahead."""
+        keys, native = fit.clip.splits["train"], RGBAvatarConfig()
+        drawn = GroupedBatches([key.timestep for key in keys], native.batch, native.together, fit.seed)
+        return (drawn.batch(step) for step in range(1, (fit.budget.iterations or 0) + 2))
 
     def done(self, line: str) -> tuple[int, str] | None:
         """Their training counts images."""
@@ -126,9 +218,11 @@ class RGBAvatarOfficial(PartsMethod[RGBAvatarOfficialConfig]):
         """Write the frames of each camera's intrinsics as a subject, all rendered with a link to the avatar's splats."""
         for frame in frames:
             check_no_skew(frame.camera)
-        subject = write_program(*read_identity(folder), work)
+        identity, head = read_identity(folder)
+        own_chart = self._has_own_chart(head, work.checkout)
+        subject = write_program(identity, head, work, own_chart=own_chart)
         script = [*work.checkout.python, str(work.checkout.folder / "render.py")]
-        command = self.launched(script, work, [CLIPPED])
+        command = self.launched(script, work, [CLIPPED, *self.render_patches(folder, work.checkout)])
         calls = []
         for index, part in enumerate(in_parts(frames, same_intrinsics, PART)):
             name = f"part_{index:04d}"
@@ -142,11 +236,29 @@ class RGBAvatarOfficial(PartsMethod[RGBAvatarOfficialConfig]):
 
     def differences(self, clip: Clip, seed: int) -> list[str]:
         """Of the export, the head model, the renders and the seed."""
-        return [
+        differences = [
             "frames are renumbered and all of them are used (--split all); their code holds out the last 350",
             "the background is removed from partly covered pixels, and the static offset is part of the template",
             "eyelids are added before skinning by their code, after it in the capture's head model",
             "colours of renders are limited to 0 to 255 before they are rounded down to 8 bits by their code",
             "their code sets no seed: a run with the same seed is a repetition",
-            *padding_remarks(clip.head),
         ]
+        if self.config.motion == "root":
+            differences.append(
+                "the motion of the head is that of the whole head, not of its neck joint (retarget_neck)"
+            )
+        if self.config.values:
+            differences.append(f"other values in their configuration: {', '.join(self.config.values)}")
+        if self.config.device != "cuda" and not has_their_topology(clip.head, self.inspect()):
+            differences.append(
+                "the head has another topology than FLAME's: its own chart is used, on the head with its teeth, with as many "
+                + "texels as the native method has, and splats of the size that they have there at the start"
+            )
+        return differences + padding_remarks(clip.head)
+
+
+def _as_native(head: HeadAsset, samples: int) -> dict[str, Any]:
+    """Entries of their configuration with which the splats of a chart are those of the native method."""
+    uv = chart_of(head)
+    count = len(texel_points(uv, np.arange(len(uv)), samples).triangles)
+    return {"tex_size": chart_resolution(uv, samples), "init_scaling": RGBAvatarConfig().initial_scale(count)}

@@ -11,6 +11,7 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from types import ModuleType
 from typing import Any
 
@@ -22,27 +23,27 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from . import blendshapes, meshes, rasterizer
+from . import blended, blendshapes, meshes, rasterizer
 from .unused import OF_FLASHAVATAR, REPLACED, Silent
 
 
 def install(threads: int, code: str) -> None:
     """Install the shim for everything that is imported later.
 
-    ``code``: "bound splats", "blendshapes" or "charted splats", see `OfficialMethod.shimmed`. Packages that code imports optionally must
-    stay missing, so stand-ins are limited to the required ones.
+    ``code``: "bound splats", "blendshapes", "charted splats" or "blended splats", see `OfficialMethod.shimmed`. Packages that code imports
+    optionally must stay missing, so stand-ins are limited to the required ones.
     """
     torch.set_num_threads(threads)
-    _module("diff_gaussian_rasterization", rasterizer.PUBLIC | blendshapes.RASTERIZER)
+    own = blended.RASTERIZER if code == "blended splats" else {}
+    _module("diff_gaussian_rasterization", rasterizer.PUBLIC | blendshapes.RASTERIZER | own)
     _module("diff_gaussian_rasterization._C", blendshapes.RASTERIZER_KERNELS)
     _module("simple_knn")
     _module("simple_knn._C", {"distCUDA2": mean_square_distances, **blendshapes.NEIGHBOURS})
     packages = {
         "blendshapes": blendshapes.PACKAGES,
         "charted splats": {**meshes.PACKAGES, **OF_FLASHAVATAR},
+        "blended splats": blended.PACKAGES,
     }
-    for name, content in REPLACED.items() if code == "charted splats" else ():
-        _module(name, content)
     # Imported by scripts, but not used: no mesh is drawn, no external OBJ file read and no LPIPS measured.
     context = dict.fromkeys(("RasterizeCudaContext", "RasterizeGLContext"), Silent)
     unused: dict[str, dict[str, Any]] = {
@@ -58,6 +59,8 @@ def install(threads: int, code: str) -> None:
     for name, content in unused.items():
         if not _is_installed(name):
             _module(name, content)
+    for name, content in {"charted splats": REPLACED, "blended splats": blended.ALWAYS}.get(code, {}).items():
+        _module(name, content)
     _without_cuda()
     _signed_images()
 
@@ -133,7 +136,10 @@ def _without_cuda() -> None:
     replaced: Any = torch.cuda
     for name in ("synchronize", "set_device", "empty_cache"):
         setattr(replaced, name, lambda *arguments, **options: None)
-    replaced.Event = _Event
+    replaced.Event, replaced.Stream, replaced.current_stream = _Event, Silent, Silent
+    replaced.stream = lambda stream: nullcontext()
+    pinned: Any = Tensor
+    pinned.pin_memory = lambda self, *arguments, **options: self
     for of in (Tensor, torch.nn.Module):
         of.cuda = lambda self, *arguments, **options: self  # type: ignore[method-assign,union-attr,assignment]
     OnCPU().__enter__()  # active until the process ends

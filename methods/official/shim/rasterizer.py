@@ -95,7 +95,7 @@ class GaussianRasterizer(nn.Module):
         offset = (means2D - means2D.detach())[:, :2] * half
         rendering = rasterize(
             *(means3D, rotations, to.scale_modifier * scales, opacities.reshape(-1), colors_precomp),
-            *(to.viewmatrix.detach().T, _intrinsics(to), width, height),
+            *(to.viewmatrix.detach().T, self.intrinsics(), width, height),
             background=to.bg,
             near=NEAR,
             means2d_offset=offset,
@@ -105,6 +105,12 @@ class GaussianRasterizer(nn.Module):
         return (
             (image, rendering.radii) if alpha_point_id is None else (image, rendering.alpha, rendering.radii)
         )
+
+    def intrinsics(self) -> Tensor:
+        """(3, 3): the principal point is the middle of the image."""
+        width, height = float(self.raster_settings.image_width), float(self.raster_settings.image_height)
+        focal = width / (2 * self.raster_settings.tanfovx), height / (2 * self.raster_settings.tanfovy)
+        return torch.tensor([[focal[0], 0, width / 2], [0, focal[1], height / 2], [0, 0, 1]])
 
     def markVisible(self, positions: Tensor) -> Tensor:
         """(N,) whether positions are beyond the near plane."""
@@ -117,13 +123,6 @@ def _colors(shs: Tensor, vectors: Tensor, degree: int) -> Tensor:
     if degree == 0:
         return torch.relu(0.5 + C0 * shs[:, 0])
     return harmonic_colors(shs[:, 0].contiguous(), shs[:, 1:].transpose(1, 2).contiguous(), vectors, degree)
-
-
-def _intrinsics(settings: GaussianRasterizationSettings) -> Tensor:
-    """(3, 3): the principal point is the middle of the image."""
-    width, height = float(settings.image_width), float(settings.image_height)
-    focal = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
-    return torch.tensor([[focal[0], 0, width / 2], [0, focal[1], height / 2], [0, 0, 1]])
 
 
 PUBLIC: dict[str, Any] = {

@@ -20,6 +20,7 @@ dataset:
 
 model:
   tex_size: 256
+  init_scaling: 0.0008
 
 train:
   batch_size: 10

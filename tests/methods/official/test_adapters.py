@@ -100,7 +100,7 @@ def test_renders_that_are_not_what_was_listed_are_found(method, clip, behave, tm
 
 # ------------------------------------------------------------------ settings
 
-NO_SHIM = ("gha", "insta", "rgbavatar")
+NO_SHIM = ("gha", "insta")
 REPOSITORIES = {
     "insta": "Zielon/INSTA .*built as its installation page says",
     "rgbavatar": "gapszju/RGBAvatar",
@@ -140,9 +140,7 @@ def test_doctor_names_checkout_and_environment(method, monkeypatch, name):
     assert environment.found.startswith("instant-ngp 1.0dev" if name == "insta" else "Python 3")
 
 
-@pytest.mark.parametrize(
-    ("name", "remedy"), [("insta", "a CUDA device"), ("rgbavatar", "CUDA build of PyTorch")]
-)
+@pytest.mark.parametrize(("name", "remedy"), [("insta", "a CUDA device"), ("gha", "CUDA build of PyTorch")])
 def test_doctor_misses_a_gpu(method, monkeypatch, name, remedy):
     monkeypatch.setattr(checkout, "_DEVICES", "print('headbench-devices', 0)")
     monkeypatch.setitem(needs.METHODS, type(method.config), type(method))

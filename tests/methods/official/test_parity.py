@@ -20,6 +20,7 @@ from headbench.methods.flashavatar.config import FlashAvatarConfig
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.official.parity.parity import as_theirs, differences_of, run_config
 from headbench.methods.official.parity.settings import ParitySettings
+from headbench.methods.rgbavatar.config import RGBAvatarConfig
 from headbench.methods.shared.config import PAPER_ITERATIONS, SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, ShuffledEpochs, Timeline
 
@@ -116,6 +117,20 @@ def test_settings_do_what_the_program_is_told(tmp_path):
     assert config.settings["gbs-official"]["arguments"] == ("--init_face_point_number", "300")
     native = build(GBSConfig, {k: v for k, v in config.settings["gbs"].items() if k != "budget"}, "gbs")
     assert (native.samples, native.teeth_samples, native.min_sh_every) == (300, 30, 1_000)
+
+
+def test_rgbavatar_is_compared_on_a_chart_with_its_axes(tmp_path):
+    config = run_config(ParitySettings("rgbavatar", checkout="x", out="y", samples=300), tmp_path)
+    assert config.methods == ("rgbavatar", "rgbavatar-official")
+    assert config.clip.name == "rigid-head"
+    assert [(c.as_tracked, c.clip.name) for c in config.conditions] == [(True, "packed-chart")]
+    assert [method.spec.monocular for method, _ in resolve_cells(config)] == [False, False]
+    native, official = (config.settings[name] for name in config.methods)
+    settings = build(RGBAvatarConfig, {k: v for k, v in native.items() if k != "budget"}, "rgbavatar")
+    assert (settings.frame_variant, settings.color_init_variant) == ("official", "official")
+    assert (settings.inputs, settings.random_background, settings.samples) == (("expression",), False, 300)
+    assert (official["samples"], official["motion"], official["order"]) == (300, "root", "native")
+    assert {"use_pose_weight=False", "random_bg_color=False"} < set(official["values"])
 
 
 def test_flashavatar_is_compared_as_tracked_without_a_neck(tmp_path):

@@ -9,9 +9,12 @@ import yaml
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.steps.charted import packed_chart
 from headbench.methods.official.method import TRAINING_LOG
 from headbench.methods.official.rgbavatar import method as implementation
 from headbench.methods.official.spec import RGBAVATAR_OFFICIAL
+from headbench.methods.rgbavatar.config import RGBAvatarConfig
+from headbench.methods.rgbavatar.method import RGBAvatarTraining
 
 from .repository import (
     BUDGET,
@@ -106,6 +109,39 @@ def test_another_topology_than_flames_is_refused(method, repository, video_clip,
     method.config = replace(method.config, checkout=str(folder), commit=commit)
     with pytest.raises(InputError, match=expected):
         method.check(video_clip, BUDGET)
+
+
+def test_another_topology_has_its_chart_with_the_shim(method, repository, video_clip, tmp_path):
+    """Its own chart, with the texels and the initial size of the native method; without a chart it is refused."""
+    folder = repository[0].with_name("other")
+    commit = make_rgbavatar_repository(folder, len(video_clip.head.template) + 1, len(video_clip.head.faces))
+    values = {"checkout": str(folder), "commit": commit, "device": "cpu-shim", "samples": 500}
+    method.config = replace(method.config, **values, motion="root", values=("position_lr_final=0.1",))
+    with pytest.raises(InputError, match="uv: expected texture coordinates"):
+        method.check(video_clip, BUDGET)
+    uv = packed_chart(video_clip.head.template, video_clip.head.faces)
+    clip = replace(video_clip, head=replace(video_clip.head, uv=uv))
+    work, _ = export(method, clip, tmp_path / "work")
+    chart = np.load(work.program / "data/FLAME2020/flame_uv.npz")
+    np.testing.assert_array_equal(chart["vt"][chart["ft"]], uv)
+    method.train_command(type("Run", (), {"budget": BUDGET, "clip": clip}), work)
+    found = yaml.safe_load((work.program / "config.yaml").read_text())
+    points = RGBAvatarTraining(clip, RGBAvatarConfig(samples=500), "cpu", 0).points
+    texels = found["model"]["tex_size"]
+    across = 0.5 * np.abs(np.linalg.det(uv[:, 1:] - uv[:, :1])).sum() * texels**2
+    assert across == pytest.approx(500, rel=0.1)
+    scale = 0.0008 * (60_000 / len(points.triangles)) ** 0.5
+    assert found["model"]["init_scaling"] == pytest.approx(scale)
+    assert found["dataset"] == {"retarget_neck": False, "pin_memory": True}
+    assert found["train"]["recon"]["position_lr_final"] == 0.1
+
+
+def test_the_order_is_that_of_the_native_batches(method, video_clip, tmp_path):
+    run = type("Run", (), {"budget": replace(BUDGET, iterations=5), "clip": video_clip, "seed": 3})
+    native = RGBAvatarTraining(video_clip, RGBAvatarConfig(samples=100), "cpu", 3)
+    expected = [native._batches.batch(step) for step in range(1, 7)]  # their loader reads one ahead
+    assert list(method.batches(run)) == expected
+    assert method.image_name("input/head/images/00012.png") == "12"
 
 
 def test_files_missing_in_the_checkout_are_named(method, repository, video_clip):

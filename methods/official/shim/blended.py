@@ -1,0 +1,154 @@
+"""Stand-ins for RGBAvatar's rasteriser, which sums the colours of images for each splat, and for nvdiffrast's rasterisation of a chart.
+
+Blending, axes and binding have PyTorch forms in the authors' code, which the adapter selects.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ...splats import pixel_weights
+from .meshes import Mesh, rasterize_meshes
+from .rasterizer import NEAR, GaussianRasterizer
+from .unused import REPLACED, Silent
+
+LEAST_WEIGHT = 0.1
+"""Weights of a splat in a pixel up to this do not count, as published (``forward.cu``, ``renderCUDA``)."""
+LEAST_COVERAGE = 0.5
+"""Pixels of the target image with a coverage up to this do not count, as published (the same)."""
+
+
+class Settings(SimpleNamespace):
+    """The published settings by name, see `GaussianRasterizationSettings`; ``bg`` is set for every batch."""
+
+
+class TargetRasterizer(GaussianRasterizer):
+    """The published module for one image."""
+
+    raster_settings: Any
+
+    def forward(self, target_image: Tensor | None = None, **splats: Any) -> tuple[Tensor, ...]:  # type: ignore[override]
+        """Render splats.
+
+        Parameters
+        ----------
+        target_image : Tensor | None
+            (4, H, W) straight colours and coverage in [0, 1]; none if it is empty.
+        splats : Any
+            Those of `GaussianRasterizer.forward`, by name.
+
+        Returns
+        -------
+        tuple[Tensor, ...]
+            Image (3, H, W), coverage (1, H, W), sums over pixels of weight times target colour (N, 3) and of weight (N,), and
+            radii (N,).
+        """
+        image, alpha, radii = super().forward(**splats, alpha_point_id=0)
+        sums = image.new_zeros(len(radii), 4)
+        if target_image is not None and target_image.numel():
+            self._add_sums(sums, target_image, **splats)
+        return image, alpha[None], sums[:, :3], sums[:, 3], radii
+
+    def intrinsics(self) -> Tensor:
+        """(3, 3) with the principal point of the projection matrix."""
+        to = self.raster_settings
+        projection = (torch.linalg.inv(to.viewmatrix.double()) @ to.projmatrix.double()).T
+        width, height = to.image_width, to.image_height
+        focal = projection[0, 0] * width / 2, projection[1, 1] * height / 2
+        center = (projection[0, 2] + 1) * width / 2, (projection[1, 2] + 1) * height / 2
+        return torch.tensor([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]])
+
+    @torch.no_grad()
+    def _add_sums(
+        self,
+        sums: Tensor,
+        target: Tensor,
+        means3D: Tensor,
+        rotations: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        **rest: Any,
+    ) -> None:
+        to = self.raster_settings
+        shapes = means3D, rotations, to.scale_modifier * scales, opacities.reshape(-1)
+        camera = to.viewmatrix.T, self.intrinsics().to(means3D), to.image_width, to.image_height
+        splats, pixels, weights = pixel_weights(*shapes, *camera, NEAR)
+        colors, coverage = target[:3].flatten(1).T, target[3].flatten()
+        counted = (weights > LEAST_WEIGHT) & (coverage[pixels] > LEAST_COVERAGE)
+        weights, splats, pixels = weights[counted, None], splats[counted], pixels[counted]
+        sums.index_add_(0, splats, torch.cat([weights * colors[pixels], weights], dim=1))
+
+
+class BatchRasterizer(nn.Module):
+    """The published module for images of one camera: every argument and result has a leading axis of images."""
+
+    def __init__(self, max_gaussian_size: int, max_batch_size: int, raster_settings: Settings):
+        super().__init__()
+        self.raster_settings = raster_settings
+
+    def forward(self, **batch: Tensor) -> tuple[Tensor, ...]:
+        """Render every image on its own background; see `TargetRasterizer.forward`."""
+        found = []
+        for index, ground in enumerate(self.raster_settings.bg.reshape(-1, 3)):
+            settings: Any = Settings(**{**vars(self.raster_settings), "bg": ground})
+            one = TargetRasterizer(settings)
+            found.append(one(**{name: values[index] for name, values in batch.items()}))
+        return tuple(torch.stack(parts) for parts in zip(*found, strict=True))
+
+
+def rasterize_chart(
+    context: Any, pos: Tensor, tri: Tensor, resolution: tuple[int, int]
+) -> tuple[Tensor, None]:
+    """nvdiffrast's ``rasterize`` for a flat mesh in a square: the triangle at the centre of each texel, the lowest row first.
+
+    Of several triangles in a texel the first is taken.
+
+    Parameters
+    ----------
+    pos, tri : Tensor
+        (1, V, 4) clip coordinates with w = 1; (F, 3) triangles.
+    resolution : tuple[int, int]
+        Texels of both sides, S and S.
+
+    Returns
+    -------
+    tuple[Tensor, None]
+        (1, S, S, 4): first two barycentric coordinates, z, and the number of the triangle from 1, all 0 without a triangle.
+
+    Raises
+    ------
+    ValueError
+        The sides differ.
+    """
+    if resolution[0] != resolution[1]:
+        raise ValueError("expected a square; the shim does not support other charts")
+    # PyTorch3D's coordinates, which `rasterize_meshes` takes, point the other way along both sides.
+    turned = torch.cat([-pos[..., :2], pos[..., 2:3]], dim=-1)
+    triangles, z, barycentric, _ = rasterize_meshes(Mesh(turned, tri[None].long()), resolution[0])
+    found = torch.cat([barycentric[..., 0, :2], z, triangles + 1.0], dim=-1)
+    return found * (triangles >= 0), None
+
+
+RASTERIZER: dict[str, Any] = {
+    "GaussianRasterizationSettings": Settings,
+    "GaussianRasterizer": TargetRasterizer,
+    "BatchGaussianRasterizer": BatchRasterizer,
+}
+PACKAGES: dict[str, dict[str, Any]] = {
+    "torch.utils.tensorboard": {"SummaryWriter": Silent},
+    "fused_ssim": {"fused_ssim": None},
+}
+"""Stand-in modules for packages that are not installed, by name."""
+ALWAYS: dict[str, dict[str, Any]] = {
+    **REPLACED,
+    "nvdiffrast": {},
+    "nvdiffrast.torch": {
+        **dict.fromkeys(("RasterizeCudaContext", "RasterizeGLContext"), Silent),
+        "rasterize": rasterize_chart,
+    },
+}
+"""Those of packages that are replaced also where they are installed: nvdiffrast needs CUDA or OpenGL."""
