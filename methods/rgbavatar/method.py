@@ -102,9 +102,9 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
             self._seen = []
         if not self._official:
             self._still(self._take_colors())
-        # While images arrive, time is counted from the first one, whatever the length of the run.
+        # While images arrive, time is counted from the first one, whatever the length of the run. The first step has the initial rate.
         settles = config.position_settles if config.online else self._timeline.at(config.position_settles)
-        rate = log_linear(config.position_lr, config.position_lr_final, iteration / max(settles, 1))
+        rate = log_linear(config.position_lr, config.position_lr_final, (iteration - 1) / max(settles, 1))
         self.optimiser.set_learning_rate("means", rate)
         self.optimiser.set_learning_rate(SHAPES["means"], config.position_share * rate)
         self._decay_rates(iteration, apart=("means", SHAPES["means"]))
@@ -153,9 +153,12 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         seen, self._seen = self._seen, []
         sums = torch.zeros(len(self.colored), 4, device=self.colored.device)
         for world, opacities, view, pixels in seen:
-            truth = torch.cat([pixels[:, :, :3], torch.ones_like(pixels[:, :, :1])], dim=2)
+            colors, coverage = pixels[:, :, :3], pixels[:, :, 3:]
+            if self._masked and self._official:  # without the background
+                colors = (colors - (1 - coverage) * self._background) / coverage.clamp(min=0.5)
+            truth = torch.cat([colors, torch.ones_like(pixels[:, :, :1])], dim=2)
             if self._masked:
-                truth = truth * (pixels[:, :, 3:] > 0.5)
+                truth = truth * (coverage > 0.5)
             sums += pixel_sums(world, opacities, view, truth, OFFICIAL_LEAST if self._official else 0.0)
         new = (sums[:, 3] > self._config.color_weight) & ~self.colored
         rows = new.nonzero().squeeze(1)

@@ -87,8 +87,7 @@ CAUSES = {
     ),
     "rgbavatar": (
         "random numbers besides the order: the network at the start, which has 100 inputs in the official code",
-        "the official code takes the last step of the optimiser and decays the positions' rate from its second step",
-        "initial colours of partly covered pixels: official without the background, native with it",
+        "the last step of the optimiser is taken by the official code alone",
         "splats nearer than 0.2 m are left out by theirs, than 0.01 m by ours",
     ),
 }
