@@ -51,7 +51,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 RGBAVATAR = MethodSpec(
     name="rgbavatar",
-    version="1",
+    version="2",
     summary="RGBAvatar: splats on the mesh with a few learnt blendshapes, weighted by a network of the tracked parameters.",
     implementation="headbench.methods.rgbavatar.method:RGBAvatar",
     config="headbench.methods.rgbavatar.config:RGBAvatarConfig",
