@@ -81,10 +81,10 @@ def _values(
 
 def _around(change: FloatArray, place: int, grid: FloatArray) -> tuple[float | None, float | None] | None:
     """Costs between which the interval of the mean ``change``, (S, G), contains 0, around a place of the grid."""
-    bounds = [interval(each.tolist()) for each in change.T]
+    # A method has no value below its lowest cost, and so no interval there.
+    bounds = [interval(each.tolist()) if np.isfinite(each).all() else None for each in change.T]
     if bounds[place] is None:
         return None
-    # Not so where a method has no value yet, whose bounds are NaN.
     apart = [each is not None and (each[0] > 0 or each[1] < 0) for each in bounds]
     low = next((float(grid[i]) for i in range(place - 1, -1, -1) if apart[i]), None)
     high = next((float(grid[i]) for i in range(place, len(grid)) if apart[i]), None)

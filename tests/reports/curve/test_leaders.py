@@ -53,6 +53,14 @@ def test_a_method_takes_part_from_its_lowest_cost_on():
     ]
 
 
+def test_the_interval_ends_where_a_method_has_no_value_yet():
+    short = {f"s{n}": [(4.0, 5.0 + n), (64.0, 5.0 + n)] for n in range(3)}
+    late = {f"s{n}": [(19.0 + n, 9.0 + n), (64.0, 9.0 + n)] for n in range(3)}
+    _, second = leaders({"short": short, "late": late}, higher_is_better=True)
+    assert second.start == pytest.approx(21.0, rel=0.01)
+    assert second.interval == (None, second.start)  # apart at once
+
+
 def test_costs_of_zero_are_compared_on_a_linear_axis():
     falling, constant = {"s0": [(0.0, 4.0), (2.0, 0.0)]}, {"s0": [(0.0, 1.0), (2.0, 1.0)]}
     found = leaders({"falling": falling, "constant": constant}, higher_is_better=True)
