@@ -57,6 +57,7 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         self.colored = torch.zeros(count, dtype=torch.bool, device=device)
         self._official = config.color_init_variant == "official"
         self._seen: list[tuple[WorldSplats, Tensor, View, Tensor]] = []
+        self._unfinished = False
         splats = {
             "means": (torch.zeros(count, 3), config.position_lr),
             "colors": (torch.zeros(count, 3), config.color_lr),
@@ -73,6 +74,7 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
     def loss(self, iteration: int, index: int) -> Tensor:
         """Mean loss of the images of a batch; ``index`` is that of the first."""
         self._finish_step()
+        self._seen = []
         images, splats = self._batches.positions(iteration), self.tensors()
         rows = sorted({self._tracked.row[self.keys[image].timestep] for _, image in images})
         posed = [splats] * len(rows)
@@ -100,6 +102,7 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         due = config.color_weight > 0 and (iteration - 1) % config.color_every == 0
         if not due or bool(self.colored.all()):
             self._seen = []
+        self._unfinished = self._official
         if not self._official:
             self._still(self._take_colors())
         # While images arrive, time is counted from the first one, whatever the length of the run. The first step has the initial rate.
@@ -141,8 +144,9 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         return recomposited(pixels[:, :, :3], pixels[:, :, 3:], self._background, background), background
 
     def _finish_step(self) -> None:
-        """Set the colours that the last step found, if they are set after it."""
-        if self._official:
+        """Set the colours that the last step found, if they are set after it; none without a step, as while steps are timed."""
+        if self._unfinished:
+            self._unfinished = False
             self._take_colors()
 
     def _take_colors(self) -> Tensor:

@@ -356,6 +356,24 @@ def test_official_colours_are_set_after_the_step(clip):
     training.close()
 
 
+@pytest.mark.parametrize("variant", ["paper", "official"])
+def test_timed_steps_give_no_colours(clip, variant):
+    """Steps that only estimate the number of iterations are without effect on the first step."""
+    found = []
+    for timed in ((2, 3), ()):
+        training = make(clip, color_init_variant=variant)
+        for iteration in timed:
+            training.loss(iteration, 0).backward()
+            training.optimiser.zero_grad()
+        training.loss(1, 0).backward()
+        assert not training.colored.any()
+        training.after_backward(1)
+        found.append((training.state()["colored"], training.optimiser["colors"].detach()))
+        training.close()
+    assert found[0][0].any()
+    torch.testing.assert_close(*found, rtol=0, atol=0)
+
+
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
