@@ -67,15 +67,12 @@ RENDERING_CHANGES: tuple[Patch, ...] = (
     ),
 )
 """Every frame of the list is rendered, and written as PNG instead of a video that loses detail."""
-ORDER: tuple[Patch, ...] = (
-    (
-        "train.py",
-        "viewpoint_stack.pop(random.randint(0, len(viewpoint_stack)-1))",
-        "scene.getCameras()[int(images_in_order[iteration - 1])]",
-    ),
-    ("train.py", "if iteration < opt.iterations", "if iteration <= opt.iterations"),
+ORDER: Patch = (
+    "train.py",
+    "viewpoint_stack.pop(random.randint(0, len(viewpoint_stack)-1))",
+    "scene.getCameras()[int(images_in_order[iteration - 1])]",
 )
-"""They draw a frame at random; it is replaced by the next of the given order. A step follows each, also the last one."""
+"""They draw a frame at random; it is replaced by the next of the given order. As in the native method, no step follows the last one."""
 NETWORK_FILE = "network.pth"
 START: tuple[Patch, ...] = (
     (
@@ -134,7 +131,7 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
     name, version = FLASHAVATAR_OFFICIAL.name, FLASHAVATAR_OFFICIAL.version
     config_class, repository = FlashAvatarOfficialConfig, FLASHAVATAR_REPOSITORY
     shimmed = "charted splats"
-    changes, order_changes = CHANGES, ORDER
+    changes, order_changes = CHANGES, (ORDER,)
     iteration_line = r"^step: (\d+), huber: ([\d.]+|nan|inf)"
     avatar_files = (CHECKPOINT_FILE, OPTIONS_FILE, SUBJECT_FILE)
     # Frames and checkpoints contain more than tensors, which newer versions of torch read only if requested.
