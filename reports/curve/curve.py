@@ -137,8 +137,8 @@ def read_curve(runs: Sequence[RunData], over: str) -> CurveData:
     Raises
     ------
     InputError
-        A folder is not the run of such a curve, two have the same training, they do not have the same metrics, device and
-        held-out frames, or no subject has all methods.
+        A folder is not the run of such a curve, two have the same training, they do not have the same device, preset, image size, seeds,
+        metrics and held-out frames, or no subject has all methods.
     """
     points = [point for run in runs for point in _points(run, over)]
     _check_together(runs, points)
@@ -215,8 +215,10 @@ def _check_together(runs: Sequence[RunData], points: Sequence[CurvePoint]) -> No
     frames: dict[tuple[str, str], set[FrameKey]] = {}
     for run in runs:
         place, other = run.folder.manifest, run.manifest
-        if other.configuration.device != first.configuration.device:
-            raise InputError(place, "device", first.configuration.device, other.configuration.device)
+        for name in ("device", "preset", "divide", "seeds"):
+            expected, found = (str(getattr(each.configuration, name)) for each in (first, other))
+            if found != expected:
+                raise InputError(place, name, expected, found)
         if other.metrics != first.metrics:
             raise InputError(place, "metrics", f"those of {runs[0].folder.root}", "others")
         if run.tasks != runs[0].tasks:

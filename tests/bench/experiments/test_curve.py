@@ -410,6 +410,11 @@ def test_curves_of_several_subjects_and_methods_are_joined(make_run, tmp_path, m
         curve_runs(CurveReportSettings((parts[0], parts[0]), str(tmp_path / "twice")))
     with pytest.raises(InputError, match="run curve --over seconds`, found none"):
         curve_runs(CurveReportSettings(tuple(parts), str(tmp_path / "other"), "seconds"))
+    manifest = RunFolder(Path(parts[1])).read_manifest()
+    seeded = replace(manifest, configuration=replace(manifest.configuration, seeds=(1,)))
+    seeded.write(RunFolder(Path(parts[1])).manifest)
+    with pytest.raises(InputError, match=r"seeds: expected .*0.*, found .*1"):
+        curve_runs(CurveReportSettings(tuple(parts[:2]), str(tmp_path / "seeds")))
     other = tmp_path / "camera"
     curve_run(
         settings(tmp_path / "run-ball-a", out=str(other), fractions=("1",), camera="4", methods=("timed",))
