@@ -122,7 +122,8 @@ class DensifiedTraining(SplatSettings):
         In iterations of the actual run. A gradient mean needs several views, and opacities several
         steps to recover.
     min_settle : int
-        Number of last iterations of the actual run without densification and reset.
+        Number of last iterations of the actual run without densification; a run shorter than published has no reset in the last
+        `schedule.RECOVERY` iterations, either.
     """
 
     position_lr: float = 5e-3
