@@ -187,7 +187,7 @@ def publish_further(out: Path, root: Path) -> None:
 
 def publish_curves(out: Path, root: Path) -> None:
     """Copy manifests and rows of curves to the repository ``root``, and write their blocks and plots."""
-    for over in CURVE_UNITS:
+    for over in (name for name in CURVE_UNITS if (out / name).is_dir()):
         target = root / GALLERY / CURVES / over
         _copy_all(out / over, target)
         runs = stored_curves(root / GALLERY, over)

@@ -136,7 +136,8 @@ def train(
     path, compiled = fit.out / CHECKPOINT, bool(instruction_sets())
     wait = synchroniser(fit.device)
     saved = load_checkpoint(path, fit.run, fit.device)
-    started = clock() if fit.began is None else fit.began
+    # The preparation of a resumed training has counted before.
+    started = clock() if fit.began is None or saved is not None else fit.began
     losses: list[tuple[int, float]] = []
     if saved is None:
         iteration, spent = 0, 0.0

@@ -20,6 +20,7 @@ from ...bench.manifest import ClipRecord, MethodRecord
 from ...bench.rows import ALL, Rows
 from ...bench.specs import CommandResult, MetricSpec
 from ..aggregate import subject_means
+from ..recommend import OVERRUN
 from ..runs import RunData
 from ..statistics.paired import LEAST_SUBJECTS
 from ..writers import csv_text, pipe_table
@@ -213,6 +214,7 @@ def _check_together(runs: Sequence[RunData], points: Sequence[CurvePoint]) -> No
     """Raise `InputError` for runs whose trainings cannot be compared."""
     first = runs[0].manifest
     frames: dict[tuple[str, str], set[FrameKey]] = {}
+    versions: dict[str, str] = {}
     for run in runs:
         place, other = run.folder.manifest, run.manifest
         for name in ("device", "preset", "divide", "seeds"):
@@ -221,6 +223,13 @@ def _check_together(runs: Sequence[RunData], points: Sequence[CurvePoint]) -> No
                 raise InputError(place, name, expected, found)
         if other.metrics != first.metrics:
             raise InputError(place, "metrics", f"those of {runs[0].folder.root}", "others")
+        every = [each.configuration.clip.parameters["every"] for each in (first, other)]
+        if every[1] != every[0]:
+            raise InputError(place, "every", str(every[0]), str(every[1]))
+        for record in other.methods:
+            version = versions.setdefault(record.name, record.version)
+            if record.version != version:
+                raise InputError(place, f"version of {record.name}", version, record.version)
         if run.tasks != runs[0].tasks:
             raise InputError(place, "tasks", ", ".join(runs[0].tasks), ", ".join(run.tasks))
         for task, subject in product(run.tasks, run.rows.subjects):
@@ -236,20 +245,23 @@ def _check_together(runs: Sequence[RunData], points: Sequence[CurvePoint]) -> No
 
 
 def _cost(point: CurvePoint, axis: str) -> float | None:
-    """What a training took: a measured cost, the `LIMIT` of its time, or a field of the point."""
+    """What a training took: a measured cost, its `LIMIT` of seconds or, where that was exceeded, its seconds, or a field of the point."""
     if axis == LIMIT:
-        return point.budget.seconds
+        limit, seconds = point.budget.seconds, point.cost["seconds"]
+        return seconds if limit and seconds and seconds > OVERRUN * limit else limit
     return point.cost[axis] if axis in point.cost else getattr(point, axis)
 
 
 def _leaders(
     points: Sequence[CurvePoint], metrics: Sequence[MetricSpec], tasks: Sequence[str], axis: str
 ) -> dict[tuple[str, str], list[Leader]]:
-    """The best method by what a training takes, by name of a metric of frames and task."""
+    """The method with the best mean by what a training takes, by name of a metric of frames and task; without methods with a failed one."""
     found = {}
     for spec, task in product((spec for spec in metrics if spec.per_frame), tasks):
         lines: dict[str, dict[str, list[tuple[float, float]]]] = {}
-        for point in points:
+        # A line must not pass over a training that failed.
+        failed = {point.method for point in points if point.values[column(spec, task)] is None}
+        for point in (point for point in points if point.method not in failed):
             cost, value = _cost(point, axis), point.values[column(spec, task)]
             if cost is not None and value is not None:
                 lines.setdefault(point.method, {}).setdefault(point.subject, []).append((cost, value))
@@ -268,11 +280,11 @@ def leaders_text(curve: CurveData) -> str:
         lines.append([spec.label, *(cell or "–" for cell in cells)])
     taken = "the limit of seconds" if curve.over == "seconds" else curve.axis.lower()
     crossings = (
-        "95 % intervals of the crossings in brackets"
+        "95 % intervals of each crossing in brackets"
         if len(curve.subjects) >= LEAST_SUBJECTS
         else f"without intervals, which take {LEAST_SUBJECTS} subjects"
     )
-    return f"Best method by {taken}, {crossings}:\n\n{pipe_table(lines)}"
+    return f"Best mean by {taken}, interpolated between trainings, {crossings}:\n\n{pipe_table(lines)}"
 
 
 def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipRecord) -> CurvePoint:

@@ -28,22 +28,26 @@ class Leader:
     interval : tuple[float | None, float | None] | None
         Costs around ``start`` at which the 95 % interval of the paired difference of both methods contains 0; None at an end
         that lies beyond the measured costs, or in all for the first leader and with too few subjects for an interval.
+    measured : tuple[float, float]
+        The lowest and the highest measured cost.
     """
 
     method: str
     start: float
-    interval: tuple[float | None, float | None] | None = None
+    interval: tuple[float | None, float | None] | None
+    measured: tuple[float, float]
 
     def text(self) -> str:
-        """Method, cost and interval, such as "`ga` from 11 [8.2, above]"."""
+        """Method, cost and interval, such as "`ga` from 11 [8.2, above 120]"."""
         if self.interval is None:
             return f"`{self.method}` from {self.start:.3g}"
         low, high = (f"{end:.3g}" if end is not None else "" for end in self.interval)
-        return f"`{self.method}` from {self.start:.3g} [{low or 'below'}, {high or 'above'}]"
+        ends = f"{low or f'below {self.measured[0]:.3g}'}, {high or f'above {self.measured[1]:.3g}'}"
+        return f"`{self.method}` from {self.start:.3g} [{ends}]"
 
 
 def leaders(lines: Lines, *, higher_is_better: bool) -> list[Leader]:
-    """The best method by rising cost, from means over the subjects that all methods have.
+    """The method with the best mean by rising cost, over over the subjects that all methods have.
 
     Quality is interpolated linearly between measured trainings, over the logarithm of the cost if all costs are above 0. A
     method takes part from its lowest cost on, and keeps the quality of its highest: that training fits a larger budget too.
@@ -66,7 +70,7 @@ def leaders(lines: Lines, *, higher_is_better: bool) -> list[Leader]:
         if not known[place] or (found and found[-1].method == name):
             continue
         around = _around(values[name] - values[found[-1].method], place, grid) if found else None
-        found.append(Leader(name, float(grid[place]), around))
+        found.append(Leader(name, float(grid[place]), around, (min(costs), max(costs))))
     return found
 
 

@@ -64,6 +64,11 @@ def test_short_runs_keep_the_minimum_intervals(total):
         assert resets == []
 
 
+def test_the_last_iterations_of_a_short_run_have_no_reset():
+    assert schedule(3_000 + RECOVERY).is_reset(3_000)
+    assert not schedule(3_000 + RECOVERY - 1).is_reset(3_000)
+
+
 def test_log_linear_ends_and_middle():
     assert log_linear(5e-3, 5e-5, 0.0) == pytest.approx(5e-3)
     assert log_linear(5e-3, 5e-5, 1.0) == pytest.approx(5e-5)

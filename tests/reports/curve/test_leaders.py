@@ -39,7 +39,7 @@ def test_an_interval_that_leaves_the_measured_costs_is_open():
     lines = {"slow": straight(3.0, 0.0, offsets), "fast": straight(1.0, 0.0, [0] * 4)}
     _, second = leaders(lines, higher_is_better=True)
     assert second.interval == (None, None)
-    assert second.text() == f"`slow` from {second.start:.3g} [below, above]"
+    assert second.text() == f"`slow` from {second.start:.3g} [below 4, above 64]"
 
 
 def test_a_method_takes_part_from_its_lowest_cost_on():
@@ -49,7 +49,7 @@ def test_a_method_takes_part_from_its_lowest_cost_on():
     assert [(each.method, round(each.start)) for each in found] == [("short", 4), ("late", 20)]
     # A training that took 8 fits a budget of 64 too.
     assert leaders({"short": short, "late": {"s0": [(20.0, 5.5)]}}, higher_is_better=True) == [
-        Leader("short", pytest.approx(4.0))
+        Leader("short", pytest.approx(4.0), None, (4.0, 20.0))
     ]
 
 
