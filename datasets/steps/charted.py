@@ -37,7 +37,8 @@ def packed_chart(vertices: FloatArray, faces: IntArray) -> FloatArray:
         (V, 3) metres, (F, 3).
     """
     v0, v1, v2 = np.moveaxis(np.asarray(vertices, np.float64)[faces], 1, 0)
-    base = np.linalg.norm(v1 - v0, axis=1)
+    # A triangle without area stays one: no division by 0.
+    base = np.maximum(np.linalg.norm(v1 - v0, axis=1), np.finfo(np.float64).tiny)
     along = ((v2 - v0) * (v1 - v0)).sum(1) / base
     height = np.linalg.norm(np.cross(v1 - v0, v2 - v0), axis=1) / base
     flat = np.zeros((len(faces), 3, 2))

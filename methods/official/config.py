@@ -132,6 +132,21 @@ class INSTAOfficialConfig(OfficialConfig):
             raise ValueError(f"images_on_gpu must be at least 1, found {self.images_on_gpu}")
 
 
+SET_ENTRIES = (
+    *(
+        "data_dir",
+        "output_dir",
+        "dataset",
+        "batch_size",
+        "iteration",
+        "blend_start_iter",
+        "position_lr_max_steps",
+    ),
+    *("tex_size", "init_scaling"),
+)
+"""Entries of RGBAvatar's configuration that the adapter writes."""
+
+
 @dataclass(frozen=True)
 class RGBAvatarOfficialConfig(OfficialConfig):
     """RGBAvatar by its authors' code; the default commit is the one that the adapter was written for.
@@ -157,8 +172,9 @@ class RGBAvatarOfficialConfig(OfficialConfig):
         if self.samples < 1:
             raise ValueError(f"samples must be at least 1, found {self.samples}")
         for each in self.values:
-            if "=" not in each:
-                raise ValueError(f"values must be NAME=VALUE, found {each!r}")
+            if "=" not in each or each.partition("=")[0] in SET_ENTRIES:
+                known = f"NAME=VALUE of other entries than {', '.join(SET_ENTRIES)}, which headbench sets"
+                raise ValueError(f"values must be {known}, found {each!r}")
 
 
 @dataclass(frozen=True)

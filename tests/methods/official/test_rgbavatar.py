@@ -10,6 +10,7 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.steps.charted import packed_chart
+from headbench.methods.official.config import RGBAvatarOfficialConfig
 from headbench.methods.official.method import TRAINING_LOG
 from headbench.methods.official.rgbavatar import method as implementation
 from headbench.methods.official.spec import RGBAVATAR_OFFICIAL
@@ -155,3 +156,9 @@ def test_a_configuration_of_another_form_is_refused(method, repository, video_cl
     path.write_text(CONFIG.replace("blend_start_iter", "blend_from"))
     with pytest.raises(InputError, match="blend_start_iter: expected one entry, found 0"):
         fit(method, video_clip, tmp_path / "a")
+
+
+@pytest.mark.parametrize("value", ["tex_size", "iteration=5", "tex_size=9"])
+def test_entries_that_the_adapter_writes_cannot_be_given(value):
+    with pytest.raises(ValueError, match="values must be NAME=VALUE of other entries than data_dir"):
+        RGBAvatarOfficialConfig(values=(value,))
