@@ -62,7 +62,7 @@ CASES = [
     ("lint c --thorough --duplicates 600", "--duplicates: expected no --thorough"),
     ("run parity ga --checkout c --out out --data d --size 96x136", "--size: expected no --data"),
     ("run parity ga --checkout c --out out --data d --timesteps 24", "--timesteps: expected no --data"),
-    ("run parity ga --checkout c --out out --samples 5000", f"--samples: expected METHOD flashavatar or gbs, {NO_EFFECT} METHOD ga"),
+    ("run parity ga --checkout c --out out --samples 5000", f"--samples: expected METHOD flashavatar or gbs or rgbavatar, {NO_EFFECT} METHOD ga"),
     ("frames c --out out --trust", "--trust: expected a run, with run.json, at c"),
     ("doctor check x:SPEC --reader ga", f"--reader: expected --data, {NO_EFFECT} none"),
 ]  # fmt: skip

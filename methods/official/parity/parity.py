@@ -194,7 +194,7 @@ def run_config(settings: ParitySettings, out: Path) -> RunConfig:
     if settings.method == "rgbavatar":
         of_theirs |= {"samples": samples, "motion": "root", "values": RGBAVATAR_VALUES}
     of_both = {"budget": {"iterations": settings.iterations}}
-    values = {
+    values: dict[str, Any] = {
         "data": settings.data or str(_capture(out)),
         "out": str(out / "run"),
         "methods": (settings.method, official),
@@ -206,13 +206,13 @@ def run_config(settings: ParitySettings, out: Path) -> RunConfig:
         "frames_per_task": settings.frames,
         "device": "cuda" if settings.device == "cuda" else "cpu",
         "reader_settings": {} if settings.head is None else {"head": settings.head},
-        "clip": Named("rigid-head" if settings.method in _ON_TEXELS else ""),
-        "conditions": _ON_TEXELS.get(settings.method, ()),
         "settings": {
             settings.method: {**of_both, **as_theirs(settings.method, settings.iterations, samples)},
             official: {**of_both, **of_theirs},
         },
     }
+    if settings.method in _ON_TEXELS:
+        values |= {"clip": Named("rigid-head"), "conditions": _ON_TEXELS[settings.method]}
     return build(RunConfig, values, "parity")
 
 
