@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -26,6 +27,7 @@ from .schedule import Sampler, Timeline
 from .threads import torch_on_one_thread
 
 CHECKPOINT = "checkpoint.safetensors"
+log = logging.getLogger(__name__)
 TIMED_STEPS = 5  # steps timed to turn seconds into iterations
 COST_GROWTH = 1.6  # estimated cost of a late step relative to an early one, because there are more splats
 ESTIMATED_AGAIN = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4)
@@ -201,6 +203,8 @@ def train(
                 last_save = clock()
             fit.progress(iteration, total, note + trainable.note() if note else "")
     wait()
+    if iteration == 1 and limit:
+        log.warning("the limit of %g s left no time for a step: the avatar is as it was at the start", limit)
     return TrainingSummary(iteration, total, seconds(), losses)
 
 

@@ -191,6 +191,17 @@ def test_seconds_of_preparation_count(tmp_path):
     assert outcome.seconds == pytest.approx(5 + 9)
 
 
+def test_a_limit_that_the_preparation_takes_up_is_said(tmp_path, caplog):
+    clock = Clock()
+    clock.now = 30.0
+    outcome = run(Drift(clock, 1.0), tmp_path / "none", Budget(seconds=10.0), clock=clock, began=0.0)
+    assert outcome.iterations == 1
+    assert "left no time for a step" in caplog.text
+    caplog.clear()
+    run(Drift(clock, 1.0), tmp_path / "some", Budget(seconds=30.0), clock=clock)
+    assert not caplog.text
+
+
 def test_divergence_is_reported(tmp_path):
     with pytest.raises(InputError, match="diverged"):
         run(Drift(loss=float("nan")), tmp_path, Budget(iterations=20))
