@@ -68,16 +68,15 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
         progress = _phase_progress(fit.progress, 0, second.iterations or 0)
         mesh = mesh_phase(scene, mesh_head, replace(fit, budget=first, progress=progress))
         sampler = ShuffledEpochs(len(scene.keys), fit.seed)
-        second_fit = replace(fit, began=fit.clock())
+        began = fit.clock()
         training = GaussianTraining(scene, head, mesh_head, mesh.tensors, sampler)
         budget = within(second, fit.budget, mesh.seconds)
+        progress = _phase_progress(fit.progress, mesh.iterations, 0)
         try:
             summary = train(
                 training,
                 sampler,
-                replace(
-                    second_fit, budget=budget, progress=_phase_progress(fit.progress, mesh.iterations, 0)
-                ),
+                replace(fit, began=began, budget=budget, progress=progress),
                 published_length=round(config.schedule_length * (1 - config.mesh_fraction)),
                 checkpoint_every_s=config.checkpoint_every_s,
             )

@@ -1,10 +1,12 @@
-"""Settings shared by all official methods. Light: only the standard library is imported."""
+"""Settings shared by all official methods. Light: neither torch nor numpy is imported here."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
+
+from ..shared.config import check_at_least_one
 
 
 def option_words(options: Mapping[str, Any]) -> list[str]:
@@ -128,21 +130,19 @@ class INSTAOfficialConfig(OfficialConfig):
     def __post_init__(self) -> None:
         if self.python:
             raise ValueError("python must be empty: the authors' code is a program; set program")
-        if self.images_on_gpu < 1:
-            raise ValueError(f"images_on_gpu must be at least 1, found {self.images_on_gpu}")
+        check_at_least_one(self, "images_on_gpu")
 
 
 SET_ENTRIES = (
-    *(
-        "data_dir",
-        "output_dir",
-        "dataset",
-        "batch_size",
-        "iteration",
-        "blend_start_iter",
-        "position_lr_max_steps",
-    ),
-    *("tex_size", "init_scaling"),
+    "data_dir",
+    "output_dir",
+    "dataset",
+    "batch_size",
+    "iteration",
+    "blend_start_iter",
+    "position_lr_max_steps",
+    "tex_size",
+    "init_scaling",
 )
 """Entries of RGBAvatar's configuration that the adapter writes."""
 
@@ -169,8 +169,7 @@ class RGBAvatarOfficialConfig(OfficialConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.samples < 1:
-            raise ValueError(f"samples must be at least 1, found {self.samples}")
+        check_at_least_one(self, "samples")
         for each in self.values:
             if "=" not in each or each.partition("=")[0] in SET_ENTRIES:
                 known = f"NAME=VALUE of other entries than {', '.join(SET_ENTRIES)}, which headbench sets"
@@ -202,5 +201,4 @@ class FlashAvatarOfficialConfig(OfficialConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.samples < 1:
-            raise ValueError(f"samples must be at least 1, found {self.samples}")
+        check_at_least_one(self, "samples")
