@@ -124,8 +124,8 @@ TIMES = re.compile(
     "(?i)seconds|interruptions|memory|since|started|finished|time|fingerprint|load|training.json"
 )
 """Keys of what depends on the clock and on the machine, and of digests of that."""
-MEASURED = "fps|latency_|processor_time|throughput|stage_"
-"""Metrics of speed, by how their names begin."""
+MEASURED = "fps|latency_|processor_time|throughput|stage_|training_"
+"""Metrics of speed and of what training took, by how their names begin."""
 
 
 def tree(place: Place, writer: Writer) -> dict[str, Any]:
