@@ -58,9 +58,10 @@ ORDER: tuple[Patch, ...] = (
         "[int(index) for index in images_in_order.pop(0).split()]",
     ),
     ("model/reconstruction.py", "self.iteration += batch_size", "self.iteration += self.batch_size"),
+    ("train_offline.py", "range((iteration + batch_size - 1) // batch_size)", "range((iteration - 1) // batch_size)"),
 )
-"""They draw the frames of a step at random; they are replaced by the next of the given order. Steps of fewer frames count as
-whole ones in their schedule, as in the native method."""
+"""They draw the frames of a step at random; they are replaced by the next of the given order. As in the native method, steps of
+fewer frames count as whole ones in their schedule, and no step follows the last batch."""
 IN_TORCH: tuple[Patch, ...] = (
     (
         "model/binding.py",
@@ -197,10 +198,10 @@ class RGBAvatarOfficial(PartsMethod[RGBAvatarOfficialConfig]):
         return str(int(Path(path).stem))
 
     def batches(self, fit: Fit) -> Iterator[Sequence[int]]:
-        """Indices of the training frames of each step of the native method, and of one more, since their loader reads ahead."""
+        """Indices of the training frames of each batch of the native method; the last, after which it takes no step, is read ahead."""
         keys, native = fit.clip.splits["train"], RGBAvatarConfig()
         drawn = GroupedBatches([key.timestep for key in keys], native.batch, native.together, fit.seed)
-        return (drawn.batch(step) for step in range(1, (fit.budget.iterations or 0) + 2))
+        return (drawn.batch(step) for step in range(1, (fit.budget.iterations or 0) + 1))
 
     def done(self, line: str) -> tuple[int, str] | None:
         """Their training counts images."""
