@@ -18,7 +18,7 @@ import cv2
 import pandas as pd
 import pytest
 
-from headbench.bench import cli
+from headbench.bench import cli, machine
 from headbench.bench.engine.config import RunConfig, resolve_metrics
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.io.documents import read_json
@@ -40,11 +40,11 @@ METHODS = {"mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours", 
 @contextmanager
 def timed_in_few_frames():
     """Time a few frames: how many decides how exact speeds are, which nothing here asks for."""
-    few = partial(
-        speed.SpeedProtocol, warm_up=2, warm_up_s=0.1, window=1, latency=3, throughput=3, stages=2, static=2
-    )
+    short = {"warm_up": 2, "warm_up_s": 0.1, "window": 1, "latency": 3, "throughput": 3}
+    few = partial(speed.SpeedProtocol, **short, stages=2, one_thread=2, static=2)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(speed, "SpeedProtocol", few)
+        patch.setattr(machine, "SHORTEST_LOAD_S", 0.02)
         yield
 
 

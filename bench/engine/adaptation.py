@@ -13,13 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 from ..contracts import Clip, FloatArray, FrameKey, Progress
 from ..errors import HeadbenchError, InputError
 from ..progress import progress
+from ..registry import entry_points
 from ..specs import MethodSpec, ResolutionRule
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import functools
 import importlib
-import importlib.metadata
 import json
 import multiprocessing
 import os
@@ -165,13 +163,8 @@ def load_everything() -> None:
     import cv2
     import torch
 
-    from headbench.bench import registry
-
     torch.set_num_threads(1)
     cv2.setNumThreads(0)
-    # The entry points do not change while this runs, and reading them takes longer than most cases.
-    registry.entry_points = functools.cache(importlib.metadata.entry_points)  # type: ignore[attr-defined]
-    registry._origin = functools.cache(registry._origin)  # type: ignore[attr-defined]
     root = Path(__file__).parents[2]
     for package in ("bench", "datasets", "methods", "metrics", "reports"):
         for path in sorted((root / package).rglob("*.py")):

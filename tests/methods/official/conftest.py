@@ -64,9 +64,27 @@ def video_clip():
     return replace(clip, cameras=cameras, poses=lids)
 
 
+@pytest.fixture(scope="session")
+def answers():
+    """Answers of this interpreter by the question and the environment: asking takes a second, mostly of importing torch."""
+    ask, found = checkout._answer, {}
+
+    def answer(command, *arguments):
+        if command[0] != sys.executable:
+            return ask(command, *arguments)
+        key = (*command, *arguments, *checkout.environment().items())
+        if key not in found:
+            found[key] = ask(command, *arguments)
+        return found[key]
+
+    answer.ask = ask
+    return answer
+
+
 @pytest.fixture(autouse=True)
-def small_renders_and_a_gpu(monkeypatch):
+def small_renders_and_a_gpu(monkeypatch, answers):
     """Renders of Gaussian Head Avatar of 64 pixels instead of 2048, and a device for INSTA's program."""
+    monkeypatch.setattr(checkout, "_answer", answers)
     monkeypatch.setattr(gha, "RENDERED", 64)
     monkeypatch.setattr(checkout, "_DEVICES", "print('headbench-devices', 1)")
 

@@ -18,7 +18,7 @@ from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
 from headbench.methods.flashavatar.config import FlashAvatarConfig
 from headbench.methods.flashavatar.method import FlashAvatarTraining
 from headbench.methods.flashavatar.model import layer_of_points, network_outputs
-from headbench.methods.official import needs
+from headbench.methods.official import checkout, needs
 from headbench.methods.official.config import FlashAvatarOfficialConfig
 from headbench.methods.official.flashavatar import method as implementation
 from headbench.methods.official.flashavatar.export import (
@@ -337,7 +337,8 @@ def test_limits_of_their_files_are_kept(method, repository, video_clip, file, ex
         method.check(video_clip, BUDGET)
 
 
-def test_missing_weights_are_named_before_any_work(method, video_clip, tmp_path, monkeypatch):
+def test_missing_weights_are_named_before_any_work(method, video_clip, tmp_path, monkeypatch, answers):
+    monkeypatch.setattr(checkout, "_answer", answers.ask)  # which changes with the file
     repository = replace(FLASHAVATAR_REPOSITORY, modules=("torch",))
     monkeypatch.setattr(FlashAvatarStandIn, "repository", repository)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "hub"))
