@@ -10,7 +10,8 @@ import ast
 import os
 import sys
 from collections.abc import Iterator
-from functools import cache
+from contextlib import suppress
+from functools import cache, lru_cache
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
@@ -92,7 +93,7 @@ def _with_imports(module: str) -> dict[str, Path]:
         new = _below(left.pop(), home)
         files |= new
         for path in new.values():
-            names = set() if installed else _imports(path) - _LEFT_OUT
+            names = set() if installed else _imports(_source(path)) - _LEFT_OUT
             beside = {p for name in names for p in (home / f"{name}.py", home / name) if p.exists()}
             left += beside - seen
             seen |= beside
@@ -112,16 +113,24 @@ def _walk(root: Path) -> Iterator[Path]:
         yield from (Path(folder, name) for name in names if name.endswith(_SUFFIXES))
 
 
-def _imports(path: Path) -> set[str]:
-    """First parts of the absolute names that a Python file imports; none if it cannot be parsed."""
+def _source(path: Path) -> bytes:
+    """Source of a module; empty for a compiled one and one that cannot be read."""
+    with suppress(OSError):
+        return path.read_bytes() if path.suffix == ".py" else b""
+    return b""
+
+
+@lru_cache(maxsize=256)
+def _imports(source: bytes) -> frozenset[str]:
+    """First parts of the absolute names that a module imports; none if it cannot be parsed."""
     try:
-        tree = ast.parse(path.read_bytes() if path.suffix == ".py" else b"")
-    except (SyntaxError, ValueError, OSError):
-        return set()
+        tree = ast.parse(source)
+    except (SyntaxError, ValueError):
+        return frozenset()
     names: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name.partition(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and not node.level and node.module:
             names.add(node.module.partition(".")[0])
-    return names
+    return frozenset(names)

@@ -9,15 +9,20 @@ import re
 import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
+from functools import cache
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..bench.io.provenance import tool
 from ..bench.io.style import SHAPES, stylesheet
 from .compact import compact
 from .tables import TITLES, Column, Table, TableCell
 
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+HERE = Path(__file__).parent
 MARKDOWN_RANKS = {1: ("**", "**"), 2: ("<ins>", "</ins>"), 3: ("*", "*")}
 
 
@@ -231,24 +236,27 @@ def to_html(table: Table) -> str:
 
 def render_page(template: str, **content: Any) -> str:
     """Fill an HTML template of this package, with the shared style as ``look``; text is escaped."""
-    from jinja2 import Environment, FileSystemLoader
-
-    here = Path(__file__).parent
-    environment = Environment(
-        autoescape=True,
-        keep_trailing_newline=True,
-        loader=FileSystemLoader([here, here / "leaderboard", here / "page"]),
-    )
     shared = {
         "look": stylesheet(),
         "shapes": SHAPES,
-        "sort": (here / "sort.js").read_text("utf-8"),
+        "sort": (HERE / "sort.js").read_text("utf-8"),
         "tool": tool(),
     }
     ranks = {1: "first", 2: "second", 3: "third"}
-    return environment.get_template(template).render(
-        **shared | content, spans=_spans, ranks=ranks, compact=compact
+    return (
+        _templates()
+        .get_template(template)
+        .render(**shared | content, spans=_spans, ranks=ranks, compact=compact)
     )
+
+
+@cache
+def _templates() -> Environment:
+    """The templates, each of which is compiled when it is first used."""
+    from jinja2 import Environment, FileSystemLoader
+
+    folders = [HERE, HERE / "leaderboard", HERE / "page"]
+    return Environment(autoescape=True, keep_trailing_newline=True, loader=FileSystemLoader(folders))
 
 
 FORMULA_STARTS = ("=", "+", "-", "@")

@@ -58,7 +58,11 @@ ORDER: tuple[Patch, ...] = (
         "[int(index) for index in images_in_order.pop(0).split()]",
     ),
     ("model/reconstruction.py", "self.iteration += batch_size", "self.iteration += self.batch_size"),
-    ("train_offline.py", "range((iteration + batch_size - 1) // batch_size)", "range((iteration - 1) // batch_size)"),
+    (
+        "train_offline.py",
+        "range((iteration + batch_size - 1) // batch_size)",
+        "range((iteration - 1) // batch_size)",
+    ),
 )
 """They draw the frames of a step at random; they are replaced by the next of the given order. As in the native method, steps of
 fewer frames count as whole ones in their schedule, and no step follows the last batch."""
