@@ -47,7 +47,7 @@ class Leader:
 
 
 def leaders(lines: Lines, *, higher_is_better: bool) -> list[Leader]:
-    """The method with the best mean by rising cost, over over the subjects that all methods have.
+    """The method with the best mean by rising cost, over the subjects that all methods have.
 
     Quality is interpolated linearly between measured trainings, over the logarithm of the cost if all costs are above 0. A
     method takes part from its lowest cost on, and keeps the quality of its highest: that training fits a larger budget too.

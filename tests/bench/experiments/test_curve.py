@@ -411,10 +411,15 @@ def test_curves_of_several_subjects_and_methods_are_joined(make_run, tmp_path, m
     with pytest.raises(InputError, match="run curve --over seconds`, found none"):
         curve_runs(CurveReportSettings(tuple(parts), str(tmp_path / "other"), "seconds"))
     manifest = RunFolder(Path(parts[1])).read_manifest()
-    seeded = replace(manifest, configuration=replace(manifest.configuration, seeds=(1,)))
-    seeded.write(RunFolder(Path(parts[1])).manifest)
-    with pytest.raises(InputError, match=r"seeds: expected .*0.*, found .*1"):
-        curve_runs(CurveReportSettings(tuple(parts[:2]), str(tmp_path / "seeds")))
+    seeds = replace(manifest.configuration, seeds=(1,))
+    for changed, said in (
+        ({"configuration": seeds}, r"seeds: expected .*1.*, found .*0"),
+        ({"metrics": [replace(m, label="other") for m in manifest.metrics]}, "metrics: expected those of"),
+        ({"methods": [replace(m, version="9") for m in manifest.methods]}, "version of timed: expected 9"),
+    ):
+        replace(manifest, **changed).write(RunFolder(Path(parts[1])).manifest)
+        with pytest.raises(InputError, match=said):
+            curve_runs(CurveReportSettings((parts[1], parts[3]), str(tmp_path / "changed")))
     other = tmp_path / "camera"
     curve_run(
         settings(tmp_path / "run-ball-a", out=str(other), fractions=("1",), camera="4", methods=("timed",))
