@@ -30,8 +30,9 @@ def test_the_two_directions_are_18_degrees_from_orthogonal():
     place = packed_chart(corners, np.array([[0, 1, 2]])).astype(np.float64)[0]
     edges, of_chart = corners[1:] - corners[0], place[1:] - place[0]
     tangent, bitangent = np.linalg.solve(of_chart, edges)
-    cosine = tangent @ bitangent / np.linalg.norm(tangent) / np.linalg.norm(bitangent)
-    assert abs(abs(np.degrees(np.arcsin(cosine))) - 18) < 1e-3
+    lengths = np.linalg.norm([tangent, bitangent], axis=1)
+    assert abs(abs(np.degrees(np.arcsin(tangent @ bitangent / lengths.prod()))) - 18) < 1e-3
+    assert abs(lengths[1] / lengths[0] * np.cos(np.radians(18)) - 1) < 1e-5  # nothing but sheared
 
 
 def test_triangles_without_area_have_none_in_the_chart():
