@@ -185,8 +185,11 @@ def write_curve(path: Path, curve: CurveData) -> None:
     ]
     where = f"{curve.every}th training timestep" if curve.every > 2 else "second training timestep"
     note = f"Held out of every training: a training camera, every {where}. No test frame was looked at."
-    if len(curve.subjects) > 1:
-        note += f" Bars: 95 % intervals of the mean over {len(curve.subjects)} subjects."
+    count = len(curve.subjects)
+    if count >= LEAST_SUBJECTS:
+        note += f" Bars: 95 % intervals of the mean over {count} subjects."
+    elif count > 1:
+        note += f" Means over {count} subjects, which are too few for intervals."
     write_plot(path, rows, curve.axis, note)
 
 

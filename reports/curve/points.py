@@ -11,7 +11,7 @@ from typing import Any
 
 from ...bench.contracts import Budget
 from ...bench.specs import MetricSpec
-from ..statistics.paired import half_width
+from ..statistics.paired import LEAST_SUBJECTS, half_width
 
 HELD_OUT: Mapping[str, str] = {"novel_view": "camera", "self_reenactment": "timesteps"}
 """Held-out data by task."""
@@ -27,11 +27,11 @@ MEASURED: Mapping[str, tuple[str, float]] = {
 class CurvePoint:
     """A method trained with a part of its budget or of the frames, or with a level of tracking error.
 
-    ``place`` orders the points of a method and tells them apart. Means over seeds of one subject, or over subjects (""). ``cameras``, ``timesteps`` and ``pictures`` count the training
-    data. ``tracking_error`` is the level of a synthetic capture, None for a recording. ``cost`` is `MEASURED`
-    by name, ``values`` are the metrics by name and held-out data, such as "psnr_camera"; None: not measured.
-    ``halves`` are half the widths of the 95 % intervals of means over subjects, by the same names, where
-    there are at least two subjects.
+    ``place`` orders the points of a method and tells them apart. Means over seeds of one subject, or over subjects ("").
+    ``cameras``, ``timesteps`` and ``pictures`` count the training data. ``tracking_error`` is the level of a synthetic capture, None
+    for a recording. ``cost`` is `MEASURED` by name, ``values`` are the metrics by name and held-out data, such as "psnr_camera";
+    None: not measured. ``halves`` are half the widths of the 95 % intervals of means over subjects, by the same names, None with
+    fewer than `LEAST_SUBJECTS`.
     """
 
     method: str
@@ -72,9 +72,9 @@ def mean(values: Sequence[float | None]) -> float | None:
 
 
 def _half_width(values: Sequence[float | None]) -> float | None:
-    """Half the width of the interval of a mean; None for fewer than two numbers or a missing one."""
+    """Half the width of the interval of a mean; None for fewer than `LEAST_SUBJECTS` numbers or a missing one."""
     known = [value for value in values if value is not None]
-    return half_width(known) if 1 < len(known) == len(values) else None
+    return half_width(known) if LEAST_SUBJECTS <= len(known) == len(values) else None
 
 
 def mean_point(points: Sequence[CurvePoint]) -> CurvePoint:
