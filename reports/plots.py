@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import textwrap
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,7 @@ from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from ..bench.io.files import atomic_path
 
@@ -23,6 +24,8 @@ MARKERS = "osD^vPX"
 GREY, LIGHT_GREY = "#6e6e6e", "#cdcdcd"
 SMALL = 8
 """Size of text next to plots, in points."""
+CHARACTERS = 14
+"""Number of characters of that size in an inch of width."""
 
 
 @contextmanager
@@ -42,7 +45,8 @@ def plot_file(
     """
     with style.context(["default", {"text.parse_math": False, "font.size": 10}]):
         figure = Figure(figsize=size, dpi=dpi, layout="constrained")
-        figure.supxlabel(note, x=0.01, ha="left", fontsize=SMALL, color=GREY)
+        wrapped = textwrap.fill(note, int(size[0] * CHARACTERS))
+        figure.supxlabel(wrapped, x=0.01, ha="left", fontsize=SMALL, color=GREY)
         looks = dict(zip(dict.fromkeys(names), zip(itertools.cycle(COLOURS), itertools.cycle(markers))))
         handles = [Line2D([], [], marker=m, linestyle=line, color=c, label=n) for n, (c, m) in looks.items()]
         figure.legend(handles=handles, loc="outside upper left", ncols=8, fontsize=SMALL, frameon=False)
@@ -64,11 +68,12 @@ def show_missing(axes: Axes, text: str) -> None:
 
 
 def cost_axis(axes: Axes, *, logarithmic: bool = True) -> None:
-    """A horizontal axis, a logarithmic one with numbers at 1, 2 and 5."""
+    """A horizontal axis; a logarithmic one has numbers at 1, 2 and 5, or evenly spaced ones within a factor of 10. Called after drawing."""
     axes.margins(0.08, 0.12)
     if logarithmic:
         axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        low, high = axes.get_xlim()
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)) if high > 10 * low else MaxNLocator(5))
         axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter("{x:g}")
     axes.grid(axis="y", color=LIGHT_GREY, linewidth=0.5)

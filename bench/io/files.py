@@ -415,7 +415,9 @@ def _writable(path: Path, option: str, what: str) -> Iterator[None]:
     try:
         yield
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        found = getattr(error, "strerror", None) or str(error)
+        kinds = {errno.EEXIST: "a file", errno.EISDIR: "a folder"}
+        known = getattr(error, "strerror", None) or str(error)
+        found = kinds.get(getattr(error, "errno", None) or 0, known)
         raise InputError(path, option, f"{what} that can be written", found) from error
 
 

@@ -75,7 +75,8 @@ def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult
     }
     held_out = {subject: curve.held_out[subject] for subject in curve.subjects}
     text = points_text(curve.means, curve.metrics, curve.tasks, held_out, curve.missing, failed)
-    return CommandResult(f"{text}\n\n{leaders_text(curve)}", data, not failed)
+    written = f"Written: {out / 'curve.csv'}, {out / 'curve.png'}"
+    return CommandResult(f"{text}\n\n{leaders_text(curve)}\n\n{written}", data, not failed)
 
 
 @dataclass(frozen=True)
@@ -197,20 +198,32 @@ def _points(run: RunData, over: str) -> list[CurvePoint]:
     """The trainings of a run that differ in ``over``. Raises `InputError` where there are none."""
     config = run.manifest.configuration
     conditions = {condition.name: condition for condition in config.conditions}
-    kind = "" if over in TIMED else over.replace("_", "-"), over == "seconds"
-    chosen = [
-        name for name, each in conditions.items() if (each.clip.name, each.budget.endswith(" s")) == kind
-    ]
+    quantities = (
+        {name: _quantity(each) for name, each in conditions.items()}
+        if "every" in config.clip.parameters
+        else {}
+    )
     points = [
         _point(run, record, conditions[record.condition], clip)
         for record in run.manifest.methods
         for clip in run.manifest.clips
-        if "every" in config.clip.parameters and record.condition in chosen
+        if quantities.get(record.condition) == over
     ]
     if not points:
         expected = f"trainings of `headbench run curve --over {over}`"
-        raise InputError(run.folder.manifest, "configuration", expected, "none")
+        others = sorted(
+            {quantities[each.condition] for each in run.manifest.methods if each.condition in quantities}
+        )
+        found = f"trainings of --over {' and '.join(others)}" if others else "none"
+        raise InputError(run.folder.manifest, "configuration", expected, found)
     return points
+
+
+def _quantity(condition: Condition) -> str:
+    """The quantity that a condition of a curve changes."""
+    return condition.clip.name.replace("-", "_") or (
+        "seconds" if condition.budget.endswith(" s") else "budget"
+    )
 
 
 def _check_together(runs: Sequence[RunData], points: Sequence[CurvePoint]) -> None:

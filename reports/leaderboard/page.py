@@ -111,7 +111,7 @@ def build(settings: LeaderboardSettings, progress: Progress = no_progress) -> Co
         content["summary"] = _summary(submissions, boards)
         write_text(out / "leaderboard.md", _markdown(boards, settings.title, refused))
         write_text(out / "leaderboard.html", render_page("leaderboard.html", **content))
-    text = f"{len(files)} bundles, {len(boards)} tables: {out / 'leaderboard.md'}, {out / 'leaderboard.html'}"
+    text = f"{counted(len(files), 'bundle')}, {counted(len(boards), 'table')}: {out / 'leaderboard.md'}, {out / 'leaderboard.html'}"
     data = {
         "out": out,
         "tables": [asdict(board.table) for board in boards],

@@ -73,7 +73,9 @@ def pareto(
         "rates": [asdict(rate) for rate in rates],
     }
     text = _text(points, fronts, left_out, metric.label, metric.digits, note)
-    return CommandResult("\n".join([text, *map(_rate_text, rates)]), data)
+    names = ["points.csv", "pareto.png", *(("rates.csv", "rate_distortion.png") if rates else ())]
+    written = ", ".join(str(out / name) for name in names)
+    return CommandResult("\n".join([text, *map(_rate_text, rates), f"Written: {written}"]), data)
 
 
 def _rates(

@@ -22,6 +22,7 @@ from ...bench.io.files import grouped_writes
 from ...bench.io.images import quantise, read_png, write_png
 from ...bench.io.provenance import COMPOSITE, RENDER
 from ...bench.io.video import browser_encoder, write_browser_video
+from ...bench.progress import counted
 from ...bench.specs import CommandResult
 from .settings import RenderSettings
 
@@ -66,7 +67,9 @@ def render_avatar(settings: RenderSettings, progress: Progress = no_progress) ->
             write_png(shot.path, quantise(shot.finish(rgb)), RENDER)
             progress(index + 1, len(shots), shot.path.name)
     videos = _videos(shots, settings) if settings.video else []
-    text = f"{out}: {len(shots)} frames in {shots[0].path.parent.name}/" + "".join(f"\n{v}" for v in videos)
+    text = f"{out}: {counted(len(shots), 'frame')} in {shots[0].path.parent.name}/" + "".join(
+        f"\n{v}" for v in videos
+    )
     return CommandResult(text, {"out": out, "frames": [shot.path for shot in shots], "videos": videos})
 
 

@@ -22,6 +22,7 @@ from ....bench.engine.run import check_settings, run
 from ....bench.engine.scoring import FULL
 from ....bench.engine.store import RunFolder
 from ....bench.engine.stored import TRAINING_FILE
+from ....bench.errors import InputError
 from ....bench.executors.settings import check_executor
 from ....bench.io.documents import read_json
 from ....bench.io.files import write_json, write_text
@@ -136,9 +137,12 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
     """Train and score both methods, and write the table of their differences; see the command."""
     out = Path(settings.out)
     config = run_config(settings, out)
-    found = resolve_cells(config)
-    check_settings(found)
     check_executor(settings.execution, config.device)
+    try:
+        found = resolve_cells(config)
+        check_settings(found)
+    except InputError as error:
+        raise _with_options(error, OFFICIAL[settings.method]) from error
     native, official = (method.spec.name for method, _ in found)
     condition = found[0][1].name
     with log_to_file(out / "parity.log"):
@@ -172,6 +176,17 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
     write_json(out / "parity.json", data)
     apart = [d for d in differences if d.metric == "psnr" and abs(d.difference) > settings.tolerance]
     return CommandResult(text, data, bool(differences) and not apart and not rows.failed)
+
+
+def _with_options(error: InputError, official: str) -> InputError:
+    """The error with the options of this command in place of the settings that a run has for them."""
+    texts = error.file, error.key, error.expected, error.found, error.remedy
+    return InputError(
+        *(
+            text.replace(f"--set settings.{official}.", "--").replace(f"settings.{official}.", "--")
+            for text in texts
+        )
+    )
 
 
 def run_config(settings: ParitySettings, out: Path) -> RunConfig:

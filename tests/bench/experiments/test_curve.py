@@ -401,14 +401,14 @@ def test_curves_of_several_subjects_and_methods_are_joined(make_run, tmp_path, m
     fewer = curve_runs(CurveReportSettings(tuple(parts[:3]), str(tmp_path / "fewer")))
     assert len(fewer.data["points"]) == 6
     one = curve_runs(CurveReportSettings(tuple(parts[:2]), str(tmp_path / "one")))
-    assert fewer.text == one.text
+    assert fewer.text.partition("Written:")[0] == one.text.partition("Written:")[0]
     with pytest.raises(InputError, match="a subject that all methods were trained on"):
         curve_runs(CurveReportSettings((parts[0], parts[3]), str(tmp_path / "none")))
     assert {entry["metric"] for entry in joined.data["best"]} == {"psnr"}
     assert (tmp_path / "joined" / "curve.png").is_file()
     with pytest.raises(InputError, match="each training of noting on ball-a once"):
         curve_runs(CurveReportSettings((parts[0], parts[0]), str(tmp_path / "twice")))
-    with pytest.raises(InputError, match="run curve --over seconds`, found none"):
+    with pytest.raises(InputError, match="run curve --over seconds`, found trainings of --over budget"):
         curve_runs(CurveReportSettings(tuple(parts), str(tmp_path / "other"), "seconds"))
     manifest = RunFolder(Path(parts[1])).read_manifest()
     seeds = replace(manifest.configuration, seeds=(1,))

@@ -92,7 +92,7 @@ def test_the_order_is_that_of_the_native_method(folder, monkeypatch):
     ("words", "expected"),
     [
         (("--checkout", "nowhere"), "git clone --recursive"),
-        (("--python", "no-such-program"), "settings.ga-official.python"),
+        (("--python", "no-such-program"), "no-such-program, --python: expected"),
         (("--commit", "0123456"), "commit 0123456"),
         (("--data", "nowhere"), "nowhere"),
     ],
