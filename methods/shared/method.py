@@ -49,7 +49,8 @@ class TrainedMethod(Generic[Config, Avatar]):
         check_budget(budget)
         check_training_split(clip)
         self.prepare(device)
-        load_optimisers()
+        if budget.seconds is not None:
+            load_optimisers()
         began = self._clock()
         config, settings = self._resolved(clip, device)
         run = run_digest(self.name, self.version, settings, clip, budget, seed)
