@@ -82,7 +82,7 @@ class StressSettings:
     part: tyro.conf.Positional[str]
     """What to measure: splats, or what `headbench list benchmarks` shows."""
     quick: bool = False
-    """Less where there is much: fewer sizes, runs, cases."""
+    """Measure fewer sizes, runs and cases."""
     out: str | None = None
     """Also write the results to this JSON file."""
 

@@ -32,8 +32,8 @@ class ListSettings:
             "protocols",
         ]
     ]
-    """What to list; datasets are readers, and what makes captures; papers and protocols those
-    that tables can be printed in the form of, and by."""
+    """What to list; `datasets` are readers and steps that make captures, `papers` are published tables whose
+    layout `headbench table` can print, and `protocols` are evaluation protocols of papers."""
 
     cite: bool = False
     """With methods: their sources, BibTeX entries, and the figures that papers printed for them."""

@@ -82,7 +82,7 @@ def get(group: Group, name: str) -> Any:
         _entries.cache_clear()  # it may have been installed meanwhile, as in a notebook
         plugins = discover(group)
     if name not in plugins:
-        hint = "A plug-in's is known once it is installed here."
+        hint = "A plug-in is known when its package is installed here."
         raise unknown(f"registry of {group}", "name", name, plugins, hint)
     plugin = plugins[name]
     if plugin.spec is None:

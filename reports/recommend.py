@@ -41,8 +41,8 @@ UNITS = {"seconds": "s of training", "megabytes": "MB", "milliseconds": "ms a fr
 class RecommendSettings:
     """The best method within a budget by the rows of finished runs, and methods that cannot be told apart from it.
 
-    Every method is a choice, also with other settings, with a part of the training, and coded. A choice fits if no subject and
-    no seed exceeds a limit. Among those that fit, the one with the best mean over subjects is recommended. The answer is tested on each
+    The choices are all methods, including those with other settings, with shorter trainings and with coded avatars. A choice fits if no
+    subject and no seed exceeds a limit. Among those that fit, the one with the best mean over subjects is recommended. The answer is tested on each
     subject with the rows of the others.
     """
 

@@ -105,7 +105,13 @@ class _Forms:
         for clip, method, condition in cells:
             changed, needs = self._clip(clip, condition), MethodNeeds.of(method.spec)
             if (changed.fingerprint, needs) not in planned:
-                step = adaptation.plan(changed, needs, self._config.heads)
+                try:
+                    step = adaptation.plan(changed, needs, self._config.heads)
+                except InputError as error:
+                    if error.key != "head_models":
+                        raise
+                    key = f"{error.key} of {method.spec.name}"
+                    raise InputError(error.file, key, error.expected, error.found, error.remedy) from error
                 planned[changed.fingerprint, needs] = (changed, step)
         with output_inside(self._out.root):
             if self._out.root != self._run.root:

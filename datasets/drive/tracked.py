@@ -59,7 +59,7 @@ def read_capture_signal(request: SignalRequest) -> DrivingSignal:
     if request.sequence and request.sequence not in names:
         raise InputError("command line", "--sequence", f"one of {', '.join(names)}", request.sequence)
     if len(names) > 1 and not request.sequence:
-        remedy = "Sequences are cuts, over which nothing can be smoothed."
+        remedy = "Choose one sequence: poses are smoothed over time, which must not join two sequences."
         raise InputError("command line", "--sequence", f"one of {', '.join(names)}", "none", remedy)
     left_out = {key.timestep for key in clip.excluded}
     timesteps = [

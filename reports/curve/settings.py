@@ -13,7 +13,7 @@ from ...bench.experiments.curve_settings import Over
 class CurveReportSettings:
     """Runs of `headbench run curve` as one curve: of several subjects, or of several methods of a subject.
 
-    Prints the means over subjects and the best method by what a training takes, with 95 % intervals of the crossings of two methods."""
+    Prints the means over subjects and the best method for each cost of a training, with 95 % intervals of the crossings of two methods."""
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders that `headbench run curve` wrote."""

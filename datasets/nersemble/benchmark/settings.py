@@ -53,7 +53,7 @@ class SubmissionWriteSettings:
     """Method of a run with several."""
 
     data: str | None = None
-    """The benchmark's folder: its tracking tells how many frames a sequence has. Without it, published totals are held to."""
+    """The benchmark's folder, whose tracking has the number of frames of each sequence. Without it, the published totals are checked."""
 
 
 @dataclass(frozen=True)
@@ -70,4 +70,4 @@ class SubmissionCheckSettings:
     """Task of the benchmark; default: the one that the zip has most files of."""
 
     data: str | None = None
-    """The benchmark's folder: its tracking tells how many frames a sequence has. Without it, published totals are held to."""
+    """The benchmark's folder, whose tracking has the number of frames of each sequence. Without it, the published totals are checked."""
