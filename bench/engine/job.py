@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -17,7 +17,7 @@ from ..condition import PLAIN, Condition, label_of
 from ..contracts import CheckedMethod, Clip, FrameKey, Progress
 from ..errors import InputError
 from ..io.documents import read_json
-from ..io.files import digest, refuse_links
+from ..io.files import digest, refuse_links, to_jsonable
 from ..isolation.parent import IsolatedMethod
 from ..progress import RunProgress, duration, progress
 from ..protocol import Protocol
@@ -155,11 +155,16 @@ class Job:
                     f"{earlier}: the code of the plug-in has changed since its training {trained_ago(state)}"
                 )
             raise InputError(file, "method, code", expected, found, remedy)
+        record = json.loads(json.dumps(self.method.record(), default=to_jsonable))
+        new, old = (dict(_leaves(each)) for each in (record, state.get("method")))
+        other = [name for name in new if name in old and name != "code" and new[name] != old[name]]
+        wanted, there = ("".join(f", {name} {each[name]}" for name in other[:3]) for each in (new, old))
+        what = "settings" if other else "data, seed, device or condition"
         raise InputError(
             file,
             "fingerprint",
-            f"{self.fit_fingerprint[:12]}, that of this run's settings and data",
-            f"{str(state.get('fingerprint'))[:12]}, an avatar of other settings, data, method version or code",
+            f"the avatar of this run's settings and data{wanted}",
+            f"one of other {what}{there}",
             remedy,
         )
 
@@ -231,3 +236,12 @@ def avatar_record(job: Job) -> tuple[str, Mapping[str, str]]:
     """What distinguishes trained avatars of the same settings."""
     state = job.cell.step("fit")
     return ("", {}) if state is None else (state.get("derived_from", ""), state.get("files", {}))
+
+
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Values of nested mappings by their path, such as "budget.iterations"."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _leaves(item, f"{name}.{key}" if name else str(key))
+    else:
+        yield name, value
