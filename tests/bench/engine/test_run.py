@@ -221,7 +221,11 @@ def test_several_views_for_a_monocular_method_are_refused(config, toy, monkeypat
 
 def test_other_settings_in_the_same_folder_are_refused(config, refuses):
     runner.run(config)
-    refuses(config, "data, config.level 0.75, found one of other settings, config.level .*Choose another --out", settings={"toy": {"level": 0.75}})
+    refuses(
+        config,
+        "data, config.level 0.75, found one of other settings, config.level .*Choose another --out",
+        settings={"toy": {"level": 0.75}},
+    )
 
 
 BOTH = {"methods": ("toy_plugin:METHOD", "toy_plugin:MIRROR"), "seeds": (0, 1)}
