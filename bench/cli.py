@@ -50,7 +50,7 @@ def _fail(message: str, code: ExitCode) -> ExitCode:
 def _described(error: OSError) -> str:
     """An error of the system in one line: the file, the reason, and what to do where that is not obvious."""
     reason = error.strerror or " ".join(str(error).split()) or type(error).__name__
-    if error.errno == errno.EEXIST and error.strerror == os.strerror(errno.EEXIST):
+    if error.errno == errno.EEXIST and os.path.isfile(error.filename or ""):
         reason = "expected a folder, found a file"  # a folder that is made may be there, a file may not
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
     remedy = ". Make room (or let it be written) and start again." if full else ""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import logging
+import os
 import sys
 from dataclasses import dataclass
 from functools import lru_cache
@@ -79,9 +80,6 @@ def get(group: Group, name: str) -> Any:
         return _checked(resolve(name), group, name)
     plugins = discover(group)
     if name not in plugins:
-        _entries.cache_clear()  # it may have been installed meanwhile, as in a notebook
-        plugins = discover(group)
-    if name not in plugins:
         hint = "A plug-in is known when its package is installed here."
         raise unknown(f"registry of {group}", "name", name, plugins, hint)
     plugin = plugins[name]
@@ -113,11 +111,19 @@ def unknown(file: str, key: str, name: str, known: Any, remedy: str = "") -> Inp
 
 def entry_points(group: str) -> tuple[EntryPoint, ...]:
     """Entry points of a group. Looking through all distributions takes 5 ms, and hundreds of calls ask."""
-    return _entries(group, tuple(sys.path))
+    return _entries(group, tuple((folder, _changed_at(folder or ".")) for folder in sys.path))
+
+
+def _changed_at(folder: str) -> int:
+    """When an entry of a folder was last added or removed, as by an installation; 0 if there is no folder."""
+    try:
+        return os.stat(folder).st_mtime_ns
+    except OSError:
+        return 0
 
 
 @lru_cache(maxsize=64)
-def _entries(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+def _entries(group: str, folders: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
     return tuple(metadata.entry_points(group=group))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -155,11 +155,12 @@ class Job:
                     f"{earlier}: the code of the plug-in has changed since its training {trained_ago(state)}"
                 )
             raise InputError(file, "method, code", expected, found, remedy)
-        record = json.loads(json.dumps(self.method.record(), default=to_jsonable))
-        new, old = (dict(_leaves(each)) for each in (record, state.get("method")))
-        other = [name for name in new if name in old and name != "code" and new[name] != old[name]]
-        wanted, there = ("".join(f", {name} {each[name]}" for name in other[:3]) for each in (new, old))
-        what = "settings" if other else "data, seed, device or condition"
+        decides = json.loads(json.dumps(self.method.identity(), default=to_jsonable))
+        both = ((path, value, _at(state.get("method"), path)) for path, value in _leaves(decides))
+        other = [(".".join(path), value, there) for path, value, there in both if there != value][:3]
+        wanted = "".join(f", {name} {value}" for name, value, _ in other)
+        there = "".join(f", {name} {value}" for name, _, value in other)
+        what = "settings" if other else "data, device, condition or format"
         raise InputError(
             file,
             "fingerprint",
@@ -238,10 +239,19 @@ def avatar_record(job: Job) -> tuple[str, Mapping[str, str]]:
     return ("", {}) if state is None else (state.get("derived_from", ""), state.get("files", {}))
 
 
-def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Values of nested mappings by their path, such as "budget.iterations"."""
+def _leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Values of nested mappings and their paths, such as ("budget", "iterations")."""
     if isinstance(value, Mapping):
         for key, item in value.items():
-            yield from _leaves(item, f"{name}.{key}" if name else str(key))
+            yield from _leaves(item, (*path, key))
     else:
-        yield name, value
+        yield path, value
+
+
+def _at(value: Any, path: Sequence[str]) -> Any:
+    """The value at a path in nested mappings, which may be anything; "none" where there is none."""
+    for key in path:
+        if not isinstance(value, Mapping) or key not in value:
+            return "none"
+        value = value[key]
+    return value

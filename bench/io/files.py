@@ -415,9 +415,9 @@ def _writable(path: Path, option: str, what: str) -> Iterator[None]:
     try:
         yield
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        kinds = {errno.EEXIST: "a file", errno.EISDIR: "a folder"}
-        known = getattr(error, "strerror", None) or str(error)
-        found = kinds.get(getattr(error, "errno", None) or 0, known)
+        found = getattr(error, "strerror", None) or str(error)
+        if isinstance(error, FileExistsError | IsADirectoryError) and (path.is_file() or path.is_dir()):
+            found = "a file" if path.is_file() else "a folder"
         raise InputError(path, option, f"{what} that can be written", found) from error
 
 

@@ -125,6 +125,7 @@ INSTA_OFFICIAL = MethodSpec(
 
 RGBAVATAR_OFFICIAL = MethodSpec(
     name="rgbavatar-official",
+    version="2",
     summary="RGBAvatar by its authors' code, in your checkout and environment; needs CUDA.",
     implementation="headbench.methods.official.rgbavatar.method:RGBAvatarOfficial",
     config="headbench.methods.official.config:RGBAvatarOfficialConfig",

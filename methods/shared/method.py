@@ -49,8 +49,6 @@ class TrainedMethod(Generic[Config, Avatar]):
         check_budget(budget)
         check_training_split(clip)
         self.prepare(device)
-        if budget.seconds is not None:
-            load_optimisers()
         began = self._clock()
         config, settings = self._resolved(clip, device)
         run = run_digest(self.name, self.version, settings, clip, budget, seed)
@@ -66,7 +64,11 @@ class TrainedMethod(Generic[Config, Avatar]):
         return self.load(out, device=device)
 
     def prepare(self, device: str) -> None:
-        """Prepare the renderer for ``device``; see `cuda.prepare`."""
+        """Prepare a training on ``device``: the renderer, see `cuda.prepare`, and optimisers."""
+        self._use(device)
+        load_optimisers()
+
+    def _use(self, device: str) -> None:
         if self.draws_splats:
             cuda.prepare(device)
         else:
@@ -74,7 +76,7 @@ class TrainedMethod(Generic[Config, Avatar]):
 
     def load(self, path: Path, *, device: str) -> Avatar:
         """Read an avatar that `fit` wrote."""
-        self.prepare(device)
+        self._use(device)
         avatar: Avatar = self.avatar_class.read(path, device)
         return avatar
 
@@ -105,5 +107,5 @@ class TrainedMethod(Generic[Config, Avatar]):
 
 
 def load_optimisers() -> None:
-    """Import what PyTorch imports with the first optimiser of a process, 1.5 s that would count for the limit of one training alone."""
+    """Import what PyTorch imports with the first optimiser of a process: 1.5 s that belong to no training."""
     importlib.import_module("torch._dynamo")

@@ -240,11 +240,8 @@ def test_a_benchmark_that_finds_a_fault_fails_the_command(capsys):
         (InputError("a.json", "x", "1", "2"), 2, "headbench: a.json, x: expected 1, found 2.\n"),
         (HeadbenchError("no"), 2, "headbench: no\n"),
         (OSError(errno.EACCES, "Permission denied", "a"), 2, "headbench: a: Permission denied\n"),
-        (
-            FileExistsError(errno.EEXIST, "File exists", "a"),
-            2,
-            "headbench: a: expected a folder, found a file\n",
-        ),
+        (FileExistsError(errno.EEXIST, "File exists", __file__), 2, ": expected a folder, found a file\n"),
+        (FileExistsError(errno.EEXIST, "File exists", "."), 2, "headbench: .: File exists\n"),
         (OSError(errno.EIO, "Input/output error"), 2, "headbench: Input/output error\n"),
         (OSError(errno.ENOSPC, "No space left on device", "a"), 2, "start again.\n"),
         (OSError("of a library,\nin two lines"), 2, "headbench: of a library, in two lines\n"),

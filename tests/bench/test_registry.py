@@ -75,3 +75,14 @@ def test_a_profile_with_the_label_of_another_metric_is_refused(changes):
     )
     with pytest.raises(ValueError, match="psnr"):
         ProfileSpec("lab", "in Lab", "", (metric,))
+
+
+def test_a_plugin_installed_meanwhile_is_found(toy, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    assert "late" not in registry.discover("metrics")
+    installed = tmp_path / "late-1.0.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: late\nVersion: 1.0\n")
+    (installed / "entry_points.txt").write_text("[headbench.metrics]\nlate = toy_plugin:ERROR\n")
+    assert registry.discover("metrics")["late"].origin == "late 1.0"
+    assert registry.get("metrics", "late") is toy.ERROR

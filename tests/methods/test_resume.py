@@ -24,7 +24,6 @@ from headbench.methods.insta.method import Insta
 from headbench.methods.ours.method import Ours
 from headbench.methods.rgbavatar.config import RGBAvatarConfig
 from headbench.methods.rgbavatar.method import RGBAvatar
-from headbench.methods.shared import method as shared
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.loop import CHECKPOINT
 from headbench.methods.shared.optimisation import Optimiser
@@ -168,14 +167,3 @@ def test_a_process_killed_outright(unbroken, clip, tmp_path, after_s):
     os.kill(child.pid, signal.SIGKILL)
     assert child.wait() == -signal.SIGKILL
     assert content(fit(name, clip, tmp_path)) == expected
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_what_a_process_loads_once_counts_for_no_limit(name, clip, tmp_path, monkeypatch):
-    events = []
-    monkeypatch.setattr(shared, "load_optimisers", lambda: events.append("loaded"))
-    method = METHODS[name]()
-    method._clock = lambda: events.append("asked") or 0.0
-    with pytest.raises(Killed):
-        method.fit(clip, tmp_path, Budget(24, seconds=9.0), device="cpu", seed=0, progress=killing(1))
-    assert events[:2] == ["loaded", "asked"]
