@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import textwrap
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
 from ..bench.io.files import atomic_path
 
@@ -67,13 +68,19 @@ def show_missing(axes: Axes, text: str) -> None:
     axes.set(xticks=[], yticks=[])
 
 
-def cost_axis(axes: Axes, *, logarithmic: bool = True) -> None:
-    """A horizontal axis; a logarithmic one has numbers at 1, 2 and 5, or evenly spaced ones within a factor of 10. Called after drawing."""
+def cost_axis(axes: Axes, *, logarithmic: bool = True, whole: bool = False) -> None:
+    """A horizontal axis, set after drawing. A logarithmic one has numbers at 1, 2 and 5, or evenly spaced ones if fewer than three of
+    those are in view; ``whole``: whole numbers, if the range is not too narrow."""
     axes.margins(0.08, 0.12)
     if logarithmic:
         axes.set_xscale("log")
         low, high = axes.get_xlim()
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)) if high > 10 * low else MaxNLocator(5))
+        powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)))
+        marks = [
+            tick for power in powers for part in (1, 2, 5) if low <= (tick := part * 10.0**power) <= high
+        ]
+        few = len(marks) < 3
+        axes.xaxis.set_major_locator(MaxNLocator(4, integer=whole) if few else FixedLocator(marks))
         axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter("{x:g}")
     axes.grid(axis="y", color=LIGHT_GREY, linewidth=0.5)

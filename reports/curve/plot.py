@@ -45,4 +45,5 @@ def _draw(axes: Axes, panel: CurvePanel, cost: str, looks: Mapping[str, tuple[st
             colour, marker = looks[name]
             line = axes.errorbar(costs, values, bars, color=colour, linewidth=1.2, capsize=2)
             line.lines[0].set(marker=marker, markersize=4)
-    cost_axis(axes, logarithmic=all(cost > 0 for line in panel.lines.values() for cost, _, _ in line))
+    each = [paid for line in panel.lines.values() for paid, _, _ in line]
+    cost_axis(axes, logarithmic=min(each) > 0, whole=all(paid == round(paid) for paid in each))

@@ -95,6 +95,10 @@ CAUSES = {
 adapter."""
 
 
+OPTIONS = ("checkout", "python", "commit", "device")
+"""Settings of the official method that are options of the command, by their names."""
+
+
 @dataclass(frozen=True)
 class Difference:
     """Difference of one metric in one task, official minus native, over orders.
@@ -180,13 +184,15 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
 
 def _with_options(error: InputError, official: str) -> InputError:
     """The error with the options of this command in place of the settings that a run has for them."""
-    texts = error.file, error.key, error.expected, error.found, error.remedy
-    return InputError(
-        *(
-            text.replace(f"--set settings.{official}.", "--").replace(f"settings.{official}.", "--")
-            for text in texts
-        )
+    place = f"settings.{official}"
+    names = re.compile(rf"(?:--set )?{re.escape(place)}\.({'|'.join(OPTIONS)})\b")
+    file, key, *texts = (
+        names.sub(r"--\1", text)
+        for text in (error.file, error.key, error.expected, error.found, error.remedy)
     )
+    if file == place and key in OPTIONS:
+        file, key = "command line", f"--{key}"
+    return InputError(file, key, *texts)
 
 
 def run_config(settings: ParitySettings, out: Path) -> RunConfig:

@@ -91,7 +91,9 @@ def test_the_order_is_that_of_the_native_method(folder, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (("--checkout", "nowhere"), "git clone --recursive"),
+        (("--checkout", "nowhere"), "nowhere, --checkout: expected a folder"),
+        (("--checkout", "nowhere"), "; then --checkout=DIR and --python=PYTHON of"),
+        (("--commit", "xyz"), "command line, --commit: expected"),
         (("--python", "no-such-program"), "no-such-program, --python: expected"),
         (("--commit", "0123456"), "commit 0123456"),
         (("--data", "nowhere"), "nowhere"),
