@@ -273,7 +273,7 @@ CASES = {
         ),
         case(
             f"render {cell('gha')} --method gha --capture {{capture}} --out gha --frames novel_view --timesteps 0",
-            "frames in novel_view",
+            "1 frame in novel_view",
         ),
     ],
     "drive": [
