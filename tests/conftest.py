@@ -123,6 +123,15 @@ def pytest_sessionfinish(session):
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
+SLOW_FILES = (
+    "test_end_to_end.py",
+    "test_readme.py",
+    "test_forgeries.py",
+    "test_flame_files.py",
+    "test_benchmarks.py",
+)
+
+
 def pytest_collection_modifyitems(items):
-    """Put the slowest file first: with several processes the other files fill the time that it takes."""
-    items.sort(key=lambda item: item.path.name != "test_end_to_end.py")
+    """Put slow files first that would come last: with several processes the other files fill the time that they take."""
+    items.sort(key=lambda item: item.path.name not in SLOW_FILES)

@@ -36,7 +36,14 @@ SMALLEST = {
 }
 
 
-@pytest.mark.parametrize("measure", SMALLEST, ids=lambda f: f"{f.__module__}.{f.__name__}")
+BROWSER = pytest.param(viewer.speed, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(
+    "measure",
+    [BROWSER if each is viewer.speed else each for each in SMALLEST],
+    ids=lambda f: f"{f.__module__}.{f.__name__}",
+)
 @pytest.mark.usefixtures("bare_machine")
 def test_a_benchmark_has_every_row(measure, monkeypatch):
     sizes, rows = SMALLEST[measure]

@@ -25,7 +25,7 @@ class Insta(TrainedMethod[InstaConfig, InstaAvatar]):
     config_class, avatar_class = InstaConfig, InstaAvatar
     draws_splats = False
 
-    def prepare(self, device: str) -> None:
+    def _use(self, device: str) -> None:
         """Raise `InputError` for any device but the CPU; docs/explanation/methods/insta.md says why."""
         if not SPEC.computes_on(device):
             remedy = "Train and render it with device=cpu."

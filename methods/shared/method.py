@@ -69,6 +69,7 @@ class TrainedMethod(Generic[Config, Avatar]):
         load_optimisers()
 
     def _use(self, device: str) -> None:
+        """Prepare drawing on ``device``. Raises `InputError` where the method cannot."""
         if self.draws_splats:
             cuda.prepare(device)
         else:

@@ -206,7 +206,7 @@ def test_pages_fit_and_are_silent(site, browser, scheme, width):
 READ = (*SEEN, "explanation/results", "reference/generated/api/contracts", "tutorials/paper-table")
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
 def test_axe_finds_nothing_serious_in_pages(site, new_tab, serious, scheme):
     tab = new_tab(1440, 900, color_scheme=scheme)
     found = {}
