@@ -243,11 +243,8 @@ def render_page(template: str, **content: Any) -> str:
         "tool": tool(),
     }
     ranks = {1: "first", 2: "second", 3: "third"}
-    return (
-        _templates()
-        .get_template(template)
-        .render(**shared | content, spans=_spans, ranks=ranks, compact=compact)
-    )
+    page = _templates().get_template(template)
+    return page.render(**shared | content, spans=_spans, ranks=ranks, compact=compact)
 
 
 @cache

@@ -157,9 +157,9 @@ class Job:
             raise InputError(file, "method, code", expected, found, remedy)
         decides = json.loads(json.dumps(self.method.identity(), default=to_jsonable))
         both = ((path, value, _at(state.get("method"), path)) for path, value in _leaves(decides))
-        other = [(".".join(path), value, there) for path, value, there in both if there != value][:3]
+        other = [(".".join(path), value, old) for path, value, old in both if old != value][:3]
         wanted = "".join(f", {name} {value}" for name, value, _ in other)
-        there = "".join(f", {name} {value}" for name, _, value in other)
+        there = "".join(f", {name} {old}" for name, _, old in other)
         what = "settings" if other else "data, device, condition or format"
         raise InputError(
             file,

@@ -74,10 +74,8 @@ def run_status(run: Path) -> CommandResult:
     told += [cell for cell in cells if cell.state == "waiting" and cell.note not in ("", SPEED)]
     lines = []
     for cell in told[:SHOWN]:
-        notes = [cell.note, f"restarts: {cell.restarts}" if cell.restarts else ""]
-        lines.append(
-            f"{cell.state:<8} {': '.join(filter(None, [cell.name, ', '.join(filter(None, notes))]))}"
-        )
+        notes = ", ".join(filter(None, [cell.note, f"restarts: {cell.restarts}" if cell.restarts else ""]))
+        lines.append(f"{cell.state:<8} {cell.name}{': ' if notes else ''}{notes}")
     if len(told) > SHOWN:
         lines.append(f"and {len(told) - SHOWN} more")
     data = {

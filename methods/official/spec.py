@@ -139,6 +139,7 @@ RGBAVATAR_OFFICIAL = MethodSpec(
 
 FLASHAVATAR_OFFICIAL = MethodSpec(
     name="flashavatar-official",
+    version="2",
     summary="FlashAvatar by its authors' code, in your checkout and environment; needs CUDA.",
     implementation="headbench.methods.official.flashavatar.method:FlashAvatarOfficial",
     config="headbench.methods.official.config:FlashAvatarOfficialConfig",
