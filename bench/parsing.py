@@ -78,6 +78,10 @@ def _parse(command: Any, program: str, words: Sequence[str]) -> Any:
             " ".join(part.split()).rstrip(".") for part in parts if not part.startswith("For full helptext")
         ]
         message = ". ".join(parts)
+        settings = get_args(getattr(command, "__annotations__", {}).get("settings"))
+        unknown = "Unrecognized options" in message and "Perhaps you meant" not in message
+        if unknown and settings and hasattr(settings[0], "set"):
+            message += ". A setting that has no option is given with --set, such as `--set device=cuda`"
         raise HeadbenchError(f"command line: {message}. `{program} --help` lists the options.") from None
 
 

@@ -81,8 +81,11 @@ def primary_table(runs: RunSet) -> str:
 def primary_section(runs: RunSet) -> str:
     """The primary endpoints as Markdown, and what the other tests of a page are."""
     exploratory = (
-        "All other tests on this page are exploratory: they are corrected over the comparisons of one metric and task alone, "
-        "those of the endpoints among them."
+        "All other tests on this page are exploratory. They are corrected over the comparisons of one metric and task, "
+        "including the primary endpoints."
     )
-    table = primary_table(runs) or f"None: they compare `{PAIR[0]}` with `{PAIR[1]}`."
+    table = (
+        primary_table(runs)
+        or f"These runs have none: primary endpoints compare `{PAIR[0]}` with `{PAIR[1]}`."
+    )
     return f"## Primary endpoints\n\n{table} {exploratory}"

@@ -101,7 +101,11 @@ def test_a_list_without_values_is_refused(offer, capsys, words):
 
 @pytest.mark.parametrize(
     ("words", "named"),
-    [("look", "What to look at"), ("look here --limti 1", "--limti"), ("look here --limit much", "--limit")],
+    [
+        ("look", "What to look at"),
+        ("look here --limti 1", "--limti"),
+        ("look here --limit much", "--limit"),
+    ],
 )
 def test_words_that_do_not_parse_end_in_one_line(offer, capsys, words, named):
     offer("look")
@@ -111,6 +115,12 @@ def test_words_that_do_not_parse_end_in_one_line(offer, capsys, words, named):
     assert named in line
     assert line.count("--help") == 1
     assert not re.search("[│─╭|]", line)
+
+
+@pytest.mark.parametrize(("words", "hint"), [("run --device cuda", True), ("doctor --devic cuda", False)])
+def test_settings_without_an_option_are_explained(capsys, words, hint):
+    assert cli.main(words.split()) == 2
+    assert ("with --set" in capsys.readouterr().err) is hint
 
 
 def test_commands_that_take_an_avatar_describe_it_alike():

@@ -72,7 +72,7 @@ def test_the_section_shows_each_endpoint_with_its_test(runs):
 def test_runs_without_the_pair_have_no_primary_endpoint(runs):
     other = runs.only(["ours", "gbs"])
     assert primary_comparisons(other) == []
-    assert "None: they compare `ours` with `ga`" in primary_section(other)
+    assert "primary endpoints compare `ours` with `ga`" in primary_section(other)
 
 
 @pytest.mark.parametrize(("planned", "interim"), [(0, 0), (10, 0), (12, len(PRIMARY))])
