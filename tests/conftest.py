@@ -76,7 +76,7 @@ def new_tab(browser):
     def new_tab(width=640, height=400, **options):
         contexts.append(browser.new_context(viewport={"width": width, "height": height}, **options))
         tab = contexts[-1].new_page()
-        tab.set_default_timeout(20_000)
+        tab.set_default_timeout(60_000)  # a busy machine takes tens of seconds to open a page
         tab.on("pageerror", lambda error: faults.append(str(error)))
         return tab
 

@@ -45,7 +45,7 @@ def settled(tab, wanted=lambda picture: True):
 
     On a busy machine the picture from before an action may stay for longer than three pictures take.
     """
-    pictures, end = [tab.screenshot(clip=CANVAS)], time.monotonic() + 40
+    pictures, end = [tab.screenshot(clip=CANVAS)], time.monotonic() + 60
     while len(pictures) < 3 or len({*pictures[-3:]}) > 1 or not wanted(pictures[-1]):
         assert time.monotonic() < end, "the picture that is wanted never comes to rest"
         tab.wait_for_timeout(400)
