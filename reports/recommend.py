@@ -178,9 +178,10 @@ def read_choices(
     """
     together = RunSet.joined(runs)
     labels_of_runs = training_labels(runs)
+    rows = Rows.joined([run.rows.renamed(own) for run, own in zip(runs, labels_of_runs)])
     quality: dict[str, dict[str, float]] = {}
     costs: dict[str, dict[str, dict[str, float]]] = {}
-    everybody: set[str] = set()
+    everybody = rows.subjects
     spec = None
     for run, labels in zip(runs, labels_of_runs):
         folder = run.folder.root
@@ -190,25 +191,25 @@ def read_choices(
             raise InputError(folder, "metric", f"a metric of frames: {known}", metric_name)
         if task not in run.tasks:
             raise InputError(folder, "task", ", ".join(run.tasks), task)
-        everybody |= set(run.rows.subjects)
         conditions = {condition.name: condition for condition in run.manifest.configuration.conditions}
         for record in run.manifest.methods:
             condition = conditions.get(record.condition)
             changed = condition is not None and (
                 condition.clip.name or condition.drive.name or condition.as_tracked
             )
-            if record.trivial or changed:
+            label = labels[record.label]
+            if record.trivial or changed or label in quality:
                 continue
-            label, own = labels[record.label], record.label
-            quality.setdefault(label, {}).update(_quality(run.rows, own, metric_name, task))
+            quality[label] = _quality(rows, label, metric_name, task)
             derived = condition is not None and condition.derive.name
+            costs[label] = {}
             for cost, (name, factor) in COSTS.items():
-                source = record.name if derived and cost == "seconds" else own
-                found = {subject: factor * value for subject, value in _costs(run.rows, source, name).items()}
+                source = labels.get(record.name, "") if derived and cost == "seconds" else label
+                found = {subject: factor * value for subject, value in _costs(rows, source, name).items()}
                 if cost == "seconds":
                     limit = None if record.budget.get("iterations") else record.budget.get("seconds")
                     found = _within(found, limit)
-                costs.setdefault(label, {}).setdefault(cost, {}).update(found)
+                costs[label][cost] = found
     choices, without = {}, []
     for label, values in quality.items():
         if set(values) != everybody:
@@ -224,7 +225,6 @@ def read_choices(
     if spec is None or not choices:
         found_instead = "; ".join(without) or "none"
         raise InputError("runs", "methods", "a method with values of every subject", found_instead)
-    rows = Rows.joined([run.rows.renamed(own) for run, own in zip(runs, labels_of_runs)])
     return Choices(choices, spec, without, _time_notes(rows, together.metrics, list(choices)))
 
 

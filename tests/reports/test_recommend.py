@@ -199,6 +199,21 @@ def test_trainings_of_one_method_stay_apart(tmp_path, write_manifest, run):
         assert sorted(found.values()) == pytest.approx([20.0, 32.0, 33.0])
 
 
+def test_seeds_of_separate_runs_count_together(tmp_path, write_manifest):
+    """A training with two seeds, each in a run of its own: the mean of the qualities and the largest cost, in any order of the runs."""
+    folders = []
+    for seed, psnr, minutes in ((0, 30.0, 1.0), (1, 32.0, 3.0)):
+        folder = RunFolder(tmp_path / f"seed-{seed}")
+        rows = [row("a", "psnr", psnr, subject, seed=seed) for subject in SUBJECTS]
+        rows += [avatar_row("a", "training_time", minutes, subject, seed=seed) for subject in SUBJECTS]
+        Rows.of(rows).write(folder.rows)
+        write_manifest(folder, METRICS[:1] + METRICS[3:], {"a": None}, {"novel_view": "h"}, seeds=(seed,))
+        folders.append(str(folder.root))
+    for order in (folders, folders[::-1]):
+        found = recommend(RecommendSettings(tuple(order), task="novel_view")).data
+        assert (found["quality"], found["costs"]) == (31.0, {"seconds": 180.0})
+
+
 def test_choices_without_a_measured_cost_are_named(tmp_path, write_manifest):
     folder, rows = RunFolder(tmp_path / "run"), []
     for method in ("known", "unknown"):
