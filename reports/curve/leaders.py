@@ -24,12 +24,13 @@ class Leader:
     Attributes
     ----------
     start : float
-        The cost from which on the method is best: where its curve crosses that of the leader before.
+        The cost from which on the method is best: where its curve crosses that of the leader before, or its lowest cost.
     interval : tuple[float | None, float | None] | None
         Costs around ``start`` at which the 95 % interval of the paired difference of both methods contains 0; None at an end
-        that lies beyond the measured costs, or in all for the first leader and with too few subjects for an interval.
+        that lies beyond the measured costs. None in all for the first leader, for one that is best from its lowest cost on, whose
+        curve crosses none, and with too few subjects for an interval.
     measured : tuple[float, float]
-        The lowest and the highest measured cost.
+        The lowest and the highest cost at which the method and the leader before it have values.
     """
 
     method: str
@@ -69,8 +70,12 @@ def leaders(lines: Lines, *, higher_is_better: bool) -> list[Leader]:
         name = names[best[place]]
         if not known[place] or (found and found[-1].method == name):
             continue
-        around = _around(values[name] - values[found[-1].method], place, grid) if found else None
-        found.append(Leader(name, float(grid[place]), around, (min(costs), max(costs))))
+        compared = [lines[name], *(lines[leader.method] for leader in found[-1:])]
+        lowest = max(min(own[subject])[0] for own in compared for subject in subjects)
+        around = None
+        if found and np.isfinite(values[name][:, place - 1]).all():
+            around = _around(values[name] - values[found[-1].method], place, grid)
+        found.append(Leader(name, float(grid[place]), around, (lowest, max(costs))))
     return found
 
 

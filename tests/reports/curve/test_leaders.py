@@ -53,12 +53,23 @@ def test_a_method_takes_part_from_its_lowest_cost_on():
     ]
 
 
-def test_the_interval_ends_where_a_method_has_no_value_yet():
+def test_a_method_that_is_best_from_its_lowest_cost_on_crosses_no_other():
     short = {f"s{n}": [(4.0, 5.0 + n), (64.0, 5.0 + n)] for n in range(3)}
     late = {f"s{n}": [(19.0 + n, 9.0 + n), (64.0, 9.0 + n)] for n in range(3)}
     _, second = leaders({"short": short, "late": late}, higher_is_better=True)
     assert second.start == pytest.approx(21.0, rel=0.01)
-    assert second.interval == (None, second.start)  # apart at once
+    assert second.interval is None
+    assert second.text() == f"`late` from {second.start:.3g}"
+
+
+def test_an_interval_is_open_below_the_lowest_cost_of_a_method():
+    """Of two lines that cross at 32, the rising one is measured from 16 on."""
+    offsets = (-3.0, 0.0, 3.0)
+    short = {f"s{n}": [(4.0, 5.0), (64.0, 5.0)] for n in range(3)}
+    late = {f"s{n}": [(16.0, 4.0 + offset), (64.0, 6.0 + offset)] for n, offset in enumerate(offsets)}
+    _, second = leaders({"short": short, "late": late}, higher_is_better=True)
+    assert second.start == pytest.approx(32.0, rel=0.01)
+    assert second.text() == f"`late` from {second.start:.3g} [below 16, above 64]"
 
 
 def test_costs_of_zero_are_compared_on_a_linear_axis():
