@@ -184,8 +184,12 @@ def write_curve(path: Path, curve: CurveData) -> None:
         [_panel(curve.means, spec, task, axis, curve.missing) for spec in curve.of_frames]
         for task in curve.tasks
     ]
-    where = f"{curve.every}th training timestep" if curve.every > 2 else "second training timestep"
-    note = f"Held out of every training: a training camera, every {where}. No test frame was looked at."
+    left_out = {
+        "novel_view": "a training camera",
+        "self_reenactment": f"one of {curve.every} consecutive training timesteps",
+    }
+    held = " and ".join(left_out[task] for task in curve.tasks)
+    note = f"Held out of every training: {held}. No test frame was looked at."
     count = len(curve.subjects)
     if count >= LEAST_SUBJECTS:
         note += f" Bars: 95 % intervals of the mean over {count} subjects."

@@ -5,6 +5,7 @@ from fractions import Fraction
 import pytest
 
 from headbench.bench.contracts import Budget
+from headbench.reports.curve import curve
 from headbench.reports.curve.points import CurvePoint, mean_point
 
 
@@ -38,3 +39,21 @@ def test_a_mean_has_an_interval_from_three_subjects(values, mean, half):
     found = mean_point(points)
     assert (found.values["psnr"], found.cost["megabytes"]) == (mean, 2.0)
     assert found.halves["psnr"] == (None if half is None else pytest.approx(half))
+
+
+@pytest.mark.parametrize(
+    ("tasks", "says"),
+    [
+        (
+            ("novel_view", "self_reenactment"),
+            "a training camera and one of 3 consecutive training timesteps.",
+        ),
+        (("self_reenactment",), "Held out of every training: one of 3 consecutive training timesteps."),
+    ],
+)
+def test_the_plot_says_what_is_held_out(monkeypatch, tmp_path, tasks, says):
+    notes = []
+    monkeypatch.setattr(curve, "write_plot", lambda path, rows, cost, note: notes.append(note))
+    empty = curve.CurveData("cameras", ["s"], [], [], [], tasks, "seconds", {}, 3, {}, {})
+    curve.write_curve(tmp_path / "curve.png", empty)
+    assert says in notes[0]
