@@ -24,8 +24,8 @@ def label_of(method: str, condition: str) -> str:
 
 def part_of_text(text: str, name: str) -> Fraction:
     """A part as a number. Raises `ValueError` for text that is not a part above 0 and at most 1."""
-    # Bounded, since a long exponent would keep `Fraction` busy for hours.
-    known = re.fullmatch(r"\d{1,6}(\.\d{1,12})?(/\d{1,6})?", text)
+    # Bounded, since a long exponent would keep `Fraction` busy for hours. A fraction as it is written after reduction is known, too.
+    known = re.fullmatch(r"\d{1,6}(\.\d{1,12})?(/\d{1,6})?|\d{1,18}/\d{1,18}", text)
     parts = text.split("/") if known else ["0"]
     value = Fraction(parts[0]) / (int(parts[1]) if len(parts) > 1 and int(parts[1]) else 1)
     if not 0 < value <= 1 or (len(parts) > 1 and not int(parts[1])):

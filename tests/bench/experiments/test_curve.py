@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from headbench.bench import cli
+from headbench.bench.condition import Condition, part_of_text
 from headbench.bench.contracts import Budget
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.store import RunFolder
@@ -265,6 +266,13 @@ def test_with_one_camera_timesteps_alone_are_held_out(plugin, tmp_path):
 def test_settings_out_of_range_are_refused(changes, match):
     with pytest.raises(ValueError, match=match):
         CurveSettings("run", **changes)
+
+
+@pytest.mark.parametrize("text", ["1/3", "0.25", "0.333333", "0.123456789012", "0.123456789012/999999"])
+def test_a_part_is_known_as_it_is_written_after_reduction(text):
+    assert Condition("part", budget=str(Condition("part", budget=text).part)).part == part_of_text(
+        text, "fractions"
+    )
 
 
 @pytest.mark.parametrize(
