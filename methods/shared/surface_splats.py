@@ -84,8 +84,9 @@ class HeadSurface(PointSurface):
     def axes(self, arguments: Mapping[str, Tensor], vertices: Tensor) -> tuple[Tensor, Tensor]:
         """See `PointSurface.axes`."""
         root, neck = (axis_angle_to_quaternion(arguments[name]) for name in ("rotation", "neck"))
+        # The shorter way from root to head: the real part of their quotient, the neck's, is not negative.
+        neck = torch.where(neck[:, :1] < 0, -neck, neck)
         head = apply_matrices(left_products(root).flatten(1), neck)
-        # The shorter way from one to the other, as the real part of their quotient, the neck's, is not negative.
         turns = normalize(head + self._of_root * (root - head), dim=1)
         return quaternion_to_matrix(turns), turns
 

@@ -22,3 +22,15 @@ def test_axes_follow_the_neck_where_the_surface_does(clip):
         np.testing.assert_allclose((end.inv() * found).magnitude(), part * neck.magnitude(), atol=0.005)
     assert share.max() > 0.5
     assert share.min() == 0
+
+
+def test_axes_of_a_neck_beyond_half_a_turn_are_those_of_the_shorter_turn(clip):
+    mesh = clip_mesh(clip, "cpu")
+    faces, vertices = clip.head.faces, mesh.canonical.numpy()
+    surface = HeadSurface(mesh, poisson_disk(vertices, faces, np.arange(len(faces)), 400, 0))
+    neck = np.array([0.5, 0.0, -0.2])
+    longer = neck * (1 - 2 * np.pi / np.linalg.norm(neck))
+    found, expected = (
+        surface.posed(mesh.arguments([replace(clip.poses[0], neck=each)])).rotation for each in (longer, neck)
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-4)
