@@ -24,7 +24,7 @@ from .config import SurfaceSettings
 from .image_training import ImageTrainer
 from .loop import Fit
 from .method import TrainedMethod
-from .networks import tracked_inputs
+from .networks import input_count, tracked_inputs
 from .rendering import LastPose, PlacedSplats, StoredSplatAvatar
 from .schedule import Sampler
 from .subject_mesh import BoundedCache, SubjectMesh, TrainingPoses
@@ -256,6 +256,9 @@ class SurfaceTrainer(ImageTrainer, Generic[Config]):
         )
         self.rest = self.points.positions(vertices, np.asarray(clip.head.faces))
         self._surface = self.stored_class.surface(self._mesh, self.points, clip.head, config)
+        if not input_count(clip.head, inputs):
+            expected = "at least one tracked parameter of the head model"
+            raise InputError(f"clip {clip.subject}", "inputs", expected, ", ".join(inputs))
         self._tracked = TrainingPoses(clip, self._mesh)
         self._inputs = tracked_inputs(self._tracked.arguments, inputs)
         entries = config.mesh_cache_mb * 2**20 // (4 * 17 * len(self.rest))

@@ -391,6 +391,12 @@ def test_settings_out_of_range_are_refused(settings, says):
         RGBAvatarConfig(**settings)
 
 
+def test_inputs_that_the_head_model_lacks_alone_are_refused(clip):
+    without = replace(clip, head=replace(clip.head, eyelid_basis=None))
+    with pytest.raises(InputError, match=r"inputs: expected .* of the head model, found eyelids"):
+        make(without, inputs=("eyelids",))
+
+
 def test_a_batch_larger_than_the_capture_takes_all_its_images(clip):
     training = make(clip, batch=100)
     assert sorted(training._batches.batch(1)) == list(range(len(clip.splits["train"])))
