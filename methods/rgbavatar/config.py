@@ -15,6 +15,8 @@ INPUTS = ("expression", "neck", "jaw", "eyes", "eyelids", "translation")
 """Tracked parameters that the weights may depend on."""
 PUBLISHED_SAMPLES = 60_000
 """Number of splats for which the published size at the start is given: texels of 256 x 256 that show FLAME, rounded."""
+LOCAL = 150
+"""Number of newest images that ``online`` draws from, see `OnlineBatches`."""
 OFFICIAL_LEAST = 0.1
 """Weight of a splat in a pixel above which the pixel counts for its initial colour in the authors' program."""
 
@@ -112,8 +114,12 @@ class RGBAvatarConfig(SurfaceSettings):
             raise ValueError(
                 f"color_weight must be above 0 with color_init_variant=official, found {self.color_weight}"
             )
+        if not self.color_weight >= 0:
+            raise ValueError(f"color_weight must not be negative, found {self.color_weight}")
         if self.online and self.together != 1:
             raise ValueError(f"together must be 1 with online, found {self.together}")
+        if self.online and self.batch > LOCAL:
+            raise ValueError(f"batch must be at most {LOCAL} with online, found {self.batch}")
         if not 0 <= self.ssim_weight <= 1:
             raise ValueError(f"ssim_weight must lie in [0, 1], found {self.ssim_weight}")
 

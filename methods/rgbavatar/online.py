@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..shared.schedule import Batches, numpy_generator
+from .config import LOCAL
 
-LOCAL, GLOBAL = 150, 1_000
-"""Newest frames, and frames kept of all older ones."""
+GLOBAL = 1_000
+"""Number of kept frames of those older than the newest `LOCAL`."""
 MOST_GLOBAL, RAMP = 0.7, 599
 """Maximum share of draws from the older frames, and the number of older frames from which on it holds."""
 
@@ -26,7 +27,7 @@ class OnlineBatches(Batches):
     order : Sequence[int]
         Indices of the images in the order of their arrival.
     size : int
-        Images of a batch; fewer before that many have arrived.
+        Images of a batch, at most `LOCAL`; fewer before that many have arrived.
     trained : int
         Images trained on for each that arrives.
     """

@@ -378,6 +378,8 @@ def test_timed_steps_give_no_colours(clip, variant):
     ("settings", "says"),
     [
         ({"color_init_variant": "official", "color_weight": 0.0}, "color_weight"),
+        ({"color_weight": -1.0}, "color_weight must not be negative"),
+        ({"online": True, "batch": 151}, "batch must be at most 150"),
         ({"samples": 0}, "samples"),
         ({"inputs": ()}, "inputs"),
         ({"inputs": ("smile",)}, "inputs"),
