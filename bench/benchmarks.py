@@ -77,7 +77,7 @@ def _cell(value: Any) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class StressSettings:
-    """Exit code 1 where a case does not behave as expected."""
+    """Exit code 1 if a case does not behave as expected."""
 
     part: tyro.conf.Positional[str]
     """What to measure: splats, or what `headbench list benchmarks` shows."""
@@ -89,12 +89,12 @@ class StressSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class BenchSettings(StressSettings):
-    """What is compared is timed in turns, and each table says whether times are processor times or by the clock, and of
-    how many threads; compare ratios, not milliseconds, between machines.
+    """Compared variants are timed alternately. Each table states whether times are processor time or wall-clock time, and the number
+    of threads. Between machines compare ratios, not milliseconds.
     """
 
     tradeoffs: bool = False
-    """Measure the speed and accuracy of approximate settings instead of speed alone."""
+    """Measure speed and accuracy of approximate settings instead of only speed."""
 
 
 def bench(settings: BenchSettings, progress: Progress) -> CommandResult:

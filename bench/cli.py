@@ -53,7 +53,7 @@ def _described(error: OSError) -> str:
     if error.errno == errno.EEXIST and os.path.isfile(error.filename or ""):
         reason = "expected a folder, found a file"  # a folder that is made may be there, a file may not
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
-    remedy = ". Make room (or let it be written) and start again." if full else ""
+    remedy = ". Free disk space or allow writing, then start again." if full else ""
     return f"{'' if error.filename is None else f'{error.filename}: '}{reason}{remedy}"
 
 

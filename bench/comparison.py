@@ -56,19 +56,19 @@ Assignments = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.ar
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """Needs no data, no accelerator and no network. Everything is written to OUT: the capture, the avatars, the renders,
-    tables (Markdown, CSV, LaTeX) and contact_sheet.png. Started again after a kill it continues.
+    """Needs no data, no accelerator and no network. Everything is written to OUT: the capture, the avatars, the renders, tables
+    (Markdown, CSV, LaTeX) and contact_sheet.png. If it is interrupted, the same command continues it.
     """
 
     out: str = "demo-output"
-    """Folder for everything the demo makes."""
+    """Output folder."""
     preset: Preset = "demo"
     """Preset: smoke takes seconds and gives no meaningful quality; demo takes minutes."""
     seed: int = 0
-    """Seeds the training."""
+    """Seed of the training."""
     set: Assignments = ()
-    """Change a setting of the run, as for `headbench run`; repeatable. `capture.size=96x136`, `capture.subject_seed=3`
-    and the like change the capture."""
+    """Change a setting of the run, as for `headbench run`; repeatable. `capture.size=96x136`, `capture.subject_seed=3` and
+    similar settings change the capture."""
 
 
 def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
@@ -98,9 +98,9 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
 
 @dataclass(frozen=True)
 class RunSettings:
-    """Settings come from --config, then from the options here, then from --set. A run that was killed continues
-    when started again. Exit code 0: all done; 1: some method failed (the table shows which and why); 2: bad input,
-    found before any training.
+    """Settings come from --config, then from the options here, then from --set. The same command continues a run that was
+    killed. Exit code 0: all done; 1: some method failed (the table shows which and why); 2: bad input, found before any
+    training.
     """
 
     data: str | None = None
@@ -113,26 +113,26 @@ class RunSettings:
     """Names, separated by commas; see `headbench list methods`. Default:
     mean-image,nearest-camera,ga,ours."""
     preset: str | None = None
-    """How much training: smoke (seconds), demo (minutes), fast, paper (the published schedule), or another that each
-    method of the run has: those above. Default: fast."""
+    """Length of the training: smoke (seconds), demo (minutes), fast, paper (the published schedule), or another preset that all
+    methods of the run have, as listed above. Default: fast."""
     config: str | None = None
     """YAML file with any settings of a run."""
     head: str | None = None
     """Head model of captures that do not contain one: FLAME pickle or npz."""
     protocol: tuple[str, ...] = ()
-    """Published protocols whose metrics and regions are measured, too, and whose tasks are: names of `headbench list protocols`.
-    `headbench table --protocol NAME` prints the table of one."""
+    """Published protocols (`headbench list protocols`) whose tasks, metrics and regions are also measured. `headbench table
+    --protocol NAME` prints the table of one."""
     seeds: str | None = None
     """Seeds of the training, separated by commas: an avatar is trained for each. Default: 0."""
     executor: ExecutorName | None = None
-    """Where cells (a subject, a method, a seed) run: inline, one after another; processes, several at once on this machine;
-    slurm, a job for each. Default: inline."""
+    """How cells (a subject, a method, a seed) are executed: inline, one after another; processes, several at once on this
+    machine; slurm, one job for each. Default: inline."""
     workers: int | None = None
     """Number of processes, with `--executor processes`. Default: one for each core."""
     unchecked: bool = False
     """Train even if `headbench lint` finds an error that makes the results of a capture meaningless."""
     dry_run: bool = False
-    """Check everything and list the cells with the time, disk and memory that each will probably take; train nothing."""
+    """Check everything and list the cells with estimates of their time, disk space and memory; train nothing."""
     estimates: str | None = None
     """With --dry-run: folder of an earlier run on a machine like this one, to estimate from; that of --out is always used."""
     set: Assignments = ()

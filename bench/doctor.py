@@ -24,8 +24,8 @@ class DoctorSettings:
     """
 
     methods: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Methods to check and to decide the exit code by: names or "module:SPEC"; by default all are checked,
-    and the default methods decide. Official repositories are checked if settings name their checkout."""
+    """Methods to check, which also decide the exit code: names or "module:SPEC". By default all are checked, and the default
+    methods decide the exit code. Official repositories are checked if settings name their checkout."""
 
     device: str = "cpu"
     """Device that the methods run on: cpu, cuda, cuda:1, ..."""

@@ -36,7 +36,7 @@ class ListSettings:
     layout `headbench table` can print, and `protocols` are evaluation protocols of papers."""
 
     cite: bool = False
-    """With methods: their sources, BibTeX entries, and the figures that papers printed for them."""
+    """With methods: their sources, BibTeX entries, and the values that papers report for them."""
 
     def __post_init__(self) -> None:
         """Refuse citations of anything but methods."""

@@ -91,9 +91,7 @@ def check_device_answers(device: str) -> None:
         resolve("torch:cuda").synchronize(device)
     except RuntimeError as error:
         first = next(iter(str(error).splitlines()), "")
-        message = (
-            f"{device} answers this process no more: {first}. Start the command again; what is done is kept."
-        )
+        message = f"{device} no longer responds to this process: {first}. Start the command again; finished work is kept."
         raise HeadbenchError(message) from error
 
 

@@ -499,8 +499,8 @@ class Rows:
         for task in sorted(self.tasks):
             found = self.protocols(task)
             if len(found) > 1:
-                wanted = "one protocol: numbers of different protocols do not compare"
-                remedy = "Take the rows of each protocol for themselves."
+                wanted = "one protocol: values of different protocols are not comparable"
+                remedy = "Use the rows of each protocol separately."
                 raise InputError(source, f"protocol of {task}", wanted, ", ".join(found), remedy)
             if expected is not None and found != [expected.get(task)]:
                 raise InputError(source, f"protocol of {task}", str(expected.get(task)), found[0])

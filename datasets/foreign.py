@@ -113,7 +113,7 @@ def _nersemble(path: Path, names: list[str]) -> Foreign | None:
     some = ",".join(subjects[:3])
     command = f"headbench prepare nersemble --root {_quoted(root)} --tracking VHAP --out captures"
     command += f" --subjects {some}" if some else ""
-    return Foreign("a raw NeRSemble recording", f"Make captures of it: {command}")
+    return Foreign("a raw NeRSemble recording", f"Make captures from it: {command}")
 
 
 def _nested(path: Path, names: list[str]) -> Foreign | None:
@@ -144,7 +144,7 @@ def _tracked(path: Path, names: list[str]) -> Foreign | None:
         ),
         (
             "the files of Metrical Tracker or Pixel3DMM (checkpoint/*.frame)",
-            f"Make a capture of them: headbench import tracking {_quoted(path)} --head FLAME2020/generic_model.pkl --out capture",
+            f"Make a capture from them: headbench import tracking {_quoted(path)} --head FLAME2020/generic_model.pkl --out capture",
             lambda name: name == "checkpoint" and any((path / name).glob("*.frame")),
         ),
         (

@@ -26,7 +26,7 @@ COLMAP = DatasetSpec(
 
 MONOCULAR = DatasetSpec(
     name="monocular",
-    summary="A tracked video of one camera, as INSTA and Metrical Tracker or IMavatar and PointAvatar lay it out.",
+    summary="A tracked video of one camera, in the layout of INSTA and Metrical Tracker, or of IMavatar and PointAvatar.",
     implementation="headbench.datasets.monocular.reader:read_video",
     errors=ERRORS,
     find="headbench.datasets.monocular.reader:find_videos",
@@ -43,14 +43,14 @@ SYNTHETIC = DatasetSpec(
 
 HEAD = BenchmarkSpec(
     name="head",
-    summary="the head model: time of a forward pass, fast beside readable path; numerical extremes",
+    summary="the head model: time of a forward pass, fast and readable implementation; numerical extremes",
     speed="headbench.datasets.benchmarks.head:speed",
     stress="headbench.datasets.benchmarks.head:stress",
 )
 
 REFIT = BenchmarkSpec(
     name="refit",
-    summary="the refit to another head model: residuals, timesteps a second",
+    summary="the refit to another head model: residuals, timesteps per second",
     speed="headbench.datasets.benchmarks.refit:speed",
 )
 
@@ -130,14 +130,14 @@ TRACKED = ConditionSpec(
 
 RIGID_HEAD = ConditionSpec(
     name="rigid-head",
-    summary="Clip: the rotation of the neck moved into the motion of the head, as trackers without a neck joint have it.",
+    summary="Clip: the rotation of the neck moved into the motion of the head, as in trackers without a neck joint.",
     kind="clip",
     implementation="headbench.datasets.steps.rigid:as_rigid_head",
 )
 
 PACKED_CHART = ConditionSpec(
     name="packed-chart",
-    summary="Clip: texture coordinates for a head model without, in which every triangle has its own place.",
+    summary="Clip: texture coordinates for a head model without any, with a separate area for every triangle.",
     kind="clip",
     implementation="headbench.datasets.steps.charted:with_packed_chart",
 )
@@ -145,7 +145,7 @@ PACKED_CHART = ConditionSpec(
 IMPORT_TRACKING = CommandSpec(
     name="import tracking",
     group="data",
-    summary="Make a capture of the files of another tracker and the video's frames.",
+    summary="Make a capture from the files of another tracker and the frames of the video.",
     settings="headbench.datasets.tracker_files.settings:ImportTrackingSettings",
     function="headbench.datasets.tracker_files.command:import_tracking",
     writes="out",

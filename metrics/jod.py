@@ -99,7 +99,7 @@ def _spec(name: str, label: str, by: str, implementation: str, needs: str) -> Me
         higher_is_better=True,
         digits=2,
         implementation=f"headbench.metrics.jod:{implementation}",
-        summary=f"{by} of each sequence and camera as a video of {RATE} frames a second on a 4K display; 10 is equal.",
+        summary=f"{by} of each sequence and camera as a video of {RATE} frames per second on a 4K display; 10 is equal.",
         kind="sequence",
         needs=f"headbench.metrics.jod:{needs}",
     )

@@ -63,10 +63,10 @@ def _milliseconds(name: str, label: str, detail: str, summary: str) -> MetricSpe
     )
 
 
-LATENCY_P50 = _milliseconds("latency_p50", "p50", "p50_ms", "Median time of a frame, each waited for.")
-LATENCY_P95 = _milliseconds("latency_p95", "p95", "p95_ms", "95 % of frames take no longer.")
-LATENCY_P99 = _milliseconds("latency_p99", "p99", "p99_ms", "99 % of frames take no longer.")
-_STATIC = "Median time of a frame where neither camera nor pose changes."
+LATENCY_P50 = _milliseconds("latency_p50", "p50", "p50_ms", "Median latency, one frame at a time.")
+LATENCY_P95 = _milliseconds("latency_p95", "p95", "p95_ms", "95th percentile of the latency.")
+LATENCY_P99 = _milliseconds("latency_p99", "p99", "p99_ms", "99th percentile of the latency.")
+_STATIC = "Median latency if neither camera nor pose changes."
 LATENCY_STATIC = _milliseconds("latency_static", "Static pose", "static_ms", _STATIC)
 _PROCESSOR = "Processor time of a frame, all threads together."
 PROCESSOR_TIME = _milliseconds("processor_time", "CPU", "processor_ms", _PROCESSOR)
@@ -79,14 +79,14 @@ def _stage(name: str, label: str, what: str) -> MetricSpec:
 STAGE_DRIVE = _stage("drive", "Drive", "from driving signal to mesh and features")
 STAGE_DEFORM = _stage("deform", "Deform", "from mesh to primitives as the camera sees them")
 STAGE_RASTERIZE = _stage("rasterize", "Rasterize", "from primitives to image")
-STAGE_POST = _stage("post", "Post", "of what changes the image afterwards")
+STAGE_POST = _stage("post", "Post", "of the post-processing of the image")
 STAGE_READ_BACK = _stage("read_back", "Read-back", "to bring the image into host memory")
 THROUGHPUT = replace(
     FPS,
     name="throughput",
     label="Throughput",
     detail="throughput_fps",
-    summary="Frames per second with up to 8 frames under way before the oldest is waited for.",
+    summary="Frames per second with up to 8 frames in flight.",
     tables=("speed",),
 )
 
@@ -95,7 +95,7 @@ FPS_ONE_THREAD = replace(
     name="fps_one_thread",
     label="1 thread",
     detail="one_thread_fps",
-    summary="The same on one thread.",
+    summary="Frames per second, as fps, on one thread.",
     tables=("speed",),
 )
 FPS_WITHOUT_HEAD = replace(
@@ -103,7 +103,7 @@ FPS_WITHOUT_HEAD = replace(
     name="fps_without_head",
     label="1 thread, without head model",
     detail="without_head_fps",
-    summary="The same on one thread, from the posed mesh: without the stage from driving signal to mesh and features.",
+    summary="Frames per second on one thread, from the posed mesh: without the stage from driving signal to mesh and features.",
 )
 
 WHITE = (1.0, 1.0, 1.0)

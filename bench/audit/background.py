@@ -50,7 +50,7 @@ def check_background(clip: Clip, renders: Mapping[FrameKey, Render]) -> None:
         renders[wrong[0][0]].image,
         "background",
         expected,
-        f"{_rgb(found)} (in {len(wrong)} of {len(judged)} frames looked at)",
+        f"{_rgb(found)} (in {len(wrong)} of {len(judged)} frames checked)",
         f"Composite the renders on {_rgb(declared)}, or score them as they are with --any-background.",
     )
 

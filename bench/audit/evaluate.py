@@ -234,9 +234,9 @@ def find_images(
         first = "; ".join(f"{task} {key}" for task, key in missing[:SHOWN])
         if named is None:
             looked = ", ".join(str(p.relative_to(folder)) for p in _places(folder, *missing[0], len(clips)))
-            remedy = f"The first was looked for as {looked}; other names are told by --names."
+            remedy = f"The first one was expected as {looked}; give other names with --names."
         elif missing[0][1] in named:
-            remedy = f"The first was looked for as {named[missing[0][1]].image}."
+            remedy = f"The first one was expected as {named[missing[0][1]].image}."
         else:
             remedy = (
                 f"{names} names none for the first. Leave a task out with --tasks, or render all its frames."

@@ -18,7 +18,7 @@ from ..specs import LABEL, is_label
 
 @dataclass(frozen=True)
 class VerifySettings(RunOptions, ExecutionOptions):
-    """Recompute hashes and metrics of runs from the files they left; state what was not verified.
+    """Recompute hashes and metrics of runs from their stored files, and state what was not verified.
 
     Of a bundle the listed digests are checked, and with renders in it all metrics of frames as well: against the capture
     that --data names, or for a synthetic one against a capture made again from the recorded seed. Definitions of metrics and
@@ -44,10 +44,10 @@ class VerifySettings(RunOptions, ExecutionOptions):
 
 @dataclass(frozen=True)
 class BundleSettings:
-    """Write the results of a finished run to one file that a leaderboard takes and `headbench verify` checks.
+    """Write the results of a finished run to one file for a leaderboard and for `headbench verify`.
 
-    It holds the rows and records of a run with the digest of each file, and no folder names of this machine; no images
-    unless requested. Licensed data stay out: renders of real people only with their consent.
+    It holds the rows and records of a run with the digest of each file, and no folder names of this machine; no images unless
+    requested. It contains no licensed data. Add renders of real people only with their consent.
     """
 
     run: tyro.conf.Positional[str]
@@ -57,10 +57,10 @@ class BundleSettings:
     """File to write, for example NAME.zip."""
 
     by: str
-    """Who submits it, as a leaderboard shows it."""
+    """Name of the submitter on a leaderboard."""
 
     link: str = ""
-    """Web address with more, such as that of a paper or a repository."""
+    """Web address, such as that of a paper or a repository."""
 
     comment: str = ""
     """Anything else, one line."""
@@ -89,19 +89,19 @@ def check_shown(submission: Any, source: str) -> None:
 
 @dataclass(frozen=True)
 class EvaluateSettings(ExecutionOptions):
-    """Score a folder of images named by key, so that a method needs no plug-in to be compared, or a stored avatar.
+    """Score a folder of images, made without a plug-in, or a stored avatar.
 
-    An image is SEQUENCE_TIMESTEP_CAMERA.png (timestep of five digits), as `headbench run` names its renders: 8-bit RGB
-    PNG of the ground truth's size, composited on the capture's background. It lies in FOLDER itself, in a folder named after
-    the task, or in renders/TASK; with several subjects, in a folder named after the subject. A cell of a run
-    (SUBJECT/METHOD/seed-N) has this layout, too. Other names are given with --names.
+    An image is SEQUENCE_TIMESTEP_CAMERA.png (timestep of five digits), as `headbench run` names its renders: 8-bit RGB PNG of
+    the ground truth's size, composited on the capture's background. It lies in FOLDER itself, in a folder named after the task,
+    or in renders/TASK; with several subjects, in a folder named after the subject. A cell of a run (SUBJECT/METHOD/seed-N) also
+    has this layout. Give other names with --names.
     """
 
     folder: tyro.conf.Positional[str]
     """Folder with the images, or with --avatar that of an avatar as `headbench render` takes it."""
 
     out: str
-    """Folder to write: that of a run with one method, which every report, `table`, `compare` and `verify` read."""
+    """Folder to write: a run with one method, which `table`, `compare`, `verify` and every report can read."""
 
     clip: str | None = None
     """Capture to score against (or folder of several); default: that of the run named by --like."""
@@ -129,7 +129,7 @@ class EvaluateSettings(ExecutionOptions):
     """Run whose protocols to follow: capture, reader and its settings, tasks, frames, metrics are taken from it."""
 
     tasks: tuple[TaskName, ...] = ("novel_view", "self_reenactment")
-    """What to score. Not with --like, whose run decides it."""
+    """Tasks to score. Not with --like, whose run decides it."""
 
     metrics: tuple[str, ...] = ()
     """Metrics of frames to compute; default: those of `headbench run`. Not with --like."""
@@ -168,10 +168,10 @@ class FramesSettings(RunOptions):
     """List the frames that `headbench evaluate` scores, for renders that are made outside of headbench.
 
     Writes OUT/frames.csv, one row for each frame: task, key (subject, sequence, timestep, camera), the file name that
-    `headbench evaluate` expects in a folder of images, size, background, intrinsics in pixels (the centre of the top left
-    pixel is at 0.5, 0.5), the first three rows of the 4 x 4 world-to-camera matrix (OpenCV axes, metres), and the file
-    with the tracking parameters of the timestep, where the capture has one. OUT/MAP.csv has the same frames in the form
-    that `headbench evaluate --names` takes: replace the names in its column file by those of your renders.
+    `headbench evaluate` expects in a folder of images, size, background, intrinsics in pixels (the centre of the top left pixel
+    is at 0.5, 0.5), the first three rows of the 4 x 4 world-to-camera matrix (OpenCV axes, metres), and the file with the
+    tracking parameters of the timestep, where the capture has one. OUT/MAP.csv has the same frames in the format of `headbench
+    evaluate --names`: replace the names in its column file by those of your renders.
     """
 
     source: tyro.conf.Positional[str]

@@ -95,7 +95,7 @@ class Findings:
         checked = f"{self.files} files and {self.values} values"
         verdict = f"{checked} as recorded." if checked and not self.mismatches else ""
         if self.mismatches:
-            verdict = f"{len(self.mismatches)} mismatches: {checked} computed again."
+            verdict = f"{len(self.mismatches)} mismatches: {checked} recomputed."
         elif not self.values:
             verdict = f"{self.files} files as listed. No value was recomputed."
         lines = [f"  {mismatch}" for mismatch in self.mismatches[:SHOWN]]
@@ -193,7 +193,7 @@ def verify(
     known, methods = known_metrics(), known_methods()
     findings.mismatches += contradictions(manifest, folder.manifest, known, methods)
     if bundle is not None:
-        findings.unverified |= dict.fromkeys(("author", "link", "comment"), "the author's own words")
+        findings.unverified |= dict.fromkeys(("author", "link", "comment"), "the author's statement")
     if bundle is not None and not bundle.renders:
         findings.files = len(bundle.files)
         lacking = lacking_frames(check_results(folder, manifest), manifest)

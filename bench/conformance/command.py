@@ -24,7 +24,7 @@ from .metrics import check_metric
 
 @dataclass(frozen=True)
 class CheckPluginSettings:
-    """Try a method, a reader or a metric and list every breach of its contract.
+    """Test a method, a reader or a metric and list every violation of its contract.
 
     Exit code 0: it conforms; 1: it does not; 2: wrong usage, or the plug-in cannot be imported.
     """
@@ -33,11 +33,10 @@ class CheckPluginSettings:
     """The plug-in: "package.module:SPEC", or a name that `headbench list` shows."""
 
     kind: Literal["methods", "datasets", "metrics"] | None = None
-    """What it is, where several have the name."""
+    """Kind of the plug-in, if several kinds have this name."""
 
     data: str | None = None
-    """Capture: for a reader one in its layout (required); for a method default: a tiny synthetic one, made on the
-    spot."""
+    """Capture: for a reader one in its layout (required); for a method by default a tiny synthetic one, made by the command."""
 
     reader: str = ""
     """Which reader opens --data for a method; default: the one that finds it."""

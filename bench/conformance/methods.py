@@ -48,7 +48,7 @@ def refusal(call: Callable[[], Any], what: str, *, expected: type[Exception] = I
     except Exception as error:  # noqa: BLE001
         yield f"{what} raised {described(error)} instead of {expected.__name__}"
     else:
-        yield f"{what} was taken instead of refused by {expected.__name__}"
+        yield f"{what} was accepted instead of raising {expected.__name__}"
 
 
 def check_method(method: ResolvedMethod, clip: Clip, out: Path, *, device: str = "cpu") -> list[str]:
@@ -111,13 +111,13 @@ def _render_breaches(avatar: Avatar, loaded: Avatar, clip: Clip) -> Iterator[str
     for (camera, pose), frame in zip(reversed(views), reversed(first)):
         again = loaded.render(camera, pose)
         if not (np.array_equal(again.rgb, frame.rgb) and np.array_equal(again.alpha, frame.alpha)):
-            yield "a loaded avatar, asked in another order, renders something else"
+            yield "a loaded avatar renders different images if the frames are requested in another order"
             break
     camera, pose = views[0]
     black = avatar.render(camera, pose, (0.0, 0.0, 0.0))
     uncovered = black.alpha < 1e-3
     if uncovered.any() and np.abs(black.rgb[uncovered]).max() > 0.01:
-        yield "where alpha is 0 the background asked for does not show"
+        yield "the requested background is not visible where alpha is 0"
     # An avatar that knows no head model (an image, a folder of frames) has nothing to refuse.
     if hasattr(avatar, "splats"):
         other = replace(pose, head_model="some other model")

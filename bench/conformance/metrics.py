@@ -118,7 +118,7 @@ def _repeat_breaches(compare: Compare, spec: MetricSpec) -> Iterator[str]:
         yield "a value depends on what was compared before"
     with ThreadPoolExecutor(4) as pool:
         if list(pool.map(lambda pair: compare(*pair), pairs * 4)) != before * 4:
-            yield "a value differs when several threads compare at one time"
+            yield "a value differs if several threads compute the metric at the same time"
     image, truth = pairs[0]
     other = np.asfortranarray(np.concatenate([image, image], axis=1))[:, : image.shape[1]]
     if not math.isclose(compare(other, truth), before[0], rel_tol=TOLERANCE):
@@ -162,7 +162,7 @@ def _region_breaches(metric: Any, spec: MetricSpec) -> Iterator[str]:
     masks = {"left": left, "everything": np.ones(SIZE, np.bool_), "nothing": np.zeros(SIZE, np.bool_)}
     values = metric.in_regions(image, truth, masks)
     if set(values) != {"left", "everything"}:
-        yield f"in_regions names {', '.join(sorted(values))}; masks with a pixel are left and everything"
+        yield f"in_regions names {', '.join(sorted(values))}; it must name the masks with pixels: left and everything"
         return
     if not all(math.isfinite(value) for value in values.values()):
         yield "a region's value is not finite"

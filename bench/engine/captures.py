@@ -92,7 +92,7 @@ def finds(spec: DatasetSpec, root: Path) -> bool:
     except HeadbenchError:
         return False
     except Exception as error:  # noqa: BLE001 - a plug-in may fail in any way; the others must still be asked
-        log.warning("reader %s cannot look at %s: %s: %s", spec.name, root, type(error).__name__, error)
+        log.warning("reader %s cannot check %s: %s: %s", spec.name, root, type(error).__name__, error)
         return False
 
 

@@ -45,7 +45,7 @@ FINAL = {
 """Final states for which a restart would not help or is not wanted."""
 STUCK = {"PartitionTimeLimit", "PartitionNodeLimit", "BadConstraints", "JobHeldAdmin", "JobHeldUser"}
 """Reasons of pending jobs that are permanent."""
-WAITING = "jobs wait for %s, which does not pass. To give them other settings, end them by `scancel --name %s` and start again"
+WAITING = "jobs wait for %s, which does not resolve by itself. To change their settings, end them by `scancel --name %s` and start again"
 _THREADS = (
     "export OMP_NUM_THREADS=$SLURM_CPUS_PER_TASK",
     "export SRUN_CPUS_PER_TASK=$SLURM_CPUS_PER_TASK",  # which srun took from the job itself before Slurm 22.05
@@ -121,7 +121,7 @@ class Slurm:
                 self._jobs[task.place] = _Job(task, known, earlier=True)
         if self._jobs and len(left) < len(tasks):
             log.info(
-                "following %d jobs that were submitted before, with the settings of then",
+                "following %d jobs that were submitted before, with their earlier settings",
                 len(tasks) - len(left),
             )
         if left and not self._strays_gone:
@@ -146,7 +146,7 @@ class Slurm:
             self._unanswered += 1
             if self._unanswered > UNANSWERED:
                 raise
-            log.warning("%s; it is asked again", error)
+            log.warning("%s; trying again", error)
             return []
         self._unanswered = 0
         found = []
@@ -166,7 +166,7 @@ class Slurm:
         """Leave the jobs to the cluster; remove the list if all have ended."""
         if self._jobs:
             log.info(
-                "%d jobs are left to the cluster; `headbench status` shows those of a run, the same command follows them",
+                "%d jobs continue on the cluster; `headbench status` shows their state, the same command attaches to them again",
                 len(self._jobs),
             )
         else:

@@ -67,7 +67,7 @@ def run_status(run: Path) -> CommandResult:
     text = f"{run}: {len(cells)} cells: {', '.join(f'{counts[state]} {state}' for state in STATES)}"
     speed = sum(cell.note == SPEED for cell in cells)
     if speed:
-        text += f"; {speed} of those waiting are done but for their speed, which is measured last"
+        text += f"; {speed} of those waiting lack only their speed, which is measured last"
     if left is not None:
         text += f"; {'more than' if bound else 'about'} {duration(left)} left"
     told = [cell for state in ("failed", "running") for cell in cells if cell.state == state]

@@ -23,10 +23,10 @@ Over: TypeAlias = Literal["budget", "seconds", "cameras", "timesteps", "pictures
 
 @dataclass(frozen=True)
 class CurveSettings(RunOptions, ExecutionOptions):
-    """Quality against training time, cameras, timesteps, pictures or tracking error: trains each method with parts of them.
+    """Quality against training time, cameras, timesteps, images or tracking error. Each method is trained with parts of them.
 
-    Each part, number or level is a whole training of its own. Quality is measured on training frames that are held out of every training,
-    the same for all parts, never on test frames."""
+    Each part, number or level is a separate training. Quality is measured on training frames that are held out of every
+    training, the same for all parts, never on test frames."""
 
     run: tyro.conf.Positional[str]
     """Folder of a finished run."""
@@ -38,16 +38,16 @@ class CurveSettings(RunOptions, ExecutionOptions):
     """Methods to train; default: all but the trivial baselines."""
 
     over: Over = "budget"
-    """What to take parts of (budget, cameras, timesteps) or a number of (seconds of training, pictures); or the error of tracking, of
-    a synthetic capture, whose pictures stay."""
+    """What is varied: fractions of budget, cameras or timesteps; numbers of seconds of training or of images (pictures); or the
+    tracking error of a synthetic capture, whose images stay the same."""
 
     fractions: tuple[str, ...] = ()
     """Parts of the method's budget, or of the training cameras or timesteps, above 0 and at most 1; default: 1/16 1/8 1/4 1/2
     1. Not with `--over tracking_error`."""
 
     seconds: tuple[float, ...] = ()
-    """Training times for `--over seconds`; default: 5 30 120. Trainings that a time ends are not reproducible to the bit. Not with
-    another `--over`."""
+    """Training times for `--over seconds`; default: 5 30 120. Trainings with a time limit are not bitwise reproducible. Not
+    with another `--over`."""
 
     pictures: tuple[int, ...] = ()
     """Numbers of training frames for `--over pictures`; default: 1 4 16. Not with another `--over`."""

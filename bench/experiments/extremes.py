@@ -259,9 +259,9 @@ def _judged(
     truths, missing = _truth(job)
     scores = TruthJudge(job.device)
     if truths is None:
-        log.warning("%s: there is no truth to compare with: %s", job.name, missing)
+        log.warning("%s: no ground truth: %s", job.name, missing)
     elif count := truths.missing([(plan.views[frame.view].camera, frame.pose) for frame in plan.frames]):
-        log.info("%s: path-tracing %d pictures of the truth, half a second or more each", job.name, count)
+        log.info("%s: path-tracing %d ground-truth images, at least half a second each", job.name, count)
     measured: list[Measures] = []
     compared: list[TruthPair | None] = []
     against: list[tuple[list[LimitCheck], list[LimitCheck]]] = []

@@ -46,7 +46,7 @@ FACING = 0.35
 SMOOTHING = 0.01
 """Deviation of the Gaussian that images are smoothed by, as a share of the head's height in the image."""
 LEAST_VERTICES = 20
-NO_APPEARANCE = "no recorded frames of that camera, or no parts that expressions leave alone, to compare with"
+NO_APPEARANCE = "no recorded frames of that camera, or no parts that expressions do not move"
 HIDDEN = ("teeth", "tongue", "eyeball", "lips", "mouth")
 """Regions by part of their name that lie behind others, or open and close over them."""
 
@@ -124,7 +124,7 @@ def identity(
         absent = "not finite" if appearance is not None else NO_APPEARANCE
         return LimitCheck("identity", None, 0.0, math.inf, absent)
     value = appearance.difference(sample(quantise(frame.rgb), camera, *appearance.parts.posed(pose)))
-    return LimitCheck("identity", value, 0.0, math.inf, "too little of the steady parts is seen")
+    return LimitCheck("identity", value, 0.0, math.inf, "too little of the static parts is visible")
 
 
 def of_recording(

@@ -13,8 +13,8 @@ from ..executors.options import ExecutionOptions
 
 @dataclass(frozen=True)
 class ExtremesSettings(RunOptions, ExecutionOptions):
-    """Render a run's avatars in new views and joint samples of expression and jaw; 1 where a limit is broken. Synthetic captures
-    have a path-traced truth for every pose and view."""
+    """Render a run's avatars in new views and in random poses of expression and jaw; exit code 1 if a limit is exceeded.
+    Synthetic captures have a path-traced ground truth for every pose and view."""
 
     run: tyro.conf.Positional[str]
     """Folder of a finished run."""
@@ -29,13 +29,13 @@ class ExtremesSettings(RunOptions, ExecutionOptions):
     """Views of the turntable, in even steps."""
 
     beyond: float = 30.0
-    """How far the turntable goes on beyond the outermost training cameras, degrees."""
+    """Angle of the turntable beyond the outermost training cameras, degrees."""
 
     dimensions: int = 8
     """Principal components of expression and jaw in training."""
 
     samples: int = 24
-    """Poses drawn jointly along all components, each seen in two views."""
+    """Number of random poses along all components, each rendered in two views."""
 
     sigmas: float = 3.0
     """Largest distance along a component, in standard deviations; never beyond the range of training."""
@@ -71,7 +71,7 @@ class ReenactSettings(RunOptions, ExecutionOptions):
     """Folder to write; default: `cross_reenactment` in the folder of the run."""
 
     source: str | None = None
-    """Capture (or folder of several) that drives; default: every other subject of the run."""
+    """Driving capture (or folder of several); default: every other subject of the run."""
 
     methods: tuple[str, ...] = ()
     """Methods to drive; default: all but the trivial baselines."""

@@ -32,7 +32,7 @@ CURVE = CommandSpec(
 EXTREMES_COMMAND = CommandSpec(
     name="run extremes",
     group="compare",
-    summary="Render views and poses beyond training; check against truth and stability limits.",
+    summary="Render views and poses beyond training; check against ground truth and stability limits.",
     settings="headbench.bench.experiments.robustness_settings:ExtremesSettings",
     function="headbench.bench.experiments.robustness:extremes_run",
 )
@@ -110,7 +110,7 @@ AGAINST_TRUTH = (
 
 EXTREMES = ConditionSpec(
     name="extremes",
-    summary="Renders new views and poses; checks them against the truth of synthetic captures, and stability limits.",
+    summary="Renders new views and poses; checks them against the ground truth of synthetic captures, and stability limits.",
     kind="drive",
     implementation="headbench.bench.experiments.extremes:drive",
     protocols="headbench.bench.experiments.extremes:protocols",

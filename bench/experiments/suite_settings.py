@@ -29,10 +29,11 @@ third other training seeds."""
 
 @dataclass(frozen=True)
 class SuiteSettings(ExecutionOptions):
-    """The whole benchmark: makes the suite's synthetic subjects, trains and measures methods on all, writes result tables.
+    """The whole benchmark: makes the synthetic subjects of the suite, trains and measures methods on all of them, and writes
+    result tables.
 
-    Subjects differ in shape, skin, hair and performance. Each is captured, trained and measured in a run of its own, so that finished
-    subjects can be kept apart from a machine. Started again after a kill it continues. Takes hours.
+    Subjects differ in shape, skin, hair and performance. Each subject has a separate run, so that subjects can be measured on
+    different machines. If it is interrupted, the same command continues it. Takes hours.
     """
 
     out: str
@@ -42,7 +43,7 @@ class SuiteSettings(ExecutionOptions):
     """Methods; default: those of `headbench demo`."""
 
     preset: str = "fast"
-    """How much training, as for `headbench run`, whose help lists the presets."""
+    """Preset, as for `headbench run`, whose help lists the presets."""
 
     seeds: tuple[int, ...] = (0,)
     """Seeds of the training."""
@@ -53,12 +54,13 @@ class SuiteSettings(ExecutionOptions):
 
     tracked: tuple[str, ...] = ()
     """Methods trained a second time, on tracking estimated from the images as by `headbench track`, as condition `tracked` of
-    the run; or "none". Default: those of ga, gbs, ours and ours-plus that run. Tracking takes about 1 second a timestep, once a
-    subject; each method one more training."""
+    the run; or "none". Default: those of ga, gbs, ours and ours-plus that run. Tracking takes about 1 second per timestep, once
+    per subject, and each method one more training."""
 
     tracked_ablations: tuple[str, ...] = ()
-    """Train ours with these parts left out or changed also under the conditions of --tracked and --levels, as conditions such as
-    `no-lines-tracked`: does an effect depend on the tracking? For example lines-move-splats (Table 4 of the paper)."""
+    """Train ours with these parts left out or changed also under the conditions of --tracked and --levels, as conditions such
+    as `no-lines-tracked`. This tests whether an effect depends on the tracking, for example lines-move-splats (Table 4 of the
+    paper)."""
 
     levels: tuple[float, ...] = ()
     """Train the methods of --tracked a further time for each of these levels of simulated tracking errors (see `headbench synth`), as
@@ -76,22 +78,22 @@ class SuiteSettings(ExecutionOptions):
     """Begin with this subject, counted from 1. Earlier ones may have been measured on another machine."""
 
     large: int = 2
-    """At most this many subjects, from the first, are also rendered at twice the size, with runs and tables of their own, without
+    """At most this many subjects, from the first, are also rendered at twice the size, in separate runs and tables, without
     conditions. Each takes about half a processor hour to render, twice as long as at the usual size."""
 
     repeated: int = 0
-    """At most this many subjects, from the first, are also trained with two further seeds, without conditions, in runs of their own;
-    `results.md` then has the variance between and within subjects."""
+    """At most this many subjects, from the first, are also trained with two further seeds, without conditions, in separate
+    runs; `results.md` then has the variance between and within subjects."""
 
     extremes: int = 10
-    """Avatars of at most this many subjects, from the first, are also rendered in new poses and views, as by `headbench run extremes`; a
-    broken limit is a result, not a failure."""
+    """Avatars of at most this many subjects, from the first, are also rendered in new poses and views, as by `headbench run
+    extremes`. A frame that exceeds a limit is a result, not a failure."""
 
     cameras: int = 16
-    """Views of each, the held-out one included."""
+    """Number of cameras, including the held-out one."""
 
     timesteps: int = 96
-    """Of each subject; a quarter is held out."""
+    """Number of timesteps of each subject; a quarter is held out."""
 
     size: str = "275x401"
     """Width x height of the images in pixels."""
@@ -106,7 +108,7 @@ class SuiteSettings(ExecutionOptions):
     """As for `headbench synth`."""
 
     isolation: Isolation = "plugins"
-    """Methods that train and render in processes of their own, without access to test images (see SECURITY.md)."""
+    """Methods that train and render in separate processes, without access to test images (see SECURITY.md)."""
 
     def __post_init__(self) -> None:
         """Refuse invalid sizes and names."""

@@ -27,8 +27,9 @@ class BaselineOptions:
     that are synthesised again for every run: everything except the fingerprint must be the same."""
 
     judge_speed: bool = False
-    """With --baseline: also judge metrics that depend on the machine and its load (frames per second, milliseconds, training time, memory),
-    where the baseline was measured on a machine of the same kind. Without it they are shown and decide nothing."""
+    """With --baseline: also judge metrics that depend on the machine and its load (frames per second, milliseconds, training
+    time, memory), where the baseline was measured on a machine of the same kind. Without it they are shown, but do not affect
+    the exit code."""
 
     junit: str | None = None
     """With --baseline: also write a JUnit XML file: one test case for every task, method, subject and metric."""

@@ -56,7 +56,7 @@ def write_video(path: Path, frames: Iterable[ByteArray], fps: float) -> str:
             height, width = frame.shape[:2]
             if writer is None:
                 if width % 2 or height % 2:
-                    expected = "even width and height, as the codec asks"
+                    expected = "even width and height, as the codec requires"
                     raise InputError(path, "size", expected, f"{width}x{height}")
                 code = cv2.VideoWriter.fourcc(*codec)
                 writer = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, code, fps, (width, height))
@@ -134,7 +134,7 @@ def write_browser_video(path: Path, frames: Iterable[ByteArray], fps: float, kin
             if stream is None:
                 height, width = frame.shape[:2]
                 if width % encoding.multiple or height % encoding.multiple:
-                    expected = "even width and height, as the codec asks"
+                    expected = "even width and height, as the codec requires"
                     raise InputError(path, "size", expected, f"{width}x{height}", "Name a file in .webm.")
                 rate = Fraction(fps).limit_denominator(1001)
                 stream = container.add_stream(encoding.encoder, rate=rate, options=dict(encoding.options))

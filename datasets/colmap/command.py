@@ -37,7 +37,7 @@ class ExportColmapSettings(CaptureOptions):
     """Write every timestep. The points are the mesh of the first one."""
 
     format: Literal["bin", "txt"] = "bin"
-    """Of the sparse model."""
+    """Format of the sparse model."""
 
     names: Literal["nested", "flat"] = "nested"
     """Names of images: SUBJECT/SEQUENCE/TIMESTEP/CAMERA.png, or SEQUENCE_TIMESTEP_CAMERA.png in one folder, as readers

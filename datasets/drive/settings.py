@@ -15,7 +15,7 @@ MOST_SIZE = 4096
 class DriveSettings(CaptureOptions):
     """Drive a stored avatar with a signal, and write a video, or a capture of its frames and FLAME parameters.
 
-    Prints jitter, identity spill, lip closure and latency, and the channels of the signal that drive nothing.
+    Prints jitter, identity spill, lip closure and latency, and the channels of the signal without effect.
     """
 
     avatar: AvatarFolder
@@ -35,11 +35,11 @@ class DriveSettings(CaptureOptions):
     head model, or "avatar" for that of the avatar."""
 
     map: str = ""
-    """YAML file {column: {coefficient: weight}} for tables of one's own; coefficients are expression.0, jaw.0, eyes.0,
-    eyelids.0, neck.0, rotation.0, translation.0, named expressions of the head, or ARKit's names."""
+    """YAML file {column: {coefficient: weight}} for your own tables; coefficients are expression.0, jaw.0, eyes.0, eyelids.0,
+    neck.0, rotation.0, translation.0, named expressions of the head, or ARKit's names."""
 
     sequence: str = ""
-    """Of a signal that is a capture: the sequence that drives; required if it has several."""
+    """Driving sequence, if the signal is a capture; required if it has several."""
 
     capture: str = ""
     """Capture of the avatar, whose camera and mean head pose are used; default: a camera in front of the head."""

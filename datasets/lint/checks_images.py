@@ -74,7 +74,7 @@ def _faulty_masks(evidence: Evidence, is_faulty: Callable[[MaskFacts], bool], wh
     faulty = [view for view, mask in _masks(evidence) if is_faulty(mask)]
     if faulty:
         path = faulty[0].entry.mask or faulty[0].entry.image
-        yield Hit(f"{what} in {len(faulty)} of {counted(len(evidence.views), 'frame')} looked at", path)
+        yield Hit(f"{what} in {len(faulty)} of {counted(len(evidence.views), 'frame')} checked", path)
 
 
 @rule("HB307", "error")
@@ -125,14 +125,14 @@ def _blank_images(evidence: Evidence) -> Iterator[Hit]:
     cameras = blank_cameras(evidence)
     if cameras:
         yield Hit(
-            f"every image looked at of {counted(len(cameras), 'camera')} is of one colour: "
+            f"every checked image of {counted(len(cameras), 'camera')} is of one colour: "
             + some(f"{camera} (level {_level(evidence, camera):.0f})" for camera in cameras),
             first_entries(evidence)[cameras[0]].image,
         )
     single = [view for view in faulty if view.entry.camera_id not in cameras]
     if single:
         yield Hit(
-            f"{len(single)} of {counted(len(evidence.views), 'frame')} looked at are of one colour, level "
+            f"{len(single)} of {counted(len(evidence.views), 'frame')} checked are of one colour, level "
             f"{single[0].low}",
             single[0].entry.image,
         )
@@ -181,7 +181,7 @@ def _wrong_background(evidence: Evidence) -> Iterator[Hit]:
         shown = f"level {tuple(found.tolist())}" if uniform else "no one colour"
         yield Hit(
             f"declared background is level {tuple(stated.tolist())}, outside the subject there is {shown} in "
-            f"{len(wrong)} of {counted(len(seen), 'frame')} looked at",
+            f"{len(wrong)} of {counted(len(seen), 'frame')} checked",
             wrong[0][0].entry.image,
         )
 
@@ -201,7 +201,7 @@ def _dirty_background(evidence: Evidence) -> Iterator[Hit]:
         typical = float(np.median([share for _, share in dirty]))
         yield Hit(
             f"{typical:.0%} of the pixels outside the mask differ from the background, in {len(dirty)} of "
-            f"{counted(len(seen), 'frame')} looked at",
+            f"{counted(len(seen), 'frame')} checked",
             dirty[0][0].entry.image,
         )
 
@@ -304,7 +304,7 @@ def _grey(evidence: Evidence) -> Iterator[Hit]:
     grey = [view for view in views if view.grey]
     if grey:
         yield Hit(
-            f"{len(grey)} of {counted(len(views), 'frame')} looked at have no colour", grey[0].entry.image
+            f"{len(grey)} of {counted(len(views), 'frame')} checked have no colour", grey[0].entry.image
         )
 
 

@@ -392,7 +392,7 @@ def _missed_once(evidence: Evidence) -> Iterator[Hit]:
         cameras = sorted({view.entry.camera_id for view, _ in lost})
         where = f"camera {cameras[0]}, " if len(cameras) == 1 else ""
         yield Hit(
-            f"the mesh misses the face in {len(lost)} of {counted(len(laid), 'frame')} looked at ({where}"
+            f"the mesh misses the face in {len(lost)} of {counted(len(laid), 'frame')} checked ({where}"
             f"timesteps {spans(timesteps)})",
             lost[0][0].entry.image,
         )

@@ -119,7 +119,7 @@ def _report(evidence: Evidence, findings: Sequence[Finding], passed: bool) -> st
     lines += [
         f"{Path(evidence.folder).name}: {found}.",
         (
-            f"Looked at {seen['frames']} frames ({seen['timesteps']} timesteps, {seen['cameras']} cameras), decoded "
+            f"Checked {seen['frames']} frames ({seen['timesteps']} timesteps, {seen['cameras']} cameras), decoded "
             f"{seen['frames_decoded']}, compared {seen['frames_compared_for_near_duplicates']} for near-duplicates."
         ),
     ]

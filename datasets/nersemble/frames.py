@@ -152,7 +152,7 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        remedy = "Make room (or let it be written) and start again: it continues where it stopped."
+        remedy = "Free disk space or allow writing, then start again: the command continues where it stopped."
         found = error.strerror or str(error)
         raise InputError(error.filename or path, "", "a file that can be written", found, remedy) from error
 

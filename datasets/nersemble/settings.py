@@ -22,8 +22,8 @@ class PrepareSettings:
     subjects: str = "paper"
     """Ids separated by commas, "paper" (the nine of the comparison) or "ablation" (306)."""
     sequences: str = "paper"
-    """Names or unique prefixes separated by commas; "paper" (the ten of UNION10, and FREE); "all" (but the tongue
-    and GLASSES)."""
+    """Names or unique prefixes separated by commas; "paper" (the ten of UNION10, and FREE); "all" (except the tongue and
+    GLASSES)."""
     split: Literal["free", "union10"] = "free"
     """"free" holds out FREE for self-reenactment; "union10" holds out one of the ten sequences by VHAP's seeded
     rule. The frontal camera is held out for novel views either way."""

@@ -22,8 +22,8 @@ from ...bench.specs import CommandResult
 
 @dataclass(frozen=True)
 class SynthSettings(ExecutionOptions):
-    """Ray-traced heads of people of all ages, lit by eight large panels, on NeRSemble's camera rig, with sequences named as
-    there. Skin folds and blushes with expressions, with hysteresis and delay. The same settings give the same bytes on
+    """Ray-traced heads of people of all ages, lit by eight large panels, on NeRSemble's camera rig, with NeRSemble's names of
+    sequences. Skin wrinkles and blushes with expressions, with hysteresis and delay. The same settings give the same bytes on
     every processor; frames that exist are kept. Needs the compiled kernel.
     """
 
@@ -40,7 +40,7 @@ class SynthSettings(ExecutionOptions):
     head: str = "procedural"
     """`procedural`, or the path of a head model (ICT-FaceKit npz)."""
     seed: int = 0
-    """Decides subjects and performances."""
+    """Seed of subjects and performances."""
     tracking_noise: float = 0.0
     """Noise on the tracked parameters, as a fraction of their standard deviation."""
     performance: Literal["natural", "full", "parts", "expressions", "still"] = "natural"
@@ -58,17 +58,17 @@ class SynthSettings(ExecutionOptions):
     drift, jitter, and 1.2 mm on lips and lids; the error of a per-frame tracker drifts from each timestep
     to the next."""
     hair_lag: float = 0.0
-    """Lag of hair and of the skin of the neck behind the head, which the tracked mesh does not have; 1 is as a rod of the
-    hair's length swings. 0 to 4."""
+    """Lag of hair and of the skin of the neck behind the head, which the tracked mesh does not have; at 1 hair swings like a
+    rod of its length. 0 to 4."""
     camera_colour: float = 0.0
     """Differences between cameras in exposure (5 % at 1), white balance (2 %) and gamma (3 %). 0 to 4."""
     motion_blur: float = 0.0
-    """Time of exposure in units of NeRSemble's 3 ms. Frames with motion take several times as long to render. 0 to 4."""
+    """Exposure time in units of NeRSemble's 3 ms. Frames with motion take several times as long to render. 0 to 4."""
     mask_error: float = 0.0
-    """Errors of masks at hair: without single hairs, and displaced by up to 4 mm at 1; pictures are composited by these masks.
-    0 to 4."""
+    """Errors of masks at hair: single hairs are missing, and outlines are displaced by up to 4 mm at 1. Images are composited
+    with these masks. 0 to 4."""
     correctives: float = 0.0
-    """Shapes of each subject that the head model lacks, where controls act together; each is 0.75 mm on the face at 1. The
+    """Shapes of each subject that the head model lacks, driven by pairs of controls; each is 0.75 mm on the face at 1. The
     tracked mesh does not have them. 0 to 4."""
 
 

@@ -114,7 +114,7 @@ def _text(
         lines.append(f"  not used  {counted(pictures.unused, 'image')} without a tracked frame")
     return [
         *lines,
-        f"Look at {out / PICTURE}: a mesh beside the head means other images or another --first-image.",
+        f"Look at {out / PICTURE}: if the mesh is beside the head, the images or --first-image are wrong.",
         f"Then: headbench lint {union}",
         f"Capture: {union}",
     ]

@@ -31,14 +31,14 @@ class TrackSettings(VideoOptions, CaptureOptions):
     the error of such a network."""
 
     embedding: str = ""
-    """Capture of another subject with exact tracking in the same head model, from which the places of the network's landmarks
-    on the mesh are learnt; default: drawings of the head model. Only with --landmarks."""
+    """Capture of another subject with exact tracking in the same head model, from which the positions of the network's
+    landmarks on the mesh are learnt; default: renders of the head model. Only with --landmarks."""
 
     against: str = ""
     """Capture with the exact tracking, to print errors in millimetres by region."""
 
     program: Annotated[Literal["light", "vhap", "pixel3dmm"], tyro.conf.arg(name="with")] = "light"
-    """Tracker: the one of headbench, or VHAP or Pixel3DMM in an installation of yours, for the file of a video; they need an NVIDIA GPU."""
+    """Tracker: that of headbench, or for a video file your own installation of VHAP or Pixel3DMM, which need an NVIDIA GPU."""
 
     checkout: str = ""
     """With vhap or pixel3dmm: folder of its repository."""
@@ -47,7 +47,7 @@ class TrackSettings(VideoOptions, CaptureOptions):
     """With vhap or pixel3dmm: interpreter of its environment."""
 
     seed: int = 0
-    """Seed of the error of landmarks that are not a network's."""
+    """Seed of the errors of simulated landmarks."""
 
     dependent = (
         DependentOptions(("landmarks", "embedding", "cameras", "against", "seed"), "program", ("light",)),

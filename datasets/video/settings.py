@@ -10,15 +10,15 @@ MASKLESS, BACKGROUND = "none", "background"
 
 @dataclass(frozen=True, kw_only=True)
 class VideoOptions:
-    """What `headbench track` needs to know of a video file; without effect on captures."""
+    """Options of `headbench track` for a video file; without effect on captures."""
 
     segmentation: str = ""
     """Video: MediaPipe's selfie_segmentation.tflite, which finds the person in each frame; needs ai-edge-litert."""
 
     masks: str = ""
-    """Video: folder of masks instead, of the video's size, named by the number of the frame in the file (00000.png is the first frame, also
-    where --rate takes fewer); "background" to take what differs from the empty room, which a camera that stands still has to show
-    for some seconds without anyone; or "none" to keep the room behind the person, which then counts in every metric."""
+    """Video: folder of masks instead, of the video's size, named by the number of the frame in the file (00000.png is the first
+    frame, also where --rate takes fewer); "background" for the difference from the empty room, which a static camera must show
+    for some seconds without a person; or "none" to keep the room behind the person, which then counts in every metric."""
 
     focal: float | None = None
     """Video: focal length in pixels of its upright frames; default: estimated from the landmarks, which is inexact."""

@@ -48,7 +48,7 @@ class ExportOptions(AvatarOptions):
 
 @dataclass(frozen=True)
 class ExportPlySettings(ExportOptions):
-    """Write an avatar in one pose as a 3D Gaussian splatting PLY, in full precision, that common viewers open."""
+    """Write an avatar in one pose as a 3D Gaussian splatting PLY, in full precision, for common viewers."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,8 @@ class ExportGlbSettings(ExportOptions):
 
 @dataclass(frozen=True)
 class ExportSogSettings(ExportOptions):
-    """Write an avatar in one pose as SOG, for web viewers, in about a sixth of a PLY's bytes. Needs gaussforge (extra `formats`)."""
+    """Write an avatar in one pose as SOG, for web viewers, in about a sixth of the size of a PLY. Needs gaussforge (extra
+    `formats`)."""
 
 
 @dataclass(frozen=True)

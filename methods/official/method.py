@@ -209,7 +209,7 @@ class OfficialMethod(ABC, Generic[Config]):
         """A sentence for the record of code that fixes its seed."""
         if not seed or self.config.order != "published":
             return []
-        return [f"their code fixes the seed at 0; seed {seed} is a repetition, not another start"]
+        return [f"their code fixes the seed at 0; seed {seed} repeats the same training"]
 
     def inspect(self) -> Checkout:
         """Check the settings; see `checkout.inspect_checkout`."""

@@ -268,7 +268,7 @@ def test_an_error_ends_in_a_line_and_its_exit_code(capfd, monkeypatch, raised, c
     assert ("Traceback" in error) == (code == 70)
 
 
-MAKE_ROOM = "Make room (or let it be written) and start again.\n"
+MAKE_ROOM = "Free disk space or allow writing, then start again.\n"
 LONG = "n" * 300
 
 

@@ -63,7 +63,7 @@ def test_readers_of_plug_ins_beside_the_one_that_fits(pristine_capture, monkeypa
     assert open_clip(pristine_capture.union, "ga").poses
     offer(find=f"{__name__}:fails")
     assert find_reader(pristine_capture.union).name == "ga"
-    assert "reader other cannot look at" in caplog.text
+    assert "reader other cannot check" in caplog.text
 
 
 def test_a_clip_of_another_reader_passes_through_steps(plain_folder, pristine_capture):

@@ -38,7 +38,7 @@ class SubmissionRenderSettings:
 
 @dataclass(frozen=True)
 class SubmissionWriteSettings:
-    """Encode rendered frames and write the zip that the NeRSemble benchmark takes."""
+    """Encode rendered frames and write the zip for the NeRSemble benchmark."""
 
     frames: tyro.conf.Positional[str]
     """Folder with PARTICIPANT/SEQUENCE_TIMESTEP_SERIAL.png, or a run whose subjects are the participants."""
@@ -58,7 +58,7 @@ class SubmissionWriteSettings:
 
 @dataclass(frozen=True)
 class SubmissionCheckSettings:
-    """Say what the NeRSemble benchmark's server would refuse of a submission.
+    """Report what the NeRSemble benchmark's server would refuse in a submission.
 
     Exit code 0: no fault; 1: a fault; 2: not a readable zip.
     """

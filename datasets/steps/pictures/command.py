@@ -27,10 +27,10 @@ class StepsSettings(CaptureOptions):
     """Folder for jaw_bases.png, expression_clusters.png and steps.json."""
 
     bases: int = 16
-    """Jaw bases at most."""
+    """Maximum number of jaw bases."""
 
     clusters: int = 16
-    """Expression clusters at most."""
+    """Maximum number of expression clusters."""
 
     seed: int = 0
     """Seed of the choice of landmarks in long captures."""

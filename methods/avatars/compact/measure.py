@@ -137,12 +137,12 @@ def _text(data: Mapping[str, Any]) -> str:
     rows.append(line)
     if exact:
         rows.append(
-            f"Quality on {data['frames']} held-out frames, each part rounded alone. Left out: what no training pose "
-            "shows, nothing rounded."
+            f"Quality on {data['frames']} held-out frames with only one part quantised. Left out: splats that no "
+            "training pose shows are removed, nothing is quantised."
         )
         if exact["psnr"] is not None:
             rows.append(
-                f"Exact avatar: {exact['psnr']:.3f} dB, SSIM {exact['ssim']:.5f}; above are the differences."
+                f"Exact avatar: {exact['psnr']:.3f} dB, SSIM {exact['ssim']:.5f}; the table has differences from it."
             )
     return "\n".join(rows)
 

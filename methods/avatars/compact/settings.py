@@ -12,7 +12,7 @@ from .precision import Precision
 
 @dataclass(frozen=True)
 class CompactSettings(CaptureOptions):
-    """Store an avatar of a native method through the one codec of all: quantised by visible effect, and entropy-coded."""
+    """Store an avatar of a native method by the common codec: quantised by visible effect, and entropy-coded."""
 
     avatar: AvatarFolder
 

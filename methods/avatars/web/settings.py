@@ -12,8 +12,7 @@ from ..settings import AvatarOptions
 class ExportHtmlSettings(AvatarOptions):
     """Write an avatar as one HTML file with sliders; it needs no network and no other file.
 
-    For methods with splats, and browsers with WebGL2. Prints the number of bytes, and the loss of quality against the
-    avatar's own frames.
+    For methods with splats, and browsers with WebGL2. Prints the size, and the PSNR relative to the avatar's own frames.
     """
 
     capture: str | None = None

@@ -266,7 +266,7 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
         window = inside(camera).camera
         masks = {
             "parts": "masks of head and neck and of the mouth are those of the head model's mesh, not of a network that parses faces",
-            "native": "masks of head and neck have all covered pixels, those of the mouth are the native method's",
+            "native": "masks of head and neck contain all foreground pixels; masks of the mouth are those of the native method",
         }
         differences = [
             "frames are renumbered and all of them are used; their code holds out the last 500",

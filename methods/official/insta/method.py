@@ -122,11 +122,11 @@ class INSTAOfficial(PartsMethod[INSTAOfficialConfig]):
             differences.append(f"{size} expression coefficients are padded with zeros to {CONDITIONS}")
         if len(clip.splits["train"]) > self.config.images_on_gpu:
             differences.append(
-                f"{self.config.images_on_gpu} of {len(clip.splits['train'])} images are drawn anew after every 1,500 "
+                f"{self.config.images_on_gpu} of {len(clip.splits['train'])} images are drawn again after every 1,500 "
                 + "iterations, as their code does it"
             )
         if seed:
-            differences.append(f"their code fixes the seeds; seed {seed} is a repetition, not another start")
+            differences.append(f"their code fixes the seeds; seed {seed} repeats the same training")
         return differences
 
 

@@ -17,18 +17,17 @@ WITHOUT_PERCEPTUAL_LOSS = 15_000
 
 @dataclass(frozen=True)
 class ParitySettings(ExecutionOptions):
-    """Trains both on one capture with equal settings, the published ones for this length, with the same image in each
-    iteration, and scores all renders by one implementation of the metrics. This is repeated with other orders of the
-    images, since the order alone changes results by half a decibel. Writes parity.md, parity.json and the run. A
-    killed run is continued by the same command. Exit code 1: PSNR differs by more than the tolerance in the mean over
-    orders, or a training failed.
+    """Trains both on one capture with the published settings for a run of this length and the same image in each iteration, and
+    scores all renders by one implementation of the metrics. This is repeated with other orders of the images, since the order
+    itself changes results by half a decibel. Writes parity.md, parity.json and the run. The same command continues a run that
+    was killed. Exit code 1: the mean PSNR over orders differs by more than the tolerance, or a training failed.
     """
 
     method: tyro.conf.Positional[Literal["flashavatar", "ga", "gbs", "ours", "rgbavatar"]]
     """The native method. The authors' code of method ours is TensorialGaussianAvatar (`tga-official`)."""
 
     checkout: str
-    """Folder of a checkout of the authors' repository; it is read, never written."""
+    """Folder of a checkout of the authors' repository; it is not changed."""
 
     out: str
     """Folder to write."""

@@ -85,7 +85,7 @@ FAULTS = {
         with_image(lambda image, key: SHARED.setdefault(key, image)), "can be changed by who reads it"),
     "images that differ by order": (with_image(lambda image, key: image + np.uint8(next(COUNT))), "another order"),
     "an image for any key": (
-        everything(lambda c: {"image": lambda key: np.zeros((12, 10, 3), np.uint8)}), "taken instead of refused"),
+        everything(lambda c: {"image": lambda key: np.zeros((12, 10, 3), np.uint8)}), "accepted instead of raising"),
     "a dark background": (everything(lambda c: {"background": -np.ones(3)}), "leaves [0, 1]"),
     "steps that are no record": (everything(lambda c: {"steps": [object()]}), "cannot be written as JSON"),
     "a mask of another size": (everything(lambda c: {"mask": lambda key: np.zeros((3, 3), np.uint8)}), "mask of"),
@@ -157,7 +157,7 @@ def test_what_is_no_capture_must_be_an_input_error(reader, npz_capture, monkeypa
     monkeypatch.setattr(reader.module, "read", read)
     found = check_reader(reader.module.SPEC, npz_capture)
     for case in ("a path that does not exist", "an empty folder", "a text file"):
-        assert f"{case} was taken instead of refused by InputError" in found
+        assert f"{case} was accepted instead of raising InputError" in found
 
 
 def test_a_reader_that_finds_nothing_does_not_conform(reader, tmp_path):

@@ -95,19 +95,19 @@ PROCESSES = ("--executor", "processes", "--workers", "1")
 CASES = {
     "no slurm": (no_slurm, SLURM, "there is no sbatch", "choose --executor processes"),
     "no partition": (no_partition, SLURM, "invalid partition specified: nowhere", "`sinfo` lists partitions"),
-    "disk full, submitting": (no_space_to_submit, SLURM, "{out}/jobs: No space left", "Make room"),
+    "disk full, submitting": (no_space_to_submit, SLURM, "{out}/jobs: No space left", "Free disk space"),
     "disk full, job": (
         no_space_in_a_job,
         SLURM,
         "{out}/subject1/toy/seed-0: No space left on device (job 7)",
-        "Make room",
+        "Free disk space",
     ),
-    "disk full, no log": (no_space_for_a_log, SLURM, "{out}: No space left", "Make room"),
+    "disk full, no log": (no_space_for_a_log, SLURM, "{out}: No space left", "Free disk space"),
     "disk full, process": (
         None,
         PROCESSES,
         "{out}/subject1/full/seed-0/avatar/level.txt: No space",
-        "Make room",
+        "Free disk space",
     ),
     "two attachments": (two_at_once, PROCESSES, "that no other process works in", "Wait for it to end"),
 }

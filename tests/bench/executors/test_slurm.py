@@ -72,7 +72,7 @@ def test_rows_equal_inline_through_kill_preemption_failure(
     wait_for(lambda: any(starts(config, f"subject{n}", "slow") for n in (1, 2, 3)))
     os.kill(first.pid, signal.SIGINT)  # detach
     assert first.wait(30) == 130
-    assert "jobs are left to the cluster" in first.stdout.read()
+    assert "jobs continue on the cluster" in first.stdout.read()
     running = next(n for n in (1, 2, 3) if starts(config, f"subject{n}", "slow"))
     hog = ["sbatch", "--wait", "-p", "urgent", f"-c{os.cpu_count()}", "-o/dev/null", "--wrap=true"]
     subprocess.run(hog, check=True, capture_output=True, timeout=90)  # which has preempted all others
