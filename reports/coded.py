@@ -36,7 +36,7 @@ CODED_CHANGE = MetricSpec(
     higher_is_better=True,
     digits=2,
     implementation="headbench.reports.coded:with_coded",
-    summary="PSNR with the coded avatar less that of the trained one, on the same frames: the lower of the tasks' means.",
+    summary="PSNR of the coded avatar minus that of the trained one, on the same frames; the lower one of the tasks' means.",
     kind="avatar",
     tables=("comparison", "cost"),
 )
@@ -87,7 +87,7 @@ def check_codecs(manifests: Sequence[Manifest], file: Path) -> None:
     ):
         if found and (set(found) != {""} if found is trained else len(found) > 1 or "" in found):
             text = "; ".join(f"codec {codec or 'none'} ({label})" for codec, label in sorted(found.items()))
-            remedy = "Bytes of different codecs do not compare; code all avatars alike."
+            remedy = "Sizes from different codecs are not comparable; code all avatars with one codec."
             raise InputError(file, f"methods, codec of {kind} avatars", expected, text, remedy)
 
 

@@ -104,7 +104,7 @@ def suspects(rows: Rows, methods: Sequence[str]) -> dict[tuple[str, str, str], s
         for (metric, task), found in own.groupby(["metric", "task"]):
             why = str(found["reason"].iloc[0]).removeprefix(SUSPECT)
             notes[str(metric), method, str(task)] = (
-                f"Suspect, not ranked: {len(found)} frames are {why}, which no method reaches that has not seen them."
+                f"Suspect, not ranked: {len(found)} frames are {why}, which a method that has not seen them cannot reach."
             )
     return notes
 

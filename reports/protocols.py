@@ -117,10 +117,10 @@ def differences(runs: RunSet, protocol: NamedProtocol) -> list[str]:
     synthetic = all(synthetic_settings(clip) for run in runs.runs for clip in run.manifest.clips)
     subjects = len({clip.subject for run in runs.runs for clip in run.manifest.clips})
     if protocol.subjects and synthetic:
-        found.append(f"Subjects: {subjects} synthetic, there {protocol.subjects}.")
+        found.append(f"Subjects: {subjects} synthetic; in the protocol: {protocol.subjects}.")
     sizes = {p.resolution for run in runs.runs for p in run.manifest.protocols.values()}
     if protocol.size and sizes != {protocol.size}:
-        found.append(f"Pixels: {', '.join(sorted(sizes))}, there {protocol.size}.")
+        found.append(f"Pixels: {', '.join(sorted(sizes))}; in the protocol: {protocol.size}.")
     budgets = sorted(
         {
             n
@@ -130,16 +130,16 @@ def differences(runs: RunSet, protocol: NamedProtocol) -> list[str]:
     )
     if protocol.iterations is not None and budgets and budgets != [protocol.iterations]:
         most = f"{budgets[0]:,}" + (f" to {budgets[-1]:,}" if len(budgets) > 1 else "")
-        found.append(f"Iterations: {most}, there {protocol.iterations:,}.")
+        found.append(f"Iterations: {most}; in the protocol: {protocol.iterations:,}.")
     return found
 
 
 @dataclass(frozen=True)
 class ProtocolsSettings:
-    """Change of every metric by each choice of an evaluation alone, and under whole protocols, from stored rows."""
+    """Change of every metric by each single evaluation choice, and by whole protocols, from stored rows."""
 
     runs: tyro.conf.Positional[tuple[str, ...]]
-    """Folders of runs, best ones made with `headbench run --protocol NAME`, which have the profiles and regions."""
+    """Folders of runs, preferably made with `headbench run --protocol NAME`, which measures the profiles and regions."""
     methods: tuple[str, ...] = ()
     """Only these methods; default: all that are ranked."""
     out: str | None = None
@@ -243,15 +243,15 @@ def _text(
             for m in methods
             if (found := [own[key] for own in values.values() if (key := f"{m} {task} psnr") in own])
         ]
-        spread = f"The same avatars differ by up to {max(spans, default=0):.1f} dB between these rows."
+        spread = f"The PSNR of one method differs by up to {max(spans, default=0):.1f} dB between these rows."
         parts.append(f"### {TASK_TITLES[task]}\n\n{table}\n\n{spread}")
     parts.append(
-        'The row "usual" has values: all frames and pixels, the mean over frames and then subjects, the canonical metrics. The others '
-        "have differences from it: rows of protocols with all of their choices, other rows with one."
+        'The row "usual" shows values: all frames and pixels, the mean over frames and then subjects, canonical metrics. Other rows show '
+        "differences from it: a protocol changes all of its choices, any other row one choice."
     )
     if refused:
         parts.append(
-            "\n".join(["Not possible with these rows:", "", *(f"- {k}: {v}" for k, v in refused.items())])
+            "\n".join(["Not available from these rows:", "", *(f"- {k}: {v}" for k, v in refused.items())])
         )
     return "\n\n".join(parts)
 

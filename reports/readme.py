@@ -398,7 +398,7 @@ def choices_text(runs: Sequence[Path]) -> str:
         if key in own and choice != USUAL
     ]
     ends = " to ".join(f"{change:+.1f} dB ({choice})" for change, choice in (min(changes), max(changes)))
-    return f"Other choices of an evaluation change the mean PSNR of these avatars by {ends}: [all choices]({PAGES[PROTOCOLS]})."
+    return f"Other evaluation choices change the mean PSNR of these avatars by {ends}: [all choices]({PAGES[PROTOCOLS]})."
 
 
 def suite_options(folder: Path) -> tuple[str, ...]:
@@ -443,13 +443,13 @@ def suite_block(root: Path) -> str:
             [
                 to_markdown(table_of(shown, columns=columns)).strip(),
                 f"Primary endpoints:\n\n{primary_table(shown)} {variance_text(folders, seeds)}".strip(),
-                f"Other differences, exploratory, mean over subjects and its 95 % interval:\n\n{beside_table(shown)}",
+                f"Other differences (exploratory), mean over subjects and 95 % interval:\n\n{beside_table(shown)}",
                 (
-                    f"{_speed_text(shown)} {choices_text(folders)} SSIM, baselines, tables by region and by part of FREE, and all other "
+                    f"{_speed_text(shown)} {choices_text(folders)} SSIM, baselines, tables by region and by part of the sequence FREE, and all other "
                     f"comparisons with tests are in [the results]({results}).".lstrip()
                 ),
                 (
-                    f"The captures are of edition {made.get('edition', 1)}, made with seed {made['seed']}, and have the options "
+                    f"The captures are of edition {made.get('edition', 1)}, made with seed {made['seed']} and the options "
                     f"`headbench run suite {options}`. {_cost_text(runs, folders, seeds)}"
                 ),
             ],
@@ -476,9 +476,8 @@ def _speed_text(runs: RunSet) -> str:
     printed = {row.method: row.values["fps"] for row in rows if "fps" in row.values}
     paper = " and ".join(f"{printed[name]} (`{name}`)" for name in COMPARED)
     return (
-        f"On one thread of {runs.machine}, under the load that the table notes, {whole} frames are drawn per second, and {deformed} without "
-        f"the head model; the paper of "
-        f"`{OURS}` prints {paper}, without the hardware."
+        f"Frames per second on one thread of {runs.machine}, under the load that the table notes: {whole}; without the head model {deformed}. "
+        f"The paper of `{OURS}` reports {paper}, without naming the hardware."
     )
 
 
@@ -505,10 +504,10 @@ def _cost_text(runs: RunSet, folders: Sequence[Path], seeds: Sequence[Path]) -> 
     busy = sum(value for value in seconds if value is not None) / 3600
     hours = sum(value for value in minutes if value is not None) / 60
     without = minutes.count(None)
-    interrupted = f", without {without} that were interrupted and continued" if without else ""
+    interrupted = f"; {without} that were interrupted and continued are not included" if without else ""
     return (
-        f"Mean processor seconds of a training: {known}. {len(minutes) - without} trainings, baselines and further seeds included, took "
-        f"{busy:.1f} processor hours ({hours:.1f} hours){interrupted}."
+        f"Mean processor seconds of a training: {known}. {len(minutes) - without} trainings, including baselines and further seeds, took "
+        f"{busy:.1f} processor hours ({hours:.1f} hours of wall-clock time){interrupted}."
     )
 
 

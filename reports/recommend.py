@@ -39,11 +39,11 @@ UNITS = {"seconds": "s of training", "megabytes": "MB", "milliseconds": "ms a fr
 
 @dataclass(frozen=True)
 class RecommendSettings:
-    """The best method within a budget by the rows of finished runs, and methods that cannot be told apart from it.
+    """The best method within a budget by the rows of finished runs, and methods that are not significantly worse.
 
-    The choices are all methods, including those with other settings, with shorter trainings and with coded avatars. A choice fits if no
-    subject and no seed exceeds a limit. Among those that fit, the one with the best mean over subjects is recommended. The answer is tested on each
-    subject with the rows of the others.
+    The choices are all methods, including those with other settings, with shorter trainings and with coded avatars. A choice
+    fits if no subject and no seed exceeds a limit. Among those that fit, the one with the best mean over subjects is
+    recommended. The recommendation is cross-validated over subjects.
     """
 
     runs: tyro.conf.Positional[tuple[str, ...]]
@@ -53,7 +53,7 @@ class RecommendSettings:
     """Limit of the training time on the machine of the runs."""
 
     megabytes: float | None = None
-    """Limit of the avatar's files."""
+    """Limit of the size of the avatar's files."""
 
     milliseconds: float | None = None
     """Limit of the median time of a frame on the machine of the runs."""
@@ -378,7 +378,7 @@ def _text(data: Mapping[str, Any], fitting: Mapping[str, Choice], subjects: int,
         shown = [cost_text(max(costs[cost].values())) if cost in costs else "–" for cost in COSTS]
         lines.append([name, f"{fmean(fitting[name].quality.values()):.{metric.digits}f}", *shown])
     parts = [
-        f"Recommended for {_limits(limits)}: {best}. Mean over {counted(subjects, 'subject')}, {task}; costs are the largest of a subject.",
+        f"Recommended for {_limits(limits)}: {best}. Mean over {counted(subjects, 'subject')}, {task}; costs are maxima over subjects.",
         pipe_table(lines),
     ]
     by_cost = data["by_cost"]
@@ -395,13 +395,13 @@ def _text(data: Mapping[str, Any], fitting: Mapping[str, Choice], subjects: int,
 def verdict_text(found: BestSet, fitting: Collection[str]) -> str:
     """What may be said of the choices that fit, the one with the best mean first, in a sentence."""
     if len(fitting) == 1:
-        return "It is the only choice that fits."
+        return "It is the only choice within the limits."
     if found.methods is None:
         there = f"there {'is' if found.subjects == 1 else 'are'} {found.subjects}"
-        return f"It takes {found.needed} subjects to tell these methods apart; {there}."
+        return f"A test of these methods needs {found.needed} subjects; {there}."
     if alike := sorted(found.methods - {next(iter(fitting))}):
-        return f"Not told apart from it (sign-flip tests, Holm, 5 %): {', '.join(alike)}."
-    return "No other method that fits can be the best (sign-flip tests, Holm, 5 %)."
+        return f"Not significantly worse (sign-flip tests, Holm, 5 %): {', '.join(alike)}."
+    return "All other choices within the limits are significantly worse (sign-flip tests, Holm, 5 %)."
 
 
 def outcome_on_left_out(
@@ -416,11 +416,11 @@ def outcome_on_left_out(
         behind = (
             f"on average {fmean(losses):.{metric.digits}f}{unit} behind"
             if losses
-            else "never within the limits, so not compared with"
+            else "never within the limits, and therefore not compared with"
         )
         parts.append(
-            f"On each subject from the rows of the others: the same recommendation for {same} of {len(trials)}, {behind} "
-            f"the best choice for the subject, beyond a limit for {len(trials) - len(losses)}."
+            f"Cross-validation over subjects: the same recommendation for {same} of {len(trials)}, {behind} "
+            f"the best choice for the subject; a limit was exceeded for {len(trials) - len(losses)}."
         )
     if always is not None and always["gains"]:
         sign = 1.0 if metric.higher_is_better else -1.0
@@ -428,7 +428,7 @@ def outcome_on_left_out(
         spread = f"from {min(gains):+.{metric.digits}f} to {max(gains):+.{metric.digits}f} by subject"
         parts.append(
             f"Over the budgets of the {always['budgets']} choices, recommendations change {metric.label} by "
-            f"{fmean(gains):+.{metric.digits}f}{unit} on subjects that were left out ({spread}), compared with always taking the best on "
-            f"average, now {always['always']}, and the most frugal choice where that does not fit."
+            f"{fmean(gains):+.{metric.digits}f}{unit} on left-out subjects ({spread}), compared with always using the method that is "
+            f"best on average ({always['always']}), or the cheapest choice where that exceeds the budget."
         )
     return parts

@@ -344,7 +344,7 @@ class RunSet:
                     codes.setdefault(f"{record.name} (version {record.version})", set()).add(record.code)
         changed = [name for name, found in codes.items() if len(found) > 1]
         return (
-            f"Files in the folders of these methods changed between the runs, their version did not: {', '.join(changed)}.",
+            f"Files of these methods changed between the runs, although their version did not: {', '.join(changed)}.",
         ) * bool(changed)
 
     @property

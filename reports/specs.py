@@ -19,14 +19,14 @@ TABLE_TEXT = ReportSpec(
 
 PAPERS = ReportSpec(
     name="papers",
-    summary="The papers in whose form tables can be printed, with their tables.",
+    summary="Papers whose table layouts are available, with their tables.",
     implementation="headbench.reports.papers:listed",
     writes=False,
 )
 
 CITATIONS = ReportSpec(
     name="citations",
-    summary="Source, citation and printed figures of every registered method.",
+    summary="Source, citation and published values of every registered method.",
     implementation="headbench.reports.method_cards:citations",
     writes=False,
 )
@@ -45,7 +45,7 @@ PAGE = ReportSpec(
 
 CURVE_REPORT = ReportSpec(
     name="curve",
-    summary="Quality over what trainings were given, as a table, CSV and a plot.",
+    summary="Quality against training time, cameras, timesteps, images or tracking error, as a table, CSV and a plot.",
     implementation="headbench.reports.curve.curve:curve_report",
     writes=False,
 )
@@ -66,20 +66,20 @@ SUITE_REPORT = ReportSpec(
 
 ROBUSTNESS = ReportSpec(
     name="robustness",
-    summary="Contact sheet and summary of avatars rendered beyond a run, from what extremes and reenact left.",
+    summary="Contact sheet and summary of the output of `run extremes` and `run reenact`.",
     implementation="headbench.reports.robustness.sheets:robustness_report",
     writes=False,
 )
 
 STATISTICS = BenchmarkSpec(
     name="statistics",
-    summary="tests and intervals on simulated comparisons: do they reject and cover as often as stated?",
+    summary="tests and intervals on simulated comparisons: rejection rates and coverage",
     stress="headbench.reports.statistics.calibration:stress",
 )
 
 VIEWER = BenchmarkSpec(
     name="viewer",
-    summary="the viewer in a browser: updates a second while a slider moves, milliseconds by step",
+    summary="the viewer in a browser: updates per second while a slider moves, milliseconds by step",
     speed="headbench.reports.view.benchmark:speed",
 )
 

@@ -20,7 +20,7 @@ from ..bench.specs import CommandResult
 
 @dataclass(frozen=True)
 class TableSettings:
-    """Runs are merged into one table: seeds of the same settings are averaged, other settings get rows of their own."""
+    """Runs are merged into one table: seeds of the same settings are averaged, other settings get separate rows."""
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of the runs."""
@@ -30,13 +30,13 @@ class TableSettings:
     layout: str = "comparison"
     """Which table: comparison, speed (latency, throughput, stages) or cost (storage, training)."""
     paper: Annotated[str | None, tyro.conf.arg(name="as")] = None
-    """Paper in the form of whose tables the runs are shown, with the rows that it printed below: `headbench list papers`."""
+    """Paper (`headbench list papers`) in whose table layout the runs are shown, with the rows of the paper below."""
     number: Annotated[str | None, tyro.conf.arg(name="table")] = None
     """With --as: the number of the table. Default: all that were read in full, or quoted in full texts."""
     protocol: str | None = None
     """Published protocol by which frames, pixels, metrics and means are chosen from the rows: a name of `headbench list protocols`."""
     region: str = "full"
-    """Region of the frames to show instead of the whole, such as face."""
+    """Region to show instead of the whole frame, such as face."""
     sequences: tuple[str, ...] = ()
     """Only frames of these sequences; default: all."""
     columns: tuple[str, ...] = ()

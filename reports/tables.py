@@ -147,13 +147,13 @@ class Table:
         parts += [*self.missing, *filter(None, [self.cameras, self.part])]
         if self.image_size:
             parts.append(f"Images of {self.image_size} pixels.")
-        spread = f"mean of {self.seeds} seeds ± its standard deviation from seed to seed"
+        spread = f"mean of {self.seeds} seeds ± standard deviation over seeds"
         seeds = spread if self.seeds > 1 else "one seed"
         parts.append(f"Mean over {self.averaged}; {seeds}.")
         parts += [self.marking] if self.marking else []
         parts += self.printed
         if any(column.metric == CODED_CHANGE.name for column in self.columns):
-            parts.append("By coding: change of PSNR, the lower one of the tasks.")
+            parts.append("By coding: change of PSNR by the codec, in the task with the lower value.")
         if self.machine and self.has_speed:
             parts.append(f"Speed measured on {self.machine}.")
         return tuple(parts)
@@ -412,15 +412,15 @@ def _marking(columns: Sequence[Column], lines: Sequence[TableRow], bests: Sequen
     if not tested:
         needed = max(best.needed for _, best in untested)
         return (
-            f"Best bold, {places}, by the digits shown alone: with {subjects} no test can tell the best"
-            f" (it takes {needed})."
+            f"Best bold, {places}, by the digits shown, without a test, which needs {needed} subjects"
+            f" (here {subjects})."
         )
     test = f"exact sign-flip test over {subjects}, each method against all others, Holm, {LEVEL:.0%}"
     text = (
-        f"Bold: every method that cannot be told from the best by a test, whatever its mean ({test}); the others by the digits "
-        f"shown, {places}."
+        f"Bold: every method that is not significantly worse than the best one, whatever its mean ({test}). The others by the digits "
+        f"shown: {places}."
     )
     if untested:
         names = ", ".join(f"{column.title} {column.label}" for column, _ in untested)
-        text += f" Too few subjects for the test, so that the digits alone decide: {names}."
+        text += f" Too few subjects for a test, ranked by the digits alone: {names}."
     return text

@@ -189,7 +189,7 @@ def write_curve(path: Path, curve: CurveData) -> None:
         "self_reenactment": f"one of {curve.every} consecutive training timesteps",
     }
     held = " and ".join(left_out[task] for task in curve.tasks)
-    note = f"Held out of every training: {held}. No test frame was looked at."
+    note = f"Held out of every training: {held}. No test frame was used."
     count = len(curve.subjects)
     if count >= LEAST_SUBJECTS:
         note += f" Bars: 95 % intervals of the mean over {count} subjects."
@@ -298,13 +298,16 @@ def leaders_text(curve: CurveData) -> str:
     for spec in curve.of_frames:
         cells = ("; ".join(leader.text() for leader in curve.best[spec.name, task]) for task in curve.tasks)
         lines.append([spec.label, *(cell or "–" for cell in cells)])
-    taken = "the limit of seconds" if curve.over == "seconds" else curve.axis.lower()
+    taken = "limit of seconds" if curve.over == "seconds" else curve.axis.lower()
     crossings = (
-        "95 % intervals of each crossing in brackets"
+        "95 % interval of each crossing in brackets"
         if len(curve.subjects) >= LEAST_SUBJECTS
-        else f"without intervals, which take {LEAST_SUBJECTS} subjects"
+        else f"without intervals, which need {LEAST_SUBJECTS} subjects"
     )
-    return f"Best mean by {taken}, interpolated between trainings, {crossings}:\n\n{pipe_table(lines)}"
+    return (
+        f"Methods with the best mean, each with the {taken} from which it leads (interpolated between trainings, {crossings}):"
+        f"\n\n{pipe_table(lines)}"
+    )
 
 
 def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipRecord) -> CurvePoint:

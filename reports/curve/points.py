@@ -132,7 +132,7 @@ def points_text(
         given = f"{point.part!s:>7}{size:>10}{point.cameras:>8g}{point.timesteps:>11g}{point.pictures:>10g}"
         given += _shown(point.tracking_error, 2, 10) if tracked else ""
         lines.append(f"{point.method:<{wide}}{given}{''.join([*cost, *cells])}")
-    lines.append("Means over subjects. Held out of every training; no test frame was looked at:")
+    lines.append("Means over subjects. Held out of every training; no test frame was used:")
     for subject, parameters in held.items():
         steps = ", ".join(map(str, parameters["timesteps"][:6])) + (
             ", ..." if len(parameters["timesteps"]) > 6 else ""

@@ -14,9 +14,9 @@ from ...bench.executors.options import ExecutionOptions
 class LeaderboardSettings(RunOptions, ExecutionOptions):
     """Make a page of all result bundles in a folder: a table for each set of frames, and their submitters.
 
-    Bundles whose rows are of the same frames by the same protocol share a table, with the marks and tests of `headbench
-    table`. Results of different bundles are never merged. Metrics of frames are recomputed from renders as by `headbench
-    verify`; only values that were verified are ranked. Bundles of synthetic captures need no --data.
+    Bundles with the same frames and protocol share a table, with the marks and tests of `headbench table`. Results of different
+    bundles are never merged. Metrics of frames are recomputed from renders as by `headbench verify`; only values that were
+    verified are ranked. Bundles of synthetic captures need no --data.
     """
 
     folder: tyro.conf.Positional[str]
@@ -29,5 +29,5 @@ class LeaderboardSettings(RunOptions, ExecutionOptions):
     """Heading of the page."""
 
     recompute: tuple[str, ...] = ()
-    """File names of bundles to train again from their seeds and settings on captures made again. The settings decide how
-    long this takes: look at them first."""
+    """File names of bundles to train again from their seeds and settings, on captures that are made again. Check the settings
+    first: they decide how long this takes."""

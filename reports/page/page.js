@@ -483,7 +483,7 @@ function budget() {
   const fitting = names.map((_, i) => i).filter(within), key = fitting.reduce((bits, i) => bits | 1n << BigInt(i), 0n).toString(16);
   const words = limits.map(({cost, limit}) => `${limit} ${units[cost]}`).join(" and ") || "no limit";
   const unknown = limits.flatMap(({cost}) => names.filter((_, i) => costs[cost][i] === null).map(name => `Left out: ${name}: no measured ${cost}.`));
-  const found = fitting.length ? [`Recommended for ${words}: `, make("b", {textContent: names[fitting[0]]}), `. ${sentences[sets[key]] ?? "Which choices cannot be told apart from it, headbench recommend says."}`] : [`No choice is within ${words}.`];
+  const found = fitting.length ? [`Recommended for ${words}: `, make("b", {textContent: names[fitting[0]]}), `. ${sentences[sets[key]] ?? "headbench recommend lists the choices that are not significantly worse."}`] : [`No choice is within ${words}.`];
   $("answer").replaceChildren(...found, ...unknown.map(text => ` ${text}`));
   budgetRows.forEach((row, i) => { row.hidden = !within(i); row.cells[1].classList.toggle("first", i === fitting[0]); });
 }

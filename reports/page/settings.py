@@ -14,11 +14,12 @@ MAX_MB, MAX_SPLIT_MB = 10.0, 500.0
 
 @dataclass(frozen=True)
 class PageSettings(RunOptions):
-    """Write finished runs to one HTML file: what it shows in words, frames of all methods side by side, tables, curves, provenance.
+    """Write finished runs to one HTML file: the result in words, frames of all methods side by side, tables, curves, record of
+    the run.
 
-    It needs no network and no other file. Pictures are chosen to fit in --max-mb: the worst frames of each
-    method and task always, the others evenly over time. With --split it is a folder whose index.html loads
-    pictures when they are viewed, for large runs.
+    It needs no network and no other file. Images are chosen to fit in --max-mb: always the worst frames of each method and
+    task, the others evenly over time. With --split the output is a folder, for large runs, whose index.html loads images when
+    they are viewed.
     """
 
     runs: tyro.conf.Positional[tuple[str, ...]]
@@ -28,13 +29,13 @@ class PageSettings(RunOptions):
     """File to write, with --split a folder that is new or holds an earlier report. By default report.html or report."""
 
     split: bool = False
-    """Whether pictures are in separate files, in a folder with the page."""
+    """Write images to separate files, in a folder with the page."""
 
     max_mb: float | None = None
     """Maximum size in megabytes (10^6 bytes). By default 10, with --split 500."""
 
     papers: Annotated[tuple[str, ...], tyro.conf.arg(name="as")] = ()
-    """Papers in the form of whose tables the runs are shown, too, with the rows that they printed: `headbench list papers`."""
+    """Papers (`headbench list papers`) in whose table layout the runs are also shown, with the rows of the paper."""
 
     def __post_init__(self) -> None:
         if not self.runs:

@@ -180,7 +180,7 @@ def _tested(
     alike = sorted((n for n, c in against.items() if not c["better"]), key=lambda n: against[n]["gain"])
     text = Markup("<b>{}</b> has the best {} in {}, {}.").format(leader, spec.label, where, amount)
     if alike:
-        text += Markup(" It cannot be told apart from {}.").format(listed([*map(with_interval, alike)]))
+        text += Markup(" Its lead over {} is not significant.").format(listed([*map(with_interval, alike)]))
     if better:
         shown, rest = better[:NAMED], better[NAMED:]
         parts = [*map(with_interval, shown)]
@@ -241,20 +241,20 @@ def _limits(runs: RunSet, methods: int, spans: Sequence[Markup], untested: bool)
     if not untested:
         return [
             Markup(
-                "Exact sign-flip test over {}, Holm’s correction, level {:g}\u00a0%. It holds for the subjects of captures like "
-                "these, not for other captures, resolutions or training budgets. “Cannot be told apart” does not mean equal: the "
-                "interval says how large a difference may be."
+                "Exact sign-flip test over {}, Holm’s correction, level {:g}\u00a0%. It applies to subjects of captures like "
+                "these, not to other captures, resolutions or training budgets. “Not significant” does not mean equal: "
+                "the interval shows how large a difference may be."
             ).format(counted(subjects, "subject"), 100 * LEVEL)
         ]
-    text = Markup("{} cannot decide which method is better: a test of {} takes {}.").format(
+    text = Markup("{} cannot decide which method is better: a test of {} needs {}.").format(
         f"{in_words(subjects).capitalize()} subject{'s' * (subjects != 1)}",
         counted(pairs, "pair"),
         counted(subjects_needed(LEVEL, pairs), "subject"),
     )
     if spans:
         text += Markup(
-            " In single frames, {}. These spans hold the middle {:.0f}\u00a0% of the frames of the recordings; they are not"
-            " confidence intervals."
+            " In single frames, {}. These ranges contain the middle {:.0f}\u00a0% of the frames; they are not confidence"
+            " intervals."
         ).format(Markup("; ").join(spans), 100 * MIDDLE)
     return [text]
 

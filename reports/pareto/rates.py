@@ -163,8 +163,8 @@ def _difference(
     lacking = [subject for subject, value in values.items() if value is None]
     if lacking or not values:
         reason = (
-            f"{len(lacking)} of {len(values)} subjects have fewer than {LEAST_POINTS} steps of rising quality, or curves "
-            "without a common quality"
+            f"{len(lacking)} of {len(values)} subjects have fewer than {LEAST_POINTS} steps of increasing quality, or curves "
+            "without a common range of quality"
         )
         return RateDifference(method, reference, metric, None, reason=reason)
     known = [float(value) for value in values.values() if value is not None]

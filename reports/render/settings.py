@@ -37,7 +37,7 @@ class RenderSettings:
     """With --frames orbit: angle beyond the outermost cameras, degrees."""
 
     video: bool = False
-    """Write videos, too: one for each sequence and camera. Needs PyAV (extra `video`)."""
+    """Also write videos, one for each sequence and camera. Needs PyAV (extra `video`)."""
 
     beside: bool = False
     """With --video of captured frames: show the captured image next to each."""

@@ -54,7 +54,7 @@ def write_extremes_sheet(
         title="Novel views and poses",
         subtitle="Turntable between the training cameras and beyond; joint samples of expression and jaw along the principal "
         "components of training; a path through two of them. Truth: the person of the synthetic capture, path-traced.",
-        marks={EXTRAPOLATED: "view beyond the training cameras", BROKEN: "a limit is broken"},
+        marks={EXTRAPOLATED: "view beyond the training cameras", BROKEN: "a limit is exceeded"},
         label_width=66,
     )
 
@@ -95,7 +95,7 @@ def write_reenact_sheet(
         sections,
         title="Cross-reenactment",
         subtitle="Expressions of the source in the first row, avatars of another subject below; no ground truth.",
-        marks={BROKEN: "a limit is broken"},
+        marks={BROKEN: "a limit is exceeded"},
     )
 
 
@@ -129,7 +129,7 @@ def _extremes_sections(folder: Path, avatar: Mapping[str, Any], width: int) -> l
         frames = [column[index] if index < len(column) else None for column in columns.values()]
         made += rows(frames, "samples" if index else "typical")
     title = f"{avatar['method']}, subject {avatar['subject']}, seed {avatar['seed']}"
-    found = f"{avatar['frames_broken']} of {avatar['frames']} frames break a limit"
+    found = f"{avatar['frames_broken']} of {avatar['frames']} frames exceed a limit"
     sections = [
         SheetSection(f"{title}: {found}", [f"{view['azimuth']:+.0f}°" for view in views.values()], made)
     ]
@@ -156,7 +156,7 @@ def table(avatars: Sequence[Mapping[str, Any]]) -> str:
     form = "  {:<16} {:>10} {:>10} {:>7} {:>7}".format
     for avatar in avatars:
         title = f"{avatar['subject']} {avatar['method']} seed {avatar['seed']}"
-        lines.append(f"{title}: {avatar['frames_broken']} of {avatar['frames']} frames break a limit")
+        lines.append(f"{title}: {avatar['frames_broken']} of {avatar['frames']} frames exceed a limit")
         if "missing" in avatar:
             lines.append(f"  missing: {avatar['missing']}")
             continue

@@ -27,21 +27,20 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class CompareSettings(BaselineOptions):
     """Paired differences between methods of finished runs: size, interval, exact test, Holm's correction. With --baseline:
-    one run against the numbers of a file, for CI.
+    comparison of one run with a baseline file, for CI.
     """
 
     runs: tyro.conf.Positional[tuple[str, ...]]
-    """Folders of finished runs on the same frames. Further seeds of a method join it; another setting is another
-    method."""
+    """Folders of finished runs on the same frames. Seeds of a method are combined; other settings count as another method."""
 
     against: Annotated[str | None, tyro.conf.arg(metavar="METHOD")] = None
-    """Compare every method with this one alone, instead of all pairs: fewer comparisons, so fewer subjects needed."""
+    """Compare every method with this one only, instead of all pairs: with fewer comparisons, fewer subjects are needed."""
 
     metrics: tuple[str, ...] = ()
     """Metrics to compare; default: those of the comparison table."""
 
     trivial: bool = False
-    """Compare the trivial baselines (mean image, nearest camera), too."""
+    """Also compare the trivial baselines (mean image, nearest camera)."""
 
     region: str = "full"
     """Region of the frames to compare on, such as face."""
@@ -53,10 +52,11 @@ class CompareSettings(BaselineOptions):
     """Level of the tests; intervals have a confidence of one minus it."""
 
     equivalence: tuple[str, ...] = ()
-    """Test whether methods are equivalent, too: METRIC=MARGIN in the metric's unit, such as `psnr=0.3`, for each metric to test."""
+    """Also test whether methods are equivalent: METRIC=MARGIN in the metric's unit, such as `psnr=0.3`, for each metric to
+    test."""
 
     format: Literal["text", "csv"] = "text"
-    """How to print; --json gives everything, each subject's difference included."""
+    """Format of the output; --json prints everything, including the difference of each subject."""
 
     dependent = (
         *DEPENDENT,

@@ -166,7 +166,7 @@ class PairedComparison:
             needed = subjects_needed(self.level, self.family)
             return f"not testable with {counted(self.subjects, 'subject')} (it takes {needed})"
         if self.p_holm > self.level:
-            return "cannot be told apart"
+            return "no significant difference"
         if self.minus:
             return "the differences differ"
         return f"{self.first if (self.difference > 0) == self.higher_is_better else self.second} is better"

@@ -70,8 +70,8 @@ def primary_table(runs: RunSet) -> str:
             continue
         lines.append([head, *numbers, c.verdict, equivalence_text(c, spec.unit)])
     how = (
-        "Intervals are those of Student's t over subjects, each for itself and not corrected; they may exclude 0 where the test does not "
-        f"reject. Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in found)} endpoints with values; "
+        "Intervals are Student's t intervals over subjects, not corrected for multiple comparisons; they may exclude 0 where the test does "
+        f"not reject. Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in found)} endpoints with values; "
         "equivalence by two one-sided sign-flip tests, which assume that subjects differ symmetrically about the mean, Holm over "
         f"these; level {LEVEL:.0%}."
     )

@@ -106,7 +106,7 @@ def _marking(tested: Sequence[PairedComparison], meaning: str, family: str) -> s
     first = tested[0]
     needed = subjects_needed(LEVEL, first.family)
     subjects = counted(first.subjects, "subject")
-    return f"{meaning} With {subjects} no test can tell whether they are 0 (it takes {needed}; {test})."
+    return f"{meaning} {subjects} are too few to test whether they differ from 0 (needed: {needed}; {test})."
 
 
 def _cell(found: PairedComparison, digits: int) -> TableCell:

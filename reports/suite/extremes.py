@@ -61,7 +61,7 @@ def extremes_section(avatars: Sequence[Mapping[str, Any]]) -> str:
             )
     if not rows:
         return ""
-    lines = [["method", "measure", "subjects", "mean", "worst", "frames that break the limit"], ["---"] * 6]
+    lines = [["method", "measure", "subjects", "mean", "worst", "frames that exceed the limit"], ["---"] * 6]
     text = pipe_table([*lines, *rows])
     how = (
         "Joint samples of expression and jaw along the principal components of training, in views between and beyond the training "

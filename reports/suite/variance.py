@@ -46,8 +46,8 @@ def variance_section(runs: RunSet, pair: tuple[str, str]) -> str:
                 lines.append([name, title, *counts, shown, f"{between:.3f}", f"{within:.3f}"])
     table = pipe_table(lines)
     how = (
-        "Standard deviations: between subjects, of the means over seeds; within subjects, of trainings with different seeds, pooled. "
-        "Both methods of a difference have the same seed."
+        "Standard deviations: between subjects, of the means over seeds; within subjects, over seeds, pooled. "
+        "Differences are between trainings with the same seed."
     )
     return f"## Variance between and within subjects (exploratory)\n\n{table}\n\n{how}"
 
@@ -66,9 +66,8 @@ def variance_text(runs: Sequence[Path], seeds: Sequence[Path]) -> str:
         return ""
     subjects, mean, between, within = found
     return (
-        f"Trained with {len(by_seed)} seeds on {subjects} of the subjects, the difference of `{PAIR[0]}` and `{PAIR[1]}` in novel views is "
-        f"{mean:+.2f} dB; its standard deviation is {within:.2f} dB between the seeds of a subject, and {between:.2f} dB between the subjects' "
-        "means over seeds."
+        f"With {len(by_seed)} training seeds on {subjects} of the subjects, the mean of `{PAIR[0]}` - `{PAIR[1]}` in novel views is {mean:+.2f} dB. "
+        f"Its standard deviation is {within:.2f} dB over the seeds of one subject, and {between:.2f} dB over subjects (means over seeds)."
     )
 
 

@@ -15,19 +15,18 @@ STANDARD_INPUT = "-"
 
 @dataclass(frozen=True)
 class ViewSettings(RunOptions):
-    """Move avatars in a browser: side by side, from any view, with sliders and with recorded sequences.
-
-    Images are drawn on this machine, smaller while something moves. Ends with Ctrl-C. Needs viser (extra `view`).
+    """View avatars in a browser: side by side, from any view, with sliders and with recorded sequences. Images are rendered on
+    this machine, at a smaller size while something moves. Ends with Ctrl-C. Needs viser (extra `view`).
     """
 
     avatars: tyro.conf.Positional[tuple[str, ...]]
     """Folders of runs, or of avatars as `headbench render` takes them; an imported avatar needs --data, its capture."""
 
     methods: tuple[str, ...] = ()
-    """Of runs, only these; by default all that are trained, without the trivial baselines."""
+    """Only these methods of runs; by default all but the trivial baselines."""
 
     subjects: tuple[str, ...] = ()
-    """Of runs, only these; by default the first."""
+    """Only these subjects of runs; by default the first."""
 
     source: str | None = None
     """Capture of another subject, with the same head model, whose sequences drive the avatars too."""

@@ -126,7 +126,7 @@ def test_marked_images_have_a_frame_outside_their_pixels(tmp_path):
     tiles = [Tile(images[0], mark="#ff0000"), Tile(images[1])]
     heads = ["long head " * 20] * 2
     section = SheetSection("A", heads, [TileRow(["label"], tiles)])
-    marks = {"#ff0000": "a limit is broken"}
+    marks = {"#ff0000": "a limit is exceeded"}
     write_sheet(tmp_path / "x.png", [section], title="T", subtitle="S " * 300, marks=marks)
     sheet = read_png(tmp_path / "x.png")
     (left, top), (plain_left, plain_top) = (found(sheet, image) for image in images)

@@ -50,7 +50,7 @@ def test_versions_tell_the_code_of_this_package_apart(
         )
     runs = RunSet.read(folders)
     assert runs.methods == methods
-    said = "Files in the folders of these methods changed between the runs, their version did not: toy (version 1)."
+    said = "Files of these methods changed between the runs, although their version did not: toy (version 1)."
     assert (said in table_of(runs).facts) == (len(methods) == 1)
 
 

@@ -117,13 +117,13 @@ def many_subjects(methods, subjects=9, seeds=(0,), spread=0.0):
             30.02,
             9,
             {"a": 1, "b": 1, "c": 2, "d": 3},
-            "(exact sign-flip test over 9 subjects, each method against all others, Holm, 5%); the others",
+            "(exact sign-flip test over 9 subjects, each method against all others, Holm, 5%). The others",
         ),
         (
             30.5,
             5,
             {"a": 2, "b": 1, "c": 3, "d": 4},
-            "by the digits shown alone: with 5 subjects no test can tell the best (it takes 7)",
+            "by the digits shown, without a test, which needs 7 subjects (here 5 subjects)",
         ),
     ],
 )
@@ -142,7 +142,7 @@ def test_a_column_with_too_few_subjects_for_its_test_is_named(metrics):
     both = both[~((both["metric"] == "lpips") & (both["method"] == "c"))]
     table = table_of(both, metrics[:2], "abc", ["novel_view"])
     assert ranks(table, "psnr") == {"a": 1, "b": 2, "c": 3}
-    assert "Too few subjects for the test, so that the digits alone decide: Novel view PSNR." in table.caption
+    assert "Too few subjects for a test, ranked by the digits alone: Novel view PSNR." in table.caption
     assert "sign-flip test over 6 subjects" in table.caption
 
 

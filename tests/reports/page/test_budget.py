@@ -93,9 +93,9 @@ def test_answers_are_those_of_the_command(made):
         assert sentence in expected.text
         verdicts.add(sentence.partition(" (")[0])
     assert verdicts == {
-        "Not told apart from it",
-        "No other method that fits can be the best",
-        "It is the only choice that fits.",
+        "Not significantly worse",
+        "All other choices within the limits are significantly worse",
+        "It is the only choice within the limits.",
     }
 
 
@@ -136,7 +136,7 @@ def test_the_table_has_costs_marks_and_tests(made):
 def test_one_subject_leaves_open_what_cannot_be_known(made):
     found = content(made(1))
     assert found["left_out"][0].startswith("The runs have one subject, so it is not known")
-    assert "It takes 7 subjects to tell these methods apart; there is 1." in found["answers"]["sentences"]
+    assert "A test of these methods needs 7 subjects; there is 1." in found["answers"]["sentences"]
 
 
 def test_without_costs_there_is_nothing_to_limit(made, tmp_path):
