@@ -111,7 +111,7 @@ def _render_breaches(avatar: Avatar, loaded: Avatar, clip: Clip) -> Iterator[str
     for (camera, pose), frame in zip(reversed(views), reversed(first)):
         again = loaded.render(camera, pose)
         if not (np.array_equal(again.rgb, frame.rgb) and np.array_equal(again.alpha, frame.alpha)):
-            yield "a loaded avatar renders different images if the frames are requested in another order"
+            yield "a loaded avatar renders different images if frames are requested in another order"
             break
     camera, pose = views[0]
     black = avatar.render(camera, pose, (0.0, 0.0, 0.0))

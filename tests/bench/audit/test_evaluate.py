@@ -141,7 +141,7 @@ def test_missing_images_are_counted_before_anything_is_written(run, images, tmp_
     for path in gone:
         path.unlink()
     with pytest.raises(
-        InputError, match=r"an image for each of 5 frames, found 2 without.*looked for as subject1/"
+        InputError, match=r"an image for each of 5 frames, found 2 without.*expected as subject1/"
     ):
         scored(images, run, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -281,7 +281,7 @@ def test_a_list_in_csv_names_images(run, images, tmp_path):
         (HEADER + "a.png,EMO,1\n", "line 2: expected 4 entries"),
         (HEADER + "a.png,EMO,77,a\n", "a frame of the capture"),
         (HEADER + "a.png,EMO,0,b\nb.png,EMO,0,b\n", "each frame once"),
-        (HEADER + "a.png,EMO,0,b\n", "5 without.*looked for as .*a.png"),
+        (HEADER + "a.png,EMO,0,b\n", "5 without.*expected as .*a.png"),
         ("\xff", "line 1"),
     ],
 )

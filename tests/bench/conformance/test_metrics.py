@@ -67,7 +67,7 @@ FAULTS = {
     "memory of calls": (Counting, "depends on what was compared before"),
     "a changed input": (writing, "changes its input"),
     "a memory layout": (by_layout, "memory layout"),
-    "sizes that are cropped": (lambda a, b: mean(a[:, :40], b[:, :40]), "80x96 pixels was taken"),
+    "sizes that are cropped": (lambda a, b: mean(a[:, :40], b[:, :40]), "80x96 pixels was accepted"),
     "NaN that is cleaned": (
         lambda a, b: mean(*(np.nan_to_num(x).astype(np.uint8) for x in (a, b))),
         "NaN gives",
@@ -112,7 +112,7 @@ def test_a_fault_in_regions_is_found(metrics, monkeypatch, fault):
         ("JUMP", "jump", lambda a, b, c, d: -mean(a, b), "higher_is_better"),
         ("FILES", "file_count", lambda avatar, workload: 1.0, "a float, not a Measurement"),
         ("FILES", "file_count", lambda avatar, workload: Measurement(np.inf, {}), "not a finite number"),
-        ("HOURS", "hours", lambda record: Measurement(1.0, {}), "a record without any entry was taken"),
+        ("HOURS", "hours", lambda record: Measurement(1.0, {}), "a record without any entry was accepted"),
     ],
 )
 def test_other_kinds_are_checked_by_their_own_protocols(metrics, monkeypatch, spec, function, faulty, breach):
