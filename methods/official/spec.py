@@ -53,7 +53,7 @@ def _paper_of(native: MethodSpec) -> dict[str, Any]:
 
 GA_OFFICIAL = MethodSpec(
     name="ga-official",
-    summary="GaussianAvatars by its authors' code, in your checkout and environment; needs CUDA.",
+    summary="GaussianAvatars by its authors' code, in your checkout and environment; needs CUDA or device=cpu-shim.",
     implementation="headbench.methods.official.ga.method:GAOfficial",
     config="headbench.methods.official.config:GAOfficialConfig",
     renders="headbench.methods.official.renders:gaussian_avatars",
@@ -67,7 +67,7 @@ GA_OFFICIAL = MethodSpec(
 
 TGA_OFFICIAL = MethodSpec(
     name="tga-official",
-    summary="The method ours by its authors' code, in your checkout and environment; needs CUDA.",
+    summary="The method ours by its authors' code, in your checkout and environment; needs CUDA or device=cpu-shim.",
     implementation="headbench.methods.official.tga.method:TGAOfficial",
     config="headbench.methods.official.config:TGAOfficialConfig",
     renders="headbench.methods.official.renders:gaussian_avatars",
@@ -81,7 +81,7 @@ _SAMPLES = "--init_face_point_number"
 
 GBS_OFFICIAL = MethodSpec(
     name="gbs-official",
-    summary="GaussianBlendshapes by its authors' code, in your checkout and environment; needs CUDA.",
+    summary="GaussianBlendshapes by its authors' code, in your checkout and environment; needs CUDA or device=cpu-shim.",
     implementation="headbench.methods.official.gbs.method:GBSOfficial",
     config="headbench.methods.official.config:GBSOfficialConfig",
     renders="headbench.methods.official.renders:gaussian_blendshapes",
@@ -126,7 +126,7 @@ INSTA_OFFICIAL = MethodSpec(
 RGBAVATAR_OFFICIAL = MethodSpec(
     name="rgbavatar-official",
     version="2",
-    summary="RGBAvatar by its authors' code, in your checkout and environment; needs CUDA.",
+    summary="RGBAvatar by its authors' code, in your checkout and environment; needs CUDA or device=cpu-shim.",
     implementation="headbench.methods.official.rgbavatar.method:RGBAvatarOfficial",
     config="headbench.methods.official.config:RGBAvatarOfficialConfig",
     # The published schedule, shortened; one iteration is a batch of ten images.
@@ -140,7 +140,7 @@ RGBAVATAR_OFFICIAL = MethodSpec(
 FLASHAVATAR_OFFICIAL = MethodSpec(
     name="flashavatar-official",
     version="2",
-    summary="FlashAvatar by its authors' code, in your checkout and environment; needs CUDA.",
+    summary="FlashAvatar by its authors' code, in your checkout and environment; needs CUDA or device=cpu-shim.",
     implementation="headbench.methods.official.flashavatar.method:FlashAvatarOfficial",
     config="headbench.methods.official.config:FlashAvatarOfficialConfig",
     # The paper's number of iterations is not stated; "paper" is the default of their script.

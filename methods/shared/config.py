@@ -10,7 +10,7 @@ Iterations are given on the published scale and mapped to the budget as fraction
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 
@@ -59,6 +59,9 @@ class SplatSettings:
             raise ValueError(f"initial_opacity must lie between 0 and 1, found {self.initial_opacity}")
         if not 0 < self.final_rate <= 1:
             raise ValueError(f"final_rate must lie in (0, 1], found {self.final_rate}")
+        for field in fields(self):
+            if field.name.endswith(("_lr", "_share")) and not getattr(self, field.name) >= 0:
+                raise ValueError(f"{field.name} must not be negative, found {getattr(self, field.name)}")
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.spec import INSTA
 from headbench.methods.ours.config import Lines, OursConfig, OuterLayers, Penalty, Planes, PlannedCapacity
 from headbench.methods.ours.spec import OURS
+from headbench.methods.rgbavatar.config import RGBAvatarConfig
 from headbench.methods.rgbavatar.spec import RGBAVATAR
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, Timeline
@@ -154,6 +155,8 @@ def test_the_paper_preset_of_gbs_is_the_paper():
         (SplatTraining, {"ssim_weight": 1.5}),
         (SplatTraining, {"max_splats": 0}),
         (SplatTraining, {"final_rate": 0.0}),
+        (SplatTraining, {"scale_lr": -1e-3}),
+        (RGBAvatarConfig, {"position_share": -1.0}),
         (FlashAvatarConfig, {"samples": 0}),
         (FlashAvatarConfig, {"final_rate": 0.0}),
         (FlashAvatarConfig, {"frequencies": 17}),

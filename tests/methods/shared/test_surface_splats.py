@@ -24,7 +24,7 @@ def test_axes_follow_the_neck_where_the_surface_does(clip):
     assert share.min() == 0
 
 
-def test_axes_of_a_neck_beyond_half_a_turn_are_those_of_the_shorter_turn(clip):
+def test_a_neck_beyond_half_a_turn_has_axes_of_the_shorter_turn(clip):
     mesh = clip_mesh(clip, "cpu")
     faces, vertices = clip.head.faces, mesh.canonical.numpy()
     surface = HeadSurface(mesh, poisson_disk(vertices, faces, np.arange(len(faces)), 400, 0))

@@ -53,7 +53,7 @@ def test_a_method_takes_part_from_its_lowest_cost_on():
     ]
 
 
-def test_a_method_that_is_best_from_its_lowest_cost_on_crosses_no_other():
+def test_a_method_best_from_its_lowest_cost_on_crosses_no_other():
     short = {f"s{n}": [(4.0, 5.0 + n), (64.0, 5.0 + n)] for n in range(3)}
     late = {f"s{n}": [(19.0 + n, 9.0 + n), (64.0, 9.0 + n)] for n in range(3)}
     _, second = leaders({"short": short, "late": late}, higher_is_better=True)
