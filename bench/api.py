@@ -1,4 +1,4 @@
-"""What a script needs to open a capture, train a method on it, and score an avatar, beside `run` for whole comparisons."""
+"""Functions for scripts: open a capture, train a method on it, score an avatar, or `run` a whole comparison."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def open_clip(
     Raises
     ------
     InputError
-        The folder holds no capture or several, or the reader finds a fault.
+        The folder has no capture or several, or the reader finds an error in it.
     """
     config = capture_configuration(str(folder), "", reader, None if head is None else str(head))
     clips = open_clips(replace(config, reader_settings={**config.reader_settings, **settings}))
@@ -79,7 +79,7 @@ def train(
 ) -> Path:
     """Train a method on the training frames of a clip, or continue a training that was interrupted.
 
-    The clip is first brought into the form that the method needs, as `run` does: another size, one video, another head model.
+    The clip is first adapted to the method, as in `run`: image size, a single video, head model.
 
     Parameters
     ----------
@@ -150,8 +150,8 @@ def evaluate(
     Parameters
     ----------
     avatar : Path | str | Avatar
-        Folder of a stored avatar, which receives the clip in the form that its method needs; or an
-        `Avatar`, which receives the clip's own cameras and poses.
+        Folder of a stored avatar, for which the clip is adapted to its method; or an
+        `Avatar`, which is given the clip's own cameras and poses.
     clip : Clip | Path | str
         Clip returned by `open_clip`, or the folder of a capture.
     metrics : str | Sequence[str]
@@ -203,7 +203,7 @@ def evaluate(
 
 
 def run(data: Path | str, out: Path | str, **settings: Any) -> Path:
-    """Run a comparison, or continue one: train, render, measure, write tables and pictures.
+    """Run a comparison, or continue one: train, render, measure, write tables and images.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def run(data: Path | str, out: Path | str, **settings: Any) -> Path:
     Raises
     ------
     InputError
-        Any fault that can be found before the first training.
+        An error found by the checks before the first training.
     """
     values = {"data": str(data), "out": str(out), **settings}
     if "reader" not in values:
@@ -231,12 +231,12 @@ def run(data: Path | str, out: Path | str, **settings: Any) -> Path:
 
 
 def _names(given: str | Sequence[str]) -> tuple[str, ...]:
-    """One name or several, each once."""
+    """Names without duplicates, from one name or several."""
     return (given,) if isinstance(given, str) else tuple(dict.fromkeys(given))
 
 
 def _stored(folder: Path, clip: Clip, device: str, scratch: Path) -> tuple[AdaptedClip, Avatar]:
-    """A stored avatar, and the clip in the form that its method needs."""
+    """A stored avatar, and the clip adapted to its method."""
     stored = open_avatar(folder)
     stored.check_subject(clip)
     form = _adapted(clip, stored.method, stored.heads, scratch) or AdaptedClip(clip)
@@ -246,14 +246,14 @@ def _stored(folder: Path, clip: Clip, device: str, scratch: Path) -> tuple[Adapt
 def _adapted(
     clip: Clip, method: ResolvedMethod, heads: Mapping[str, str], folder: Path
 ) -> AdaptedClip | None:
-    """The clip in the form that a method needs, what takes long kept in a folder; None where it has that form."""
+    """The clip adapted to a method, with results of slow steps in a folder; None if no adaptation is needed."""
     needs = MethodNeeds.of(method.spec)
     step = plan(clip, needs, heads)
     return None if step is None else apply(step, needs, folder, f"adapting {clip.subject}")
 
 
 def _drawn(avatar: Any, form: AdaptedClip, protocol: Protocol, key: FrameKey) -> ByteArray:
-    """The 8-bit frame of a key of the protocol, at the protocol's size."""
+    """Render the frame of a protocol's key, 8-bit, at the protocol's size."""
     seen = form.key(key)
     frame = avatar.render(form.clip.cameras[seen.camera], form.clip.poses[seen.timestep], protocol.background)
     return quantise(form.restore(key, frame.rgb))

@@ -11,7 +11,7 @@ Conventions
 * Cameras have OpenCV axes: x right, y down, z forward. ``world_to_camera`` maps world points to camera
   points; ``K`` is in pixels, with the centre of the top left pixel at (0.5, 0.5).
 * Colours are display-referred sRGB in [0, 1] unless a name says 8-bit.
-* The identity of an image, a render or a row is its `FrameKey`; the order of a list has no meaning.
+* Images, renders and rows are identified by their `FrameKey`; the order of a list has no meaning.
 """
 
 from __future__ import annotations
@@ -306,7 +306,7 @@ class DepthAvatar(Avatar, Protocol):
     """An avatar that renders depth. Optional."""
 
     def depth(self, camera: Camera, pose: HeadPose) -> FloatArray:
-        """(H, W) distance along the camera's axis, metres, of what each pixel shows; NaN where that is mostly background."""
+        """(H, W) depth along the camera's axis, metres; NaN in pixels that are mostly background."""
 
 
 @runtime_checkable
@@ -344,13 +344,14 @@ class SplatAvatar(Avatar, Protocol):
 class HarmonicAvatar(SplatAvatar, Protocol):
     """An avatar whose splats' colours are spherical harmonics in every pose. Optional.
 
-    Exporters take these coefficients; those of other avatars of splats are fitted to the colours that `splats` gives.
+    Exporters use these coefficients; for other splat avatars they fit coefficients to the colours of `splats`.
     """
 
     def harmonics(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:
-        """(N, 3) of degree 0 and (N, 3, K) float32 above it, K up to 15, along world directions from the camera to the splat.
+        """(N, 3) coefficients of degree 0 and (N, 3, K) of higher degrees, K up to 15, float32.
 
-        Order, signs and offset are those of 3D Gaussian Splatting (Kerbl et al., SIGGRAPH 2023).
+        Directions point from the camera to the splat, in the world. Order, signs and offset are those of
+        3D Gaussian Splatting (Kerbl et al., SIGGRAPH 2023).
         """
 
 
@@ -370,8 +371,8 @@ class ListedFrames(Avatar, Protocol):
     ) -> Iterator[tuple[FrameKey, Frame]]:
         """Render exactly these frames; yield each once, with its key, in any order.
 
-        ``alpha`` is 1 if the program does not output coverage. Raises `HeadbenchError` with the program's
-        last lines if it fails or leaves a frame out.
+        ``alpha`` is 1 if the program does not output coverage. Raises `HeadbenchError` with the last lines of the
+        program's output if it fails or leaves a frame out.
         """
 
 
@@ -407,7 +408,7 @@ class CheckedMethod(Method, Protocol):
         """Raise `InputError` for settings that refer to missing files, and for inputs that `fit` would
         refuse.
 
-        First called without a clip, before any long work: then everything except the clip is checked.
+        It is first called without a clip, before any long work, and then checks everything except the clip.
         """
 
 
@@ -460,10 +461,10 @@ class TemporalMetric(Protocol):
 
 
 class SequenceMetric(Protocol):
-    """One number for the frames of a sequence at one camera, in the order of time (`MetricSpec.kind` "sequence")."""
+    """One number for the frames of a sequence from one camera, in temporal order (`MetricSpec.kind` "sequence")."""
 
     def __call__(self, images: Sequence[ByteArray], targets: Sequence[ByteArray]) -> float:
-        """Compare images with the ground truth; (H, W, 3) 8-bit each, as many as there are scored frames."""
+        """Compare images with the ground truth; (H, W, 3) 8-bit each, one per scored frame."""
 
 
 class Measurement(NamedTuple):
@@ -481,8 +482,8 @@ class AvatarMetric(Protocol):
     """One number per avatar (storage, speed), not per frame."""
 
     def __call__(self, avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurement:
-        """Measure an avatar; ``workload`` are pairs of camera and pose that both differ from the previous
-        ones."""
+        """Measure an avatar; ``workload`` has pairs of a camera and a pose, both different from the previous
+        pair's."""
 
 
 @runtime_checkable
@@ -504,19 +505,19 @@ class TrueFrame(NamedTuple):
     mask: ByteArray  #: (H, W) 8-bit foreground coverage
     face: BoolArray  #: (H, W) pixels in which the face is visible
     depth: FloatArray | None = (
-        None  #: (H, W) distance of the head along the camera's axis, metres; infinity beside it
+        None  #: (H, W) depth of the head along the camera's axis, metres; infinite where there is no head
     )
 
 
 class GroundTruth(Protocol):
-    """A subject that can be pictured in any pose and view: that of a synthetic capture, see `DatasetSpec.truth`."""
+    """Renders the subject of a synthetic capture in any pose and view, see `DatasetSpec.truth`."""
 
     @property
     def fingerprint(self) -> str:
-        """Hex digest of everything that a picture depends on besides camera and pose."""
+        """Hex digest of everything that a render depends on besides camera and pose."""
 
     def render(self, camera: Camera, pose: HeadPose) -> TrueFrame:
-        """Picture of the subject, without depth; the same for the same input."""
+        """Render the subject, without depth. Deterministic."""
 
     def depth(self, camera: Camera, pose: HeadPose) -> FloatArray:
         """Depth of the head, as `TrueFrame.depth`."""

@@ -1,7 +1,7 @@
 """Finds methods, readers, metrics and reports by entry points; imports an implementation when it is used.
 
-This is how the command line reaches packages it may not import: an entry point names a light spec, the spec
-names its implementation as ``"package.module:attribute"``.
+The command line does not import these packages: an entry point names a light spec, and the spec names its
+implementation as ``"package.module:attribute"``.
 """
 
 from __future__ import annotations
@@ -48,18 +48,18 @@ _OWN = "headbench"
 
 @dataclass(frozen=True)
 class Plugin:
-    """One entry point: its spec, or why it could not be loaded."""
+    """An entry point with its spec, or the reason why it could not be loaded."""
 
     name: str
-    origin: str  # distribution and version that brought it
+    origin: str  # distribution and version that provides it
     spec: Any | None
     error: str = ""
 
 
 def discover(group: Group) -> dict[str, Plugin]:
-    """All plug-ins of a group by name. A broken one is listed with its error, never fatal.
+    """All plug-ins of a group by name. One that cannot be loaded is listed with its error.
 
-    Where two distributions claim a name, headbench's own wins and the clash is logged.
+    If two distributions register the same name, headbench's takes precedence and the conflict is logged.
     """
     found: dict[str, Plugin] = {}
     for entry in sorted(entry_points(group=f"headbench.{group}"), key=lambda e: _origin(e) != _OWN):
@@ -110,12 +110,12 @@ def unknown(file: str, key: str, name: str, known: Any, remedy: str = "") -> Inp
 
 
 def entry_points(group: str) -> tuple[EntryPoint, ...]:
-    """Entry points of a group. Looking through all distributions takes 5 ms, and hundreds of calls ask."""
+    """Entry points of a group. Cached, since searching all distributions takes 5 ms and there are hundreds of calls."""
     return _entries(group, tuple((folder, _changed_at(folder or ".")) for folder in sys.path))
 
 
 def _changed_at(folder: str) -> int:
-    """When an entry of a folder was last added or removed, as by an installation; 0 if there is no folder."""
+    """Modification time of a folder, which an installation changes; 0 if there is no folder."""
     try:
         return os.stat(folder).st_mtime_ns
     except OSError:
@@ -133,7 +133,7 @@ def _origin(entry: EntryPoint) -> str:
 
 @lru_cache(maxsize=64)
 def _name_and_version(distribution: Distribution) -> tuple[str, str]:
-    """Of a distribution, whose entries share it; it reads its whole metadata for each question."""
+    """Name and version of a distribution. Cached, since each access parses all of its metadata."""
     metadata = distribution.metadata
     return metadata["Name"], metadata["Version"]
 

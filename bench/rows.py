@@ -31,7 +31,7 @@ FRAME = ["subject", "sequence", "timestep", "camera"]
 """Columns that name a frame."""
 STATUSES = ("ok", "missing", "failed")
 SUSPECT = "suspect: "
-"""Beginning of the reason of a measured value that is too good, see `MetricSpec.suspect_above`."""
+"""Prefix of the reason of a measured value that is suspiciously good, see `MetricSpec.suspect_above`."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Row:
     """One measured value, or the reason why it is missing. Per-avatar values have no task, timestep -1 and no
     camera.
 
-    ``condition`` names what was changed against the plain comparison, see `bench.condition.Condition`; "" for nothing.
+    ``condition`` names the changes from the plain comparison, see `bench.condition.Condition`; "" for none.
 
     ``machine``, ``threads`` and ``other_cores`` are recorded for times only, see `machine.ProcessorLoad`;
     elsewhere, and in older records, they are "", 0 and NaN.
@@ -66,7 +66,7 @@ class Row:
 
 
 LEFT_OUT = "left out: "
-"""Beginning of the reason of a missing value that means leave out, see `LeftOutError`."""
+"""Prefix of the reason of a missing value that is left out, see `LeftOutError`."""
 
 COLUMNS = tuple(f.name for f in fields(Row))
 WHOLE, NUMBERS = ("seed", "timestep", "threads"), ("seed", "timestep", "value", "threads", "other_cores")
@@ -85,16 +85,16 @@ MAX_TEXT_BYTES = 256 * 2**20
 MAX_UNPACKED_BYTES = 512 * 2**20
 """Schema of all columns in the file."""
 READING: Any = {"thrift_string_size_limit": 2**20, "thrift_container_size_limit": 2**16, "pre_buffer": False}
-"""Longest text and list in what describes the columns; a list takes its declared length in memory. Without reading ahead,
-which would leave the file to threads of pyarrow that may hold it longer than the reader."""
+"""Limits on texts and lists in the file's metadata, since a list allocates its declared length. Without pre-buffering,
+in which threads of pyarrow may keep the file open longer than the reader."""
 SPARE_ROWS = 100_000
-"""Rows that a file may have beyond one a byte: repeated rows, such as those of a metric that is missing, pack well."""
+"""Rows that a file may have in addition to one per byte: repeated rows, such as those of a missing metric, compress well."""
 JOINED_AT_ONCE = 64
-"""Tables that are joined at a time: small ones take many times the memory of their content."""
+"""Number of tables concatenated at a time: many small tables take many times the memory of their content."""
 MAX_VALUE = 1e15
-"""Of a measured value; sums and their text stay of bounded size."""
+"""Largest measured value, which bounds sums and their text."""
 MAX_REASON = 4_000
-"""Characters of a reason that are read; longer ones are cut in their middle."""
+"""Maximum characters of a reason; longer ones are shortened in the middle."""
 
 
 class All(Enum):
@@ -125,12 +125,12 @@ class Rows:
 
     @classmethod
     def joined(cls, parts: Iterable[Rows]) -> Rows:
-        """Several rows as one, in order."""
+        """Concatenate rows, in order."""
         tables = (part._table for part in parts)
         whole = []
         while batch := list(islice(tables, JOINED_AT_ONCE)):
             table = pd.concat(batch)
-            # Text of joined tables stays in as many small pieces as there were tables, until it is taken from them.
+            # Concatenated text columns keep one chunk per table; `take` copies them into one.
             whole.append(table.take(np.arange(len(table))))
         return cls(pd.concat(whole, ignore_index=True)) if whole else cls.of([])
 
@@ -138,9 +138,8 @@ class Rows:
     def read(cls, path: Path) -> Rows:
         """Read rows.
 
-        Raises `InputError` for a file that is not there, not Parquet as `write` leaves it, or larger than it may be;
-        for a column that is missing or of another type, an empty entry, an unknown status, and a measured value that
-        is not finite.
+        Raises `InputError` for a file that is missing, not Parquet as `write` leaves it, or too large; and for a missing
+        column or one of another type, an empty entry, an unknown status, or a measured value that is not finite.
         """
         if not path.exists():
             raise InputError(path, "", "the rows of a finished run", "no such file", "Start the run again.")
@@ -156,7 +155,7 @@ class Rows:
                 temporary,
                 index=False,
                 use_dictionary=repeated,
-                # Values hardly repeat; their bytes pack better by significance.
+                # Values rarely repeat; they compress better with their bytes split by significance.
                 column_encoding={"value": "BYTE_STREAM_SPLIT"},
             )
 
@@ -182,7 +181,7 @@ class Rows:
         wanted = {"method": method, "metric": metric, "task": task, "region": region, "condition": condition}
         table = self._table
         if ALL not in wanted.values():
-            # One group of the table, which is sought once for all queries: a report makes thousands.
+            # The groups are computed once: a report makes thousands of queries.
             table = table.take(self._places.get(tuple(wanted.values()), np.empty(0, int)))
             wanted = {}
         wanted["subject"] = subject
@@ -196,7 +195,7 @@ class Rows:
 
     @cached_property
     def _places(self) -> dict[tuple[Any, ...], IntArray]:
-        """Places of the rows of each method, metric, task, region and condition, in their order."""
+        """Row indices by method, metric, task, region and condition."""
         columns = ["method", "metric", "task", "region", "condition"]
         return self._table.groupby(columns, sort=False).indices if len(self._table) else {}  # type: ignore[return-value]
 
@@ -232,7 +231,7 @@ class Rows:
         return set(self._table["subject"].unique())
 
     def subjects_of(self, methods: Collection[str]) -> dict[str, frozenset[str]]:
-        """Subjects that each method has rows of."""
+        """Subjects of each method's rows."""
         pairs = self._table[["method", "subject"]].drop_duplicates()
         return {name: frozenset(map(str, pairs.loc[pairs["method"] == name, "subject"])) for name in methods}
 
@@ -251,11 +250,11 @@ class Rows:
         return sorted(map(str, self._of(method)["version"].unique()))
 
     def protocols(self, task: str) -> list[str]:
-        """Hashes of the protocols that a task was scored by, sorted."""
+        """Hashes of the protocols with which a task was scored, sorted."""
         return sorted(map(str, self._table.loc[self._table["task"] == task, "protocol"].unique()))
 
     def frames(self, task: str, region: str) -> set[tuple[str, str, int, str]]:
-        """Frames of a task: those that any method has a row for in a region."""
+        """Frames of a task for which any method has a row in a region."""
         if (task, region) not in self._frames:
             self._frames[task, region] = self._sought_frames(task, region)
         return self._frames[task, region]
@@ -270,24 +269,24 @@ class Rows:
         return set(own[FRAME].drop_duplicates().itertuples(index=False, name=None))
 
     def renamed(self, labels: Mapping[str, str]) -> Rows:
-        """The same rows, every method under another name."""
+        """Return the rows with methods renamed."""
         return Rows(self._table.assign(method=_mapped(self._table["method"], labels.__getitem__)))
 
     def of_protocols(self, hashes: Mapping[str, str]) -> Rows:
-        """The same rows with other protocols, by their hashes; those that are not named keep theirs."""
+        """Return the rows with protocol hashes replaced; hashes that are not in ``hashes`` stay."""
         protocol = _mapped(self._table["protocol"], lambda found: hashes.get(found, found))
         return Rows(self._table.assign(protocol=protocol))
 
     def labelled(self) -> Rows:
-        """The same rows with `label_of` of method and condition as the method: each label is an entry of a table."""
+        """Return the rows with the label of method and condition (`label_of`) as the method, as in tables."""
         table = self._table
         (method, methods), (condition, conditions) = (pd.factorize(table[n]) for n in ("method", "condition"))
         labels = np.array([[label_of(str(m), str(c)) for c in conditions] for m in methods], dtype=object)
-        labels = labels.reshape(len(methods), len(conditions))[method, condition]  # of no rows, too
+        labels = labels.reshape(len(methods), len(conditions))[method, condition]  # also works without rows
         return Rows(table.assign(method=pd.Series(labels, table.index, dtype="str"), condition=""))
 
     def split(self, labels: Mapping[str, tuple[str, str]]) -> Rows:
-        """The same rows, a method that is named by its label under its name and condition, as version 1 named it."""
+        """Return the rows with labels, which version 1 stored as the method, split into method and condition."""
         table = self._table
         parts = [labels.get(str(m), (str(m), str(c))) for m, c in zip(table["method"], table["condition"])]
         columns = {
@@ -297,7 +296,7 @@ class Rows:
         return Rows(table.assign(**columns))
 
     def with_suspects(self, limits: Mapping[str, float], region: str) -> Rows:
-        """The same rows; measured values of whole images, in ``region``, are marked as suspect above the limit of their metric alone."""
+        """Return the rows; of values of whole images (``region``), exactly those above their metric's limit are suspect."""
         table = self._table
         above = table["value"] > table["metric"].map(dict(limits)).astype(float)
         above &= (table["status"] == "ok") & (table["region"] == region) & (table["task"] != "")
@@ -309,14 +308,14 @@ class Rows:
         return Rows(table.assign(reason=reasons.mask(above, texts)))
 
     def in_single_precision(self) -> Rows:
-        """The same rows, values to the 24 bits of float32 (7 digits, more than tables show): half the bytes of a file."""
+        """Return the rows with values rounded to float32 (7 digits, more than tables show), which halves the file."""
         return Rows(self._table.assign(value=self._table["value"].astype(np.float32).astype(np.float64)))
 
     def of_part(self, region: str, sequences: Collection[str], full: str) -> Rows:
-        """Rows of frames over one region, relabelled as the ``full`` one, in some sequences (default: all).
+        """Rows of frames in one region, relabelled as ``full``, of some sequences (default: all).
 
-        Rows of avatars as a whole stay, and so do those that stand for all frames of a task because a method failed, for
-        every task and metric that the part has frames of.
+        Rows of avatars as a whole are kept. So are rows that stand for all frames of a task because a method failed, for
+        every task and metric with frames in the part.
         """
         table = self._table
         avatar = table["task"] == ""
@@ -331,7 +330,7 @@ class Rows:
     def split_by_camera(
         self, task: str, chosen: Collection[tuple[str, str]], inside: str, outside: str
     ) -> Rows:
-        """The same rows, frames of ``task`` as two tasks: ``inside`` for the ``chosen`` (subject, camera), else ``outside``.
+        """Return the rows with ``task`` split in two: ``inside`` for the ``chosen`` (subject, camera), else ``outside``.
 
         Rows that stand for all frames of the task because a method failed are in both.
         """
@@ -346,7 +345,7 @@ class Rows:
         return Rows(pd.concat(parts, ignore_index=True))
 
     def updated(self, new: Rows) -> Rows:
-        """These rows in their order, replaced by rows of ``new`` with the same method, seed, frame, region
+        """Return the rows in their order, replaced by rows of ``new`` with the same method, seed, frame, region
         and metric.
 
         Raises `InputError` for new rows that replace nothing.
@@ -362,7 +361,7 @@ class Rows:
         return Rows(pd.concat([self._table, new._table]).take(chosen).reset_index(drop=True))
 
     def with_values(self, other: Rows) -> Rows:
-        """The same rows; measured values that ``other`` has, too, are those of ``other``."""
+        """Return the rows with measured values replaced by those that ``other`` has as well."""
         identity = ["method", "condition", "seed", "task", *FRAME, "region", "metric"]
         theirs = other._table[other._table["status"] == "ok"].set_index(identity)["value"]
         found = theirs.reindex(pd.MultiIndex.from_frame(self._table[identity])).to_numpy()
@@ -389,12 +388,12 @@ class Rows:
     def of_metrics(self, names: Sequence[str]) -> Rows:
         """The rows of some metrics, in the order of ``names``."""
         metric = self._table["metric"]
-        # One table, not joined parts: thousands of small parts take thirty times the memory of their content.
+        # One table: concatenating thousands of small parts takes thirty times the memory of their content.
         places = np.concatenate([np.empty(0, int), *(np.flatnonzero(metric == name) for name in names)])
         return Rows(self._table.take(places).reset_index(drop=True))
 
     def with_metrics(self, names: Mapping[str, str]) -> Rows:
-        """The rows of some metrics alone, each under another name."""
+        """Return the rows of some metrics, renamed."""
         table = self._table[self._table["metric"].isin(list(names))]
         renamed = pd.Series([names[str(name)] for name in table["metric"]], table.index, dtype="str")
         return Rows(table.assign(metric=renamed))
@@ -402,7 +401,7 @@ class Rows:
     def of_frames(self, tasks: Mapping[str, Collection[tuple[str, str, int, str]]]) -> Rows:
         """The rows of some frames of some tasks, and those of avatars as a whole.
 
-        Rows that stand for all frames of one of the tasks because a method failed stay.
+        Rows that stand for all frames of one of the tasks because a method failed are kept.
         """
         table = self._table
         kept = table["task"] == ""
@@ -413,7 +412,7 @@ class Rows:
         return Rows(table[kept])
 
     def as_one_sequence(self) -> Rows:
-        """The same rows, all frames of a subject and task in one sequence, so that every frame has the same weight.
+        """Return the rows with all frames of a subject and task in one sequence, so that every frame has the same weight.
 
         Timesteps are numbered from 0, sorted by sequence and timestep.
         """
@@ -428,11 +427,11 @@ class Rows:
         return Rows(table.assign(sequence=sequence, timestep=numbers))
 
     def pooled(self, count: int, decibels: Collection[str]) -> Rows:
-        """The same rows, whose means over frames are those of batches of ``count`` frames in their order.
+        """Return the rows with values averaged over batches of ``count`` consecutive frames.
 
-        Every frame has the value of its batch: the mean, or for metrics in ``decibels`` (peak signal-to-noise ratios) that of the
-        mean squared error. In a last batch of fewer frames values are scaled, so that all batches have the same weight.
-        Groups are those of method, seed, task, subject and metric; rows without a value stay.
+        Every frame gets the value of its batch: the mean or, for metrics in ``decibels`` (peak signal-to-noise ratios), that of
+        the mean squared error. Values of an incomplete last batch are scaled, so that all batches have the same weight.
+        Batches are formed per method, seed, task, subject and metric; rows without a value are unchanged.
         """
         table = self._table
         own = table[(table["task"] != "") & (table["timestep"] >= 0) & (table["status"] == "ok")]
@@ -470,17 +469,17 @@ class Rows:
         return [" ".join(map(str, row)).rstrip() for row in lacking.itertuples(index=False, name=None)]
 
     def check_kept(self, path: Path, **planned: Iterable[str | int]) -> None:
-        """Refuse, before any work, to replace these rows, read from ``path``, by rows that lack some of them.
+        """Refuse, before any work, to replace these rows, read from ``path``, by rows that lack some of their values.
 
         Parameters
         ----------
         planned : Iterable[str | int]
-            Values of the new rows in columns of `Row`, by column.
+            Values of the new rows, by column of `Row`.
 
         Raises
         ------
         InputError
-            These rows have other values in one of the columns.
+            These rows have values in one of the columns that the new rows lack.
         """
         for column, values in planned.items():
             named = list(map(str, values))
@@ -491,7 +490,7 @@ class Rows:
                 raise InputError(path, f"{column}s", expected, found, DISCARD)
 
     def check_protocols(self, source: Path | str, expected: Mapping[str, str] | None = None) -> None:
-        """Raise `InputError` if rows of one task have several protocols, or another than ``expected``.
+        """Raise `InputError` if rows of one task have several protocols, or a protocol other than ``expected``.
 
         Numbers of different protocols are not comparable. ``expected`` holds the hash of each task's
         protocol.
@@ -510,7 +509,7 @@ class Rows:
 
 
 DISCARD = "Choose another --out. To discard the results, delete run.json and rows.parquet: trained avatars are kept."
-"""Remedy for rows that would be lost."""
+"""Remedy in the error for rows that would be lost."""
 
 
 def replace_rows(path: Path, rows: Rows) -> None:
@@ -539,7 +538,7 @@ def earlier_rows(path: Path) -> Rows | None:
 
 
 def _read_table(path: Path) -> pa.Table:
-    """Read the columns of `Row`, text as dictionaries, so that what repeats takes no memory."""
+    """Read the columns of `Row`; text as dictionaries, so that repeated text takes no memory."""
     with open_regular(path, ROWS) as stream:
         size = os.fstat(stream.fileno()).st_size
         if size > MAX_FILE_BYTES:
@@ -554,7 +553,7 @@ def _read_table(path: Path) -> pa.Table:
         rows = max(about.num_rows, sum(group.num_rows for group in groups))
         if rows > size + SPARE_ROWS:
             raise InputError(path, "", f"at most {size + SPARE_ROWS} rows in {size} bytes", f"{rows} rows")
-        # Of a group, not of its columns: pyarrow ends the process where it is asked about a damaged column.
+        # Sizes of groups, not of columns: pyarrow crashes when asked for a damaged column.
         unpacked = sum(max(0, group.total_byte_size) for group in groups)
         if unpacked > MAX_UNPACKED_BYTES:
             raise InputError(path, "", f"columns of at most {MAX_UNPACKED_BYTES} bytes", f"{unpacked}")
@@ -567,7 +566,7 @@ def _read_table(path: Path) -> pa.Table:
 
 
 def _checked(table: pa.Table, path: Path) -> pd.DataFrame:
-    """Check columns and turn them into those that `Rows.of` makes."""
+    """Check the columns and convert them to the types of `Rows.of`."""
     columns: dict[str, Any] = {}
     for name in table.column_names:
         column = table.column(name).combine_chunks()
@@ -595,7 +594,7 @@ def _checked(table: pa.Table, path: Path) -> pd.DataFrame:
 
 
 def _mapped(words: pd.Series[str], change: Callable[[str], str]) -> pd.Series[str]:
-    """Every word changed; each distinct one once."""
+    """Apply ``change`` to every word, once for each distinct word."""
     place, known = pd.factorize(words)
     changed = np.array([change(str(word)) for word in known], dtype=object)[place]
     return pd.Series(changed, words.index, dtype="str")

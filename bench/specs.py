@@ -12,11 +12,11 @@ from typing import Any, Literal, NamedTuple
 
 MAX_LABEL = 120
 LABEL = f"at most {MAX_LABEL} printable characters"
-"""Form of names, units, versions and hashes in rows and manifests; see `is_label`."""
+"""Pattern of names, units, versions and hashes in rows and manifests; see `is_label`."""
 
 
 def is_label(text: str) -> bool:
-    """Whether rows and manifests with this text can be read."""
+    """Whether a text is valid as a label in rows and manifests."""
     return len(text) <= MAX_LABEL and text.isprintable()
 
 
@@ -127,7 +127,7 @@ class MethodSpec:
         avatar is kept as long as version, settings and data are the same. After a change of the code,
         methods of this package give a warning; a run with an external plug-in is refused.
     source, bibtex : str, str
-        The paper that describes the method, in words and as a BibTeX entry; "" for none.
+        The paper that describes the method, as text and as a BibTeX entry; "" for none.
     trivial : bool
         Whether it is a trivial baseline that every method should beat; shown in tables, never ranked.
     default : bool
@@ -205,7 +205,7 @@ class MetricSpec:
         "package.module:function" for the given ``kind``; a class is instantiated without arguments.
     kind : MetricKind
         "frame", a `Metric`; "regional", a `RegionalMetric`; "temporal", a `TemporalMetric`; "sequence", a
-        `SequenceMetric`, whose value is that of each of the frames; "avatar",
+        `SequenceMetric`, whose value is assigned to each of the frames; "avatar",
         an `AvatarMetric`; "training", a `TrainingMetric`.
     detail : str
         Key of the measurement's details that holds the value, in ``unit``; "" for the main value.
@@ -223,8 +223,8 @@ class MetricSpec:
     needs : str
         As for a method, called with None for the config. Not recorded in runs.
     suspect_above : float | None
-        Values of whole frames above it are marked as suspect in rows, tables and reports: no method that was measured
-        reaches it without the test image. Not recorded in runs.
+        Values of whole frames above it are marked as suspect in rows, tables and reports, since no measured method
+        exceeds it without access to the test images. Not recorded in runs.
     """
 
     name: str
@@ -294,18 +294,18 @@ class DatasetSpec:
     """A reader: ``implementation`` names a function ``(path, **settings) -> Clip``.
 
     ``find`` names a function ``(root) -> list of paths`` that lists the captures under a folder. A reader with
-    a keyword ``progress`` is given a `Progress`; one with a keyword ``use_cache`` is given False where the bytes
-    of every file have to be read, whatever it remembers of an earlier time. ``reads`` is False for one that
-    makes captures instead: its function takes ``out`` and settings and writes what another reader reads.
-    Settings whose annotation admits a `Path` name files; a run finds them again after it was moved together with them.
-    ``listing`` names a function ``path -> {split: [(timestep, camera), ...]}``: the frames in the order in which the
-    capture's own files list them, all of them, by which official repositories number their renders; "" for none.
+    a keyword ``progress`` is given a `Progress`; one with a keyword ``use_cache`` is given False to read the bytes
+    of every file, ignoring its cache. ``reads`` is False for an entry that makes captures instead: its function takes
+    ``out`` and settings and writes a capture that another reader reads. Settings whose annotation admits a `Path` name
+    files; a run that was moved together with these files still finds them.
+    ``listing`` names a function ``path -> {split: [(timestep, camera), ...]}``: all frames, in the order of the
+    capture's own files, by which official repositories number their renders; "" for none.
     ``pose_files`` names a function ``path -> {timestep: file}``: the file with the tracking parameters of each timestep;
-    "" where timesteps have no files of their own.
-    ``truth`` names a function ``clip -> GroundTruth`` for clips of captures that this function made; it raises
+    "" if timesteps have no files of their own.
+    ``truth`` names a function ``clip -> GroundTruth`` for clips of captures that this entry made; it raises
     `UnavailableError` for others. "" for none.
-    ``needs`` is as that of a method, called with None for the config. ``errors`` names a function ``clip -> list of text``: what
-    makes every result of the capture meaningless, which a run looks for before it trains; "" for none.
+    ``needs`` is defined as for a method and called with None for the config. ``errors`` names a function
+    ``clip -> list of text``: errors that make every result of the capture meaningless, checked before training; "" for none.
     """
 
     name: str
@@ -322,25 +322,25 @@ class DatasetSpec:
 
 @dataclass(frozen=True)
 class ConditionSpec:
-    """A change that conditions of a run name, see `bench.condition.Condition`.
+    """A registered change that the conditions of a run refer to by name, see `bench.condition.Condition`.
 
     Attributes
     ----------
     name, summary : str
-        What conditions call it, and what it does.
+        Name used in conditions, and description.
     kind : str
         "clip": ``implementation`` names a function ``(clip, config, **parameters) -> clip``, where ``config`` is the
-        `RunConfig`; what takes long it keeps in ``config.out``.
+        `RunConfig`; it stores results of slow steps in ``config.out``.
         "derive": a function ``(method spec, avatar folder, folder to write, clip, device, **parameters) -> Avatar``.
-        "drive": a function ``(job, avatar, progress, **parameters) -> (Rows, details, files)`` that writes below the folder
-        of the run: details are what JSON has, files those that have to be as they were for the rows to be kept.
+        "drive": a function ``(job, avatar, progress, **parameters) -> (Rows, details, files)`` that writes below the run
+        folder. Details are JSON values; the rows are kept only as long as the files are unchanged.
     implementation : str
         "package.module:function".
     protocols : str
-        "package.module:function" of a change of kind "drive": ``(jobs, **parameters) -> protocols``, one for all jobs of
+        "package.module:function" for kind "drive": ``(jobs, **parameters) -> protocols``, called once for all jobs of
         methods with equal needs; see `bench.protocol.protocol_name` for their names.
     metrics : tuple of MetricSpec
-        What a change of kind "drive" measures.
+        Metrics that a change of kind "drive" measures.
     """
 
     name: str
@@ -371,7 +371,7 @@ class CommandResult(NamedTuple):
     text: str
     """Tables for a terminal."""
     data: Any
-    """The same as plain values, for JSON."""
+    """The same results as JSON values."""
     passed: bool = True
     """False if a check did not pass."""
     code: int | None = None
@@ -400,22 +400,22 @@ class CommandSpec:
     Attributes
     ----------
     name : str
-        The words that call it: one, or two of which the first names a group of commands ("prepare nersemble").
+        One word, or two of which the first names a group of commands ("prepare nersemble").
     group : str
         Heading of ``headbench --help`` that lists it: one of `COMMAND_GROUPS`, or another, shown after them.
     summary : str
         One sentence.
     settings : str
-        "package.module:Class" of a frozen dataclass. Its attributes become the options, the strings below them the
-        help. Help of the command loads this module. A static method ``notes() -> str``
-        gives more text for the help.
+        "package.module:Class" of a frozen dataclass. Its attributes become options, and the strings below them
+        their help; ``--help`` of the command imports this module. A static method ``notes() -> str``
+        returns additional help text.
     function : str
-        "package.module:function" of ``(settings, progress: Progress) -> CommandResult``. The exit code is 0, or 1 where
-        the findings did not pass, unless they give one.
+        "package.module:function" of ``(settings, progress: Progress) -> CommandResult``. The exit code is that of the
+        result if it has one, otherwise 0 if it passed and 1 if it did not.
     writes : str
-        The setting with the folder that the command writes: no other process works in it meanwhile; "" for none.
+        Setting with the output folder, which other processes cannot use while the command runs; "" for none.
     kinds : tuple of str
-        The kinds of folder that the command may continue in, see `bench.io.files.check_kind`.
+        Kinds of folder in which the command may continue, see `bench.io.files.check_kind`.
     programs : mapping of str to str
         Programs of other authors that the command runs, by name: "package.module:function" of ``(settings, device) -> Iterator[Need]``,
         where ``settings`` is the mapping that ``headbench doctor --set settings.NAME.KEY=VALUE`` gives.

@@ -1,6 +1,6 @@
 """AKD: average distance of facial landmarks between a render and the ground truth.
 
-Papers compute it with three kinds of landmarks at least (98 by PIPNet, 478 by MediaPipe, 68 by dlib), so that the name says which.
+Papers use at least three kinds of landmarks (98 by PIPNet, 478 by MediaPipe, 68 by dlib), so the metric's name states which.
 """
 
 from __future__ import annotations
@@ -33,41 +33,41 @@ PIPNET_REMEDY = (
 
 
 class _Akd(FaceMetric):
-    """Mean distance of landmarks, pixels."""
+    """Mean distance between landmarks, pixels."""
 
     def score(self, found: FloatArray, truth: FloatArray) -> float:
-        """Mean over (N, 2) landmarks."""
+        """Mean distance over (N, 2) landmarks."""
         return float(np.linalg.norm(found - truth, axis=1).mean())
 
 
 class AkdMediaPipe(_Akd):
-    """AKD of 468 landmarks by MediaPipe; the image is searched around the landmarks of the ground truth first, then everywhere."""
+    """AKD of 468 landmarks by MediaPipe, searched near the ground truth's landmarks first, then in the whole image."""
 
     @staticmethod
     def network() -> LandmarkNetwork:
-        """The network of the file that the variable names."""
+        """Load the network from the file in the environment variable."""
         from ..bench.landmark_network import LandmarkNetwork
 
         return LandmarkNetwork(named_file("AKD", VARIABLE, REMEDY))
 
 
 class AkdDlib(_Akd):
-    """AKD of 68 landmarks by dlib, each image searched by itself."""
+    """AKD of 68 landmarks by dlib, detected in each image independently."""
 
     network = DlibLandmarks
 
 
 class AkdPipNet(_Akd):
-    """AKD of 98 landmarks by PIPNet, each image searched by itself."""
+    """AKD of 98 landmarks by PIPNet, detected in each image independently."""
 
     @staticmethod
     def network() -> AtLandmarks:
-        """The network of the file that the variable names, at dlib's landmarks."""
+        """Load the network from the file in the environment variable; it is applied at dlib's landmarks."""
         return AtLandmarks(_pipnet)
 
 
 def mediapipe_needs(config: object, device: str) -> Iterator[Need]:
-    """The file of the network, and what reads it."""
+    """The network's file, and the package that reads it."""
     yield network_need("landmark network, for AKD", VARIABLE, REMEDY, AkdMediaPipe.network)
 
 
@@ -78,7 +78,7 @@ def _pipnet() -> PipNet:
 
 
 def pipnet_needs(config: object, device: str) -> Iterator[Need]:
-    """The files of the network, and dlib, which finds faces for it."""
+    """The network's files, and dlib, which detects faces for it."""
     yield network_need("PIPNet's weights and mean face, for AKD", PIPNET_VARIABLE, PIPNET_REMEDY, _pipnet)
     yield from dlib_needs(config, device)
 

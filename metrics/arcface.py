@@ -1,7 +1,7 @@
-"""ArcFace's description of a face, by a network in a file of ONNX.
+"""ArcFace embedding of a face, computed by a network in an ONNX file.
 
 Deng, Guo, Xue, Zafeiriou, "ArcFace: Additive Angular Margin Loss for Deep Face Recognition", CVPR 2019. Crop and colours are
-those of the project insightface.
+those of the insightface project.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from ..bench.errors import InputError
 from ..bench.io.files import read_bytes, reading
 
 SIDE = 112
-"""Pixels across the network's input."""
+"""Side of the network's input, pixels."""
 PLACES = np.array(
     [[38.2946, 51.6963], [73.5318, 51.5014], [56.0252, 71.7366], [41.5493, 92.3655], [70.7299, 92.2041]]
 )
-"""Of the eyes, the tip of the nose and the corners of the mouth in the crop, pixels."""
+"""Positions of the eyes, the tip of the nose and the corners of the mouth in the crop, pixels."""
 LENGTH = 512
 MAX_BYTES = 2**30
-"""Of a file; that of ResNet-50 has 0.17 GB."""
+"""Maximum size of a file; that of ResNet-50 has 0.17 GB."""
 
 
 class ArcFace:
-    """The network of a file.
+    """The network in an ONNX file.
 
-    Raises `InputError` if the file is missing, is not a network, or is one of another input or output, or of numbers that are
-    not finite.
+    Raises `InputError` if the file is missing or not a network, or if the network has another input or output, or returns
+    numbers that are not finite.
     """
 
     def __init__(self, path: Path):
@@ -45,7 +45,7 @@ class ArcFace:
             raise InputError(path, "", expected, "numbers that are not finite")
 
     def __call__(self, image: ByteArray, landmarks: FloatArray) -> FloatArray:
-        """(512,) numbers of the face with these (68, 2) landmarks of 300-W, pixels, in an (H, W, 3) 8-bit RGB image."""
+        """(512,) embedding of the face in an (H, W, 3) 8-bit RGB image with (68, 2) landmarks of 300-W, pixels."""
         turn = alignment(five_points(landmarks), PLACES)
         return self._run(np.asarray(cv2.warpAffine(image, turn, (SIDE, SIDE)), np.uint8))[0]
 
@@ -56,14 +56,14 @@ class ArcFace:
 
 
 def five_points(landmarks: FloatArray) -> FloatArray:
-    """(5, 2) middles of the eyes, tip of the nose and corners of the mouth, of (68, 2) landmarks of 300-W."""
+    """(5, 2) centres of the eyes, tip of the nose and corners of the mouth, from (68, 2) landmarks of 300-W."""
     eyes = landmarks[36:42].mean(axis=0), landmarks[42:48].mean(axis=0)
     return np.stack([*eyes, landmarks[30], landmarks[48], landmarks[54]])
 
 
 def alignment(points: FloatArray, places: FloatArray) -> FloatArray:
-    """(2, 3) turn, scale and shift that bring (N, 2) points to their places with the least sum of squared distances."""
-    start, end = points @ (1, 1j), places @ (1, 1j)  # as complex numbers, a turn and a scale are one factor
+    """(2, 3) similarity transform of (N, 2) points to ``places`` with the least sum of squared distances."""
+    start, end = points @ (1, 1j), places @ (1, 1j)  # rotation and scale are one factor of complex numbers
     away = start - start.mean()
     factor = np.vdot(away, end) / np.vdot(away, away)
     shift = end.mean() - factor * start.mean()

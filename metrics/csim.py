@@ -1,7 +1,7 @@
-"""CSIM: cosine similarity of the identity that a network recognises in a render and in the ground truth.
+"""CSIM: cosine similarity of the identity embeddings of a render and the ground truth.
 
-Papers compute it by several networks, most by ArcFace, whose weights may only be used for research that is not commercial, so that
-the name says which.
+Papers use several networks, most of them ArcFace, whose weights are licensed for non-commercial research only. The name of the
+metric states the network.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ class _Csim(FaceMetric):
 
 
 class CsimDlib(_Csim):
-    """Cosine similarity of the 128 numbers by which dlib recognises people."""
+    """Cosine similarity of dlib's 128-dimensional face embeddings."""
 
     network = DlibIdentity
 
 
 class CsimArcFace(_Csim):
-    """Cosine similarity of the 512 numbers by which ArcFace recognises people."""
+    """Cosine similarity of ArcFace's 512-dimensional embeddings."""
 
     @staticmethod
     def network() -> AtLandmarks:
-        """The network of the file that the variable names, at dlib's landmarks."""
+        """Load the network from the file in the environment variable; it is applied at dlib's landmarks."""
         return AtLandmarks(_arcface)
 
 
@@ -55,7 +55,7 @@ def _arcface() -> ArcFace:
 
 
 def arcface_needs(config: object, device: str) -> Iterator[Need]:
-    """The file of the network, and dlib, which finds faces for it."""
+    """The network's file, and dlib, which detects faces for it."""
     yield network_need("ArcFace's network, for CSIM", VARIABLE, REMEDY, _arcface)
     yield from dlib_needs(config, device)
 

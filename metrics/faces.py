@@ -1,4 +1,4 @@
-"""What a network finds in the face of a render and in that of its ground truth, and dlib's networks."""
+"""Metrics that compare a network's output for the faces of a render and its ground truth; dlib's networks."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from .pairs import check_pair
 
 REMEDY = f"{install_extra('faces')} (Boost licence; networks CC0, but the 68 landmarks were trained on 300-W: no commercial use)."
 ENLARGED = 1
-"""How often dlib's detector doubles the image's size: it finds faces of 80 pixels and more, and these of 40."""
+"""Number of times that dlib's detector upsamples the image: 0 finds faces of at least 80 pixels, 1 of 40."""
 
 
 class FaceNetwork(Protocol):
-    """A network for pictures of faces."""
+    """A network for images of faces."""
 
     def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:
-        """An array for an (H, W, 3) 8-bit image, or None where no face is found.
+        """Output for an (H, W, 3) 8-bit image, or None if no face is found.
 
-        ``near`` is what was found in a similar image; a network may ignore it.
+        ``near`` is the output for a similar image; a network may ignore it.
         """
         ...
 
 
 class FaceMetric(ABC):
-    """A number from what a network finds in an image and in its ground truth, (H, W, 3) 8-bit each.
+    """Compares a network's output for an image and its ground truth, (H, W, 3) 8-bit each.
 
-    Raises `LeftOutError` if one of them shows no face to the network, and `UnavailableError` without the network.
+    Raises `LeftOutError` if the network finds no face in one of them, and `UnavailableError` if the network is missing.
     """
 
     def __init__(self) -> None:
-        self._local = threading.local()  # a network serves one thread
+        self._local = threading.local()  # one network per thread
 
     def __call__(self, image: ByteArray, target: ByteArray) -> float:
         """Compute the metric."""
@@ -51,11 +51,11 @@ class FaceMetric(ABC):
     @staticmethod
     @abstractmethod
     def network() -> FaceNetwork:
-        """A new network. Raises `UnavailableError`."""
+        """Create a network. Raises `UnavailableError`."""
 
     @abstractmethod
     def score(self, found: FloatArray, truth: FloatArray) -> float:
-        """The number, of what is found in the image and in the ground truth."""
+        """Value of the metric from the outputs for the image and the ground truth."""
 
     def _find(self, image: ByteArray, name: str, near: FloatArray | None = None) -> FloatArray:
         if not hasattr(self._local, "network"):
@@ -67,7 +67,7 @@ class FaceMetric(ABC):
 
 
 class _Dlib:
-    """dlib's frontal face detector, with landmarks in the most certain face."""
+    """dlib's frontal face detector, with landmarks of the face of highest confidence."""
 
     def __init__(self, landmarks: str):
         self._dlib, self._folder = _dlib()
@@ -87,13 +87,13 @@ class DlibLandmarks(_Dlib):
         super().__init__("shape_predictor_68_face_landmarks.dat")
 
     def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:
-        """(68, 2) pixels, whole numbers, as dlib returns them."""
+        """(68, 2) landmarks in whole pixels, as dlib returns them."""
         shape = self._shape(image)
         return None if shape is None else np.array([(point.x, point.y) for point in shape.parts()], float)
 
 
 class DlibIdentity(_Dlib):
-    """dlib's descriptor of a face, by which its networks recognise people. Raises as `DlibLandmarks`."""
+    """dlib's face embedding for identification. Raises as `DlibLandmarks`."""
 
     def __init__(self) -> None:
         super().__init__("shape_predictor_5_face_landmarks.dat")
@@ -101,7 +101,7 @@ class DlibIdentity(_Dlib):
         self._network = self._dlib.face_recognition_model_v1(path)
 
     def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:
-        """(128,) numbers."""
+        """(128,) embedding."""
         shape = self._shape(image)
         if shape is None:
             return None
@@ -109,9 +109,10 @@ class DlibIdentity(_Dlib):
 
 
 class AtLandmarks:
-    """A network that is shown where a face is by `DlibLandmarks`: a function of an image and these, as `FaceNetwork.find` returns.
+    """A network applied at the landmarks of `DlibLandmarks`.
 
-    It is what the function ``network`` returns. Raises as `DlibLandmarks` before that reads a file, which it would for each frame.
+    The function ``network`` returns it: a function of an image and landmarks with the result of `FaceNetwork.find`. Errors of
+    `DlibLandmarks` are raised before ``network`` reads a file, which would be repeated for each frame.
     """
 
     def __init__(self, network: Callable[[], Callable[[ByteArray, FloatArray], FloatArray | None]]) -> None:
@@ -120,29 +121,29 @@ class AtLandmarks:
         self._landmarks = DlibLandmarks()
 
     def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:
-        """What the network finds in the most certain face."""
+        """Output for the face of highest confidence."""
         landmarks = self._landmarks.find(image)
         return None if landmarks is None else self._network(image, landmarks)
 
 
 def named_file(metric: str, variable: str, remedy: str) -> Path:
-    """The file of a metric's network that an environment variable names.
+    """Path of a metric's network file, from an environment variable.
 
     Raises `UnavailableError` if it is not set, and `InputError` if there is no such file.
     """
     path = os.environ.get(variable, "")
     if not path:
         raise UnavailableError(f"{metric} needs a network, whose file is not named.", remedy)
-    if not os.path.isfile(path):  # which also answers for paths that cannot be looked up
+    if not os.path.isfile(path):  # False, too, for paths that cannot be accessed
         found = f"{path}, {'a folder' if os.path.isdir(path) else 'not there'}"
         raise InputError(f"environment variable {variable}", "", "a file", found, remedy)
     return Path(path)
 
 
 def network_need(what: str, variable: str, remedy: str, network: Callable[[], object]) -> Need:
-    """The file of a metric's network, which is found if the function ``network``, which reads it, raises no `HeadbenchError`.
+    """The network file of a metric; it is found if ``network``, which reads it, raises no `HeadbenchError`.
 
-    Of a file that is named and cannot be read, the fault is the remedy.
+    If the file is set but cannot be read, the remedy is the error message.
     """
     try:
         network()
@@ -154,7 +155,10 @@ def network_need(what: str, variable: str, remedy: str, network: Callable[[], ob
 
 
 def _dlib() -> tuple[Any, Path]:
-    """The package, and the folder of its networks, whose package is not imported: older versions import pkg_resources, which was removed."""
+    """The dlib package, and the folder of its networks.
+
+    The package of the networks is not imported, since older versions import pkg_resources, which was removed.
+    """
     found = find_spec("face_recognition_models")
     try:
         import dlib

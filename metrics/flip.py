@@ -39,7 +39,7 @@ PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180
 # Section 4.1, table 1: Gaussians of the contrast sensitivity of each opponent channel, (a1, b1, a2, b2).
 _SENSITIVITY = ((1.0, 0.0047, 0.0, 1e-5), (1.0, 0.0053, 0.0, 1e-5), (34.1, 0.04, 13.5, 0.025))
 _QC, _PC, _PT = 0.7, 0.4, 0.95  # section 4.1: exponent, and the knee of the redistribution
-_FEATURE_WIDTH = 0.082  # section 4.2: degrees that an edge detector spans
+_FEATURE_WIDTH = 0.082  # section 4.2: width of an edge detector, degrees
 _QF = 0.5  # section 4.2
 # sRGB (D65) to XYZ, IEC 61966-2-1 with the primaries' chromaticities taken exactly.
 _TO_XYZ = np.array(
@@ -58,7 +58,7 @@ class _Filter(NamedTuple):
     terms: tuple[tuple[FloatArray, FloatArray], ...]
 
     def __call__(self, channel: FloatArray) -> FloatArray:
-        """Apply to an (H, W) channel; the border continues outwards."""
+        """Apply to an (H, W) channel; border pixels are replicated."""
         import cv2
 
         parts = [
@@ -144,7 +144,7 @@ def _lab(linear: FloatArray) -> FloatArray:
 
 
 def _hunt(lab: FloatArray) -> FloatArray:
-    """Equation 9: colours look less colourful the darker they are."""
+    """Equation 9: the darker a colour, the less colourful it appears."""
     adjusted = lab.copy()
     adjusted[..., 1:] *= 0.01 * lab[..., :1]
     return adjusted
@@ -167,7 +167,7 @@ def _hyab(a: FloatArray, b: FloatArray) -> FloatArray:
 
 @functools.cache
 def _sensitivity_filters(pixels_per_degree: float) -> tuple[_Filter, _Filter, _Filter]:
-    """Equations 5 and 6: one filter for each opponent channel; all have the radius of the widest."""
+    """Equations 5 and 6: one filter per opponent channel, all with the radius of the widest."""
     widest = max(max(b1, b2) for _, b1, _, b2 in _SENSITIVITY)
     radius = math.ceil(3 * math.sqrt(widest / (2 * math.pi**2)) * pixels_per_degree)
     squares = (np.arange(-radius, radius + 1) / pixels_per_degree) ** 2
@@ -175,7 +175,7 @@ def _sensitivity_filters(pixels_per_degree: float) -> tuple[_Filter, _Filter, _F
     def made(a1: float, b1: float, a2: float, b2: float) -> _Filter:
         terms = [(a * math.pi / b, np.exp(-(math.pi**2) * squares / b)) for a, b in ((a1, b1), (a2, b2)) if a]
         total = sum(scale * shape.sum() ** 2 for scale, shape in terms)
-        # Gaussians of a radius are products of two of x and y.
+        # A radial Gaussian is the product of Gaussians of x and y.
         return _Filter(tuple((scale / total * shape, shape) for scale, shape in terms))
 
     luminance, red_green, blue_yellow = (made(*row) for row in _SENSITIVITY)
@@ -200,7 +200,7 @@ def _balanced(kernel: FloatArray) -> FloatArray:
 
 
 def _magnitude(channel: FloatArray, pair: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """Length of the responses along x and y."""
+    """Magnitude of the responses along x and y."""
     along, across = pair
     return np.hypot(_Filter(((across, along),))(channel), _Filter(((along, across),))(channel))
 

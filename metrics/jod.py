@@ -1,4 +1,4 @@
-"""JOD: predicted quality of a sequence as a video, in just-objectionable differences, by two programs.
+"""JOD: predicted video quality of a sequence in just-objectionable differences, by FovVideoVDP or ColorVideoVDP.
 
 R. Mantiuk et al., "FovVideoVDP: A visible difference predictor for wide field-of-view video", ACM Transactions on Graphics 40(4), 2021.
 R. Mantiuk et al., "ColorVideoVDP: A visual difference predictor for image, video and display distortions", ACM Transactions on Graphics
@@ -28,7 +28,7 @@ RATE = 24.3
 
 
 class Jod:
-    """JOD of a sequence of 8-bit frames against its ground truth by FovVideoVDP, as the NeRSemble benchmark's first author computes it.
+    """JOD of a sequence of 8-bit frames by FovVideoVDP, computed as by the NeRSemble benchmark's first author.
 
     Raises `UnavailableError` without the package.
     """
@@ -40,18 +40,18 @@ class Jod:
     )
 
     def __call__(self, images: Sequence[ByteArray], targets: Sequence[ByteArray]) -> float:
-        """JOD, at most 10, of (H, W, 3) frames in the order of time; a single frame is a still picture."""
+        """JOD, at most 10, of (H, W, 3) frames in temporal order; a single frame is a still image."""
         for image, target in zip(images, targets, strict=True):
             check_pair(image, target)
         program = _program(self.package, self.program, self.remedy)
-        rate = RATE if len(images) > 1 else 0  # a still picture has none
+        rate = RATE if len(images) > 1 else 0  # still image
         stacks = np.stack(images), np.stack(targets)
         found, _ = program.predict(*stacks, dim_order="FHWC", frames_per_second=rate)
         return float(found)
 
 
 class ColorJod(Jod):
-    """The same by ColorVideoVDP, which also sees changes of colour."""
+    """JOD by ColorVideoVDP, which also models colour differences."""
 
     package, program = "pycvvdp", "cvvdp"
     modules = ("pycvvdp", "torchvision", "ffmpeg")
@@ -63,11 +63,11 @@ def _program(package: str, name: str, remedy: str) -> Any:
     before = list(sys.path)
     try:
         module = import_module(package)
-    except Exception as error:  # a torchvision that does not belong to PyTorch raises others than ImportError
+    except Exception as error:  # a torchvision for another PyTorch raises errors other than ImportError
         what = f"JOD needs the Python package {package}, which cannot be imported: {error}."
         raise UnavailableError(what, remedy) from error
     finally:
-        sys.path[:] = before  # which they extend by their own folders
+        sys.path[:] = before  # the packages append their own folders
     return getattr(module, name)(display_name=DISPLAY, heatmap=None, quiet=True)
 
 
@@ -82,12 +82,12 @@ def _needs(metric: type[Jod]) -> Iterator[Need]:
 
 
 def needs(config: Any, device: str) -> Iterator[Need]:
-    """The package pyfvvdp and what it imports."""
+    """The package pyfvvdp and its dependencies."""
     return _needs(Jod)
 
 
 def color_needs(config: Any, device: str) -> Iterator[Need]:
-    """The package pycvvdp and what it imports."""
+    """The package pycvvdp and its dependencies."""
     return _needs(ColorJod)
 
 

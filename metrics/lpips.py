@@ -56,7 +56,7 @@ class SharedLpips:
     device: str = "cpu"
 
     def on(self, device: str) -> SharedLpips:
-        """The same on another device; on a GPU in float32 without TF32."""
+        """This metric on another device; on a GPU in float32 without TF32."""
         return replace(self, device=device)
 
     def __call__(self, image: ByteArray, target: ByteArray) -> float:
@@ -98,7 +98,7 @@ def needs_alex(config: Any, device: str) -> Iterator[Need]:
 
 
 def needs_vgg(config: Any, device: str) -> Iterator[Need]:
-    """Weights of VGG-16, likewise."""
+    """Weights of VGG-16 on this machine, without a download."""
     yield _weights("vgg")
 
 

@@ -8,12 +8,12 @@ The linear layers (version 0.1 of Zhang et al. 2018) come with the installed tor
 are read without importing it. The backbone is looked for, in this order:
 
 1. an explicit path, a file or a folder;
-2. the environment variable ``HEADBENCH_LPIPS_WEIGHTS``, a folder, or a file, which is passed over if it has the name of
+2. the environment variable ``HEADBENCH_LPIPS_WEIGHTS``, a folder or a file; the file is ignored if it has the name of
    another network's weights;
 3. the user's caches: headbench's own, then torch hub's;
-4. PyTorch's publication, fetched once into headbench's cache and checked against the hash in its name.
+4. PyTorch's published file, downloaded once into headbench's cache and checked against the hash in its name.
 
-In a folder, the published file name or that of a file with the convolutional part alone is looked for.
+In a folder, the published file name, or the name of a file with only the convolutional part, is looked for.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Lpips:
     Parameters
     ----------
     net : str
-        "alex" (customary for reporting), "squeeze" or "vgg".
+        "alex" (the usual choice for evaluation), "squeeze" or "vgg".
     weights : Path | None
         File of the backbone, or folder to look in; see the module for the default.
     device : str
@@ -63,13 +63,13 @@ class Lpips:
     scaled : bool
         Whether to scale images to [-1, 1], as the constants expect; False feeds [0, 1].
     cache_mb : float
-        Maximum memory for features of ground-truth images that are kept for the next method, in 10^6
+        Maximum memory for cached features of ground-truth images, which the next method reuses, in 10^6
         bytes.
 
     Attributes
     ----------
     fingerprint : str
-        Hex digest of all weights in use, the same for a full file and one of features alone.
+        Hex digest of all weights in use, the same for a full file and one with only the convolutional part.
 
     Raises
     ------
@@ -100,7 +100,7 @@ class Lpips:
         self.device = torch.device(device)
         self._network = self.spec.build()
         self._network.load_state_dict(backbone)
-        # Pixels come channel by channel side by side; the network takes them as they lie.
+        # Channels are interleaved (channels last); the network uses this memory layout as it is.
         self._network.requires_grad_(False).to(self.device)
         for parameter in self._network.parameters():
             if parameter.ndim == 4:
@@ -150,8 +150,8 @@ class Lpips:
         for index, place in enumerate(places):
             own = [layer[index : index + 1] for layer in features]
             size = sum(layer.numel() * layer.element_size() for layer in own)
-            # What is full stays: frames come in the same order for every method, so that any frame put in the place
-            # of another would have gone before its next turn.
+            # Once the cache is full, nothing is replaced: all methods use the same frame order, so that a new entry would be
+            # evicted before its next use.
             if place not in self._cache and self._held + size <= self._cache_bytes:
                 self._cache[place] = [layer.clone() for layer in own]
                 self._held += size
@@ -168,7 +168,7 @@ class Lpips:
 
 
 class Fire(nn.Module):
-    """SqueezeNet's module: a 1 x 1 squeeze, then 1 x 1 and 3 x 3 expansions side by side."""
+    """SqueezeNet's fire module: a 1 x 1 squeeze, then parallel 1 x 1 and 3 x 3 expansions."""
 
     def __init__(self, inputs: int, squeeze: int, expand: int) -> None:
         super().__init__()
@@ -204,15 +204,15 @@ class TappedNetwork(nn.Module):
 class NetworkSpec:
     """A feature network of LPIPS and where its weights are published."""
 
-    name: str  # as `Lpips` and the files of linear layers call it
+    name: str  # as in `Lpips` and the file names of the linear layers
     channels: tuple[int, ...]  # of each tapped layer, shallow to deep
-    smallest: int  # pixels that height and width must have for the deepest layer to see anything
-    file: str  # published name; its last part before the suffix begins the SHA-256 of the content
-    features_file: str  # customary name of a file with the convolutional part alone
+    smallest: int  # minimum height and width, pixels, for the deepest layer
+    file: str  # published name; the part before the suffix is a prefix of the SHA-256
+    features_file: str  # usual name of a file with only the convolutional part
 
     @property
     def url(self) -> str:
-        """Where PyTorch publishes the weights."""
+        """URL of the weights published by PyTorch."""
         return f"https://download.pytorch.org/models/{self.file}"
 
     def build(self) -> TappedNetwork:
@@ -228,7 +228,7 @@ NETWORKS = {spec.name: spec for spec in (ALEX, SQUEEZE, VGG)}
 
 
 def _rectified(*sizes: int) -> list[nn.Module]:
-    """A convolution of these inputs, outputs, side, stride and padding, and a ReLU."""
+    """A convolution (in channels, out channels, kernel size, stride, padding), then a ReLU."""
     return [nn.Conv2d(*sizes), nn.ReLU(inplace=True)]  # type: ignore[arg-type]
 
 
@@ -302,7 +302,7 @@ def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
 
 
 def load_backbone(spec: NetworkSpec, path: Path) -> dict[str, Tensor]:
-    """Read the convolutional part of a weights file: a full torchvision one, or one of features alone.
+    """Read the convolutional part of a weights file, a full torchvision file or one with only this part.
 
     Raises `InputError` for a file of another kind, and for parameters that are missing, not finite or of
     another shape.

@@ -1,4 +1,4 @@
-"""PIPNet, which finds the 98 landmarks of the benchmark WFLW.
+"""PIPNet, which detects the 98 landmarks of the WFLW benchmark.
 
 Jin, Liao, Shao, "Pixel-in-Pixel Net: Towards Efficient Facial Landmark Detection in the Wild", International Journal of
 Computer Vision, 2021: the network with ResNet-18 (He et al., 2016), stride 32 and 10 neighbours, with the parameter names of
@@ -23,18 +23,18 @@ from .torch_file import read_weights
 COUNT = 98
 NEIGHBOURS = 10
 SIDE = 256
-"""Pixels across the network's input."""
+"""Side of the network's input, pixels."""
 SCALE = 1.2
-"""Width of the crop, relative to that of the face's box."""
+"""Width of the crop, relative to that of the face's bounding box."""
 MEAN = (0.485, 0.456, 0.406)
 DEVIATION = (0.229, 0.224, 0.225)
 MEAN_FACE = "meanface.txt"
 
 
 class PipNet:
-    """The network of a file of weights, with the mean face of the file `MEAN_FACE` beside it.
+    """The network with weights from a file; the mean face is in the file `MEAN_FACE` in the same folder.
 
-    Raises `InputError` if one of the files is missing or another.
+    Raises `InputError` if one of the files is missing or invalid.
     """
 
     def __init__(self, path: Path):
@@ -47,14 +47,14 @@ class PipNet:
         self._network = network.eval().requires_grad_(False)
 
     def __call__(self, image: ByteArray, landmarks: FloatArray) -> FloatArray | None:
-        """As `find_in`, in the box of a face with these (N, 2) landmarks, which reach from ear to ear and from brows to chin."""
+        """As `find_in`, in the box of (N, 2) landmarks of a face, which extend from ear to ear and from brows to chin."""
         return self.find_in(image, face_box(landmarks, self._mean_face))
 
     def find_in(self, image: ByteArray, box: IntArray) -> FloatArray | None:
-        """(98, 2) landmarks in pixels of an (H, W, 3) 8-bit RGB image, or None if nothing of the box lies in it.
+        """(98, 2) landmarks in pixels of an (H, W, 3) 8-bit RGB image, or None if the box does not overlap the image.
 
-        ``box`` is the left side, the top, the width and the height of a face's box, whole pixels. The crop is that of
-        the authors' demonstration: margins at the left, the right and the bottom, and less of the forehead.
+        ``box`` is the bounding box of a face (left, top, width, height), whole pixels. The crop is that of
+        the authors' demo: with margins at the left, right and bottom, and less of the forehead.
         """
         left, top, width, height = map(int, box)
         beside, below = (int(size * (SCALE - 1) / 2) for size in (width, height))
@@ -73,7 +73,7 @@ class PipNet:
 
 
 class Block(nn.Module):
-    """Two 3 x 3 convolutions, to whose output the input is added."""
+    """Residual block of two 3 x 3 convolutions."""
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
@@ -122,15 +122,15 @@ class Network(nn.Module):
 def decode(maps: list[FloatArray], votes: IntArray) -> FloatArray:
     """(98, 2) landmarks in the crop, from 0 to 1.
 
-    The cell with the highest score of a landmark gives its place, and those of its neighbours; a landmark is the mean
-    of its own place and of ``votes`` for it.
+    The cell with the highest score of a landmark predicts its position and those of its neighbours. The result is the mean
+    of a landmark's own prediction and the ``votes`` for it by others.
 
     Parameters
     ----------
     maps : list[FloatArray]
         (98, S, S) scores of cells, x and y in the cell, and (980, S, S) x and y of each landmark's neighbours.
     votes : IntArray
-        (98, V) of the function `votes`.
+        (98, V) indices, see `votes`.
     """
     scores, x, y, neighbour_x, neighbour_y = maps
     best = scores.reshape(len(scores), -1).argmax(axis=1)
@@ -140,14 +140,14 @@ def decode(maps: list[FloatArray], votes: IntArray) -> FloatArray:
 
 
 def _places(x: FloatArray, y: FloatArray, cells: IntArray) -> FloatArray:
-    """(N, 2) places, from 0 to 1, of (N, S, S) offsets in one of the S * S cells of each."""
+    """(N, 2) positions, from 0 to 1, from (N, S, S) offsets in the cell of each, one of S * S."""
     rows, columns = np.divmod(cells, x.shape[2])
     each = np.arange(len(cells)), rows, columns
     return np.stack([(columns + x[each]) / x.shape[2], (rows + y[each]) / x.shape[1]], axis=1)
 
 
 def votes(mean_face: FloatArray) -> IntArray:
-    """(98, V) indices into the 980 places of neighbours: those of a landmark, repeated in turn up to V, the most of any.
+    """(98, V) indices into the 980 neighbour predictions: those for a landmark, repeated up to V, the maximum of any landmark.
 
     The neighbours of a landmark are the `NEIGHBOURS` nearest to it in the (98, 2) mean face.
     """
@@ -157,13 +157,13 @@ def votes(mean_face: FloatArray) -> IntArray:
 
 
 def _neighbours(mean_face: FloatArray) -> IntArray:
-    """(98, 10) landmarks, the nearest first."""
+    """(98, 10) nearest landmarks, the nearest first."""
     distances = np.square(mean_face[:, None] - mean_face).sum(axis=2)
     return np.argsort(distances, axis=1, kind="stable")[:, 1 : NEIGHBOURS + 1]
 
 
 def face_box(landmarks: FloatArray, mean_face: FloatArray) -> IntArray:
-    """(4,) box of `PipNet.find_in` in whose crop (N, 2) landmarks reach as far as those of the mean face do."""
+    """(4,) box for `PipNet.find_in` such that (N, 2) landmarks have the extent of the mean face in its crop."""
     crop = np.ptp(landmarks, axis=0) / np.ptp(mean_face, axis=0)
     size = crop / (SCALE, 1)
     corner = landmarks.min(axis=0) - mean_face.min(axis=0) * crop + size * (SCALE - 1) / 2 * (1, -1)
@@ -171,7 +171,7 @@ def face_box(landmarks: FloatArray, mean_face: FloatArray) -> IntArray:
 
 
 def read_mean_face(path: Path) -> FloatArray:
-    """(98, 2) places in the crop, from 0 to 1, of a text file of 196 numbers. Raises `InputError`."""
+    """Read (98, 2) positions in the crop, from 0 to 1, from a text file of 196 numbers. Raises `InputError`."""
     expected = f"the {2 * COUNT} numbers of the project PIPNet's file data/WFLW/meanface.txt"
     text = read_bytes(path, expected, 2**16)
     with reading(path, expected):

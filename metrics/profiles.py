@@ -1,6 +1,6 @@
-"""The metric profiles: definitions of the usual names in libraries and the code of papers. Light to import.
+"""The metric profiles: definitions of the usual metrics in libraries and the code of papers. Light to import.
 
-All are taken from the stored 8-bit frames. Where the original has no bound, PSNR is capped at 100 dB here.
+All are computed from the stored 8-bit frames. PSNR is capped at 100 dB even if the original has no cap.
 """
 
 from __future__ import annotations

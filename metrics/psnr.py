@@ -22,7 +22,7 @@ PSNR = MetricSpec(
     summary="Peak signal-to-noise ratio over the 8-bit frame, or over a region of it, capped at 100 dB.",
     kind="regional",
     default=True,
-    # Of the suite's 60,480 whole frames the best has 45.5 dB, by any native method or baseline; rounding to 8 bits alone
+    # The best of the suite's 60,480 whole frames, over all native methods and baselines, has 45.5 dB. 8-bit rounding
     # limits a perfect render to 58.9 dB, unless it is the test image itself.
     suspect_above=50.0,
 )
@@ -34,8 +34,8 @@ CAP = 100.0
 class Psnr:
     """PSNR in dB of 8-bit images, ``10 log10(255^2 / mse)``, at most 100 dB.
 
-    The squared error is summed exactly, in integers. The cap keeps identical frames (a blank view, a closed
-    shutter) from turning a mean over frames into infinity.
+    The squared error is summed exactly, in integers. The cap keeps means over frames finite if some frames are
+    identical, such as blank ones.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Psnr:
         return self._decibels(errors, image.shape[0] * image.shape[1])
 
     def in_regions(self, image: ByteArray, target: ByteArray, masks: Mapping[str, Mask]) -> dict[str, float]:
-        """PSNR over the pixels of each (H, W) boolean mask: the error is averaged over the region, not diluted.
+        """PSNR over the pixels of each (H, W) boolean mask; the mean squared error is over the region alone.
 
         Regions without pixels are left out.
         """
@@ -64,7 +64,7 @@ class Psnr:
         check_masks(masks, target)
         pixels = squared_errors(image, target).reshape(-1, 3)
         counts = {name: int(mask.sum()) for name, mask in masks.items()}
-        # Sums of integers below 2^53 are exact in float64, whose product is the fastest sum.
+        # Integer sums below 2^53 are exact in float64, and a float64 matrix product is the fastest way to sum.
         sums = {
             name: masks[name].ravel().astype(np.float64) @ pixels for name, count in counts.items() if count
         }

@@ -1,8 +1,8 @@
-"""Speed of an avatar whose driving signal and camera change in every frame.
+"""Speed of an avatar with a new driving signal and camera in every frame.
 
 One measurement, in this order: warm-up until frame times are stationary; latency, waiting for every frame;
 throughput, with several frames in flight; the stages of a frame; and the same frame repeatedly, which shows
-what is cached between frames. Latency and throughput are separate, as in MLPerf's single-stream and offline
+the effect of caching between frames. Latency and throughput are separate, as in MLPerf's single-stream and offline
 scenarios (Reddi et al., "MLPerf Inference Benchmark", ISCA 2020).
 """
 
@@ -49,7 +49,7 @@ FPS = MetricSpec(
 
 
 def _milliseconds(name: str, label: str, detail: str, summary: str) -> MetricSpec:
-    """One of the times in the measurement of `FPS`."""
+    """One of the times measured with `FPS`."""
     return replace(
         FPS,
         name=name,
@@ -108,7 +108,7 @@ FPS_WITHOUT_HEAD = replace(
 
 WHITE = (1.0, 1.0, 1.0)
 HEAD_STAGE, READ_BACK = "drive", "read_back"
-NUDGE = 1e-5  # added to every expression coefficient per lap of the workload: too little to see, a new signal
+NUDGE = 1e-5  # added to every expression coefficient in each lap of the workload: an invisible change
 
 Clock = Callable[[], float]
 Frame = tuple[Camera, HeadPose]
@@ -176,15 +176,16 @@ class SpeedProtocol:
 def fps(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurement:
     """Frames per second: 1000 / mean latency in ms over ``workload``, driving signal to image in host memory.
 
-    The mean of per-frame rates would flatter a jittery method. Details, all of wall clock unless said: ``frames``,
-    ``mean_ms``, ``p5_ms``, ``p50_ms``, ``p95_ms``, ``p99_ms``, ``iqr_ms``, ``max_ms`` and ``processor_ms`` (mean time
-    of all threads) of the latency; ``throughput_fps``; ``<stage>_ms``, the median of each stage where the avatar reports
-    stages; ``one_thread_fps``, the rate of ``p50_ms`` where torch and the kernels have one thread, and ``without_head_fps``, that
-    rate without the first stage, "drive", where the avatar reports stages; ``static_ms``, the median where neither camera nor pose changes; ``warm_up_frames``; ``stationary`` (1 or
-    0); ``load``, the mean number of busy processes of the last minute. A run adds threads and the cores that others kept busy.
-    Numbers of different machines do not compare.
+    The mean of per-frame rates would favour methods with uneven frame times. Details, in wall-clock time unless stated:
+    ``frames``, ``mean_ms``, ``p5_ms``, ``p50_ms``, ``p95_ms``, ``p99_ms``, ``iqr_ms``, ``max_ms`` and ``processor_ms`` (mean
+    time of all threads) of the latency; ``throughput_fps``; ``<stage>_ms``, the median of each stage if the avatar reports
+    stages; ``one_thread_fps``, the rate of ``p50_ms`` if torch and the kernels have one thread, and ``without_head_fps``, that
+    rate without the first stage, "drive", if the avatar reports stages; ``static_ms``, the median if neither camera nor pose
+    changes; ``warm_up_frames``; ``stationary`` (1 or 0); ``load``, the mean number of busy processes of the last minute. A run
+    adds the number of threads and of cores used by other processes.
+    Values of different machines are not comparable.
 
-    Raises `InputError` for a workload whose neighbours do not differ.
+    Raises `InputError` for a workload with equal consecutive entries.
     """
     return measure_speed(avatar, workload)
 
@@ -199,7 +200,7 @@ def measure_speed(
     plan = protocol or SpeedProtocol()
     if len(workload) < 2:
         raise InputError("speed", "workload", "two or more pairs of camera and pose", str(len(workload)))
-    for index, (camera, pose) in enumerate(workload):  # the last and the first are neighbours, too
+    for index, (camera, pose) in enumerate(workload):  # the last is followed by the first
         if camera is workload[index - 1][0] and pose is workload[index - 1][1]:
             found = f"entries {(index - 1) % len(workload)} and {index} are the same"
             raise InputError("speed", "workload", "a new camera or pose every frame", found)
@@ -275,7 +276,7 @@ def latencies(drawing: Drawing, stream: Stream, frames: int, limit_s: float, clo
 def _waited_for(
     drawing: Drawing, stream: Stream, frames: int, limit_s: float, clock: Clock
 ) -> Iterator[float]:
-    """Seconds of each frame, up to a number of frames or ``limit_s``."""
+    """Seconds of each synchronised frame, up to a number of frames or ``limit_s``."""
     synchronise = synchroniser()
     for frame in _within(islice(stream, frames), limit_s, clock):
         synchronise()
@@ -314,9 +315,9 @@ def throughput(
 def stage_times(
     drawing: Drawing, stream: Stream, frames: int, limit_s: float, clock: Clock
 ) -> dict[str, float]:
-    """Median milliseconds of each stage and of reading back, each waited for.
+    """Median milliseconds of each stage and of reading back, with synchronisation after each.
 
-    Waiting keeps stages from overlapping, so that together they may take longer than a frame. Raises
+    Synchronised stages cannot overlap, so their sum may exceed the time of a frame. Raises
     `InputError` for a stage that is not in `STAGES`.
     """
     times: dict[str, list[float]] = {}
@@ -334,7 +335,7 @@ def stage_times(
     for frame in _within(islice(stream, frames), limit_s, clock):
         synchronise()
         last = clock()
-        # A copy that `draw` begins after its last stage is part of reading back.
+        # A copy started by `draw` after its last stage counts as reading back.
         drawing.read_back(drawing.draw(*frame, WHITE, end_stage))
         end_stage(READ_BACK)
     return {stage: float(np.median(values)) for stage, values in times.items()}
@@ -342,7 +343,7 @@ def stage_times(
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Run torch on one thread, and with it the kernels, which have as many as torch."""
+    """Limit torch to one thread, and with it the kernels, which use torch's number."""
     torch = sys.modules.get("torch")
     if torch is None:
         yield
@@ -356,9 +357,9 @@ def one_thread() -> Iterator[None]:
 
 
 def synchroniser() -> Callable[[], None]:
-    """Function that waits for the work of an accelerator; it does nothing if torch has started none.
+    """Return a function that synchronises the accelerator; it does nothing if torch does not use one.
 
-    It waits for torch's current device, which `use_device` has made that of the avatar.
+    It synchronises torch's current device, which `use_device` has set to the avatar's.
     """
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized():

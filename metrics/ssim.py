@@ -1,4 +1,4 @@
-"""Structural similarity of one frame, in its common forms, which give different numbers for the same images.
+"""Structural similarity of one frame, in its common variants, which give different values for the same images.
 
 Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to structural similarity",
 IEEE TIP 2004, equation 13 with K1 = 0.01, K2 = 0.03 and L = 255. Channels are compared one by one, then all are
@@ -45,8 +45,8 @@ class SsimForm:
         "gaussian", 11 x 11 with standard deviation 1.5 and weights that sum to one; or "uniform", 7 x
         7.
     border : Border
-        "valid" uses only windows that lie wholly inside the image; "reflect" mirrors the image about
-        its outermost pixels, "zero" surrounds it with black, and both use a window for every pixel.
+        "valid" uses only windows entirely inside the image; "reflect" (mirror about the outermost pixels)
+        and "zero" (black) pad the image and use a window for every pixel.
     sample_covariance : bool
         Whether to use the sample variances and covariance, n / (n - 1) times those of the window.
     downsample : bool
@@ -86,13 +86,13 @@ class SsimForm:
 
     @property
     def inset(self) -> int:
-        """Pixels along each side of the image that no counted window is centred on."""
+        """Width of the border, in pixels, without window centres."""
         return self.radius if self.border == "valid" else 0
 
 
 @dataclass(frozen=True)
 class Ssim:
-    """SSIM of 8-bit images in one of its forms: mean of `ssim_map`, in [-1, 1]; 1 for identical images."""
+    """SSIM of 8-bit images: mean of `ssim_map`, in [-1, 1]; 1 for identical images."""
 
     form: SsimForm = SsimForm()
 
@@ -122,7 +122,7 @@ def ssim_map(image: ByteArray, target: ByteArray, form: SsimForm = SsimForm()) -
     """
     check_pair(image, target, form.smallest)
     blocks = _blocks(form, target)
-    # One channel after the other: the filters of a large image take memory.
+    # One channel at a time, to save memory on large images.
     channels = (
         _channel_map(_block_means(x, blocks), _block_means(y, blocks), form)
         for x, y in zip(np.moveaxis(image, 2, 0), np.moveaxis(target, 2, 0))
@@ -142,7 +142,7 @@ def _channel_map(x: FloatArray, y: FloatArray, form: SsimForm) -> FloatArray:
         height, width = values.shape
         return np.asarray(blurred[inset : height - inset, inset : width - inset], dtype=np.float64)
 
-    # Only the sum of the two variances enters the formula, so four filters do instead of five.
+    # Only the sum of the two variances enters the formula, so four filters are enough instead of five.
     mean_x, mean_y = blur(x), blur(y)
     mean_product = mean_x * mean_y
     mean_squares = mean_x * mean_x + mean_y * mean_y
@@ -158,7 +158,7 @@ def _blocks(form: SsimForm, image: ByteArray) -> int:
 
 
 def _block_means(array: ByteArray | Mask, side: int) -> FloatArray:
-    """Means of an (H, W) array over whole blocks, float64; rows and columns left over at the end are dropped."""
+    """Means of an (H, W) array over whole blocks, float64; remaining rows and columns are dropped."""
     values = array.astype(np.float64)
     if side == 1:
         return values
@@ -171,7 +171,7 @@ ssim = Ssim()
 """The canonical form; scikit-image with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False``, torchmetrics
 before 1.4.2, dm_pix, pytorch-msssim."""
 ssim_zero_border = Ssim(SsimForm(border="zero"))
-"""Training loss and ``metrics.py`` of 3D Gaussian splatting and what derives from it."""
+"""Training loss and ``metrics.py`` of 3D Gaussian splatting and its derivatives."""
 ssim_reflected = Ssim(SsimForm(border="reflect"))
 """torchmetrics from 1.4.2."""
 ssim_uniform = Ssim(SsimForm(window="uniform", sample_covariance=True))

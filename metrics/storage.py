@@ -28,7 +28,7 @@ STORAGE = MetricSpec(
 
 
 def _detail(name: str, detail: str, label: str, unit: str, digits: int, summary: str) -> MetricSpec:
-    """Another value of the measurement of `STORAGE`; lower is better."""
+    """Another value measured with `STORAGE`; lower is better."""
     own = {"detail": detail, "label": label, "unit": unit, "digits": digits, "summary": summary}
     return replace(STORAGE, name=name, tables=("cost",), **own)  # type: ignore[arg-type]
 
@@ -45,7 +45,7 @@ DRIVING_BITRATE = _detail("driving_bitrate", "driving_kb_s", "Driving", "kB/s", 
 
 MEGA, KILO = 1e6, 1e3
 DRIVING_RATE = 25.0  # frames per second at which the driving signal's bitrate is given
-PACKING = 6  # xz's own default; higher ones take more memory than most avatars
+PACKING = 6  # xz's default; higher levels take more memory than most avatars
 CHUNK = 1 << 20
 
 
@@ -53,14 +53,14 @@ def storage(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]] = ()) ->
     """Size of all files needed to render ``avatar``, in megabytes (SI: 1 MB = 1 000 000 bytes).
 
     The avatar declares its files (`Avatar.files`: shared assets and the driving signal do not count); a file
-    that is named twice counts once.
+    that is listed twice counts once.
 
     Details: ``bytes``; ``files``; ``packed_mb``, the files packed losslessly by xz one after the other;
-    ``shared_mb``, where the avatar names its shared assets; ``primitives`` and ``primitive_bytes`` (bytes of all
-    files over primitives), where it has splats and ``workload`` a pose; ``driving_bytes`` of one pose as float32 and
-    ``driving_kb_s``, kilobytes per second at 25 frames per second, where ``workload`` has a pose.
+    ``shared_mb``, if the avatar declares its shared assets; ``primitives`` and ``primitive_bytes`` (bytes of all
+    files over primitives), if it has splats and ``workload`` a pose; ``driving_bytes`` of one pose as float32 and
+    ``driving_kb_s``, kilobytes per second at 25 frames per second, if ``workload`` has a pose.
 
-    Raises `InputError` if the avatar names no file, or a missing one.
+    Raises `InputError` if the avatar declares no file, or a missing one.
     """
     files = _checked(avatar.files())
     if not files:
@@ -81,7 +81,7 @@ def storage(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]] = ()) ->
 
 
 def packed_bytes(files: Iterable[Path]) -> int:
-    """Bytes of the files' contents in one xz stream; memory does not grow with the files."""
+    """Size of the files' contents in one xz stream; memory use does not depend on file sizes."""
     packer = lzma.LZMACompressor(preset=PACKING)
     size = 0
     for path in files:
@@ -98,7 +98,7 @@ def driving_bytes(pose: HeadPose) -> int:
 
 
 def _checked(paths: Iterable[Path]) -> list[Path]:
-    """The files, each once, sorted. Raises `InputError` for one that is not there."""
+    """Distinct files, sorted. Raises `InputError` for a missing one."""
     files = sorted({path.resolve() for path in paths})
     for path in files:
         if not path.is_file():

@@ -20,16 +20,16 @@ from ..bench.io.files import open_regular, reading
 
 EXPECTED = "a PyTorch file of weights"
 MAX_BYTES = 2**30
-"""Of a file; that of VGG-16, the largest backbone of LPIPS, has 0.55 GB."""
+"""Maximum size of a file; that of VGG-16, the largest backbone of LPIPS, has 0.55 GB."""
 MAX_MEMBERS = 10_000
 
 
 def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
     """Read the tensors named in ``shapes`` as float32, on the CPU.
 
-    Both layouts are read: the archive of PyTorch 1.6 and later, whose members are not compressed, and the one before it.
-    Raises `InputError` for a file that is missing, damaged, larger than `MAX_BYTES`, of another kind, names anything but
-    tensors, or lacks one of these, or where one is of another shape, not floating-point or not finite.
+    Both layouts are supported: the archive of PyTorch 1.6 and later, with uncompressed members, and the earlier one.
+    Raises `InputError` for a file that is missing, damaged, larger than `MAX_BYTES`, of another kind or with other objects
+    than tensors; and for a tensor that is missing, of another shape, not floating-point or not finite.
     """
     with open_regular(path, EXPECTED) as stream:
         size = os.fstat(stream.fileno()).st_size
@@ -40,12 +40,12 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str,
             with open_archive(path, EXPECTED, members=MAX_MEMBERS, spare_bytes=0, per_byte=1):
                 pass
         stream.seek(0)
-        # A file makes memory for as many bytes as a damaged pickle asks for; bytes in memory give those there are.
+        # Reading from a file allocates as many bytes as a damaged pickle declares; reading from memory does not.
         source = stream if is_archive else io.BytesIO(stream.read())
         with reading(path, EXPECTED):
             try:
                 content = torch.load(source, map_location="cpu", weights_only=True)
-            except UnpicklingError as error:  # whose words advise to load without the switch
+            except UnpicklingError as error:  # its message advises to load without weights_only
                 name = re.search(r"GLOBAL (\S+)", str(error))
                 found = f"the name {name[1]}, which no weights need" if name else "another pickle"
                 raise InputError(path, "", EXPECTED, found) from error
@@ -63,7 +63,7 @@ def _tensor(path: Path, name: str, value: object, shape: tuple[int, ...]) -> Ten
         raise InputError(path, name, expected, str(found))
     if value.shape != shape:
         raise InputError(path, name, expected, f"shape {tuple(value.shape)}")
-    with reading(path, expected, name):  # which may be sparse, or without content
+    with reading(path, expected, name):  # it may be sparse, or on the meta device
         numbers = value.detach().to(torch.float32).contiguous()
         check_numbers(path, name, numbers.numpy())
     return numbers

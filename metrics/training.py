@@ -56,7 +56,7 @@ TRAINING_ITERATIONS = replace(
 def training_time(record: Mapping[str, Any]) -> Measurement:
     """Minutes of wall clock from the start of the fit to its end.
 
-    Details: ``seconds``, and where the record has them ``threads``, ``cores`` and ``other_cores`` of `ProcessorLoad`.
+    Details: ``seconds``, and ``threads``, ``cores`` and ``other_cores`` of `ProcessorLoad` if recorded.
 
     Raises `UnavailableError` if the training was interrupted, since only its last part was recorded.
     """
@@ -71,7 +71,7 @@ def training_time(record: Mapping[str, Any]) -> Measurement:
 
 
 def training_processor(record: Mapping[str, Any]) -> Measurement:
-    """Seconds of processor time from the start of the fit to its end, all threads and finished child processes together.
+    """Processor seconds from the start of the fit to its end, of all threads and finished child processes.
 
     Raises `UnavailableError` if the training was interrupted, as `training_time` does.
     """
@@ -82,9 +82,9 @@ def training_processor(record: Mapping[str, Any]) -> Measurement:
 
 
 def training_iterations(record: Mapping[str, Any]) -> Measurement:
-    """Iterations that the training was given.
+    """Iterations in the budget of the training.
 
-    Raises `UnavailableError` for a budget in seconds alone.
+    Raises `UnavailableError` for a budget in seconds only.
     """
     budget = record.get("method", {}).get("budget", {})
     if budget.get("iterations") is None:
@@ -93,7 +93,7 @@ def training_iterations(record: Mapping[str, Any]) -> Measurement:
 
 
 def training_memory(record: Mapping[str, Any]) -> Measurement:
-    """Largest resident memory of the training process, in gigabytes (SI), its interpreter and libraries included.
+    """Peak resident memory of the training process, in gigabytes (SI), including interpreter and libraries.
 
     Details: ``bytes``; ``before_bytes``, resident memory when the training began, including earlier cells of
     a run.

@@ -1,4 +1,4 @@
-"""Which method to take for a budget of training time, file size and frame time, from the rows of finished runs."""
+"""Recommends a method for a budget of training time, file size and frame time, from the rows of finished runs."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ COSTS = {
 """Metric of each cost, and its factor."""
 COST_TITLES = {"seconds": "Training time", "megabytes": "Size", "milliseconds": "Frame time"}
 OVERRUN = 1.05
-"""A training with a limit of seconds counts with that limit if it took at most this many times as long: its last iteration and
-the files of the avatar come on top."""
+"""A training with a limit of seconds counts as that limit if it took at most this many times as long, since the last
+iteration and writing the avatar come after the limit."""
 UNITS = {"seconds": "s of training", "megabytes": "MB", "milliseconds": "ms a frame"}
 
 
@@ -80,7 +80,7 @@ class RecommendSettings:
 
 @dataclass(frozen=True)
 class Choice:
-    """A method under a condition: by subject its quality, and by cost and subject what it takes; a cost may be unknown."""
+    """A method under a condition: quality by subject, and costs by name and subject; a cost may be unknown."""
 
     quality: Mapping[str, float]
     costs: Mapping[str, Mapping[str, float]]
@@ -95,7 +95,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Choices:
-    """The choices of runs by label, the metric of their quality, what was left out with the reason, and notes on times that are not
+    """The choices of runs by label, the quality metric, omitted methods with reasons, and notes on times that are not
     comparable."""
 
     by_label: Mapping[str, Choice]
@@ -105,7 +105,7 @@ class Choices:
 
     @property
     def subjects(self) -> list[str]:
-        """The subjects, which all choices have."""
+        """The subjects that all choices have."""
         return sorted(next(iter(self.by_label.values())).quality)
 
     @property
@@ -121,8 +121,8 @@ class Choices:
 
 @dataclass(frozen=True)
 class Trial:
-    """The recommendation for a subject without its rows: the choice, and its loss against the best one for the subject; None if the
-    choice exceeds a limit there."""
+    """The recommendation for a subject made without its rows: the choice, and its loss compared with the best one for the
+    subject; None if the choice exceeds a limit there."""
 
     subject: str
     choice: str
@@ -132,7 +132,7 @@ class Trial:
 def recommend(settings: RecommendSettings, progress: Progress = no_progress) -> CommandResult:
     """Recommend a method for a budget; see the settings.
 
-    Raises `InputError` for runs that do not belong together, for a task or metric that they lack, and where nothing fits.
+    Raises `InputError` for runs that cannot be combined, for a task or metric that they lack, and if nothing fits.
     """
     limits = settings.limits
     runs = tuple(RunData.read(Path(run)) for run in settings.runs)
@@ -172,9 +172,9 @@ def recommend(settings: RecommendSettings, progress: Progress = no_progress) -> 
 def read_choices(
     runs: tuple[RunData, ...], task: str, metric_name: str, limits: Collection[str] = ()
 ) -> Choices:
-    """The choices of runs that all subjects have; ``limits`` are the names of the costs that every choice should have.
+    """The choices of runs that all subjects have; ``limits`` are the names of the costs that every choice must have.
 
-    Conditions that change what a method is trained on are no choices. Raises `InputError` as `recommend` does.
+    Conditions that change the training data are not choices. Raises `InputError` as `recommend` does.
     """
     together = RunSet.joined(runs)
     labels_of_runs = training_labels(runs)
@@ -229,14 +229,14 @@ def read_choices(
 
 
 def best_of(choices: Mapping[str, Choice], subjects: Sequence[str], sign: float) -> str:
-    """The choice with the best mean over some subjects; the first of equal ones."""
+    """The choice with the best mean over some subjects; the first in case of ties."""
     return max(choices, key=lambda name: sign * fmean(choices[name].quality[subject] for subject in subjects))
 
 
 def best_by_cost(
     choices: Mapping[str, Choice], cost: str, subjects: Sequence[str], sign: float
 ) -> list[tuple[float, str]]:
-    """The choices that no other beats in both, by rising cost, the largest over subjects; those whose cost is unknown are left out."""
+    """The Pareto front of quality and cost (the largest over subjects), by increasing cost; unknown costs are left out."""
     known = [name for name, each in choices.items() if cost in each.costs]
     at = [max(choices[name].costs[cost][subject] for subject in subjects) for name in known]
     means = [sign * fmean(choices[name].quality[subject] for subject in subjects) for name in known]
@@ -246,7 +246,7 @@ def best_by_cost(
 def held_out(
     choices: Mapping[str, Choice], limits: Mapping[str, float], subjects: Sequence[str], sign: float
 ) -> list[Trial]:
-    """What would be recommended for each subject from the rows of the others; none with a single subject."""
+    """The recommendation for each subject from the rows of the others; empty for a single subject."""
     trials = []
     for subject in subjects:
         others = [each for each in subjects if each != subject]
@@ -265,10 +265,10 @@ def held_out(
 def against_always(
     choices: Mapping[str, Choice], costs: Sequence[str], subjects: Sequence[str], sign: float
 ) -> dict[str, Any] | None:
-    """What following recommendations gains over one choice for all budgets, on subjects that were left out.
+    """Gain of recommendations over one fixed choice for all budgets, on left-out subjects.
 
-    Budgets are the largest costs of each choice over the other subjects. The one choice is the best on average; where it does
-    not fit, the one that fits the most budgets takes its place. Budgets that one of the two exceeds on the subject are left out.
+    Budgets are the largest costs of each choice over the other subjects. The fixed choice is the best on average; if it does
+    not fit, the choice that fits most budgets replaces it. Budgets that either choice exceeds on the subject are left out.
     None with fewer than two subjects or without costs.
     """
     known = {name: each for name, each in choices.items() if set(costs) <= set(each.costs)}
@@ -305,7 +305,7 @@ def against_always(
 
 
 def _quality(rows: Rows, label: str, metric: str, task: str) -> dict[str, float]:
-    """Mean of each subject all of whose frames have a value, or were left out by the metric for every method."""
+    """Mean of each subject whose frames all have a value, except frames that the metric left out for every method."""
     found = whole_images(rows, label, metric, task)
     if found.empty:
         return {}
@@ -322,7 +322,7 @@ def _quality(rows: Rows, label: str, metric: str, task: str) -> dict[str, float]
 
 
 def _costs(rows: Rows, label: str, metric: str) -> dict[str, float]:
-    """Largest value of each subject over the seeds, of subjects that have it for all."""
+    """Largest value over the seeds, for each subject with values for all seeds."""
     found = rows.select(method=label, metric=metric, task="", region=FULL, seeds=ALL)
     return {
         str(subject): float(own["value"].max())
@@ -332,7 +332,7 @@ def _costs(rows: Rows, label: str, metric: str) -> dict[str, float]:
 
 
 def _within(seconds: Mapping[str, float], limit: float | None) -> dict[str, float]:
-    """Training times by subject; the limit of the training where that was exceeded by at most `OVERRUN`."""
+    """Training times by subject; replaced by the training's limit if they exceed it by at most `OVERRUN`."""
     most = 0.0 if limit is None else OVERRUN * limit
     return {s: min(value, limit) if limit and value <= most else value for s, value in seconds.items()}
 
@@ -345,7 +345,7 @@ def _time_notes(rows: Rows, metrics: Sequence[MetricSpec], labels: Sequence[str]
 
 
 def cost_text(value: float) -> str:
-    """A cost with three digits."""
+    """Format a cost with three digits."""
     return f"{float(f'{value:.3g}'):g}"
 
 
@@ -393,7 +393,7 @@ def _text(data: Mapping[str, Any], fitting: Mapping[str, Choice], subjects: int,
 
 
 def verdict_text(found: BestSet, fitting: Collection[str]) -> str:
-    """What may be said of the choices that fit, the one with the best mean first, in a sentence."""
+    """A sentence on the choices that fit, the one with the best mean first."""
     if len(fitting) == 1:
         return "It is the only choice within the limits."
     if found.methods is None:

@@ -1,4 +1,4 @@
-"""Tables of runs by name, as text: those for a run's metrics, and those in the form of printed ones."""
+"""Named tables of runs as text: tables for a run's metrics, and tables in the form of published ones."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from .writers import WRITERS, to_text
 
 
 class ComparedRuns(RunSet):
-    """Finished runs on the same frames, as `read_runs` gives them; ``rows.select`` gives every number."""
+    """Finished runs on the same frames, returned by `read_runs`; ``rows.select`` returns single values."""
 
     def table(self) -> pd.DataFrame:
-        """The comparison table: a row for each method, a column for each (task, metric); metrics of no task are of "avatar".
+        """The comparison table: a row per method, a column per (task, metric); the task of avatar metrics is "avatar".
 
-        Values are means over frames, then sequences, subjects and seeds; not a number where one is missing.
+        Values are means over frames, then sequences, subjects and seeds; NaN if one is missing.
         """
         metrics = [spec for spec in self.metrics if "comparison" in spec.tables]
         runs = self.by_camera
@@ -53,7 +53,7 @@ def read_runs(folders: Path | str | Sequence[Path | str]) -> ComparedRuns:
     Parameters
     ----------
     folders : Path | str | Sequence[Path | str]
-        One run folder or several. Seeds of the same method with the same settings are merged.
+        One or more run folders. Seeds of the same method with the same settings are merged.
 
     Raises
     ------
@@ -66,9 +66,9 @@ def read_runs(folders: Path | str | Sequence[Path | str]) -> ComparedRuns:
 
 @dataclass(frozen=True)
 class Columns:
-    """Selection of a layout's metrics and tasks by ``names`` (none of a kind named: all of it), and digits.
+    """Selected metrics and tasks of a layout (``names``; all if none of a kind is named), and digits.
 
-    ``digits`` are numbers of decimals, as "3" for every metric and "psnr=1" for one.
+    ``digits`` are numbers of decimals, such as "3" for all metrics or "psnr=1" for one.
     """
 
     names: tuple[str, ...] = ()
@@ -80,14 +80,14 @@ class Columns:
         return tuple(dict.fromkeys(name for name in self.names if name in names)) or names
 
     def by_camera(self, tasks: Collection[str]) -> Columns:
-        """The same for ``tasks`` among which self-reenactment is two; its name stands for both."""
+        """This selection for ``tasks`` with self-reenactment split in two; its name selects both."""
         if SPLIT_TASK not in self.names or SPLIT_TASK in tasks:
             return self
         parts = {SPLIT_TASK: tuple(task for task in (SEEN_CAMERAS, UNSEEN_CAMERAS) if task in tasks)}
         return replace(self, names=tuple(n for name in self.names for n in parts.get(name) or (name,)))
 
     def check(self, metrics: Iterable[str], tasks: Iterable[str]) -> None:
-        """Raise `InputError` for a name that is neither a metric nor a task of the layout, and for digits that are no numbers from 0 to 9."""
+        """Raise `InputError` for names that are no metric or task of the layout, and digits that are no numbers from 0 to 9."""
         metrics = tuple(metrics)
         for name in self.names:
             if name not in (*metrics, *tasks):
@@ -145,12 +145,12 @@ def table_text(
     columns: tuple[str, ...] = (),
     digits: tuple[str, ...] = (),
 ) -> str:
-    """Return a table of one or more runs as text, in a format of `WRITERS` or as "text", which has aligned columns.
+    """Return a table of one or more runs as text, in a format of `WRITERS` or "text" (aligned columns).
 
-    Without a format it is "text" if standard output is a terminal, else "md".
-    ``paper`` names one of `papers`, in the form of whose tables (or of the one of a ``number``) the runs are shown, in place of a
-    layout; ``protocol`` names one of `named_protocols`, which selects frames, pixels and metrics; ``region`` and ``sequences`` are those of `FrameSelection`,
-    ``columns`` and ``digits`` those of `Columns`. Raises `InputError` for a format, a layout, columns or runs that do not fit.
+    The default format is "text" if standard output is a terminal, else "md".
+    ``paper`` names one of `papers`; the runs are shown in the form of its tables, or of the table ``number``, instead of a
+    layout. ``protocol`` names one of `named_protocols`, which selects frames, pixels and metrics; ``region`` and ``sequences``
+    are those of `FrameSelection`, ``columns`` and ``digits`` those of `Columns`. Raises `InputError` for invalid combinations.
     """
     styled = format is None and on_terminal()
     format = format or ("text" if styled else "md")
@@ -194,9 +194,9 @@ def table_of(
     apart: Sequence[RowGroup] = (),
     claimed: Collection[tuple[str, str]] = (),
 ) -> Table:
-    """Build a table of runs that were read; ``apart`` and ``claimed`` are those of `build_table`.
+    """Build a table of loaded runs; for ``apart`` and ``claimed`` see `build_table`.
 
-    Metrics of avatars that other layouts have are shown where ``columns`` names them.
+    Avatar metrics of other layouts are shown if ``columns`` names them.
     """
     runs = runs.by_camera
     columns = columns.by_camera(runs.tasks)
@@ -206,7 +206,7 @@ def table_of(
     columns.check(known, runs.tasks if any(metric.per_frame for metric in known.values()) else ())
     metrics = tuple(known[name] for name in columns.of(known))
     metrics = tuple(map(columns.shown, metrics))
-    # A table without metrics of frames has no task.
+    # A table without frame metrics has no task.
     tasks = columns.of(runs.tasks) if any(metric.per_frame for metric in metrics) else ()
     if not tasks and set(columns.names) & set(runs.tasks):
         found = ", ".join(columns.names)

@@ -45,10 +45,9 @@ class Column:
 class TableCell:
     """A value, or the reason why it is missing.
 
-    ``status`` is "ok", "claimed" (a value that was not verified, in a leaderboard), "missing" (could not or was not
-    measured), "failed" (the method ended in an error), "published" (printed in a paper, not measured) or "none" (not printed
-    there). ``rank`` is 1 for all that may be the best, then 2,
-    3, ... for the next displayed values; None where nothing is ranked.
+    ``status`` is "ok", "claimed" (an unverified value in a leaderboard), "missing" (could not be or was not measured),
+    "failed" (the method raised an error), "published" (printed in a paper, not measured) or "none" (not printed there).
+    ``rank`` is 1 for all methods that may be the best, then 2, 3, ... for the next displayed values; None if unranked.
     """
 
     status: Literal["ok", "claimed", "missing", "failed", "published", "none"]
@@ -60,13 +59,13 @@ class TableCell:
 
     @property
     def shown(self) -> str:
-        """Value and spread."""
+        """Value and spread, as displayed."""
         return f"{self.text} ± {self.spread}" if self.spread else self.text
 
 
 @dataclass(frozen=True)
 class TableRow:
-    """A method's cells, one per column; ``trivial``: it is not ranked, as a baseline or under a condition."""
+    """A method's cells, one per column; ``trivial``: it is not ranked, since it is a baseline or has a condition."""
 
     method: str
     version: str
@@ -91,12 +90,12 @@ AVERAGED = "frames, then sequences, then subjects"
 
 @dataclass(frozen=True)
 class Table:
-    """A comparison, ready to be written in any format.
+    """A comparison that can be written in any format.
 
-    ``marking`` says what the ranks mean, and by which test (``tested``: whether there is one), ``part`` which part of
-    the frames the values are of, "" for all, ``missing`` why a task has no columns, ``name`` the layout, ``cameras`` what
-    seen and unseen cameras are, or why they are not shown apart, ``printed`` where values of a paper are from,
-    with their conditions in further sentences, ``averaged`` over what values are means.
+    ``marking`` explains the ranks and their test (``tested``: whether there is one); ``part`` describes the part of the
+    frames, "" for all; ``missing`` explains why a task has no columns; ``name`` is the layout; ``cameras`` describes seen and
+    unseen cameras, or why they are not shown separately; ``printed`` is the source of published values, with their conditions
+    in further sentences; ``averaged`` describes the averaging.
     """
 
     columns: tuple[Column, ...]
@@ -117,7 +116,7 @@ class Table:
 
     @property
     def titled(self) -> bool:
-        """Whether the groups need their titles."""
+        """Whether the groups need titles."""
         common = (METHODS_TITLE, TRIVIAL_TITLE, CONDITIONS_TITLE)
         return len(self.groups) > 1 or any(title not in common for title, _ in self.groups)
 
@@ -127,7 +126,7 @@ class Table:
         return tuple(row for _, rows in self.groups for row in rows)
 
     def mapped(self, change: Callable[[TableRow], TableRow]) -> Table:
-        """The table with every row changed."""
+        """Return the table with ``change`` applied to every row."""
         groups = tuple((title, tuple(map(change, rows))) for title, rows in self.groups)
         return replace(self, groups=groups)
 
@@ -160,7 +159,7 @@ class Table:
 
     @property
     def short_caption(self) -> str:
-        """Caption for a paper: `caption` without protocols and without how values were averaged."""
+        """Caption for a paper: `caption` without protocols and averaging."""
         subjects = [counted(task.subjects, "subject") for task in self.tasks]
         same = subjects[0] if len(set(subjects)) == 1 else ""
         tasks = []
@@ -231,8 +230,8 @@ def build_table(
 ) -> Table:
     """Build the comparison table of whole images.
 
-    A cell has a value only where every frame of the task has one, for every seed the method was run with: means
-    over different frames do not compare. Otherwise it shows "–" or "failed", and a note says why.
+    A cell has a value only if every frame of the task has one, for every seed of the method, since means
+    over different frames are not comparable. Otherwise it shows "–" or "failed", and a note gives the reason.
 
     Parameters
     ----------
@@ -246,7 +245,7 @@ def build_table(
         Those of ``methods`` under conditions that change them, see `RunSet.changed`; also listed
         separately and not ranked.
     keys : Mapping[str, Collection[FrameKey]] | None
-        Frames of each task, if more are scored than have rows.
+        Frames of each task, if some scored frames have no rows.
     protocol_ids : Mapping[str, str]
         Readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` (if
         the rows do not record the machine that measured speed), ``part``, ``cameras``, ``averaged`` and
@@ -256,9 +255,9 @@ def build_table(
     name : str
         Name of the layout.
     apart : Sequence[RowGroup]
-        Groups of some methods, by what is known of their values.
+        Separate groups of methods, by the support for their values.
     claimed : Collection[tuple[str, str]]
-        Methods and metrics whose values were not verified: they are shown as such and not ranked.
+        Methods and metrics with unverified values, which are marked and not ranked.
 
     Raises
     ------
@@ -304,7 +303,7 @@ def build_table(
             shown = _cell(cell, c.digits, notes, mark)
             cells.append(shown if known or shown.status != "ok" else replace(shown, status="claimed"))
         lines.append(TableRow(method, ", ".join(rows.versions(method)), method in unranked, tuple(cells)))
-    # Times that were not measured under equal conditions have no ranks.
+    # Times measured under different conditions are not ranked.
     unequal = {metric for metric, method in marked if method not in unranked}
     bests = [
         None if column.metric in unequal else _best(rows, lines, index, column)
@@ -343,7 +342,7 @@ def build_table(
 def _task_summary(rows: Rows, task: str, protocol_id: str, keys: Collection[FrameKey]) -> TaskSummary:
     frames: set[tuple[str, str, int, str]] = rows.frames(task, FULL)
     subjects = {key[0] for key in frames}
-    frames |= {key for key in keys if key.subject not in subjects}  # on these every method failed
+    frames |= {key for key in keys if key.subject not in subjects}  # subjects on which every method failed
     subjects = {key[0] for key in frames}
     title = TASK_TITLES.get(task, task)
     return TaskSummary(task, title, protocol_id, "".join(rows.protocols(task)), len(frames), len(subjects))
@@ -356,7 +355,7 @@ def _cell(aggregate: Aggregate, digits: int, notes: list[str], mark: str) -> Tab
         notes.append(text)
     note = notes.index(text) if text else None
     if aggregate.value is not None:
-        # A digit more than the value: seeds move means less than methods do.
+        # One digit more than the value, since means differ less between seeds than between methods.
         spread = "" if aggregate.spread is None else f"{aggregate.spread:.{digits + 1}f}"
         return TableCell("ok", aggregate.value, f"{aggregate.value:.{digits}f}", spread, note=note)
     return TableCell(aggregate.status, None, "failed" if aggregate.status == "failed" else "–", note=note)
@@ -379,9 +378,9 @@ def _best(rows: Rows, lines: Sequence[TableRow], index: int, column: Column) -> 
 def _ranked(
     lines: Sequence[TableRow], columns: Sequence[Column], bests: Sequence[BestSet | None]
 ) -> list[TableRow]:
-    """Rank each column: 1 for all that may be the best and for all that look like one of them, then by digits.
+    """Rank each column: 1 for all that may be the best and all that are displayed equally, then by displayed value.
 
-    Without a test, digits alone decide. Values that look equal share a rank, and the next distinct one has the next.
+    Without a test, displayed values decide. Equal displayed values share a rank, and the next distinct one has the next.
     """
     cells = [list(line.cells) for line in lines]
     for index, (column, best) in enumerate(zip(columns, bests)):

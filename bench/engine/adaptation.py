@@ -25,7 +25,7 @@ from ..specs import MethodSpec, ResolutionRule
 
 @dataclass(frozen=True)
 class MethodNeeds:
-    """The form in which a method takes a clip; see the attributes of `MethodSpec`."""
+    """Requirements of a method on its clips; see the attributes of `MethodSpec`."""
 
     head_models: tuple[str, ...] = ()
     monocular: bool = False
@@ -33,7 +33,7 @@ class MethodNeeds:
 
     @classmethod
     def of(cls, spec: MethodSpec) -> MethodNeeds:
-        """What a method declares."""
+        """The requirements that a method declares."""
         return cls(spec.head_models, spec.monocular, spec.resolution)
 
 
@@ -62,7 +62,7 @@ Adapter = Callable[[Clip, MethodNeeds, Mapping[str, str]], Adaptation]
 
 
 def adapter() -> Adapter:
-    """The function that adapts clips, see the module."""
+    """The registered adaptation function, see the module."""
     entries = entry_points(group="headbench.adaptation")
     if not entries:
         raise HeadbenchError("nothing is registered as headbench.adaptation; install headbench again")

@@ -35,7 +35,7 @@ def open_clips(config: RunConfig, *, use_cache: bool = True, only: int | None = 
     the index of a single capture to open, None for all.
 
     Raises `InputError` for a folder without captures, a setting the reader does not know or of the wrong type,
-    subjects that are not distinct, and whatever the reader finds wrong.
+    subjects that are not distinct, and errors that the reader finds.
     """
     spec: DatasetSpec = get("datasets", config.reader)
     root = Path(config.data)
@@ -133,10 +133,10 @@ def capture_configuration(
 
 
 def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dict[str, Any]:
-    """Settings that reproduce the synthetic capture of one subject, all of them, from the steps recorded in its clip.
+    """All settings that reproduce the synthetic capture of one subject, from the steps recorded in its clip.
 
-    Raises `InputError` for a capture that is not synthetic, not of the procedural head, or made by settings that are not
-    known here.
+    Raises `InputError` for a capture that is not synthetic, not of the procedural head, or made with unknown
+    settings.
     """
     make = resolve(get("datasets", "synthetic").implementation)
     where, given = f"capture of {subject}", ("out", "pictures", "only", "execution", "workers", "progress")
@@ -313,7 +313,7 @@ def _check_registered(config: RunConfig, manifest: Path, used: tuple[Plugins, ..
 
 
 def changed(clip: Clip, change: Named, config: RunConfig) -> Clip:
-    """The clip after a registered change; the clip itself for none. Raises `InputError` as `resolve_change` does."""
+    """Apply a registered change to a clip; without a change, return the clip. Raises `InputError` as `resolve_change` does."""
     result: Clip = resolve_change(change, "clip")(clip, config)
     return result
 
@@ -328,7 +328,7 @@ def _reduced(clip: Clip, config: RunConfig) -> Clip:
 
 
 def _checked(clip: Clip) -> Clip:
-    """Make sure that files and folders can be named after what the clip holds, and results read."""
+    """Check that names in the clip are valid in file names and results."""
     source = f"clip {clip.subject}"
     check_name(clip.subject, source, "subject")
     if not is_label(clip.fingerprint):

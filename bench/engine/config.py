@@ -152,7 +152,7 @@ class RunConfig:
 
 
 def build_run_config(values: Mapping[str, Any], source: str) -> RunConfig:
-    """Build `RunConfig` as `build` does; a key of a lower level, such as ``iterations``, is answered with its place."""
+    """Build `RunConfig` as `build` does; for a misplaced nested key, such as ``iterations``, the error names its full path."""
     known = {each.name for each in fields(RunConfig)}
     for key in values:
         if isinstance(key, str) and key not in known and not get_close_matches(key, known, 1, 0.8):
@@ -166,7 +166,7 @@ def build_run_config(values: Mapping[str, Any], source: str) -> RunConfig:
 
 
 def _setting_places() -> dict[str, str]:
-    """Dotted path of every setting below the first level, by its last word; METHOD stands for any method."""
+    """Dotted path of every nested setting, by its last part; METHOD stands for any method."""
     places: dict[str, str] = {}
     for name, plugin in discover("methods").items():
         if plugin.spec is not None and plugin.spec.config:
@@ -185,14 +185,14 @@ class ResolvedMethod:
     budget: Budget
 
     def is_isolated(self, isolation: Isolation) -> bool:
-        """Whether it runs in processes of its own, see `RunConfig.isolation`."""
+        """Whether it runs in separate processes, see `RunConfig.isolation`."""
         able = bool(self.spec.implementation) and self.spec.native
         return able and (
             isolation == "all" or (isolation == "plugins" and is_outside(self.spec.implementation))
         )
 
     def create(self) -> Any:
-        """Import the implementation and make the `Method`."""
+        """Import the implementation and create the `Method`."""
         implementation = resolve(self.spec.implementation)
         return implementation() if self.config is None else implementation(self.config)
 
@@ -212,7 +212,7 @@ class ResolvedMethod:
         }
 
     def identity(self) -> dict[str, Any]:
-        """The same for fingerprints, without settings that are paths on this machine.
+        """The `record` for fingerprints, without settings that are paths on this machine.
 
         The code of a method of this package is left out: its version says whether results change.
         """
@@ -225,7 +225,7 @@ class ResolvedMethod:
 def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:
     """Resolve every method of a run.
 
-    Raises `InputError` for unknown methods, presets and settings, and for methods that do not compute on the run's device.
+    Raises `InputError` for unknown methods, presets and settings, and for methods that do not support the run's device.
     """
     forget_code()
     specs: list[MethodSpec] = [get("methods", name) for name in config.methods]
@@ -245,7 +245,7 @@ def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:
 
 
 def with_methods(config: RunConfig, names: Collection[str]) -> RunConfig:
-    """The configuration with the methods of some names alone, and their settings."""
+    """Return the configuration restricted to some methods and their settings."""
     return replace(
         config,
         methods=tuple(asked for asked in config.methods if get("methods", asked).name in names),
@@ -288,7 +288,7 @@ def resolve_cells(config: RunConfig) -> list[tuple[ResolvedMethod, Condition]]:
                     raise InputError(
                         "settings", where, f"a budget of {method.spec.name} to take a part of", "none"
                     )
-                continue  # a baseline, which has nothing to take a part of
+                continue  # a baseline without a budget to reduce
             label = check_name(label_of(method.spec.name, condition.name), "settings", "method and condition")
             if label in labels:
                 raise InputError("settings", "conditions", "another name for a method or a condition", label)
@@ -298,7 +298,7 @@ def resolve_cells(config: RunConfig) -> list[tuple[ResolvedMethod, Condition]]:
 
 
 def _unconverted(spec: MethodSpec, condition: str) -> MethodSpec:
-    """A method that takes the capture's own head model and views. Raises `InputError` for one that works only with a conversion."""
+    """Return the method without its conversion of head model and views. Raises `InputError` if it requires the conversion."""
     if spec.conversion == "required" and (spec.head_models or spec.monocular):
         expected = f"methods that work without the conversion of captures, for condition {condition}"
         raise InputError("settings", "conditions, methods", expected, spec.name)
@@ -309,9 +309,9 @@ KINDS = ("clip", "derive", "drive")
 
 
 def resolve_change(change: Named, kind: str) -> Callable[..., Any]:
-    """The function of a registered change with its parameters, the identity for no change.
+    """The function of a registered change with its parameters bound; the identity for no change.
 
-    Raises `InputError` for a change that is not registered or of another kind, and for parameters that it does not take.
+    Raises `InputError` for a change that is not registered or of another kind, and for parameters that it does not have.
     """
     if not change:
         return lambda value, *others: value
@@ -336,7 +336,7 @@ def resolve_change(change: Named, kind: str) -> Callable[..., Any]:
 
 
 def resolve_method(spec: MethodSpec, preset: str, settings: Mapping[str, Any]) -> ResolvedMethod:
-    """Lay ``settings`` over a preset. A method without presets takes any preset name."""
+    """Apply ``settings`` over a preset. A method without presets accepts any preset name."""
     if spec.presets and preset not in spec.presets:
         raise unknown(f"method {spec.name}", "preset", preset, spec.presets)
     spec = spec.at_preset(preset)
@@ -354,7 +354,7 @@ def resolve_method(spec: MethodSpec, preset: str, settings: Mapping[str, Any]) -
             raise InputError(source, next(iter(values)), "no settings: this method has none", "a setting")
         return ResolvedMethod(spec, None, budget)
     settings = build(resolve(spec.config), values, source)
-    label = getattr(settings, "label", "")  # of a method that is another with these settings
+    label = getattr(settings, "label", "")  # for a method whose settings change its name
     return ResolvedMethod(replace(spec, name=f"{spec.name} ({label})") if label else spec, settings, budget)
 
 
@@ -460,7 +460,7 @@ class DemoConfig:
 
 
 def demo_run_config(config: DemoConfig, device: str) -> dict[str, Any]:
-    """Settings of the comparison, as `RunConfig` fields, of the methods that compute on ``device``."""
+    """`RunConfig` fields of the comparison, with the methods that support ``device``."""
     specs = {name: plugin.spec for name, plugin in discover("methods").items() if plugin.spec}
     methods = tuple(n for n, spec in specs.items() if spec.demo and spec.computes_on(device))
     return {
@@ -473,7 +473,7 @@ def demo_run_config(config: DemoConfig, device: str) -> dict[str, Any]:
 
 
 CODED = "coded"
-"""Name of the condition, and of the variant that it derives, of avatars stored through the one codec of all methods."""
+"""Name of the condition, and of its variant: avatars stored with the same codec for all methods."""
 CODED_VARIANT = Named("variant", {"name": CODED})
 
 

@@ -17,7 +17,7 @@ Deletable = Literal["renders", "checkpoints", "damaged", "logs"]
 
 
 def usage(run: Path) -> dict[Kind, int]:
-    """Bytes of the files of a run by kind, the kinds in the order of `Kind`."""
+    """Bytes of the files of a run by kind, in the order of `Kind`."""
     sizes: dict[Kind, int] = dict.fromkeys(
         ("avatars", "renders", "checkpoints", "damaged", "logs", "other"), 0
     )
@@ -29,8 +29,8 @@ def usage(run: Path) -> dict[Kind, int]:
 def clean(run: Path, kinds: Sequence[Deletable]) -> int:
     """Delete the files of some kinds from a run, and empty folders; return the number of bytes freed.
 
-    Raises `InputError` for a folder that is not a run or is used by another process, and for links that lead
-    out of it.
+    Raises `InputError` for a folder that is not a run or is in use by another process, and for links that point
+    outside of it.
     """
     RunFolder(run).read_manifest()
     freed = 0

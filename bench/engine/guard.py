@@ -1,6 +1,6 @@
-"""Keeps a method from changing, and from reading, what other methods are measured by.
+"""Prevents a method from reading test images and from changing the inputs of other methods.
 
-In one process this prevents accidents, not intent: `bench.isolation` runs a method in processes of its own.
+Within one process this prevents accidents, not malicious code: `bench.isolation` runs a method in separate processes.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from ..errors import ChangedInputError, HeadbenchError, InputError
 
 HEAD = tuple(name for name in vars(HeadAsset) if not name.startswith("_"))
 SHARED = ("shape", "static_offset", "background", "cameras", "poses")
-"""Attributes of a clip that all methods are given."""
+"""Attributes of a clip that all methods share."""
 SLACK = 1e-3
 """How far colours and coverage may exceed [0, 1]: rounding in float32, below a quarter of an 8-bit step."""
 
 
 class TrainingView:
-    """A `Clip` that gives images and masks of training frames only; nothing of it can be changed in place.
+    """A read-only `Clip` with images and masks of training frames only.
 
     Cameras and driving signals of held-out frames stay visible: they do not reveal the ground truth images.
     """
@@ -56,7 +56,7 @@ class TrainingView:
 
 
 def _copied(image: ByteArray) -> ByteArray:
-    """A copy in memory that cannot be made writable; the reader may keep the original for the next call."""
+    """A copy that cannot be made writable; the reader may reuse the original array in the next call."""
     return np.frombuffer(image.tobytes(), image.dtype).reshape(image.shape)
 
 
@@ -67,7 +67,7 @@ def freeze(clip: Clip) -> None:
 
 
 def state_digest(clip: Clip) -> str:
-    """Digest of what all methods are given: cameras, poses, splits, head model, shape, background."""
+    """Digest of the inputs that all methods share: cameras, poses, splits, head model, shape, background."""
     state = hashlib.blake2b(digest_size=16)
     state.update(repr([sorted(clip.cameras), list(clip.poses), sorted(clip.splits.items())]).encode())
     state.update(repr([(c.id, c.width, c.height) for c in clip.cameras.values()]).encode())
@@ -77,7 +77,7 @@ def state_digest(clip: Clip) -> str:
 
 
 def check_unchanged(clip: Clip, before: str, name: str) -> None:
-    """Raise `ChangedInputError` unless a clip has the digest that `state_digest` gave."""
+    """Raise `ChangedInputError` unless `state_digest` of the clip is still ``before``."""
     if state_digest(clip) != before:
         raise ChangedInputError(
             f"{name} changed cameras, poses or the head model of {clip.subject} in memory, which every method is given. "
@@ -92,14 +92,14 @@ def check_frame(frame: Frame, size: tuple[int, int], name: str, key: FrameKey) -
         if values.shape != shape:
             raise InputError(name, f"{part} of {key}", f"shape {shape}", f"{values.shape}")
         low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
-        if not (low >= -SLACK and high <= 1 + SLACK):  # also for values that are not a number
+        if not (low >= -SLACK and high <= 1 + SLACK):  # written so that NaN is refused, too
             raise InputError(
                 name, f"{part} of {key}", "finite values from 0 to 1", f"values from {low:g} to {high:g}"
             )
 
 
 def _arrays(clip: Clip) -> Iterator[np.ndarray[Any, Any]]:
-    """The arrays that all methods are given, in an order that depends on the clip alone."""
+    """The arrays that all methods share, in an order that depends on the clip alone."""
     for name in HEAD:
         yield from _within(getattr(clip.head, name, None))
     for name in SHARED:

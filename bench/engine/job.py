@@ -1,4 +1,4 @@
-"""One cell (a subject, a method, a seed) with its inputs, and what identifies its results."""
+"""One cell (a subject, a method, a seed) with its inputs, and the fingerprints of its results."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ class Job:
     ``clip`` is the ground truth of every metric. ``adapted`` is the clip adapted to this method and
     condition, None if that is the clip itself. ``regions`` are evaluated besides the whole frame. ``source``
     is the cell whose avatar is used instead of training. ``config`` is that of the run. ``kept`` is a cache
-    shared by the cells of a run. ``line`` shows the progress of the run. ``hidden``: the method runs in
-    processes of its own that cannot read these folders; None for this process.
+    shared by the cells of a run. ``line`` shows the progress of the run. ``hidden`` are folders that the separate
+    processes of an isolated method cannot read; None to run the method in this process.
     """
 
     clip: Clip
@@ -63,7 +63,7 @@ class Job:
     kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     def create(self) -> Any:
-        """The `Method` of this cell, created when it is first asked for."""
+        """The `Method` of this cell, created on first use."""
         if not self.created:
             own = self.hidden is not None
             made = IsolatedMethod(self.method, self.cell.avatar, self.hidden or ()) if own else None
@@ -71,7 +71,7 @@ class Job:
         return self.created[0]
 
     def rows_of(self, rows: Rows) -> pd.DataFrame:
-        """The rows of this cell among those of a run."""
+        """Select the rows of this cell from those of a run."""
         return rows.select(
             method=self.method.spec.name,
             condition=self.condition.name,
@@ -83,13 +83,13 @@ class Job:
         )
 
     def check_unchanged(self) -> None:
-        """Raise `ChangedInputError` if the clip in memory differs from when it was first given to a method."""
+        """Raise `ChangedInputError` if the clip in memory has changed since it was first passed to a method."""
         clip = self.form.clip
         place = f"state of {id(clip)}"
         check_unchanged(clip, self.kept.setdefault(place, state_digest(clip)), self.label)
 
     def progress(self, step: str) -> AbstractContextManager[Progress]:
-        """The progress of a step: of the run if the cell belongs to one, otherwise a separate one."""
+        """Progress of a step: part of the run's if the cell belongs to one, otherwise separate."""
         return self.line.step(self.name, step) if self.line else progress(f"{self.name}: {step}")
 
     @property
@@ -108,7 +108,7 @@ class Job:
 
     @property
     def follows(self) -> bool:
-        """Whether its avatar is derived from that of another cell of the same run, which is worked on before."""
+        """Whether its avatar is derived from that of another cell of the same run, which runs first."""
         return self.source is not None and self.source.folder.parents[2] == self.run
 
     @property
@@ -134,7 +134,7 @@ class Job:
         }
 
     def check(self) -> None:
-        """Refuse a folder with an avatar from other inputs or other code, or with links that lead out of it.
+        """Refuse a folder with an avatar from other inputs or other code, or with links that point outside of it.
 
         Damaged records of steps are removed, with a warning.
         """
@@ -200,7 +200,7 @@ def source_digest(job: Job) -> str:
 
 
 def source_now(job: Job) -> str:
-    """`source_digest`; "" where the cell of this run that the avatar is derived from has none yet."""
+    """`source_digest`; "" if the source is a cell of this run that has no avatar yet."""
     try:
         return source_digest(job)
     except InputError:
@@ -217,7 +217,7 @@ def trained_ago(state: StepState) -> str:
 
 
 def warn_of_damage(job: Job, damaged: Mapping[str, str], remedy: str) -> None:
-    """Log which files of a cell are damaged, and what happens to them."""
+    """Log the damaged files of a cell, and how they are handled."""
     first, *more = (f"{job.cell.folder / name} {why}" for name, why in damaged.items())
     log.warning("%s: %s%s; %s", job.name, first, f", {len(more)} more are damaged" if more else "", remedy)
 
@@ -234,7 +234,7 @@ def trained_files(job: Job) -> Mapping[str, str]:
 
 
 def avatar_record(job: Job) -> tuple[str, Mapping[str, str]]:
-    """What distinguishes trained avatars of the same settings."""
+    """Data that distinguishes avatars trained with the same settings."""
     state = job.cell.step("fit")
     return ("", {}) if state is None else (state.get("derived_from", ""), state.get("files", {}))
 
@@ -249,7 +249,7 @@ def _leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str,
 
 
 def _at(value: Any, path: Sequence[str]) -> Any:
-    """The value at a path in nested mappings, which may be anything; "none" where there is none."""
+    """The value at a path in nested mappings; "none" if there is none."""
     for key in path:
         if not isinstance(value, Mapping) or key not in value:
             return "none"

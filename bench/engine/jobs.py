@@ -88,7 +88,7 @@ def make_jobs(
         for method, condition in cells
         for seed in config.seeds
     ]
-    return sorted(jobs, key=lambda job: job.follows)  # stable
+    return sorted(jobs, key=lambda job: job.follows)  # a stable sort
 
 
 class _Forms:
@@ -147,7 +147,7 @@ def _copy_kept(source: Path, folder: Path) -> None:
 
 
 def steps_ahead(job: Job, metrics: Sequence[MetricSpec]) -> dict[str, str]:
-    """The unfinished steps of a cell, each with the kind of cells of similar duration."""
+    """The unfinished steps of a cell, each with the group of cells whose duration is similar."""
     trained = job.cell.is_done("fit", job.fit_fingerprint)
     if trained and job.cell.is_done("measure", job.fit_fingerprint):
         return {}
@@ -178,7 +178,7 @@ def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
 
 
 def check_programs(folder: RunFolder, methods: Sequence[MethodSpec], *, trust: bool) -> None:
-    """Refuse methods that run a program which a run folder names, unless the caller trusts who made the run."""
+    """Refuse methods that run a program named in the run folder, unless the caller trusts its author."""
     programs = [method.name for method in methods if not method.native]
     if programs and not trust:
         expected = "methods that run no program which the run folder names"
@@ -187,7 +187,7 @@ def check_programs(folder: RunFolder, methods: Sequence[MethodSpec], *, trust: b
 
 
 def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -> tuple[RunConfig, list[Job]]:
-    """Return the settings of a run and its cells whose avatar is trained; `load` reads one.
+    """Return the settings of a run and its cells with a trained avatar, which `load` reads.
 
     Parameters
     ----------
@@ -227,6 +227,6 @@ def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -
 
 
 def load(job: Job) -> Avatar:
-    """Read the avatar of a cell, which was trained for it or for its source."""
+    """Read the avatar of a cell or of its source."""
     avatar: Avatar = job.create().load((job.source or job.cell).avatar, device=job.device)
     return avatar

@@ -42,7 +42,7 @@ def measure(
 ) -> Rows:
     """Evaluate the stored frames and the avatar as a whole; existing results are read back.
 
-    Metrics of one implementation are one measurement and are read back or repeated together. A measurement
+    Metrics with the same implementation are one measurement, which is read back or repeated as a whole. A measurement
     with any value is read back; a failed one is repeated. Damaged rows are measured again, with a warning.
     Rows of metrics that are not requested stay in the cell's file, with the record of their inputs.
 
@@ -104,7 +104,7 @@ def measure(
             f"The new measurement has no value of {lost[0]}, and the former has one.", "The former is kept."
         )
     others = sorted(old.metrics - fingerprints.keys())
-    job.cell.begin("measure", job.fit_fingerprint, **record)  # interrupted between the rows and their record
+    job.cell.begin("measure", job.fit_fingerprint, **record)  # in case of an interruption before the record
     Rows.joined([result, old.of_metrics(others)] if others else [result]).write(job.cell.rows)
     job.cell.finish(
         "measure",
@@ -119,7 +119,7 @@ def measure(
 
 
 def _replaced(rows: Rows) -> dict[str, Any]:
-    """Record of the values of a cell before they are replaced, with the conditions of their measurement."""
+    """Record the former values of a cell with the conditions of their measurement."""
     table = rows.select(method=ALL, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
     table = table[table["status"] == "ok"]
     first = table.iloc[0]
@@ -135,7 +135,7 @@ def _replaced(rows: Rows) -> dict[str, Any]:
 def drive(job: Job, avatar: Avatar) -> Rows:
     """Render and evaluate the avatar with the condition's change; write the rows and a record to the cell.
 
-    The record has the details of the change, and digests of its files by their place in the run folder.
+    The record has the details of the change, and digests of its files by their path in the run folder.
     """
     change = job.condition.drive
     with job.progress(RENDERING) as report:
@@ -210,7 +210,7 @@ def stored_rows(job: Job, metrics: Sequence[MetricSpec], *, retry: bool = False)
 
 
 def _measured_before(job: Job) -> tuple[dict[str, str], dict[str, Any], Rows]:
-    """Fingerprints and details of the measurements that were taken, by metric, and the rows."""
+    """Fingerprints and details of finished measurements by metric, and the rows."""
     step = job.cell.step("measure")
     if step is None or step["status"] != "done" or "rows" not in step:
         return {}, {}, Rows.of([])
@@ -235,7 +235,7 @@ def _measure_fingerprint(job: Job, spec: MetricSpec, rendered: Mapping[str, str]
 
 
 def failed_rows(job: Job, metrics: Sequence[MetricSpec], reason: str) -> Rows:
-    """Rows that show a failed cell as failed, with its reason."""
+    """Rows that mark a cell as failed, with the reason."""
     rows = [
         _row(job, spec, protocol, status="failed", reason=reason)
         for spec in metrics
@@ -249,7 +249,7 @@ def workload(
 ) -> list[tuple[Camera, HeadPose]]:
     """Cameras and poses of the scored frames in pairs, a new camera and pose in every pair.
 
-    ``size`` is the (width, height) that the cameras are brought to, None for their own.
+    Cameras are resized to ``size``, (width, height); None for their own.
     """
     clip = form.clip
     keys = [form.key(k) for p in protocols.values() for k in p.keys if k.subject == clip.subject]
@@ -289,7 +289,7 @@ def _score(job: Job, specs: Sequence[MetricSpec], protocol: Protocol) -> dict[st
 
 
 def _suspicion(spec: MetricSpec, score: Score) -> str:
-    """Reason of a row whose value is too good to be true, "" for any other."""
+    """Reason of a row whose value is suspiciously good; "" for any other."""
     if spec.suspect_above is None or score.region != FULL or not score.value > spec.suspect_above:
         return ""
     return f"{SUSPECT}above {spec.suspect_above:g} {spec.unit}"

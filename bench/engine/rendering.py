@@ -15,7 +15,7 @@ from .guard import check_frame
 from .job import DIGESTS, RENDERING, Job, avatar_record, warn_of_damage
 
 RECORD_EVERY_S = 10.0
-"""Seconds between records of the frames rendered; those after the last one are rendered again after a kill."""
+"""Seconds between records of rendered frames; after a kill, frames since the last record are rendered again."""
 
 
 def render(job: Job, avatar: Avatar) -> None:
@@ -59,7 +59,7 @@ def render(job: Job, avatar: Avatar) -> None:
 def _drawn(
     job: Job, avatar: Avatar, missing: Mapping[str, tuple[Protocol, FrameKey]], report: Progress
 ) -> Iterator[tuple[str, Frame]]:
-    """Path and frame of each render: one by one, or by task if the avatar renders lists."""
+    """Path and frame of each render; for avatars that render lists, a whole task at a time."""
     clip = job.form.clip
     views: dict[str, dict[FrameKey, tuple[str, tuple[Camera, HeadPose], Sequence[float]]]] = {}
     for name, (protocol, key) in missing.items():
@@ -76,7 +76,7 @@ def _drawn(
         asked = {key: view for key, (_, view, _) in listed.items()}
 
         def drawing(done: int, total: int, note: str = "", task: str = task, before: int = before) -> None:
-            report(before, len(missing), f"{task}, {done} of {total} drawn {note}")  # none of them read yet
+            report(before, len(missing), f"{task}, {done} of {total} drawn {note}")  # none read back yet
 
         for key, frame in avatar.render_listed(asked, background, drawing):
             yield listed[key][0], frame

@@ -118,7 +118,7 @@ def run_locked(
     check_executor(execution, config.device)
     rows = _run(config, cells, metrics, folder, execution, clips, each or run_cell, unchecked, record)
     if reports:
-        write_reports(folder.root)  # with the captures gone from memory
+        write_reports(folder.root)  # after the captures were freed
     log.info("finished in %s: %s", duration(time.perf_counter() - start), folder.root)
     return rows
 
@@ -188,7 +188,9 @@ def _planned(
     for method, condition in cells:
         places = product([clip.subject for clip in clips], config.seeds)
         label = label_of(method.spec.name, condition.name)
-        isolated = method.is_isolated(config.isolation)  # its process checks them with the clip
+        isolated = method.is_isolated(
+            config.isolation
+        )  # the settings are checked with the clip, in its process
         if not isolated and not all(folder.cell(s, label, seed).ended("measure") for s, seed in places):
             check_settings([(method, condition)])
     if config.drive:
@@ -257,7 +259,7 @@ def grown(config: RunConfig, folder: RunFolder, *, trust: bool = False) -> RunCo
         if before_methods is not None:
             both = () if () in (before_methods, condition.methods) else (*before_methods, *condition.methods)
             named[condition.name] = replace(condition, methods=tuple(dict.fromkeys(both)))
-    # What is named in this call has the settings of this call: they may be those of programs.
+    # Methods named in this call use the settings of this call, which may contain programs.
     asked_names = {get("methods", name).name for name in config.methods}
     others = {name: values for name, values in earlier.settings.items() if name not in asked_names}
     frames = (earlier.frames_per_task, config.frames_per_task)
@@ -294,13 +296,13 @@ def _same_place(first: str, second: str) -> bool:
 
 
 def check_settings(cells: Iterable[tuple[ResolvedMethod, Condition]]) -> None:
-    """Create each method of some cells, so that it checks its settings before any long step.
+    """Create the method of each cell, so that its settings are checked before any long step.
 
     Raises `InputError` for settings that a method refuses, and whatever importing or creating it raises.
     """
     for method, _ in cells:
         if not method.spec.implementation:
-            continue  # images of a folder
+            continue  # a folder of images
         made = method.create()
         if isinstance(made, CheckedMethod):
             made.check(None, method.budget)
@@ -330,11 +332,11 @@ def run_jobs(jobs: Sequence[Job], metrics: Sequence[MetricSpec], each: RunCell) 
 
 def _run_inline(job: Job, metrics: Sequence[MetricSpec], each: RunCell) -> Rows:
     log.info("%s", job.name)
-    outcome_path(job.cell.folder).unlink(missing_ok=True)  # of an earlier process or job
+    outcome_path(job.cell.folder).unlink(missing_ok=True)  # left by an earlier process or job
     try:
         return each(job, metrics)
     except ChangedInputError:
-        raise  # what the next cells would be given is not what the others were
+        raise  # the next cells would have other inputs than the previous ones
     except HeadbenchError as error:
         log.error("%s failed: %s", job.name, error)
         return failed_rows(job, metrics, reason_of(error))
@@ -347,7 +349,7 @@ def _run_inline(job: Job, metrics: Sequence[MetricSpec], each: RunCell) -> Rows:
 
 
 def warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
-    """Report unavailable metrics before the training instead of after it."""
+    """Report unavailable metrics before the training."""
     image = clip.image(clip.splits["train"][0])
     for spec in metrics:
         metric = make_metric(spec)
@@ -365,7 +367,7 @@ def warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
 
 
 def check_capture(config: RunConfig, clip: Clip) -> None:
-    """Raise `InputError` for an error of a capture that makes every result meaningless, as `DatasetSpec.errors` finds it."""
+    """Raise `InputError` for errors of a capture that make every result meaningless, see `DatasetSpec.errors`."""
     spec: DatasetSpec = get("datasets", config.reader)
     found = resolve(spec.errors)(clip) if spec.errors else []
     if found:
@@ -385,7 +387,7 @@ def describe(
     clips: Sequence[Clip],
     protocols: Mapping[str, Protocol],
 ) -> Manifest:
-    """The manifest of a new run."""
+    """Create the manifest of a new run."""
     return Manifest(
         configuration=config,
         paths=relative_paths(config),

@@ -1,4 +1,4 @@
-"""Scores frames against the ground truth; each is read once, by one thread pool, with bounded memory."""
+"""Scores frames against the ground truth. Each frame is read once, by one thread pool, with bounded memory."""
 
 from __future__ import annotations
 
@@ -198,7 +198,7 @@ def _temporal(
 def _sequences(
     keys: Sequence[FrameKey], frames: ScoredFrames, spec: MetricSpec, metric: Any, pool: ThreadPoolExecutor
 ) -> Iterator[Score]:
-    """Scores of a metric that compares all frames of a sequence at a camera at once; each of them has its value."""
+    """Scores of a metric that compares whole sequences of one camera; each frame gets the value of its sequence."""
     values: dict[tuple[str, str, str], float | str] = {}
     for key in keys:
         place = key.subject, key.sequence, key.camera
@@ -217,11 +217,11 @@ def _sequences(
 
 
 STREAMS = {"temporal": _temporal, "sequence": _sequences}
-"""How the frames of a metric that compares several at once are scored, by its kind."""
+"""Scoring functions of metrics that compare several frames, by kind."""
 
 
 def compared_over_time(metric: Any, kind: str) -> Callable[[ByteArray, ByteArray], float]:
-    """A metric of any kind of frames as one of single images: a neighbour in time is rendered without error, or nothing moves."""
+    """Wrap a frame metric of any kind for single images, with an error-free neighbour or a static sequence."""
     if kind == "temporal":
         return lambda image, truth: metric(image, truth, np.roll(truth, 1, axis=1), np.roll(truth, 1, axis=1))
     if kind == "sequence":

@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Change:
-    """A metric of an avatar before and after it was measured again; ``None`` for an unknown number.
+    """Value of an avatar metric before and after it was measured again; None if unknown.
 
     ``load`` is the number of cores used by other processes during the measurement.
     """
@@ -48,7 +48,7 @@ class Change:
 
     @property
     def text(self) -> str:
-        """One line."""
+        """The change as one line of text."""
         values = " -> ".join("none" if value is None else f"{value:.1f}" for value in self.value)
         loads = " -> ".join("not recorded" if load is None else f"{load:.2f}" for load in self.load)
         name = f"{self.subject} {self.method} seed {self.seed}"
@@ -143,9 +143,9 @@ def _jobs(
 
 
 def _with_cells(rows: Rows, folder: RunFolder, metrics: Sequence[MetricSpec]) -> Rows:
-    """The rows of a run with the speeds in the files of its cells.
+    """Return the rows of a run with the speeds stored in its cells.
 
-    They differ where an earlier call was killed after it had written a cell's file and before it wrote the run's.
+    They differ if an earlier call was killed between writing a cell's file and the run's.
     """
     table = rows.select(method=ALL, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
     failed = set(_cells(table[table["status"] == "failed"]))
@@ -185,13 +185,13 @@ def _check_avatar(job: Job) -> None:
 
 
 def _measured(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
-    """Rows of a cell's speed, measured now."""
+    """Measure the speed of a cell; return its rows."""
     again = [metric for metric in metrics if is_speed(metric)]
     return measure(job, load(job), metrics, again).of_metrics([metric.name for metric in again])
 
 
 def _changes(job: Job, metrics: Sequence[MetricSpec], before: Rows, after: Rows) -> Iterator[Change]:
-    """What the first number of each measurement was and is."""
+    """Change of the main value of each measurement."""
     measurements = {metric.implementation: metric for metric in reversed(metrics) if is_speed(metric)}
     for metric in measurements.values():
         old, new = (_row_of(rows, job, metric) for rows in (before, after))

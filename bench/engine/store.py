@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 
 class StepState(TypedDict, total=False):
-    """What a step of a cell records.
+    """Record of a step of a cell.
 
     Attributes
     ----------
@@ -114,11 +114,11 @@ class Cell:
         return self.folder / "rows.parquet"
 
     def render(self, task: str, key: FrameKey) -> Path:
-        """Where the render of ``key`` lies."""
+        """Path of the render of ``key``."""
         return self.folder / "renders" / task / f"{key.sequence}_{key.timestep:05d}_{key.camera}.png"
 
     def step(self, name: str) -> StepState | None:
-        """Return what `begin` or `finish` wrote for a step, or None. Raises `InputError` for a damaged record."""
+        """Return the record that `begin` or `finish` wrote, or None. Raises `InputError` for a damaged record."""
         path = self.folder / f"{name}.json"
         if not path.exists():
             return None
@@ -140,7 +140,7 @@ class Cell:
                 (self.folder / f"{name}.json").unlink()
 
     def set_aside(self, folder: Path) -> None:
-        """Rename a folder of the cell whose files cannot be trusted; nothing is deleted."""
+        """Rename a folder with invalid files instead of deleting it."""
         number = 1
         while (aside := folder.with_name(f"{folder.name}-damaged-{number}")).exists():
             number += 1
@@ -161,12 +161,12 @@ class Cell:
         return {name: why for name, why in found.items() if why}
 
     def is_done(self, name: str, fingerprint: str) -> bool:
-        """Whether the step ended with exactly these inputs."""
+        """Whether the step finished with exactly these inputs."""
         state = self.step(name)
         return state is not None and state.get("fingerprint") == fingerprint and state.get("status") == "done"
 
     def ended(self, name: str) -> bool:
-        """Whether the step ended, with any inputs; False for a record that cannot be read."""
+        """Whether the step finished, with any inputs; False for a record that cannot be read."""
         try:
             state = self.step(name)
         except InputError:
@@ -194,7 +194,7 @@ def _kept_design(manifest: Manifest) -> dict[str, str]:
 
 
 def _has_all_frames(planned: Manifest, earlier: Manifest, key: str) -> bool:
-    """Whether a planned run scores the frames that an earlier one scored of the same captures, and possibly more."""
+    """Whether a planned run scores at least the frames that an earlier one scored of the same captures."""
     if key == "tasks":
         return set(earlier.protocols) <= set(planned.protocols)
     task = key.rpartition(" ")[2]
@@ -234,7 +234,7 @@ class RunFolder:
 
     @property
     def speed_pass(self) -> Path:
-        """Present while speed is measured at the end of a run: the cells that had failed by then, and why."""
+        """Present while speed is measured at the end of a run: cells that had failed before, with reasons."""
         return self.root / "speed.json"
 
     @property
@@ -261,7 +261,7 @@ class RunFolder:
     def check_kept(self, planned: Manifest) -> None:
         """Check that a planned run keeps all rows of the folder; called before execution.
 
-        Methods, seeds and metrics may be added, not left out. Captures, frames, tasks and regions have to be the same.
+        Methods, seeds and metrics may be added but not removed. Captures, frames, tasks and regions must be the same.
 
         Raises `InputError` for a plan that would lose rows.
         """
@@ -302,7 +302,7 @@ class RunFolder:
         return Rows.read(self.rows).split(changed)
 
     def read_rows(self, manifest: Manifest) -> Rows:
-        """Read ``rows.parquet``, each method under a condition by its label, see `Rows.labelled`.
+        """Read ``rows.parquet`` with the label of method and condition as the method, see `Rows.labelled`.
 
         Raises `InputError` for rows of methods, metrics and tasks that the run does not have.
         """

@@ -30,11 +30,11 @@ AVATAR_FILE = "avatar.json"
 HEAD_FILE = "head_model.npz"
 """Head model file in an avatar's folder, which all native methods store."""
 SUBJECT_FILE = "subject.npz"
-"""Shape and static offset of the subject, which most methods store."""
+"""File with the subject's shape and static offset, which most methods store."""
 TRAINING_FILE = "training.json"
-"""Training record of methods; optional "losses" are pairs of an iteration and the loss up to there."""
+"""Training record of methods; optional "losses" are pairs of an iteration and the loss up to it."""
 SAME_SHAPE = 1e-4
-"""Largest difference of two shape coefficients of one subject; files hold float32."""
+"""Tolerance between shape coefficients of the same subject; files store float32."""
 
 Maker = Literal["training", "import", "compact", "variant"]
 
@@ -107,7 +107,7 @@ def write_avatar_record(
 
 
 def shown_by(clip: Clip) -> tuple[str, FloatArray, str]:
-    """Subject, its shape and the version of the head model, of the clip that an avatar is trained on."""
+    """Subject, shape and head model version of the clip that an avatar is trained on."""
     versions = (pose.head_model for pose in clip.poses.values())
     return clip.subject, clip.shape, next(versions, "")
 
@@ -130,14 +130,14 @@ def avatar_folder(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class StoredAvatar:
-    """An avatar in a folder before it is loaded: the folder, its record, the method that reads it with its settings."""
+    """An avatar that is not loaded yet: its folder, its record, and the method that reads it, with settings."""
 
     folder: Path
     record: AvatarRecord
     method: ResolvedMethod
 
     def load(self, device: str = "cpu") -> Avatar:
-        """Read the avatar. Raises `InputError` for damaged files, and for another head model than it was stored with."""
+        """Read the avatar. Raises `InputError` for damaged files or another head model than the recorded one."""
         head, known = self.folder / HEAD_FILE, self.record["head_digest"]
         if known and not head.is_file():
             raise InputError(head, "", "the head model that the avatar was stored with", "no such file")
@@ -149,7 +149,7 @@ class StoredAvatar:
 
     @property
     def heads(self) -> dict[str, str]:
-        """Head model file of the avatar by version, to which `adaptation.plan` refits a capture."""
+        """Head model file of the avatar by version, for `adaptation.plan` to refit a capture."""
         return {self.record["head_model"]: str(self.folder / HEAD_FILE)} if self.record["head_digest"] else {}
 
     def check_subject(self, clip: Clip) -> None:
@@ -160,9 +160,9 @@ class StoredAvatar:
             raise InputError(self.folder, "subject", expected, f"one of {shown}")
 
     def shows_another(self, subject: str, shape: FloatArray, head_model: str) -> str:
-        """The name of the subject that the avatar shows, if it differs from the given one; otherwise "".
+        """Name of the avatar's subject if it is not the given one, otherwise "".
 
-        Another subject has another name and another shape; shapes of two head models do not compare.
+        The shape decides if the head models are the same, otherwise the name: shapes of different models are not comparable.
         """
         name, own = self.record["subject"], np.asarray(self.record["shape"])
         if self.record["head_model"] == head_model and own.shape == np.shape(shape):
@@ -171,7 +171,7 @@ class StoredAvatar:
 
 
 def open_avatar(folder: Path, method: str = "") -> StoredAvatar:
-    """Read ``avatar.json`` of a folder as `avatar_folder` takes it, and find the method that reads the avatar.
+    """Read ``avatar.json`` of a folder, see `avatar_folder`, and find the method that reads the avatar.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Runs the cells of a run by an executor, in workers or as jobs, and merges their rows.
+"""Runs the cells of a run with an executor, in workers or as jobs, and merges their rows.
 
 Two passes: all cells in parallel, then the speed of their avatars, without concurrent jobs that would bias
-it. The state of a cell is that of its files; only this process writes the files of the run.
+it. The state of a cell is stored in its files; only this process writes the files of the run.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from .training import log_kept
 
 log = logging.getLogger(__name__)
 REPORT_EVERY_S, LOG_EVERY_S = 2.0, 10.0
-"""Seconds between progress records of a cell, which a terminal shows, and between lines of its log."""
+"""Seconds between progress records of a cell, shown in a terminal, and between lines of its log."""
 
 
 def execute(
@@ -70,7 +70,7 @@ def execute(
 
     failures = _failed_before(folder)
     schedule = Schedule("cells", lambda task: stored_rows(places[task.place], steady) is not None, execution)
-    for follows in (False, True):  # what is derived from an avatar waits for its training
+    for follows in (False, True):  # derived avatars wait for the training of their source
         failures |= schedule.run_all(left(steady, (follows,)))
     if len(steady) < len(metrics):
         write_json(folder.speed_pass, {"failed": failures})
@@ -85,7 +85,7 @@ def execute(
 
 
 def _failed_before(folder: RunFolder) -> Failures:
-    """Cells that had failed when the run was ended while it measured speed, and why."""
+    """Cells that had failed, with reasons, when the run was killed during the speed measurement."""
     path = folder.speed_pass
     return checked(read_json(path), dict[str, Failures], path)["failed"] if path.exists() else {}
 
@@ -97,7 +97,7 @@ def _merged(job: Job, metrics: Sequence[MetricSpec], failure: str | None) -> Row
 
 
 def machine_of(jobs: Sequence[Job], otherwise: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The machine that ran the cells; ``otherwise`` if none is recorded, all names if there were several."""
+    """The machine that ran the cells; ``otherwise`` if none is recorded; all names if there were several."""
     outcomes = [read_outcome(job.cell.folder) for job in jobs]
     machines = [outcome["machine"] for outcome in outcomes if outcome is not None and "machine" in outcome]
     if not machines:
@@ -110,7 +110,7 @@ def machine_of(jobs: Sequence[Job], otherwise: Mapping[str, Any]) -> Mapping[str
 
 
 def _all_of(names: Iterable[str]) -> str:
-    """The different names as one; of several a warning is logged."""
+    """Join distinct names; log a warning if there are several."""
     different = sorted(set(names))
     if len(different) > 1:
         log.warning(
@@ -120,14 +120,14 @@ def _all_of(names: Iterable[str]) -> str:
 
 
 def cell_task(job: Job, capture: int, folder: RunFolder) -> Task:
-    """The task of a cell of the run in ``folder``; ``capture`` is the index of its subject's among those that the reader finds."""
+    """The task of a cell of the run in ``folder``; ``capture`` is the index of its subject among the captures found."""
     place = job.cell.folder.relative_to(folder.root).as_posix()
     cell = {"subject": job.clip.subject, "label": job.label, "seed": job.seed, "capture": capture}
     return replace(Task.of(folder.root, place, f"{__name__}:execute_cell", **cell), device=job.device)
 
 
 def execute_cell(task: Task, report: Callable[[str], None]) -> None:
-    """Run a cell according to the record of its run, without its speed unless the task measures speed."""
+    """Run a cell as recorded in its run, without speed metrics unless the task measures speed."""
     job, metrics = _opened.job(Path(task.root), **task.arguments)
     reported = logged = time.monotonic()
 
@@ -151,26 +151,26 @@ def execute_cell(task: Task, report: Callable[[str], None]) -> None:
 
 
 class _Opened:
-    """The record and the capture that were read last: cells of a run and of a subject follow each other."""
+    """Cache of the last run record and capture, since cells of the same run and subject follow each other."""
 
     def __init__(self) -> None:
         self._run: _Run | None = None
         self._clips: list[Clip] = []
 
     def forget(self) -> None:
-        """Let the next cell open its capture again."""
+        """Drop the cached capture."""
         self._clips = []
 
     def job(
         self, run: Path, subject: str, label: str, seed: int, capture: int
     ) -> tuple[Job, Sequence[MetricSpec]]:
-        """A cell and the metrics of its run. Raises `InputError` for another capture than the run began with."""
+        """A cell and the metrics of its run. Raises `InputError` if the capture has changed since the run began."""
         if self._run is None or self._run.folder.root != run:
             self._run = _Run.read(run)
             self._clips = []
         config, recorded = self._run.config, self._run.fingerprints
         if [clip.subject for clip in self._clips] != [subject]:
-            self._clips = []  # the former, before another takes memory
+            self._clips = []  # free the former before reading another
             self._clips = open_clips(config, only=capture)
         if {clip.subject: clip.fingerprint for clip in self._clips} != {subject: recorded[subject]}:
             found = ", ".join(clip.subject for clip in self._clips) or "none"
@@ -185,7 +185,7 @@ _opened = _Opened()
 
 @dataclass(frozen=True)
 class _Run:
-    """A run according to its record."""
+    """A run as recorded."""
 
     folder: RunFolder
     config: RunConfig
@@ -207,7 +207,7 @@ class _Run:
         }
         began_with = {method.label: method.code for method in manifest.methods}
         for label, (method, _) in cells.items():
-            code = method.identity().get("code")  # of a plug-in outside the package
+            code = method.identity().get("code")  # for plug-ins outside the package
             if code not in (None, began_with.get(label)):
                 expected = f"{began_with.get(label)}, the digest of the plug-in's code when the run began"
                 raise InputError(folder.manifest, f"methods, code of {label}", expected, code)

@@ -38,12 +38,12 @@ def fit(job: Job) -> Avatar:
             warn_of_damage(job, damaged, "it is trained again")
             earlier = None
     if earlier is None and job.cell.avatar.exists():
-        job.cell.set_aside(job.cell.avatar)  # it is damaged, or its inputs are unknown
+        job.cell.set_aside(job.cell.avatar)  # damaged, or of unknown inputs
     if earlier is None or earlier["status"] != "done":
         interruptions = 0 if earlier is None else earlier.get("interruptions", 0) + 1
         record = job.method.record()
         job.check_unchanged()
-        use_device(job.device)  # before a record says that a training has begun
+        use_device(job.device)  # before the training is recorded as begun
         job.cell.begin("fit", job.fit_fingerprint, interruptions=interruptions, method=record)
         if isinstance(method, PreparedMethod):
             method.prepare(job.device)
@@ -92,7 +92,7 @@ def fit(job: Job) -> Avatar:
 
 
 def write_losses(job: Job) -> None:
-    """Write the losses of a training to ``losses.csv`` and, if it is installed, for TensorBoard into the cell's folder."""
+    """Write training losses to ``losses.csv`` and, if TensorBoard is installed, as its events, into the cell's folder."""
     losses = training_losses(job.cell.avatar)
     if not losses:
         return
@@ -108,7 +108,7 @@ def write_losses(job: Job) -> None:
 
 
 def derive(job: Job) -> Avatar:
-    """Use the avatar of the job's ``source``, or the one that the condition derives from it without training.
+    """Use the avatar of the job's ``source``, or derive one from it by the condition, without training.
 
     Raises `InputError` if the source has no trained avatar.
     """

@@ -1,4 +1,4 @@
-"""Stored curves as Markdown of a page: quality by what a training takes, the best methods, and recommendations."""
+"""Stored curves as Markdown for a page: quality by training cost, the best methods, and recommendations."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from .curve import CurveData, leaders_text, read_curve
 from .points import HELD_OUT, column
 
 UNITS = {"seconds": " s", "pictures": ""}
-"""Quantities of stored curves, and the unit of their columns."""
+"""Varied quantities of stored curves, and the unit of their columns."""
 TASK = "self_reenactment"
 """Held-out frames that recommendations are for."""
 
 
 def curve_block(runs: Sequence[Path], over: str) -> str:
-    """Quality of all methods, the best ones and, for seconds, what is recommended: Markdown."""
+    """Quality of all methods, the best ones and, for seconds, the recommended ones: Markdown."""
     curve = read_curve([RunData.read(run) for run in runs], over)
     parts = [_table(curve), leaders_text(curve)]
     if over == "seconds":
@@ -51,12 +51,12 @@ def _table(curve: CurveData) -> str:
 
 
 def _amount(over: str, place: Sequence[float]) -> float:
-    """Seconds or number of pictures, by the place of a point; see `CurvePoint`."""
+    """Seconds or number of images, from the place of a point; see `CurvePoint`."""
     return place[1 if over == "seconds" else 2]
 
 
 def _recommended(runs: Sequence[Path], limits: Sequence[float]) -> list[str]:
-    """What `headbench recommend` says for limits of seconds, without its tables; what it says for all of them, once."""
+    """Text of `headbench recommend` for limits of seconds, without tables and repeated sentences."""
     found = [
         recommend(RecommendSettings(tuple(map(str, runs)), seconds=limit, task=TASK)).data for limit in limits
     ]

@@ -46,13 +46,13 @@ def curve_report(out: Path, over: str) -> CommandResult:
 
 
 def curve_runs(settings: CurveReportSettings, progress: Progress = no_progress) -> CommandResult:
-    """Join the runs of curves; see the settings, and `joined_curve` for errors."""
+    """Join runs of curves; see the settings and, for errors, `joined_curve`."""
     runs, out = [RunData.read(Path(run)) for run in settings.runs], Path(settings.out)
     return joined_curve(runs, settings.over, out)
 
 
 def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult:
-    """Write ``curve.csv`` and ``curve.png`` of runs; return points, a table of their means, and the best method by what it takes.
+    """Write ``curve.csv`` and ``curve.png`` of runs; return points, a table of their means, and the best method by cost.
 
     Raises `InputError` as `read_curve` does.
     """
@@ -86,17 +86,17 @@ class CurveData:
     Attributes
     ----------
     subjects : Sequence[str]
-        The subjects that all methods have, of which the means are.
+        Subjects that all methods have, over which the means are taken.
     points, means : Sequence[CurvePoint]
         All trainings, by method, quantity and subject; and the means over subjects.
     clock : str
-        The cost in `MEASURED` that is the time of a training on the device.
+        The cost in `MEASURED` that measures training time on the device.
     best : Mapping[tuple[str, str], Sequence[Leader]]
-        The result of `leaders` by name of a metric of frames and task.
+        Result of `leaders` by name of a frame metric and task.
     every : int
-        Number of consecutive training timesteps of which one is held out.
+        One of this many consecutive training timesteps is held out.
     held_out : Mapping[str, Mapping[str, Any]]
-        Camera, timesteps and what is left to train with, by subject.
+        Held-out camera and timesteps, and the remaining training data, by subject.
     missing : Mapping[str, str]
         Reasons by label of a metric that was not measured.
     """
@@ -115,23 +115,23 @@ class CurveData:
 
     @property
     def of_frames(self) -> list[MetricSpec]:
-        """The metrics of frames."""
+        """The frame metrics."""
         return [spec for spec in self.metrics if spec.per_frame]
 
     @property
     def axis(self) -> str:
-        """Name of what is varied, as measured."""
+        """Name of the varied quantity, as measured."""
         measured = f"{'Processor seconds' if self.clock == 'processor_seconds' else 'Seconds'} of training"
         return measured if self.over in TIMED else AXES[self.over]
 
 
 def read_curve(runs: Sequence[RunData], over: str) -> CurveData:
-    """The trainings of runs that differ in one quantity.
+    """Read the trainings of runs, which differ in one quantity.
 
     Parameters
     ----------
     runs : Sequence[RunData]
-        Runs of one kind of curve: several methods of a subject, or several subjects.
+        Runs of the same kind of curve, with several methods or subjects.
     over : str
         Quantity that varies between the trainings: "budget", "seconds", "cameras", "timesteps", "pictures" or
         "tracking_error".
@@ -139,8 +139,8 @@ def read_curve(runs: Sequence[RunData], over: str) -> CurveData:
     Raises
     ------
     InputError
-        A folder is not the run of such a curve, two have the same training, they do not have the same device, preset, image size, seeds,
-        metrics and held-out frames, or no subject has all methods.
+        A folder is not a run of such a curve, two have the same training, they differ in device, preset, image size, seeds,
+        metrics or held-out frames, or no subject has all methods.
     """
     points = [point for run in runs for point in _points(run, over)]
     _check_together(runs, points)
@@ -178,7 +178,7 @@ def read_curve(runs: Sequence[RunData], over: str) -> CurveData:
 
 
 def write_curve(path: Path, curve: CurveData) -> None:
-    """Draw the means as a PNG: a row of plots for each task, a plot for each metric of frames."""
+    """Draw the means as a PNG: a row of plots for each task, a plot for each frame metric."""
     axis = curve.clock if curve.over in TIMED else curve.over
     rows = [
         [_panel(curve.means, spec, task, axis, curve.missing) for spec in curve.of_frames]
@@ -265,7 +265,7 @@ def _check_together(runs: Sequence[RunData], points: Sequence[CurvePoint]) -> No
 
 
 def _cost(point: CurvePoint, axis: str) -> float | None:
-    """What a training took: a measured cost, its `LIMIT` of seconds or, where that was exceeded, its seconds, or a field of the point."""
+    """Cost of a training: a measured cost, its `LIMIT` of seconds (or its seconds, if longer), or a field of the point."""
     if axis == LIMIT:
         limit, seconds = point.budget.seconds, point.cost["seconds"]
         return seconds if limit and seconds and seconds > OVERRUN * limit else limit
@@ -275,11 +275,11 @@ def _cost(point: CurvePoint, axis: str) -> float | None:
 def _leaders(
     points: Sequence[CurvePoint], metrics: Sequence[MetricSpec], tasks: Sequence[str], axis: str
 ) -> dict[tuple[str, str], list[Leader]]:
-    """The method with the best mean by what a training takes, by name of a metric of frames and task; without methods with a failed one."""
+    """`leaders` by name of a frame metric and task; methods with a failed training are excluded."""
     found = {}
     for spec, task in product((spec for spec in metrics if spec.per_frame), tasks):
         lines: dict[str, dict[str, list[tuple[float, float]]]] = {}
-        # A line must not pass over a training that failed.
+        # A line must not skip a failed training.
         failed = {point.method for point in points if point.values[column(spec, task)] is None}
         for point in (point for point in points if point.method not in failed):
             cost, value = _cost(point, axis), point.values[column(spec, task)]
@@ -366,7 +366,7 @@ def _panel(
         value, half = point.values[column(spec, task)], point.halves[column(spec, task)]
         line = lines.setdefault(point.method, [])
         if cost is not None and value is not None:
-            cost = max(cost, 1e-3) if axis in point.cost else cost  # recorded to a millisecond
+            cost = max(cost, 1e-3) if axis in point.cost else cost  # times are recorded in whole milliseconds
             line.append((cost, value, half or 0.0))
     unit = f", {spec.unit}" if spec.unit else ""
     title = f"{spec.label}{unit}, held-out {HELD_OUT[task]}"

@@ -1,4 +1,4 @@
-"""Which method of a curve is best at which cost, and between which costs two methods change places."""
+"""The best method of a curve at each cost, and the costs at which the best method changes."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ GRID = 600
 
 @dataclass(frozen=True)
 class Leader:
-    """The method with the best mean from a cost on.
+    """A method that has the best mean from a certain cost on.
 
     Attributes
     ----------
     start : float
-        The cost from which on the method is best: where its curve crosses that of the leader before, or its lowest cost.
+        Lowest cost at which the method is best: where its curve crosses that of the previous leader, or its lowest cost.
     interval : tuple[float | None, float | None] | None
-        Costs around ``start`` at which the 95 % interval of the paired difference of both methods contains 0; None at an end
-        that lies beyond the measured costs. None in all for the first leader, for one that is best from its lowest cost on, whose
-        curve crosses none, and with too few subjects for an interval.
+        Costs around ``start`` at which the 95 % interval of the paired difference of both methods contains 0; an end
+        beyond the measured costs is None. None instead of a pair for the first leader, for a method that is best from its
+        lowest cost on without a crossing, and with too few subjects for an interval.
     measured : tuple[float, float]
-        The lowest and the highest cost at which the method and the leader before it have values.
+        The lowest and the highest cost at which the method and the previous leader have values.
     """
 
     method: str
@@ -48,10 +48,11 @@ class Leader:
 
 
 def leaders(lines: Lines, *, higher_is_better: bool) -> list[Leader]:
-    """The method with the best mean by rising cost, over the subjects that all methods have.
+    """The methods with the best mean, by increasing cost, over the subjects that all methods have.
 
     Quality is interpolated linearly between measured trainings, over the logarithm of the cost if all costs are above 0. A
-    method takes part from its lowest cost on, and keeps the quality of its highest: that training fits a larger budget too.
+    method is included from its lowest cost on. Beyond its highest cost it keeps the quality there, since that training also
+    fits larger budgets.
     """
     subjects = sorted(set.intersection(*(set(own) for own in lines.values()))) if lines else []
     if not subjects:

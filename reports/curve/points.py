@@ -1,4 +1,4 @@
-"""Points of a curve: what trainings cost and reached, means over subjects, and their table and text."""
+"""Points of a curve: cost and quality of trainings, means over subjects, and their table and text."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MEASURED: Mapping[str, tuple[str, float]] = {
 class CurvePoint:
     """A method trained with a part of its budget or of the frames, or with a level of tracking error.
 
-    ``place`` orders the points of a method and tells them apart. Means over seeds of one subject, or over subjects ("").
+    ``place`` orders and identifies the points of a method. Values are means over seeds of one subject, or over subjects ("").
     ``cameras``, ``timesteps`` and ``pictures`` count the training data. ``tracking_error`` is the level of a synthetic capture, None
     for a recording. ``cost`` is `MEASURED` by name, ``values`` are the metrics by name and held-out data, such as "psnr_camera";
     None: not measured. ``halves`` are half the widths of the 95 % intervals of means over subjects, by the same names, None with
@@ -66,7 +66,7 @@ class CurvePoint:
 
 
 def mean(values: Sequence[float | None]) -> float | None:
-    """Mean of numbers; None where one is missing, or all."""
+    """Mean of numbers; None if any is missing or there are none."""
     known = [value for value in values if value is not None]
     return fmean(known) if known and len(known) == len(values) else None
 

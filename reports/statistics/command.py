@@ -102,7 +102,7 @@ FIELDS = (
 def compare_runs(settings: CompareSettings, progress: Progress = no_progress) -> CommandResult:
     """Test paired differences between methods of finished runs, or compare one run with a baseline file.
 
-    Raises `InputError` for runs, methods and metrics that do not fit.
+    Raises `InputError` for invalid combinations of runs, methods and metrics.
     """
     from ..runs import FrameSelection, RunSet
 
@@ -117,7 +117,7 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
 def compare_methods(
     runs: RunSet, settings: CompareSettings, progress: Progress = no_progress
 ) -> CommandResult:
-    """`compare_runs` of runs that are read already; the settings' runs, region and sequences are not looked at."""
+    """`compare_runs` of loaded runs; runs, region and sequences of the settings are ignored."""
     from ..conditions import conditions, note_of
     from ..table_report import COMPARISON
     from .comparisons import compare
@@ -178,7 +178,7 @@ def _pairs(runs: RunSet, against: str | None, trivial: bool) -> list[tuple[str, 
 
 
 def _plain(comparison: PairedComparison) -> dict[str, Any]:
-    """Everything a comparison holds and says, as plain values."""
+    """All fields and results of a comparison, as JSON values."""
     return {
         **asdict(comparison),
         "differences": dict(comparison.differences),
@@ -230,7 +230,7 @@ def _text(spec: MetricSpec, comparisons: Sequence[PairedComparison], note: str) 
         if c.difference is None or c.p is None or c.p_holm is None:
             lines.append([c.first, c.second, "-", "", "", "", "", f"{c.verdict}: {c.reason}"])
             continue
-        # A digit more than the table: differences are smaller than values.
+        # One digit more than the table, since differences are smaller than values.
         digits = spec.digits + 1
         bounds = "-" if c.low is None or c.high is None else f"{c.low:+.{digits}f} {c.high:+.{digits}f}"
         numbers = [f"{c.difference:+.{digits}f}", bounds, f"{c.p:.4f}", f"{c.p_holm:.4f}"]

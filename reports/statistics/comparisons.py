@@ -23,9 +23,9 @@ from ..aggregate import summarise, whole_images
 from .paired import LEVEL, interval, paired_differences
 
 EXACT_UP_TO = 20
-"""Subjects up to which every assignment is tried."""
+"""Maximum number of subjects for which all assignments are tried."""
 DRAWS = 99_999
-"""Random assignments beyond; the observed one counts as a further one, so that the test keeps its level."""
+"""Number of random assignments for more subjects; the observed one is added, so that the test keeps its level."""
 CHUNK = 4_096
 
 
@@ -39,14 +39,14 @@ def sign_flip_p(differences: Sequence[float] | FloatArray, *, greater: bool = Fa
         raise ValueError("differences must be finite")
     if not values.size:
         return 1.0
-    # Sums of the same terms in another order differ by rounding; they count as equal.
+    # Sums of the same terms in another order differ by rounding; they are treated as equal.
     observed = values.sum() if greater else abs(values.sum())
     threshold = observed - 1e-9 * np.abs(values).sum()
     if values.size <= EXACT_UP_TO:
         sums = np.zeros(1)
         for value in values[1:]:
             sums = np.concatenate([sums + value, sums - value])
-        # Two-sided, the first sign is fixed: flipping all signs does not change the absolute sum.
+        # In the two-sided test the first sign is fixed: flipping all signs does not change the absolute sum.
         sums = np.concatenate([sums + values[0], sums - values[0]]) if greater else np.abs(sums + values[0])
         return float(np.mean(sums >= threshold))
     generator = np.random.default_rng(0)
@@ -62,7 +62,7 @@ def equivalence_p(differences: Sequence[float] | FloatArray, margin: float) -> f
     """P-value of two one-sided sign-flip tests against means of -``margin`` and below, and of ``margin`` and above.
 
     The larger of the two p-values (D. Schuirmann, Journal of Pharmacokinetics and Biopharmaceutics 15, 1987). It is small only
-    where the mean of (n,) differences lies within the margin; at least 2^-n.
+    if the mean of the (n,) differences is within the margin; at least 2^-n.
     """
     if not (math.isfinite(margin) and margin > 0):
         raise ValueError(f"margin is {margin}; a positive number")
@@ -71,14 +71,14 @@ def equivalence_p(differences: Sequence[float] | FloatArray, margin: float) -> f
 
 
 def least_p(subjects: int) -> float:
-    """Return the smallest p-value for a number of subjects: that of differences with equal signs."""
+    """Return the smallest possible p-value for a number of subjects: all differences have the same sign."""
     if subjects < 1:
         return 1.0
     return 2.0 ** (1 - subjects) if subjects <= EXACT_UP_TO else 1.0 / (1 + DRAWS)
 
 
 def subjects_needed(level: float, comparisons: int = 1) -> int:
-    """Number of subjects required for the first of several comparisons to reach ``level`` after Holm."""
+    """Number of subjects required for the smallest of several p-values to reach ``level`` after Holm's correction."""
     return next(n for n in range(1, EXACT_UP_TO + 1) if comparisons * least_p(n) <= level)
 
 
@@ -94,12 +94,11 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 @dataclass(frozen=True)
 class PairedComparison:
-    """First method minus second on one metric of one task; the subject is the unit.
+    """First method minus second on one metric of one task, with subjects as units.
 
-    Where ``minus`` names another task, the difference in that task is subtracted: an interaction of methods and tasks, 0 where
-    the methods differ by the same in both. ``difference`` is None where a method lacks values
-    (``reason``); the interval (``low``, ``high``) over the population
-    of subjects where they are too few.
+    If ``minus`` names another task, the difference in that task is subtracted: an interaction of methods and tasks, 0 if
+    the methods differ equally in both. ``difference`` is None if a method lacks values (``reason``); the interval over the
+    population of subjects (``low``, ``high``) is None if there are too few of them.
     """
 
     task: str
@@ -109,25 +108,25 @@ class PairedComparison:
     second: str
     level: float = LEVEL  # of the test; one minus the confidence of the interval
     differences: tuple[tuple[str, float], ...] = ()  # by subject, means over frames, sequences and seeds
-    seeds: tuple[int, int] = (0, 0)  # how many of each method
+    seeds: tuple[int, int] = (0, 0)  # number of seeds of each method
     difference: float | None = None  # mean over subjects, in the metric's unit
     low: float | None = None
     high: float | None = None
     effect: float | None = (
         None  # mean over standard deviation of the differences (Cohen's d_z); None where that is 0
     )
-    p: float | None = None  # of the exact sign-flip test alone
+    p: float | None = None  # of the exact sign-flip test, uncorrected
     p_holm: float | None = None  # corrected for the family
     family: int = 0  # comparisons of this metric
     reason: str = ""
     minus: str = ""
     margin: float | None = None  # of the test of equivalence, in the metric's unit; None without this test
-    p_equivalence: float | None = None  # of `equivalence_p` alone
+    p_equivalence: float | None = None  # of `equivalence_p`, uncorrected
     p_equivalence_holm: float | None = None  # corrected for the family
 
     @property
     def equivalent(self) -> bool | None:
-        """Whether the difference is shown to lie within the margin; None without a test of equivalence."""
+        """Whether equivalence within the margin is significant; None without a test of equivalence."""
         return None if self.p_equivalence_holm is None else self.p_equivalence_holm <= self.level
 
     @property
@@ -137,12 +136,12 @@ class PairedComparison:
 
     @property
     def wins(self) -> int:
-        """Subjects on which the first method is better."""
+        """Number of subjects on which the first method is better."""
         sign = 1 if self.higher_is_better else -1
         return sum(sign * value > 0 for _, value in self.differences)
 
     def text(self, digits: int) -> str:
-        """The difference, and its interval in brackets where there is one; "–" without a difference."""
+        """The difference, and its interval in brackets if there is one; "–" without a difference."""
         if self.difference is None:
             return "–"
         interval = (
@@ -154,7 +153,7 @@ class PairedComparison:
 
     @property
     def testable(self) -> bool:
-        """Whether a corrected p-value at the level is possible with this number of subjects."""
+        """Whether the corrected p-value can reach the level with this number of subjects."""
         return self.family * least_p(self.subjects) <= self.level
 
     @property
@@ -185,9 +184,9 @@ def compare(
 ) -> list[PairedComparison]:
     """Compare pairs of methods on one metric of one task ("" for a metric of the avatar as a whole), on whole images.
 
-    The pairs are one family: their p-values are corrected together, by Holm. A method that lacks a value of any
-    frame has no comparison, but a reason; it does not count in the family. ``minus`` is a second task whose differences are
-    subtracted, subject by subject; with a ``margin``, in the metric's unit, equivalence is tested too. ``rows`` are
+    The pairs are one family, whose p-values are corrected together by Holm's method. A pair in which a method lacks values
+    of frames has a reason instead of a comparison, and is not part of the family. Differences in the task ``minus`` are
+    subtracted per subject. With a ``margin``, in the metric's unit, equivalence is tested as well. ``rows`` are
     checked by `Rows.check`. Raises `InputError` if both methods are complete, but on different frames.
     """
     comparisons = []
@@ -238,7 +237,7 @@ def _interaction(task: Mapping[str, float], other: Mapping[str, float]) -> dict[
 
 
 def as_one_family(comparisons: Iterable[PairedComparison]) -> list[PairedComparison]:
-    """Correct p-values together, by Holm: those of differences as one family, those of equivalence as another."""
+    """Apply Holm's correction to all p-values: differences are one family, equivalences another."""
     given = list(comparisons)
     tested = [c.p for c in given if c.p is not None]
     differing = iter(holm(tested))
@@ -256,7 +255,7 @@ def as_one_family(comparisons: Iterable[PairedComparison]) -> list[PairedCompari
 
 @dataclass(frozen=True)
 class BestSet:
-    """``methods`` that no other one is found better than; None where ``subjects`` are fewer than the ``needed`` ones."""
+    """``methods`` that no other is significantly better than; None if ``subjects`` are fewer than ``needed``."""
 
     methods: frozenset[str] | None
     subjects: int
@@ -265,7 +264,7 @@ class BestSet:
 
 @dataclass(frozen=True)
 class PairwiseTests:
-    """Sign-flip tests of all pairs of methods over the same subjects, from which the best of any of the methods are found.
+    """Sign-flip tests of all pairs of methods over the same subjects, to find the best of any subset of methods.
 
     Attributes
     ----------
@@ -286,7 +285,7 @@ class PairwiseTests:
 
     @classmethod
     def of(cls, means: Mapping[str, Mapping[str, float]], *, higher_is_better: bool) -> PairwiseTests:
-        """Test all pairs. ``means`` has by method (at least one) its mean of each subject; the same subjects for all."""
+        """Test all pairs. ``means`` maps each method (at least one) to its mean of each subject; the same subjects for all."""
         methods = tuple(means)
         subjects = sorted(means[methods[0]])
         values = np.array([[means[method][subject] for subject in subjects] for method in methods])
@@ -300,7 +299,7 @@ class PairwiseTests:
         return cls(methods, p, better, len(subjects))
 
     def best_set(self, among: Sequence[str]) -> BestSet:
-        """The best of the methods ``among`` all, see `best_set`; Holm's correction is over these alone."""
+        """The best of the methods ``among``, see `best_set`; Holm's correction is over these only."""
         chosen = [self.methods.index(method) for method in among]
         rivals = len(chosen) - 1
         needed = subjects_needed(LEVEL, rivals)
@@ -318,9 +317,9 @@ class PairwiseTests:
 def best_set(means: Mapping[str, Mapping[str, float]], *, higher_is_better: bool) -> BestSet:
     """Find every method that does not differ significantly from the best.
 
-    Each method is compared with all others by the sign-flip test, Holm over these comparisons; it is left out if
-    one of them is better. Whichever method is truly the best is therefore left out with a probability of at most
-    `LEVEL`, however it was chosen: a confidence set of the best (J. Hsu, Multiple Comparisons, 1996, chapter 4).
-    ``means`` has by method (at least one) its mean of each subject; the same subjects for all.
+    Each method is compared with all others by the sign-flip test, with Holm's correction over these comparisons; it is
+    excluded if one of them is better. The truly best method is therefore excluded with a probability of at most
+    `LEVEL`: a confidence set of the best (J. Hsu, Multiple Comparisons, 1996, chapter 4).
+    ``means`` maps each method (at least one) to its mean of each subject; the same subjects for all.
     """
     return PairwiseTests.of(means, higher_is_better=higher_is_better).best_set(list(means))

@@ -16,11 +16,11 @@ from ..aggregate import subject_means
 
 LEVEL = 0.05
 LEAST_SUBJECTS = 3
-"""Two subjects have one degree of freedom, which is too few for an interval."""
+"""Minimum for an interval; two subjects have only one degree of freedom."""
 
 
 def paired_differences(first: pd.DataFrame, second: pd.DataFrame) -> dict[str, float]:
-    """First minus second by subject: means over the frames of a sequence, then sequences, then seeds.
+    """First minus second by subject, averaged over the frames of a sequence, then sequences, then seeds.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def paired_differences(first: pd.DataFrame, second: pd.DataFrame) -> dict[str, f
     Raises
     ------
     InputError
-        Not both have finite values of exactly the same frames, in every seed.
+        The methods do not have finite values of exactly the same frames for every seed.
     """
     frames = [_frames(rows) for rows in (first, second)]
     unmatched = frames[0].symmetric_difference(frames[1])
@@ -42,7 +42,7 @@ def paired_differences(first: pd.DataFrame, second: pd.DataFrame) -> dict[str, f
 
 
 def _frames(rows: pd.DataFrame) -> pd.Index[Any]:
-    """Frames with one finite value in every seed, which all have."""
+    """Frames of the rows, with exactly one finite value for every seed."""
     values = rows.set_index([*FRAME, "seed"])["value"].astype(float)
     if values.index.has_duplicates:
         twice = values.index[values.index.duplicated()][0]
@@ -57,7 +57,7 @@ def _frames(rows: pd.DataFrame) -> pd.Index[Any]:
 def half_width(values: Sequence[float], level: float = LEVEL) -> float:
     """Half the width of the interval of the mean of at least two numbers by Student's t, with confidence 1 - ``level``.
 
-    What varies within a subject (frames, sequences, seeds) moves the subject's mean, and so is in the standard deviation of the means.
+    The standard deviation of subject means includes the variation within subjects (frames, sequences, seeds).
     """
     count = len(values)
     return float(student_t.ppf(1 - level / 2, count - 1)) * stdev(values) / math.sqrt(count)

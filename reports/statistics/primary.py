@@ -1,4 +1,4 @@
-"""Primary endpoints of the suite: a fixed list of tests, corrected together. All others are exploratory."""
+"""Primary endpoints of the suite: a fixed list of tests, corrected together. All other tests are exploratory."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MARGINS = {"psnr": 0.3}
 
 
 def primary_comparisons(runs: RunSet) -> list[PairedComparison]:
-    """The primary endpoints of whole frames, Holm over all; empty where the runs lack one of `PAIR` or the metrics."""
+    """The primary endpoints of whole frames, with Holm's correction; empty if the runs lack one of `PAIR` or the metrics."""
     runs = runs.by_camera
     specs = {spec.name: spec for spec in runs.metrics}
     if not {*PAIR} <= {*runs.methods} or not {metric for _, metric in PRIMARY} <= {*specs}:
@@ -38,16 +38,16 @@ def primary_comparisons(runs: RunSet) -> list[PairedComparison]:
 
 
 def planned_subjects(runs: RunSet) -> int:
-    """Number of subjects that the synthetic captures of the runs were planned for; 0 where none is recorded."""
+    """Planned number of subjects of the runs' synthetic captures; 0 if not recorded."""
     settings = [synthetic_settings(clip) for run in runs.runs for clip in run.manifest.clips]
     return max((int(each.get("subjects", 0)) for each in settings), default=0)
 
 
 def primary_table(runs: RunSet) -> str:
-    """Differences, intervals and verdicts of the primary endpoints as a Markdown table; "" where the runs lack them.
+    """Differences, intervals and verdicts of the primary endpoints as a Markdown table; "" if the runs lack them.
 
-    As long as subjects are missing that the captures were planned for, the results are interim and have no verdict: testing again
-    with each further subject rejects too often.
+    As long as planned subjects are missing, the results are interim and have no verdict: testing again after
+    each further subject would reject too often.
     """
     found = primary_comparisons(runs)
     if not found:
@@ -79,7 +79,7 @@ def primary_table(runs: RunSet) -> str:
 
 
 def primary_section(runs: RunSet) -> str:
-    """The primary endpoints as Markdown, and what the other tests of a page are."""
+    """The primary endpoints as Markdown, with the status of the page's other tests."""
     exploratory = (
         "All other tests on this page are exploratory. They are corrected over the comparisons of one metric and task, "
         "including the primary endpoints."
