@@ -1,4 +1,4 @@
-"""``headbench doctor bench`` and ``headbench doctor stress``, and what their benchmarks share: runs that take turns, tables of rows."""
+"""``headbench doctor bench`` and ``headbench doctor stress``, and shared functions: interleaved timing, tables of rows."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def take_turns(
     rounds: int,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[Key, list[float]]:
-    """Time several things in turn, so that whatever else the machine does meets all of them alike.
+    """Time several functions in turn, so that other load on the machine affects all of them equally.
 
-    A first round warms up and does not count.
+    The first round is a warm-up and is not counted.
 
     Returns
     -------
@@ -45,14 +45,14 @@ def take_turns(
 
 
 def findings(tables: Mapping[str, Sequence[Row]], note: str, faults: Sequence[str] = ()) -> CommandResult:
-    """What a benchmark found: its tables by title, a note on how to read them, and what breaks a bound."""
+    """Result of a benchmark: tables by title, a note on how to read them, and violated bounds."""
     parts = [f"{title}\n\n{table(rows)}" for title, rows in tables.items() if rows]
     data = {title: [dict(row) for row in rows] for title, rows in tables.items()}
     return CommandResult("\n\n".join([*parts, note, *faults]), data, passed=not faults)
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Align rows under the names of their columns; numbers to the right, floats with three significant digits."""
+    """Align rows under their column names; numbers right-aligned, floats with three significant digits."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     cells = [names, *([_cell(row.get(name)) for name in names] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]

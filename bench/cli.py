@@ -1,4 +1,4 @@
-"""The command line: calls the command that its words name, and ends every error in a line and an exit code."""
+"""The command line: calls the named command, and turns every error into one line and an exit code."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from .streams import prepare_streams, show
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command line, by default the process's own; returns the exit code, one of `ExitCode`."""
-    # OpenMP's workers spin by default while they wait. On a machine with any other work that makes several
-    # threads many times slower than one, so let them sleep; read once, when torch is first imported.
+    # OpenMP's workers spin by default while they wait, which makes several threads many times slower than one on a
+    # busy machine, so let them sleep. The variable is read once, when torch is first imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     prepare_streams()
     words = sys.argv[1:] if arguments is None else arguments
@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
                 raise
             return ExitCode.OK  # `headbench --help | head -1`: not an error
         finally:
-            show(end="")  # what is still buffered, here, where an error can be reported
+            show(end="")  # flush buffered output while errors can still be reported
     except HeadbenchError as error:
         return _fail(str(error), ExitCode.BAD_INPUT)
     except KeyboardInterrupt as error:
@@ -48,29 +48,29 @@ def _fail(message: str, code: ExitCode) -> ExitCode:
 
 
 def _described(error: OSError) -> str:
-    """An error of the system in one line: the file, the reason, and what to do where that is not obvious."""
+    """A system error as one line: file, reason and, if it is not obvious, remedy."""
     reason = error.strerror or " ".join(str(error).split()) or type(error).__name__
     if error.errno == errno.EEXIST and os.path.isfile(error.filename or ""):
-        reason = "expected a folder, found a file"  # a folder that is made may be there, a file may not
+        reason = "expected a folder, found a file"  # creating a folder fails with this error only if a file is there
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
     remedy = ". Free disk space or allow writing, then start again." if full else ""
     return f"{'' if error.filename is None else f'{error.filename}: '}{reason}{remedy}"
 
 
 def _reader_has_gone() -> bool:
-    """Whether standard output is a pipe that nobody reads any longer."""
+    """Whether standard output is a pipe whose reader has closed it."""
     poll = select.poll()
     poll.register(sys.stdout.fileno(), 0)
     return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
 def _call(words: list[str]) -> int:
-    """Call the command that the words of the command line name."""
+    """Call the command named by the arguments."""
     if words and words[0] in ("--version", "-V", "version"):
         show(f"headbench {version('headbench')}")
         return ExitCode.OK
     if not words or words[0] == "help":
         words = [*words[1:], "--help"]
-    from .commands import call  # which reads the specs of all commands
+    from .commands import call  # imports the specs of all commands
 
     return call(words)

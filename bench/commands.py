@@ -1,6 +1,6 @@
-"""Commands of the command line, as the registry lists them: finds the one that is named, prints the help of all.
+"""Finds the registered command named on the command line, and prints the help of all commands.
 
-Light to import: the parser and the settings of a command are loaded when it is called.
+Light to import: the parser and the settings of a command are loaded on demand.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _ALIASES = {
     "view": "viewer gui",
 }
 COMMAND_ALIASES = {word: name for name, words in _ALIASES.items() for word in words.split()}
-"""Names that other toolkits use for a command, and the command of headbench that does the same."""
+"""Command names of other toolkits, and the equivalent command of headbench."""
 
 MOVED = {
     "bench": "doctor bench",
@@ -52,21 +52,21 @@ MOVED = {
     "sweep": "run sweep",
     "tongue": "prepare tongue",
 }
-"""Commands of earlier versions, and what does the same now. `InputError` names the new command line."""
+"""Commands of earlier versions, and their replacement, which `InputError` names."""
 
 ABOUT = (
     "Benchmark of animatable 3D head avatars. Start with `headbench demo`. `headbench COMMAND --help` explains a command, "
     "`headbench --version` prints the version."
 )
 FIRST = ("demo", "run", "status", "table", "compare")
-"""Commands that stand first in their group of the help."""
+"""Commands listed first in their group of the help."""
 
 
 def call(words: Sequence[str]) -> int:
-    """Call the command that the words of a command line name, or print help; returns the exit code.
+    """Call the command named by the arguments, or print help; return the exit code.
 
-    Help of all commands reads their specs alone; help of one loads its settings, too.
-    Raises `InputError` where the words name no command, `HeadbenchError` for a command that cannot be loaded.
+    Help of all commands only reads their specs; help of one command also loads its settings.
+    Raises `InputError` for an unknown command, `HeadbenchError` for a command that cannot be loaded.
     """
     plugins = discover("commands")
     if words[0].startswith("--tyro-"):
@@ -94,7 +94,7 @@ def call(words: Sequence[str]) -> int:
 
 
 def help_page(plugins: Mapping[str, Plugin]) -> str:
-    """List commands in groups: those of `COMMAND_GROUPS` in the order of `FIRST`, then by name; a word stands above its second words."""
+    """List commands by group (`COMMAND_GROUPS` first), then `FIRST`, then by name; two-word commands are nested."""
     width = max(map(len, plugins)) + 2
     columns = min(shutil.get_terminal_size((100, 24)).columns, 120)
     lines = ["usage: headbench COMMAND [OPTIONS]", "", *textwrap.wrap(ABOUT, columns)]
@@ -117,7 +117,7 @@ def _place(name: str) -> int:
 
 
 def _unknown(words: Sequence[str], plugins: Mapping[str, Plugin]) -> InputError:
-    """The error for words that name no command: with the new command line for `MOVED`, else with the nearest command."""
+    """The error for an unknown command, with the new command line for `MOVED`, otherwise with the nearest command."""
     for asked in (" ".join(words[:2]), words[0]):
         if asked in MOVED:
             line = f"headbench {MOVED[asked]} {shlex.join(words[len(asked.split()) :])}".rstrip()

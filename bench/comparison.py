@@ -81,7 +81,7 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
     comparison = build_run_config(merge(demo_run_config(config, device), values), "--set")
     if "conditions" not in values:
         comparison = replace(comparison, conditions=(PLAIN, *coded_conditions(comparison.methods)))
-    # Errors before the capture is made, which takes minutes.
+    # Report errors before making the capture, which takes minutes.
     resolve_methods(comparison)
     resolve_metrics(comparison)
     check_device(comparison.device)
@@ -143,7 +143,7 @@ class RunSettings:
 
     @staticmethod
     def notes() -> str:
-        """What the help says of presets."""
+        """Description of the presets in the help."""
         return presets_of_methods()
 
 
@@ -164,7 +164,7 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
     if settings.protocol:
         values = merge(values, needed(settings.protocol, values))
     if "reader" not in values and isinstance(values["data"], str):
-        from .engine.captures import reader_of  # which takes long to import
+        from .engine.captures import reader_of  # slow to import
 
         values["reader"] = reader_of(values["data"])
     execution = chosen_execution(
@@ -203,8 +203,8 @@ def _run(config: RunConfig, execution: Execution | None = None, **record: Any) -
 
 
 def closing(run: Path, rows: Rows) -> str:
-    """Three lines at the end of a run: where its report is, what the report shows, and commands to try next."""
-    from .engine.store import RunFolder  # with pandas
+    """Three lines at the end of a run: path of the report, its content, and suggested commands."""
+    from .engine.store import RunFolder  # imports pandas
 
     folder, page = shlex.quote(str(run)), RunFolder(run).page
     first = f"Report: {page} (for a browser; it needs no network)"
@@ -228,7 +228,7 @@ def _table(runs: Sequence[str], **options: Any) -> str:
 
 
 def means(run_folder: str) -> list[dict[str, Any]]:
-    """Numbers of the comparison table, so that a machine reads what a person does; None where there is none."""
+    """Values of the comparison table for JSON output; None if there is no table."""
     table = json.loads(_table([run_folder], format="json"))
     return [
         {
@@ -244,9 +244,9 @@ def means(run_folder: str) -> list[dict[str, Any]]:
 
 @contextmanager
 def _log_file(out: Path) -> Iterator[None]:
-    """Log to a run's file; not where the folder cannot be made, which the run then reports properly.
+    """Log to a run's file, unless the folder cannot be created, which the run reports.
 
-    A run that is refused before it has written anything else leaves neither the file nor a new folder.
+    A run that is refused before it has written anything leaves neither the file nor a new folder.
     """
     log = out / "run.log"
     is_new = is_writable = False

@@ -1,7 +1,7 @@
-"""Conditions: what a cell of a run changes against the plain comparison.
+"""Conditions: changes of a cell of a run from the plain comparison.
 
-A condition is plain data: it is written into ``run.json``, crosses to worker processes as text, and enters the fingerprint of
-what it changes. What it names is registered as a plug-in of the group ``headbench.conditions``, see `ConditionSpec`.
+A condition is plain data: it is written into ``run.json``, sent to worker processes as text, and part of the fingerprints of
+the steps that it changes. Its changes are plug-ins of the group ``headbench.conditions``, see `ConditionSpec`.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from typing import Any
 from .contracts import Budget
 
 CONDITION_MARK = "+"
-"""Between the names of a method and of a condition in labels and in folders of cells."""
+"""Separator between method and condition in labels and folders of cells."""
 
 
 def label_of(method: str, condition: str) -> str:
-    """Name of a method under a condition, as tables and folders show it: "ours", or "ours+cameras-4"."""
+    """Label of a method under a condition in tables and folders: "ours", or "ours+cameras-4"."""
     return f"{method}{CONDITION_MARK}{condition}" if condition else method
 
 
 def part_of_text(text: str, name: str) -> Fraction:
-    """A part as a number. Raises `ValueError` for text that is not a part above 0 and at most 1."""
-    # Bounded, since a long exponent would keep `Fraction` busy for hours. A fraction as it is written after reduction is known, too.
+    """Parse a fraction in (0, 1]. Raises `ValueError` for any other text."""
+    # Bounded, since `Fraction` needs hours for a long exponent. The reduced form of a fraction is accepted, too.
     known = re.fullmatch(r"\d{1,6}(\.\d{1,12})?(/\d{1,6})?|\d{1,18}/\d{1,18}", text)
     parts = text.split("/") if known else ["0"]
     value = Fraction(parts[0]) / (int(parts[1]) if len(parts) > 1 and int(parts[1]) else 1)
@@ -34,7 +34,7 @@ def part_of_text(text: str, name: str) -> Fraction:
 
 
 def seconds_of_text(text: str) -> float | None:
-    """Training time of text such as "30 s"; None for other text. Raises `ValueError` for 0 s."""
+    """Parse a training time such as "30 s"; None for other text. Raises `ValueError` for 0 s."""
     found = re.fullmatch(r"(\d{1,6}(?:\.\d{1,6})?) s", text)
     if found and not float(found[1]):
         raise ValueError(f"budget is {text!r}; more than 0 s")
@@ -50,7 +50,7 @@ class Named:
     name : str
         Name of a `ConditionSpec`; "" for no change.
     parameters : dict
-        Keyword arguments of its implementation, values that JSON has.
+        Keyword arguments of its implementation, as JSON values.
     """
 
     name: str = ""
@@ -62,28 +62,28 @@ class Named:
 
 @dataclass(frozen=True)
 class Condition:
-    """A named set of changes. Without any it is the plain comparison, whose name is "".
+    """A named set of changes. The plain comparison has no changes and the name "".
 
     Attributes
     ----------
     name : str
-        As tables show it after the method, and part of the folder of the cell.
+        Name after the method in tables, and part of the cell's folder name.
     methods : tuple of str
-        Names of the methods that have it; empty: all.
+        Names of the methods that it applies to; empty: all.
     settings : dict
-        Changes of the method's settings, laid over those of the run.
+        Changes of the method's settings, applied over those of the run.
     budget : str
-        Part of the method's budget, above 0 and at most 1, such as "1/4"; or a training time in its place, such as "30 s".
+        Fraction of the method's budget in (0, 1], such as "1/4"; or a training time instead, such as "30 s".
     as_tracked : bool
-        The method gets the head model, neck, static offset and cameras of the capture, without the conversion to a head model and to
-        one video that it usually has (`MethodSpec.conversion`).
+        Train on the head model, neck, static offset and cameras of the capture, without the usual conversion to another head
+        model and a single video (`MethodSpec.conversion`).
     clip : Named
-        Change of the clip that the method is trained on; the frames that are scored stay those of the run.
+        Change of the clip that the method is trained on; the scored frames do not change.
     derive : Named
         Change of a trained avatar without training, such as fewer splats. The avatar is that of the run's ``source`` or,
         without one, that of the plain comparison in the same run.
     drive : Named
-        Poses and views to render in place of the scored frames, judged without ground truth.
+        Poses and views to render instead of the scored frames, evaluated without ground truth.
     """
 
     name: str = ""
@@ -96,22 +96,22 @@ class Condition:
     drive: Named = field(default_factory=Named)
 
     def __post_init__(self) -> None:
-        """Refuse a budget that is neither a part nor a time."""
+        """Refuse a budget that is neither a fraction nor a time."""
         if seconds_of_text(self.budget) is None:
             part_of_text(self.budget, "budget")
 
     @property
     def part(self) -> Fraction:
-        """Part of the budget as a number; 1 for a training time."""
+        """Fraction of the budget; 1 for a training time."""
         return Fraction(1) if seconds_of_text(self.budget) else part_of_text(self.budget, "budget")
 
     @property
     def changes_budget(self) -> bool:
-        """Whether methods train with another budget than that of the run."""
+        """Whether methods train with a budget other than the run's."""
         return seconds_of_text(self.budget) is not None or self.part != 1
 
     def part_of(self, whole: Budget) -> Budget:
-        """The part of a budget, an iteration at least; or the training time in its place."""
+        """The fraction of a budget, at least one iteration; or the training time instead."""
         seconds = seconds_of_text(self.budget)
         if seconds is not None:
             return Budget(None, seconds)
@@ -121,7 +121,7 @@ class Condition:
         )
 
     def applies_to(self, method: str) -> bool:
-        """Whether a method has this condition."""
+        """Whether the condition applies to a method."""
         return not self.methods or method in self.methods
 
 

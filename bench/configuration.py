@@ -1,4 +1,4 @@
-"""Settings: mappings and ``--set a.b=c`` into frozen dataclasses. Unknown keys and wrong types are refused."""
+"""Converts mappings and ``--set a.b=c`` into frozen dataclasses of settings. Unknown keys and wrong types are refused."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_homes(value: Any, source: str) -> Any:
-    """Settings in which each text that is a path under ``~`` is that path in the home folder, see `expand_home`."""
+    """Return settings with ``~`` in paths replaced by the home folder, see `expand_home`."""
     if isinstance(value, Mapping):
         return {key: with_homes(each, source) for key, each in value.items()}
     if isinstance(value, (list, tuple)):
@@ -63,7 +63,7 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
     Parameters
     ----------
     source : str
-        File or option that the values came from, for the error.
+        File or option of the values, for error messages.
     prefix : str
         Dotted path of ``values`` in the source.
 
@@ -92,7 +92,7 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
 
 
 def build_folder(cls: type[T], folder: Path) -> dict[str, T]:
-    """Build ``cls`` from every YAML file of a folder, by name of the file. Raises `InputError` as `build` does."""
+    """Build ``cls`` from every YAML file of a folder, by file name. Raises `InputError` as `build` does."""
     return {path.stem: build_file(cls, path) for path in sorted(folder.glob("*.yaml"))}
 
 
@@ -102,7 +102,7 @@ def build_file(cls: type[T], path: Path) -> T:
 
 
 def setting_paths(cls: Any, prefix: str = "") -> list[str]:
-    """Dotted path of every setting of a dataclass, groups before what they hold."""
+    """Dotted path of every setting of a dataclass, groups before their members."""
     hints, found = get_type_hints(cls), []
     for field in dataclasses.fields(cls):
         found.append(f"{prefix}{field.name}")
@@ -112,9 +112,9 @@ def setting_paths(cls: Any, prefix: str = "") -> list[str]:
 
 
 def deciding_settings(config: Any) -> Any:
-    """The settings of a dataclass that decide results, as plain values, for digests; other values, None say, as they are.
+    """The settings of a dataclass that affect results, as plain values for digests; other values are returned unchanged.
 
-    Settings named in the class variable ``places`` are left out: paths on this machine, and limits of time.
+    Settings in the class variable ``places`` are left out: paths on this machine, and time limits.
     """
     if isinstance(config, tuple):
         return tuple(map(deciding_settings, config))
@@ -130,9 +130,9 @@ def deciding_settings(config: Any) -> Any:
 def build_arguments(
     function: Callable[..., Any], values: Mapping[str, Any], source: str, *, harness: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Check settings that are to be passed to a function by keyword, and convert them to its annotations.
+    """Check keyword arguments for a function, and convert them to its annotations.
 
-    The first parameter and those of the names in ``harness`` are not settings: the caller gives them. Raises
+    The first parameter and those named in ``harness`` are not settings: the caller provides them. Raises
     `InputError` as `build` does.
     """
     parameters = list(inspect.signature(function).parameters.values())[1:]
@@ -148,7 +148,7 @@ def build_arguments(
 
 
 def _scalar(value: Any) -> Any:
-    """Read text that is a number as one: YAML 1.1 takes 1e-3 for text because it has no dot."""
+    """Convert numbers that YAML 1.1 reads as text, such as 1e-3, which has no dot."""
     if not isinstance(value, str):
         return value
     for kind in (int, float):

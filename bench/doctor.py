@@ -71,7 +71,7 @@ def doctor(settings: DoctorSettings, progress: Progress) -> CommandResult:
     if stray:
         raise unknown("command line", "--set", min(stray), ["settings"])
     chosen: Mapping[str, Mapping[str, Any]] = own.get("settings", {})
-    RunConfig("", "", device=settings.device)  # refuses what is no device
+    RunConfig("", "", device=settings.device)  # refuses invalid devices
     named = {get("methods", name).name: name for name in settings.methods}
     known = [*named] if named else [*discover("methods")]
     programs = {} if named else _programs()
@@ -184,8 +184,8 @@ def _method(
 
 
 def _asked(needs: str, config: Any, device: str, given: bool = False) -> Iterator[Need]:
-    """The requirements that a plug-in declares; an exception of the declaration is reported as a missing
-    one.
+    """The requirements that a plug-in declares; an exception is reported as a missing
+    requirement.
 
     Raises `InputError` of the declaration if its settings were ``given`` on the command line.
     """

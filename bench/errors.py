@@ -8,7 +8,7 @@ from os import PathLike
 
 
 class ExitCode(IntEnum):
-    """What the exit code of a command means; the same in every command."""
+    """Exit codes, with the same meaning for every command."""
 
     OK = 0
     NEGATIVE = 1
@@ -33,7 +33,7 @@ EXIT_CODES = (
 
 
 class Interruption(KeyboardInterrupt):
-    """A signal asks the program to end: Ctrl-C, SIGTERM or SIGHUP."""
+    """A signal (Ctrl-C, SIGTERM or SIGHUP) requests the end of the program."""
 
     def __init__(self, number: int):
         self.code = ExitCode(128 + number)
@@ -46,11 +46,11 @@ class HeadbenchError(Exception):
 
 
 class ChangedInputError(HeadbenchError):
-    """A method changed what other methods are given, so that no result of this process can be trusted from here on."""
+    """A method changed inputs of other methods, so that all further results of this process are invalid."""
 
 
 LONGEST_PLACE, LONGEST_WORDS, LONGEST_FOUND = 400, 1200, 300
-"""Maximum characters of an error's parts; longer text is cut in the middle."""
+"""Maximum characters of an error's parts; longer text is shortened in the middle."""
 
 
 class InputError(HeadbenchError):
@@ -61,7 +61,7 @@ class InputError(HeadbenchError):
     Parameters
     ----------
     file : str | PathLike[str]
-        The file, option or registry that holds the fault.
+        The file, option or registry with the error.
     key : str
         The entry in it (array name, JSON path, option name), or "" for the whole file.
     expected : str
@@ -82,7 +82,7 @@ class InputError(HeadbenchError):
 
 
 def text_of(error: BaseException) -> str:
-    """The message of an error; its type where that cannot be had, as the class may be anybody's."""
+    """The message of an error, or its type if the class fails to provide the message."""
     try:
         return str(error)
     except Exception:  # noqa: BLE001
@@ -90,7 +90,7 @@ def text_of(error: BaseException) -> str:
 
 
 def reason_of(error: Exception) -> str:
-    """Reason of a failed cell for its rows; running out of memory is always "out of memory"."""
+    """Reason of a failed cell for its rows; any memory error becomes "out of memory"."""
     name, text = type(error).__name__, text_of(error)
     wanted = ("out of memory", "can't allocate memory", "cannot allocate memory")
     if isinstance(error, MemoryError) or name == "OutOfMemoryError" or any(w in text.lower() for w in wanted):
@@ -99,7 +99,7 @@ def reason_of(error: Exception) -> str:
 
 
 def is_damage(error: BaseException) -> bool:
-    """Whether a reading error is caused by the file's content, and not by the disk, permissions, or lack of
+    """Whether a reading error is caused by the file's content, not by the disk, permissions or lack of
     memory."""
     cause = error.__cause__
     machine = isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno is not None)
@@ -107,7 +107,7 @@ def is_damage(error: BaseException) -> bool:
 
 
 class LeftOutError(HeadbenchError):
-    """A frame that a metric cannot judge, such as one without a face for a metric of faces: left out of means and counted."""
+    """A frame to which a metric does not apply, such as one without a face; left out of means and counted."""
 
 
 class UnavailableError(HeadbenchError):
@@ -129,7 +129,7 @@ def install_extra(extra: str) -> str:
 
 
 def shortened(text: str, longest: int) -> str:
-    """Text of bounded length, cut in the middle, and without control characters other than line ends."""
+    """Shorten text in the middle, and remove control characters except line ends."""
     if len(text) > longest:
         text = f"{text[: longest // 2]} [...] {text[-longest // 4 :]}"
     if text.isprintable():

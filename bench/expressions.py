@@ -1,4 +1,4 @@
-"""Expressions of a head model as controls: those that it names, else its strongest directions."""
+"""Expressions of a head model as controls: its named expressions, or else its strongest directions."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from .contracts import FloatArray, HeadAsset, HeadPose
 
 COEFFICIENT = 2.0
-"""Range of directions without a name and without recorded poses: standard deviations of FLAME's coefficients."""
+"""Range of unnamed directions without recorded poses: standard deviations of FLAME's coefficients."""
 BEYOND = 1.5
-"""Range of directions without a name, relative to the largest recorded coefficient."""
+"""Range of unnamed directions, relative to the largest recorded coefficient."""
 
 
 class Expression(NamedTuple):
-    """An expression: (E,) coefficients at 1, which is its natural extreme if it has a name, and its range."""
+    """An expression: (E,) coefficients at value 1, the natural extreme of a named expression, and its range."""
 
     name: str
     direction: FloatArray
@@ -29,13 +29,13 @@ class NamedExpressions(Protocol):
     """Optional capability of a head model: expressions with names."""
 
     def named_expressions(self) -> Sequence[Expression]:
-        """The expressions; none if it names none."""
+        """The named expressions, possibly none."""
 
 
 def expressions_of(head: HeadAsset, count: int, poses: Sequence[HeadPose]) -> list[Expression]:
-    """The expressions of a head model that move a vertex farthest at the end of their range, the strongest first.
+    """The expressions of a head model with the largest vertex displacement at the end of their range, the strongest first.
 
-    Those of models without names, such as FLAME, are the single coefficients, ranged by recorded ``poses``.
+    For models without names, such as FLAME, they are single coefficients with the range of the recorded ``poses``.
     """
     found = list(head.named_expressions()) if isinstance(head, NamedExpressions) else []
     basis = np.asarray(head.expression_basis, np.float64)

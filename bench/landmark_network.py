@@ -18,15 +18,15 @@ from .errors import InputError
 from .tflite import open_network
 
 CORNERS = (33, 263)
-"""Landmarks of the outer corners of the eyes, between which the crop is level."""
+"""Landmarks of the outer eye corners, which are level in the crop."""
 CROP = 1.5
-"""Side of the crop, relative to the longer side of the landmarks' box."""
+"""Side of the crop, relative to the longer side of the landmarks' bounding box."""
 MOST_CHANGE = 0.05
-"""Landmarks may move by this part of the face's size when the crop is repeated around them."""
+"""Maximum movement of landmarks, relative to the face's size, when the crop is repeated around them."""
 SAME = 0.5
-"""Faces whose middles are nearer to each other than this part of their size are one."""
+"""Detections whose centres are closer than this, relative to their size, are the same face."""
 SETTLED = 0.01
-"""As `MOST_CHANGE`, where several faces are told apart: crops beside a face approach it slowly."""
+"""As `MOST_CHANGE`, for several faces: crops beside a face converge to it slowly."""
 _TRIED, _ROUNDS, _MORE_ROUNDS = 6, 3, 15
 _ACROSS, _FULLY_ACROSS = (0.35, 0.5, 0.65), (0.1, 0.225, 0.35, 0.5, 0.65, 0.775, 0.9)
 
@@ -40,7 +40,7 @@ class _Crop(NamedTuple):
 
 
 class LandmarkNetwork:
-    """The network of a file.
+    """The network in a file.
 
     Raises
     ------
@@ -64,14 +64,14 @@ class LandmarkNetwork:
         self._side = int(self._input["shape"][1])
 
     def find(self, image: ByteArray, near: FloatArray | None = None) -> FloatArray | None:
-        """(COUNT, 2) landmarks, pixels, or None where the network sees no face.
+        """(COUNT, 2) landmarks, pixels, or None if the network finds no face.
 
         Parameters
         ----------
         image : ByteArray
             (H, W, 3) 8-bit RGB.
         near : FloatArray | None
-            Landmarks of a similar image of the camera; without them, squares of several sizes are tried.
+            Landmarks in a similar image of the camera; without them, squares of several sizes are tried.
         """
         if near is not None:
             found = self.follow(image, near)
@@ -82,12 +82,12 @@ class LandmarkNetwork:
         return best if change < MOST_CHANGE else None
 
     def follow(self, image: ByteArray, near: FloatArray) -> FloatArray | None:
-        """(COUNT, 2) landmarks of the face at ``near``, its landmarks in a similar image; None if it is not there."""
+        """(COUNT, 2) landmarks of the face at ``near``, its landmarks in a similar image; None if it is not found."""
         found, score = self._run(image, _crop_around(near))
         return found if score > 0 else None
 
     def find_all(self, image: ByteArray) -> list[FloatArray]:
-        """(COUNT, 2) landmarks of every face, the largest first; faces much smaller than the picture are not found."""
+        """(COUNT, 2) landmarks of every face, the largest first; faces much smaller than the image are not found."""
         seen: list[tuple[float, FloatArray]] = []
         for found, score in self._scored(image, _FULLY_ACROSS):
             if score > 0 and not any(same_face(found, face) for _, face in seen):
@@ -95,14 +95,14 @@ class LandmarkNetwork:
                 if change < SETTLED:
                     seen.append((score, steady))
         faces: list[FloatArray] = []
-        # What is found beside a face scores lower than it.
+        # Detections beside a face have lower scores.
         for _, face in sorted(seen, key=lambda one: -one[0]):
             if all(face_distance(face, other) > 1 for other in faces):
                 faces.append(face)
         return sorted(faces, key=face_size, reverse=True)
 
     def _scored(self, image: ByteArray, across: Sequence[float]) -> list[tuple[FloatArray, float]]:
-        """Landmarks and scores of squares everywhere in an image, the highest score first."""
+        """Landmarks and scores of squares all over an image, the highest score first."""
         crops = _candidates(image, across)
         return sorted((self._run(image, crop) for crop in crops), key=lambda one: -one[1])
 
@@ -111,9 +111,7 @@ class LandmarkNetwork:
     ) -> tuple[FloatArray, float, float]:
         """Landmarks after repeating the crop around them, their last change relative to the face's size, and their score.
 
-        The repetition ends after a number of rounds, or at a change below ``settled``.
-
-        Where the network sees a whole face, the landmarks of a crop around them are the same.
+        It stops after ``rounds``, or at a change below ``settled``. If the network sees a whole face, the landmarks converge.
         """
         change, score = np.inf, 1.0
         for _ in range(rounds):
@@ -128,7 +126,7 @@ class LandmarkNetwork:
         to_image = np.concatenate([turn, (crop.middle - turn @ np.full(2, self._side / 2))[:, None]], axis=1)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         shift = to_image.copy()
-        shift[:, 2] += turn @ np.full(2, 0.5) - 0.5  # OpenCV's pixel centres are whole numbers
+        shift[:, 2] += turn @ np.full(2, 0.5) - 0.5  # OpenCV's pixel centres are integers
         size = (self._side, self._side)
         pixels = cv2.warpAffine(image, shift, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         self._network.set_tensor(self._input["index"], pixels[None].astype(np.float32) / 255)
@@ -139,7 +137,7 @@ class LandmarkNetwork:
 
 
 COUNT = 468
-"""Landmarks of the network."""
+"""Number of landmarks of the network."""
 
 
 def face_size(landmarks: FloatArray) -> float:
@@ -148,7 +146,7 @@ def face_size(landmarks: FloatArray) -> float:
 
 
 def face_distance(first: FloatArray, second: FloatArray) -> float:
-    """Distance between the middles of two faces, relative to the size of the second."""
+    """Distance between the centres of two faces, relative to the size of the second."""
     return float(np.linalg.norm(first.mean(axis=0) - second.mean(axis=0)) / face_size(second))
 
 

@@ -79,7 +79,7 @@ def _shown(entries: list[dict[str, Any]]) -> CommandResult:
 
 
 def presets_of_methods() -> str:
-    """A sentence for the help: the presets of every method that is registered here."""
+    """A sentence for the help: the presets of every registered method."""
     methods_by_presets: dict[str, list[str]] = {}
     for name, plugin in discover("methods").items():
         if plugin.spec is not None and plugin.spec.presets:

@@ -1,4 +1,4 @@
-"""The live display of a terminal: how much is done, what each cell does, and the loss of its training as a curve."""
+"""The live display on a terminal: overall progress, activity of each cell, and its training loss as a curve."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from typing import Self
 BLOCKS, ASCII_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 BAR, ASCII_BAR = "█░", "#."
 BAR_WIDTH, CURVE_WIDTH, MOST_CELLS = 24, 24, 8
-"""Characters of the bar and of a curve, and number of cells with a line of their own."""
+"""Width of the bar and of a curve in characters, and number of cells with separate lines."""
 LOSS = re.compile(r"\bloss (\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)")
-"""The loss in a note of a method's progress."""
+"""Matches the loss in a method's progress note."""
 
 
 @dataclass(frozen=True)
 class Position:
-    """How far some work is.
+    """Progress of some work.
 
     Attributes
     ----------
     text : str
-        Everything in one line, for logs.
+        Complete text in one line, for logs.
     label : str
-        The first line of a display.
+        First line of a display.
     share : float
-        Share that is done, from 0 to 1.
+        Completed fraction, from 0 to 1.
     cells : Mapping[str, str]
-        What each cell that is running does, by its name: a line of a display each.
+        Activity of each running cell by name, one line each.
     """
 
     text: str
@@ -43,7 +43,7 @@ class Position:
 
 
 class Curve:
-    """Values over time in a fixed number of columns, each the mean of equally many values.
+    """Values over time in a fixed number of columns, each the mean of the same number of values.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class Curve:
         self._columns: list[list[float]] = []
 
     def add(self, value: float) -> None:
-        """Append a value. When all columns are full, pairs of them become one."""
+        """Append a value. When all columns are full, pairs of them are merged."""
         if self._columns and len(self._columns[-1]) < self._each:
             self._columns[-1].append(value)
             return
@@ -67,11 +67,11 @@ class Curve:
 
     @property
     def last(self) -> float:
-        """The value that was added last."""
+        """The last value."""
         return self._columns[-1][-1]
 
     def text(self, blocks: str = BLOCKS) -> str:
-        """The curve, a character for each column. The scale is logarithmic where all values are positive."""
+        """The curve, one character per column. The scale is logarithmic if all values are positive."""
         means = [sum(column) / len(column) for column in self._columns]
         heights = [math.log(mean) for mean in means] if all(mean > 0 for mean in means) else means
         low, high = min(heights, default=0.0), max(heights, default=0.0)
@@ -80,7 +80,7 @@ class Curve:
 
 
 class Display:
-    """Lines at the end of a terminal that are written again in place."""
+    """Lines at the end of a terminal that are updated in place."""
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -101,7 +101,7 @@ class Display:
             markup=False,
             emoji=False,
         )
-        # What is printed meanwhile appears above the display; standard output keeps its place if it is no terminal.
+        # Other output appears above the display; standard output is not redirected unless it is a terminal.
         self._live = Live(
             console=self._console, auto_refresh=False, transient=True, redirect_stdout=sys.stdout.isatty()
         )
@@ -116,14 +116,14 @@ class Display:
         self._live.stop()
 
     def show(self, position: Position) -> None:
-        """Write the lines again."""
+        """Update the lines."""
         from rich.text import Text
 
         lines = "\n".join(self._lines(position))
         self._live.update(Text(lines, no_wrap=True, overflow="crop"), refresh=True)
 
     def print(self, text: str) -> None:
-        """Print above the display; long lines are left to the terminal."""
+        """Print above the display; the terminal wraps long lines."""
         self._console.print(text, soft_wrap=True)
 
     def _lines(self, position: Position) -> list[str]:
@@ -147,17 +147,17 @@ class Display:
 
 
 _displays: list[Display] = []
-"""The display that is shown, if any: a process has one at most."""
+"""The current display, if any; a process has at most one."""
 
 
 def is_interactive() -> bool:
-    """Whether standard error is a terminal on which lines can be written again."""
-    # A display replaces standard error by an object that does not say that it is a terminal.
+    """Whether standard error is a terminal on which lines can be updated."""
+    # A display replaces standard error by an object that does not report a terminal.
     return bool(_displays) or (sys.stderr.isatty() and os.environ.get("TERM", "") not in ("dumb", "unknown"))
 
 
 def current() -> Display | None:
-    """The display that is shown."""
+    """The current display."""
     return _displays[0] if _displays else None
 
 
@@ -173,7 +173,7 @@ def displayed() -> Iterator[Display]:
 
 
 class TerminalHandler(logging.StreamHandler):
-    """Writes messages to standard error, above the display where there is one."""
+    """Writes messages to standard error, above the display if there is one."""
 
     def emit(self, record: logging.LogRecord) -> None:
         display = current()

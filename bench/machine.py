@@ -114,8 +114,8 @@ class PeakMemory:
     """Context that measures the largest resident memory of this process and, on a CUDA device, torch's peak
     memory.
 
-    Linux records that maximum and lets a process reset it; elsewhere a thread samples it every 20 ms, which
-    can miss short peaks. Of the children that ended in the context only the largest one so far is known.
+    Linux records this maximum and lets a process reset it; on other systems a thread samples memory every 20 ms, which
+    can miss short peaks. For child processes that ended in the context, only the largest so far is known.
 
     Attributes
     ----------
@@ -178,9 +178,9 @@ class PeakMemory:
 
 
 SHORTEST_LOAD_S = 0.5
-"""Seconds below which the load of a machine is not known: the system counts processor time in steps of 10 ms."""
+"""Minimum seconds for measuring the load: the system counts processor time in steps of 10 ms."""
 BUSY = ("user", "nice", "system", "irq", "softirq", "steal")
-"""Fields of a core's processor times during which it works, for the machine's own processes or for another guest."""
+"""Fields of a core's processor times in which it is busy with processes of this machine or of another guest."""
 
 
 class ProcessorLoad:
@@ -223,7 +223,7 @@ class ProcessorLoad:
         self.threads = 1 if torch is None else int(torch.get_num_threads())
         if self._wait and kind is None:
             time.sleep(max(0.0, self._start + SHORTEST_LOAD_S - time.perf_counter()))
-        # The own time is taken around the others', so that what is done between the two is never another's.
+        # Own time is read outside of the total, so that work between the two calls is not attributed to others.
         busy, own = _busy_seconds(), _own_processor_seconds()
         seconds = time.perf_counter() - self._start
         if seconds >= SHORTEST_LOAD_S and self._busy is not None and busy is not None:
@@ -251,7 +251,7 @@ def _own_processor_seconds() -> float:
 
     seconds = processor_seconds()
     for child in psutil.Process().children(recursive=True):
-        with suppress(psutil.Error):  # it may have ended meanwhile
+        with suppress(psutil.Error):  # it may have ended already
             times = child.cpu_times()
             seconds += times.user + times.system
     return seconds
@@ -269,19 +269,19 @@ def _busy_seconds() -> float | None:
         return None
     available = getattr(os, "sched_getaffinity", None)
     allowed = available(0) if available else range(len(cores))
-    # Where some cores are switched off their places say nothing: then all count.
+    # If some cores are offline, positions do not identify cores: use all.
     chosen = [cores[index] for index in allowed] if max(allowed) < len(cores) else cores
     return float(sum(getattr(core, name, 0.0) for core in chosen for name in BUSY))
 
 
 def peak_memory_bytes() -> int:
-    """Return the largest resident memory of this process so far, its finished children counted singly."""
+    """Return the peak resident memory so far of this process or of any single finished child."""
     own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * RUSAGE_UNIT
     return max(own, _children_peak())
 
 
 def processor_seconds() -> float:
-    """Return the processor time of this process so far, all threads, and of its finished children."""
+    """Return the processor time so far of all threads of this process and of its finished children."""
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return time.process_time() + children.ru_utime + children.ru_stime
 
@@ -315,7 +315,7 @@ def _version(name: str) -> str | None:
 def check_device(device: str) -> None:
     """Raise `InputError` unless torch can use ``device`` ("cpu", "cuda", "cuda:1", "mps", "xpu").
 
-    "cpu" is always accepted; torch checks others by name, since this package knows no device kinds.
+    "cpu" is always accepted; others are checked by torch, since this package has no list of device kinds.
     """
     kind, _, index = device.partition(":")
     if kind == "cpu":
@@ -323,7 +323,7 @@ def check_device(device: str) -> None:
     try:
         backend: Any = resolve(f"torch:{kind}")
         available = bool(backend.is_available())
-    except HeadbenchError:  # a torch that never heard of this kind, or none at all
+    except HeadbenchError:  # torch does not know this kind or is not installed
         available = False
     if not available:
         remedy = "Use device=cpu, or install a torch and a driver that support it."

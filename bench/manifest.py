@@ -1,6 +1,6 @@
-"""``run.json``: what made the numbers of a run. Written by a run, read by everything that looks at one.
+"""``run.json``: everything that determined the values of a run. Written by the run, and read by reports and checks.
 
-It names protocols by their hashes; each lies in a file of its own, ``protocols/<hash>.json`` in the run folder.
+Protocols are referenced by hash; each is in a separate file, ``protocols/<hash>.json`` in the run folder.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from .specs import LABEL, MetricSpec, is_label
 from .upgrade import upgraded_manifest
 
 MAX_CELLS = 20_000
-"""A record of few bytes can ask for any number; the largest suite has some hundred."""
+"""Maximum number of cells, since a small record can declare any number; the largest suite has some hundred."""
 
 
 @dataclass(frozen=True)
 class MethodRecord:
-    """A method as it ran under a condition; see `ResolvedMethod.record`.
+    """Record of a method under a condition; see `ResolvedMethod.record`.
 
-    ``needs`` are those of a form other than the clip's own. ``code`` is the digest of its code, see `bench.source`; None for a
-    folder of images, which has none. ``codec`` is that of the measured avatars (`CodedAvatar`), "" for files as trained, several
-    separated by semicolons; None in records of runs that did not note it, and before an avatar is measured.
+    ``needs`` are those not met by the clip itself. ``code`` is the digest of its code, see `bench.source`; None for a folder of
+    images, which has none. ``codec`` is that of the measured avatars (`CodedAvatar`), "" for files as trained, several
+    separated by semicolons; None before an avatar is measured, and in runs that did not record it.
     """
 
     name: str
@@ -47,13 +47,13 @@ class MethodRecord:
 
     @property
     def label(self) -> str:
-        """As tables and folders name it."""
+        """Name in tables and folders."""
         return label_of(self.name, self.condition)
 
 
 @dataclass(frozen=True)
 class ClipRecord:
-    """What is known of a capture: its fingerprint, the steps that made it, frames of each split, frames left out, and the
+    """Record of a capture: its fingerprint, the steps that made it, frames of each split, excluded frames, and the
     cameras of the training split (none in old records)."""
 
     subject: str
@@ -66,7 +66,7 @@ class ClipRecord:
 
 @dataclass(frozen=True)
 class AdaptedRecord:
-    """The steps that brought a clip into the form of a method, and the fingerprint they lead to."""
+    """The steps that adapted a clip to a method, and the resulting fingerprint."""
 
     subject: str
     method: str
@@ -97,7 +97,7 @@ class ProtocolRecord:
         return cls(protocol.id, protocol.hash, **own)
 
     def protocol(self, source: Path) -> Protocol:
-        """The protocol that was recorded, in the file ``source``. Raises `InputError` for another hash than the recorded one."""
+        """The protocol recorded in the file ``source``. Raises `InputError` if its hash differs from the recorded one."""
         protocol = Protocol(**{f.name: getattr(self, f.name) for f in fields(Protocol)})
         if protocol.hash != self.hash:
             raise InputError(source, f"protocols.{self.task}", self.hash, protocol.hash)
@@ -121,7 +121,7 @@ def protocol_path(folder: Path, protocol: str) -> Path:
 
 
 def _read_protocol(run: Path, task: str, name: str) -> ProtocolRecord:
-    """Read the protocol with the hash ``name``. Raises `InputError` where it is not in the run's folder."""
+    """Read the protocol with the hash ``name``. Raises `InputError` if it is not in the run folder."""
     check_name(name, run, f"protocols.{task}")
     path = protocol_path(run.parent, name)
     if not path.exists():
@@ -131,7 +131,7 @@ def _read_protocol(run: Path, task: str, name: str) -> ProtocolRecord:
     if (record.task, record.hash) != (task.partition("@")[0], name):
         raise InputError(path, "task, hash", f"{task}, {name}", f"{record.task}, {record.hash}")
     names = {part for key in record.keys for part in (key.subject, *key.sequence.split("/"), key.camera)}
-    for part in sorted(names):  # a slash stands between a driving subject and its sequence
+    for part in sorted(names):  # a slash separates a driving subject and its sequence
         check_name(part, path, "keys")
     if not is_label(record.id):
         raise InputError(path, "id", LABEL, repr(record.id))
@@ -140,13 +140,13 @@ def _read_protocol(run: Path, task: str, name: str) -> ProtocolRecord:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Everything that made the numbers of a run.
+    """Everything that determined the values of a run.
 
     Attributes
     ----------
     paths : dict[str, str] | None
         Files and folders of the configuration by dotted key, relative to the run folder; None in a
-        bundle, which does not name folders of the machine that wrote it.
+        bundle, which contains no paths of the machine that wrote it.
     metrics, methods, protocols : tuple[MetricSpec, ...], tuple[MethodRecord, ...], dict[str, ProtocolRecord]
         In the order of the configuration; protocols by task, in files of their own.
     machine : dict[str, Any]
@@ -154,11 +154,11 @@ class Manifest:
         CUDA device, also the device, CUDA's version and whether TF32 was enabled, except in old
         records. See `machine_record`.
     seconds, peak_memory_bytes : float | None, int | None
-        Of the run's last start; None until it ended.
+        Of the last start of the run; None until it has ended.
     adapted : tuple[AdaptedRecord, ...]
-        Clips that were brought into another form for a method.
+        Clips that were adapted to a method.
     capture_seconds : float | None
-        How long the demo took to make its capture.
+        Time that the demo took to make its capture.
     """
 
     configuration: RunConfig
@@ -179,11 +179,11 @@ class Manifest:
     def read(cls, path: Path) -> Manifest:
         """Read ``run.json`` and its protocols. Raises `InputError` naming what is missing, unknown or of the wrong type.
 
-        Names that folders and files are found by are checked as `check_name` does.
+        Names used in paths are checked as by `check_name`.
         """
         record = read_json(path, MAX_RECORD_BYTES)
         methods = record.get("methods")
-        if isinstance(methods, list) and len(methods) > MAX_CELLS:  # before copies are made of them
+        if isinstance(methods, list) and len(methods) > MAX_CELLS:  # before they are copied
             raise InputError(path, "methods", f"at most {MAX_CELLS} methods", str(len(methods)))
         record = upgraded_manifest(record)
         if record.get("format") != 2:
@@ -221,7 +221,7 @@ class Manifest:
         )
 
     def _printed(self) -> dict[str, list[str]]:
-        """What tables and errors print beside names, by key."""
+        """Descriptions printed next to names in tables and errors, by key."""
         return {
             "methods, version": [method.version for method in self.methods],
             "clips, fingerprint": [clip.fingerprint for clip in self.clips],
@@ -253,7 +253,7 @@ class Manifest:
         write_json(path, record)
 
     def check_done(self, path: Path) -> None:
-        """Raise `InputError` for a run that did not end."""
+        """Raise `InputError` for an unfinished run."""
         if self.status != "done":
             remedy = "Start the run again; it continues."
             raise InputError(path, "status", "'done'", repr(self.status), remedy)

@@ -1,7 +1,7 @@
-"""Protocols by name: how a paper or a benchmark evaluates, as data in `protocols`, a file for each.
+"""Named evaluation protocols of papers and benchmarks, as data: one file each in `protocols`.
 
-A run scores all frames of its captures, by every definition and region that it is asked for. A named protocol selects among these
-rows; it needs no rendering.
+A run scores all frames of its captures, with every requested definition and region. A named protocol selects some of these
+rows; nothing is rendered again.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class TaskFrames:
     cameras : Literal['all', 'seen', 'unseen']
         All cameras, or those with or without training frames in the capture.
     sequences : tuple[str, ...]
-        Beginnings of the names of sequences, such as "FREE"; () all held-out ones.
+        Prefixes of sequence names, such as "FREE"; () selects all held-out sequences.
     last : int | None
         Only this many timesteps at the end of each sequence.
     """
@@ -46,10 +46,10 @@ class TaskFrames:
 
 @dataclass(frozen=True)
 class NamedProtocol:
-    """How a paper or a benchmark evaluates.
+    """The evaluation protocol of a paper or benchmark.
 
-    ``tasks``, ``region``, ``profile``, ``average`` and ``pooled`` select and combine values; the other fields say what the published
-    figures were obtained with, and tables print how a run differs.
+    ``tasks``, ``region``, ``profile``, ``average`` and ``pooled`` select and combine values; the other fields describe how the
+    published values were obtained, and tables list how a run differs.
 
     Attributes
     ----------
@@ -58,21 +58,21 @@ class NamedProtocol:
     tasks : Mapping[str, TaskFrames]
         Scored frames by task: novel_view, self_reenactment.
     region : str
-        Pixels that PSNR and SSIM are of: "full", "foreground", "face" or another region of the captures.
+        Pixels for PSNR and SSIM: "full", "foreground", "face" or another region of the captures.
     profile : str
         Metric profile, see ``headbench list profiles``.
     average : Literal['sequences', 'frames']
         Whether every sequence of a subject has the same weight, or every frame.
     pooled : int | None
-        Frames over which a value is taken, with one mean squared error for PSNR; None for single frames.
+        Number of frames per value, with one mean squared error for PSNR; None for single frames.
     subjects, training, test : str
-        Subjects, and the sequences that are trained on and held out.
+        Subjects, and the training and held-out sequences.
     size : str
         WIDTHxHEIGHT of the images, "" if it varies.
     iterations : int | None
-        Of the training of the paper's own method.
+        Training iterations of the paper's own method.
     tracker, head_model : str
-        What the driving signal was estimated with.
+        Tracker and head model of the driving signal.
     """
 
     title: str
@@ -115,9 +115,9 @@ def protocol_named(name: str) -> NamedProtocol:
 
 
 def needed(names: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a run that measures what protocols select: their tasks, profiles and regions beside the usual ones.
+    """Settings of a run that measures everything protocols select: their tasks, profiles and regions besides the usual ones.
 
-    ``settings`` are those that are given; they decide. Raises `InputError` for one that leaves out what a protocol needs, and for
+    Given ``settings`` take precedence. Raises `InputError` for one that excludes what a protocol needs, and for
     an unknown protocol.
     """
     wanted: dict[str, list[str]] = {"tasks": [], "metric_profiles": ["canonical"], "regions": []}

@@ -32,7 +32,7 @@ class DependentOptions(NamedTuple):
 
 
 def given_options(words: Sequence[str], settings: type) -> dict[str, str]:
-    """The attributes of ``settings`` that the words of a command line give as options, and how an error names them."""
+    """The attributes of ``settings`` given as options on the command line, and their names in errors."""
     named = {word[2:].partition("=")[0].replace("-", "_") for word in words if word.startswith("--")}
     return {field.name: _option(field.name) for field in fields(settings) if field.name in named}
 
@@ -43,7 +43,7 @@ def check_dependent(dependent: Iterable[DependentOptions], given: Mapping[str, s
     Parameters
     ----------
     given : Mapping[str, str]
-        Names of the given attributes, and how the error names each.
+        Given attributes, and their names in the error.
     settings : Any
         Settings with the attributes `DependentOptions.other`.
     """
@@ -67,6 +67,6 @@ def _option(name: str) -> str:
 
 
 def _shown(settings: Any, name: str) -> str:
-    """A setting as help shows it: an option, or a positional argument."""
+    """Name of a setting in the help: an option, or a positional argument."""
     hint = get_type_hints(type(settings), include_extras=True)[name]
     return name.upper() if tyro.conf.Positional in getattr(hint, "__metadata__", ()) else _option(name)

@@ -1,4 +1,4 @@
-"""Ends processes that a program left behind, in whatever session."""
+"""Ends processes that a program left behind, in any session."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import psutil
 
 PATIENCE_S = 10.0
-"""Seconds during which processes are sought that others started meanwhile."""
+"""Seconds of searching for newly started processes."""
 _SET_SUBREAPER, _GET_SUBREAPER = 36, 37
 """From linux/prctl.h."""
 
@@ -24,7 +24,7 @@ def set_subreaper(on: bool) -> bool | None:
     Returns
     -------
     bool | None
-        Whether it did so before; None without Linux.
+        Previous state; None on systems other than Linux.
     """
     libc, before = ctypes.CDLL(None), ctypes.c_int()
     if not hasattr(libc, "prctl") or libc.prctl(_GET_SUBREAPER, ctypes.byref(before), 0, 0, 0) != 0:
@@ -35,7 +35,7 @@ def set_subreaper(on: bool) -> bool | None:
 def end_orphans(kept: Collection[int]) -> None:
     """Kill children of this process that are in other sessions, except those whose ids are in ``kept``.
 
-    Descendants of a program that started in a session of its own have another session than this process, whatever they do to
+    Descendants of a program started in a separate session never have the session of this process, even if they change
     their environment. The children of a killed process are found in the next round.
     """
     import psutil
@@ -51,7 +51,7 @@ def end_orphans(kept: Collection[int]) -> None:
 
 @contextmanager
 def orphans_ended() -> Iterator[None]:
-    """Kill, at the end, processes that programs started in the block left behind. Without subreapers, none are found."""
+    """At the end of the block, kill processes left behind by programs started in it. Requires subreapers (Linux)."""
     before = {child.pid for child in _orphans()}
     earlier = set_subreaper(True)
     try:

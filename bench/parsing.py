@@ -1,6 +1,6 @@
-"""Reads the options of a command from the words of a command line, as the command's settings declare them, and calls it."""
+"""Parses the arguments of a command by its settings class, and calls the command."""
 
-# Without `from __future__ import annotations`: the parser reads annotations that are made when a command is called.
+# Without `from __future__ import annotations`, since the parser reads annotations created when a command is called.
 
 import inspect
 import io
@@ -25,13 +25,13 @@ from .specs import HELP, CommandSpec
 from .streams import show
 
 Command = Callable[..., Callable[[], int]]
-"""Takes settings and returns what runs the command, so that errors of parsing are told from those of the command."""
+"""Takes settings and returns a function that runs the command, which separates parsing errors from errors of the command."""
 RULE = re.compile(r"[ ─╰╯+-]*")
-"""A line across the parser's box, in Unicode or ASCII."""
+"""A horizontal line of the parser's box, in Unicode or ASCII."""
 
 
 def call_command(name: str, plugins: Mapping[str, Plugin], words: Sequence[str]) -> int:
-    """Call a command with the words behind its name, or print its help; returns the exit code.
+    """Call a command with the arguments after its name, or print its help; return the exit code.
 
     Raises `HeadbenchError` for a command that cannot be loaded.
     """
@@ -41,13 +41,13 @@ def call_command(name: str, plugins: Mapping[str, Plugin], words: Sequence[str])
 
 
 def print_completion(plugins: Mapping[str, Plugin], words: Sequence[str]) -> int:
-    """Print, or write, the completion of a shell for all commands, as the parser's own options ask."""
+    """Print or write shell completion for all commands, by the parser's own options."""
     run: Callable[[], int] = _parse(_all_commands(plugins), "headbench", words)
     return run()
 
 
 def with_home(word: str) -> str:
-    """A word of the command line with the home folder for ``~``, which shells leave as it is behind ``=`` and in quotes."""
+    """Expand ``~`` in an argument, which shells do not do after ``=`` and in quotes."""
     match = re.fullmatch(r"((?:[^=]*=)*?)(~.*)", word)
     if match is None:
         return word
@@ -58,9 +58,9 @@ def with_home(word: str) -> str:
 
 
 def _parse(command: Any, program: str, words: Sequence[str]) -> Any:
-    """What ``command`` returns for the options that the words give.
+    """Parse arguments; return the result of ``command``.
 
-    Raises `HeadbenchError` with the message of the parser, which prints it in a box, in one line.
+    Raises `HeadbenchError` with the parser's message as one line, without the box that it prints.
     """
     config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     printed = io.StringIO()
@@ -86,7 +86,7 @@ def _parse(command: Any, program: str, words: Sequence[str]) -> Any:
 
 
 def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
-    """The command as a function of its settings, which the parser reads. ``words`` say what options are given."""
+    """The command as a function of its settings, for the parser. ``words`` determine which options are given."""
     try:
         spec: CommandSpec = get("commands", name)
         settings_class = resolve(spec.settings)
@@ -125,7 +125,7 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
 
 
 def _all_commands(plugins: Mapping[str, Plugin]) -> Command:
-    """All commands as one, whose first and second word choose: what completion needs. Broken ones are left out."""
+    """All commands as nested subcommands, for completion. Commands that cannot be loaded are left out."""
     found: dict[str, dict[str, Command]] = {}
     for name, plugin in sorted(plugins.items()):
         first, _, second = name.partition(" ")
@@ -135,8 +135,8 @@ def _all_commands(plugins: Mapping[str, Plugin]) -> Command:
 
 
 def _nested(group: Mapping[str, Command]) -> Command:
-    """Commands as one whose word chooses; one without a word offers its own options beside the others' words."""
-    # Not tyro's own function for subcommands: it looks for help in typing's sources, which takes as long as the rest.
+    """Commands as subcommands of one; a command without a name adds its options to this level."""
+    # Not tyro's function for subcommands: it searches typing's sources for help, which doubles the time.
     own = group.get("")
     words = {name: command for name, command in group.items() if name}
     if own is not None and not words:
@@ -154,7 +154,7 @@ def _nested(group: Mapping[str, Command]) -> Command:
 
 
 def _parts(words: Sequence[str], kind: Callable[[str], Any]) -> tuple[Any, ...]:
-    """The values of a list, separated by commas, too. Raises `ValueError` for none: the option would be ignored."""
+    """The values of a list, also separated by commas. Raises `ValueError` for none, since the option would be ignored."""
     parts = tuple(kind(part) for word in words for part in word.split(",") if part)
     if not parts:
         raise ValueError("expected at least one value, found none")
@@ -162,9 +162,9 @@ def _parts(words: Sequence[str], kind: Callable[[str], Any]) -> tuple[Any, ...]:
 
 
 def _values() -> tyro.constructors.ConstructorRegistry:
-    """How two kinds of options are read and shown.
+    """Parsing and display of two kinds of options.
 
-    Those that may be left out (``str | None``) as their values are; lists (``tuple[str, ...]``) also with commas.
+    Optional ones (``str | None``) are parsed like their values; lists (``tuple[str, ...]``) also with commas.
     """
     registry = tyro.constructors.ConstructorRegistry()
 

@@ -25,16 +25,16 @@ KEPT = (
     *("LD_LIBRARY_PATH", "CUDA_HOME", "CUDA_PATH", "CUDA_VISIBLE_DEVICES", "CUDA_DEVICE_ORDER"),
     *("NVIDIA_VISIBLE_DEVICES", "NVIDIA_DRIVER_CAPABILITIES", "TORCH_EXTENSIONS_DIR", "TORCH_HOME"),
 )
-"""Environment variables passed to a program, without those of the current interpreter."""
+"""Environment variables passed on to a program, without those of the current interpreter."""
 
 GIVEN = {"PYTHONUNBUFFERED": "1", "PYTHONDONTWRITEBYTECODE": "1", "TQDM_MININTERVAL": "1"}
-"""Additional variables: output is not buffered, and no caches are written to its folder."""
+"""Additional variables: unbuffered output, and no caches in its folder."""
 
 LAST_LINES, LONGEST_LINE = 12, 2_000
 LONGEST_LOG = 4 * 2**20
-"""Bytes of a program's output that are logged, from the beginning; of the rest the last lines."""
+"""Maximum logged bytes of a program's output, from the start; only the last lines of the rest are logged."""
 LEFT_IN_PIPE = 2**20
-"""Bytes read at most after the program has ended; what it wrote itself is within the pipe's 64 KiB."""
+"""Maximum bytes read after the program has ended; its own output is within the pipe's 64 KiB."""
 REDRAWN_EVERY_S = 30.0
 """Seconds between logged lines of a progress bar that redraws its line."""
 PATIENCE_S = 10.0
@@ -49,7 +49,7 @@ class ProgramError(HeadbenchError):
 
 @dataclass(frozen=True)
 class ProgramEnd:
-    """End of a program: its exit code (negative: the signal), its last lines, and the log file."""
+    """Result of a program: exit code (negative: signal), last lines of output, and log file."""
 
     code: int
     lines: tuple[str, ...]
@@ -62,7 +62,7 @@ class ProgramEnd:
 
 
 def described(code: int) -> str:
-    """An exit code in words."""
+    """An exit code as text."""
     if code >= 0:
         return f"ended with exit code {code}"
     name = signal.Signals(-code).name if -code in {*signal.Signals} else f"signal {-code}"

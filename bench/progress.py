@@ -19,8 +19,8 @@ from .live import Position
 LOG_EVERY_S, SHOW_EVERY_S = 15.0, 0.2
 """Seconds between lines of a log, and between changes of the display on a terminal."""
 BASIS_S, SAMPLES, SAMPLE_EVERY_S = 5.0, 60, 1.0
-"""Seconds of steps after which their speed is known, number of samples kept, and their distance in
-seconds."""
+"""Seconds of steps before a speed is estimated, number of samples kept, and seconds between
+samples."""
 Show = Callable[[Callable[[], Position]], None]
 """Shows the position returned by a function if the refresh interval has passed."""
 log = logging.getLogger("headbench")
@@ -53,7 +53,7 @@ def _logging(handler: logging.Handler, form: str) -> Iterator[None]:
 
 
 class _LogFile(logging.StreamHandler):
-    """A file of log lines, never written through a link. What keeps it from being written is an error of the run."""
+    """A log file, never written through a link. Failure to write it is an error of the run."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -62,7 +62,9 @@ class _LogFile(logging.StreamHandler):
     def handleError(self, record: logging.LogRecord) -> None:
         error = sys.exception()
         if not isinstance(error, OSError):
-            super().handleError(record)  # a faulty message of a plug-in is printed and ends nothing
+            super().handleError(
+                record
+            )  # a malformed message of a plug-in is printed and does not stop the run
             return
         error.filename = str(self.path)
         raise error
@@ -73,7 +75,7 @@ class _LogFile(logging.StreamHandler):
 
 
 class CellProgress(Protocol):
-    """A `Progress` that is also told what each running cell does, by its name. Only a terminal shows that."""
+    """A `Progress` that also receives the activity of each running cell by name, shown on terminals only."""
 
     def __call__(
         self, done: int, total: int, note: str = "", cells: Callable[[], Mapping[str, str]] = dict
@@ -82,7 +84,7 @@ class CellProgress(Protocol):
 
 @contextmanager
 def progress(label: str) -> Iterator[CellProgress]:
-    """Give a `Progress` callback that shows ``label``, the share done and the time left."""
+    """Yield a `Progress` callback that shows ``label``, the completed share and the remaining time."""
     with _line() as show:
         left = TimeLeft()
 
@@ -169,7 +171,7 @@ class RunProgress:
         self._show(lambda: self._shown(cell, step, None, None, started, ""))
         yield report
         seconds = time.monotonic() - started
-        if first and steps > first[0][1]:  # steps that an earlier start did would have taken their time, too
+        if first and steps > first[0][1]:  # steps done by an earlier start would distort the speed
             since, before = first[0]
             seconds += (time.monotonic() - since) * before / (steps - before)
         if step in self._cells[cell]:
@@ -193,7 +195,7 @@ class RunProgress:
         place = f"cell {index + 1} of {len(self._names)}"
         total = sum(known) if known else None
         text = _text(f"{place}, {cell}: {step}{count}", total, note, bound)
-        # A cell's steps count alike, which is enough for a bar.
+        # All steps of a cell have the same weight, which is sufficient for a bar.
         share = at[0] / at[1] if at is not None and at[1] else 0.0
         before = steps.index(step) if step in steps else 0
         share = (index + (before + share) / max(len(steps), 1)) / len(self._names)
@@ -228,7 +230,7 @@ def _line() -> Iterator[Show]:
             if not on_terminal:
                 log.info("%s", position().text)
                 return
-            # Made here, since work that shows nothing takes no line; what runs inside other work shares its display.
+            # Created here, so that work without output has no line; nested work shares the outer display.
             display = live.current() or stack.enter_context(live.displayed())
             display.show(position())
 
@@ -236,7 +238,7 @@ def _line() -> Iterator[Show]:
 
 
 def counted(number: int, noun: str) -> str:
-    """Such as "1 subject" or "2 subjects"."""
+    """Format a count, such as "1 subject" or "2 subjects"."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 

@@ -20,7 +20,7 @@ from .io.files import digest
 Item = TypeVar("Item")
 
 SEEN_CAMERAS, UNSEEN_CAMERAS = "self_reenactment_seen", "self_reenactment_unseen"
-"""The frames of self-reenactment in tables and tests: at cameras of the training split, and at those held out of it."""
+"""Parts of self-reenactment in tables and tests: frames at training cameras, and at held-out cameras."""
 
 TASK_TITLES: Mapping[str, str] = {
     "novel_view": "Novel view",
@@ -32,13 +32,13 @@ TASK_TITLES: Mapping[str, str] = {
 }
 
 TaskWithoutTruth = Literal["cross_reenactment", "extremes"]
-"""Tasks without recorded ground truth, which measure the stability of an avatar and whose appearance it keeps. Extremes of
-synthetic captures have a truth that is rendered for them."""
+"""Tasks without recorded ground truth, which measure the stability of an avatar and the preservation of its appearance. For
+extremes of synthetic captures, the truth is rendered."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """Definition of a measurement. Everything that changes a number is a field and thus part of the hash.
+    """Definition of a measurement. Everything that affects values is a field and thus part of the hash.
 
     Attributes
     ----------
@@ -53,9 +53,9 @@ class Protocol:
     resolution : str
         Image sizes of the truth at which metrics are computed, WIDTHxHEIGHT.
     background : tuple[float, float, float]
-        Colour that renders and truth are composited on.
+        Colour on which renders and truth are composited.
     quantisation : str
-        How float renders become 8-bit frames.
+        Conversion of float renders to 8-bit frames.
     metric_profile : str
         The named set of metric definitions.
     conditions : tuple[tuple[str, str], ...]
@@ -83,7 +83,7 @@ class Protocol:
         """First 12 hex digits of the digest of all fields, cached because every row uses it."""
         fields = asdict(self)
         if not self.conditions:
-            del fields["conditions"]  # so that protocols made before there were any keep their hashes
+            del fields["conditions"]  # so that older protocols without conditions keep their hashes
         return digest(self.id, fields)[:12]
 
 
@@ -143,10 +143,10 @@ def make_protocols(
 
 
 def joined_protocol(protocols: Sequence[Protocol]) -> Protocol:
-    """The protocol of one task over the clips of several, the same as if one run had scored all of them.
+    """Join the protocols of one task: the protocol of one run that scored all of their clips.
 
-    A subject of two of them has the same frames and capture in both. Raises `InputError` for protocols that differ in more than
-    their clips.
+    A subject in two of them must have the same frames and capture in both. Raises `InputError` for protocols that differ in
+    anything but their clips.
     """
     first = protocols[0]
     for protocol in protocols:
@@ -166,7 +166,7 @@ def _without_clips(protocol: Protocol) -> Protocol:
 
 
 def missing_tasks(tasks: Sequence[str], done: Container[str]) -> dict[str, str]:
-    """Why a requested task is not measured, by task; shown in tables and in the run's log."""
+    """Reasons why requested tasks are not measured, by task, for tables and the run's log."""
     reasons = {"novel_view": "the captures hold out no camera, as videos of one camera cannot"}
     return {
         task: f"{TASK_TITLES.get(task, task)} is missing: {reasons.get(task, 'the captures hold out no frames for it')}."
@@ -176,12 +176,12 @@ def missing_tasks(tasks: Sequence[str], done: Container[str]) -> dict[str, str]:
 
 
 def protocol_name(task: str, needs: Any = None) -> str:
-    """What a run calls a protocol: the task, with a digest of what its methods need of a clip if that is anything.
+    """Name of a protocol in a run: the task, with a digest of the methods' needs if there are any.
 
     Parameters
     ----------
     needs : MethodNeeds, optional
-        Given for tasks whose frames depend on it: avatars of methods with other needs are shown other frames.
+        For tasks whose frames depend on the needs of the methods.
     """
     return task if needs is None or needs == type(needs)() else f"{task}@{digest(asdict(needs))[:12]}"
 
@@ -193,7 +193,7 @@ def make_protocol_without_truth(
     sizes: Iterable[tuple[int, int]],
     conditions: Mapping[str, str],
 ) -> Protocol:
-    """Make the protocol of a task without ground truth: frames of ``sizes`` (width, height), shown as conditions say.
+    """Make the protocol of a task without ground truth: frames of ``sizes`` (width, height), rendered as conditions describe.
 
     Raises `InputError` for clips on different backgrounds.
     """
@@ -221,7 +221,7 @@ def _background(clips: Sequence[Clip]) -> tuple[float, float, float]:
 
 
 def evenly(frames: Sequence[Item], count: int | None) -> list[Item]:
-    """At most ``count`` items, each in the middle of its equal share; None: all."""
+    """At most ``count`` items, from the middles of equal intervals; None: all."""
     if count is None or count >= len(frames):
         return list(frames)
     if count < 1:
@@ -230,7 +230,7 @@ def evenly(frames: Sequence[Item], count: int | None) -> list[Item]:
 
 
 def evenly_with_ends(items: Sequence[Item], most: int) -> list[Item]:
-    """Evenly spread items, up to a maximum number, including the first and the last if there are two or more."""
+    """Evenly spaced items, up to a maximum number, including the first and the last if there are two or more."""
     return [
         items[place] for place in np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)
     ]

@@ -1,7 +1,7 @@
-"""The source code of plug-ins: which files it is in, and their digest.
+"""Finds the source files of plug-ins and computes their digest.
 
-Results are kept as long as what made them is the same. For a method of this package, its version says so. A plug-in outside
-the package may be edited without a new version, so the digest of its files counts as well.
+Results are reused as long as the code is the same. For a method of this package, this is determined by its version. A plug-in
+outside of the package may be edited without a new version, so the digest of its files is compared as well.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _OWN = __name__.partition(".")[0]
 _LEFT_OUT = {_OWN, *sys.stdlib_module_names}
 _INSTALLED = {"site-packages", "dist-packages"}
 _SUFFIXES = (".py", *(suffix for suffix in EXTENSION_SUFFIXES if suffix.count(".") > 1))
-"""Of modules. A plain ".so" is left out: it may be any library, and large."""
+"""Suffixes of modules, without ".so", which may be any large library."""
 
 
 def is_outside(reference: str) -> bool:
@@ -37,11 +37,11 @@ def code_digest(reference: str) -> str:
     Inside this package, the code is the Python files in the folder of the named module.
 
     Outside, it is all modules of the package that contains the named module (the outermost folder with an ``__init__.py``,
-    else the outermost folder), or the file of a module without a package. Further modules count if these files import
-    them from the same folder on the module path, unless that is a folder of installed packages. Modules that are imported
+    else the outermost folder), or the file of a module without a package. Modules that these files import from the same
+    folder on the module path are included, unless it is a folder of installed packages. Modules that are imported
     by a computed name are not found.
 
-    Relative file names are part of the digest, their location is not. The result is cached, see `forget_code`.
+    Relative file names are part of the digest, but not their location. The result is cached, see `forget_code`.
     """
     module = reference.partition(":")[0]
     resolve(reference)  # imports the module
@@ -55,7 +55,7 @@ def code_digest(reference: str) -> str:
 
 
 def forget_code() -> None:
-    """Clear the cache of `code_digest`: files may have changed since."""
+    """Clear the cache of `code_digest`, since files may have changed."""
     code_digest.cache_clear()
 
 
@@ -80,14 +80,14 @@ def _root(module: str) -> tuple[Path, Path] | None:
 
 
 def _with_imports(module: str) -> dict[str, Path]:
-    """Files of the package that contains a module, and of what they import from beside it, by relative name."""
+    """Files of the package that contains a module, and of neighbouring modules that they import, by relative name."""
     found, own = _root(module), _file(module)
     if found is None:
         return {}
     root, home = found
     installed = not _INSTALLED.isdisjoint(home.parts)
     files: dict[str, Path] = {}
-    seen = {root, own or root}  # its own file may be a compiled one of any name
+    seen = {root, own or root}  # its file may be a compiled one with any name
     left = list(seen)
     while left:
         new = _below(left.pop(), home)
@@ -109,7 +109,7 @@ def _walk(root: Path) -> Iterator[Path]:
     if not root.is_dir():
         yield root
     for folder, folders, names in os.walk(root):
-        folders[:] = [name for name in folders if name.isidentifier()]  # no others can be imported
+        folders[:] = [name for name in folders if name.isidentifier()]  # others cannot be imported
         yield from (Path(folder, name) for name in names if name.endswith(_SUFFIXES))
 
 

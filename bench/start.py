@@ -1,8 +1,8 @@
-"""Entry point of the console script, and how signals end the program and its workers. Light to import.
+"""Entry point of the console script, and signal handling of the program and its workers. Light to import.
 
-Ctrl-C, SIGTERM and SIGHUP end a command in one line, and what it has written is kept: started again, it continues.
-They raise an exception, so that what is open is closed. Inside an import, where an exception leaves modules half
-made, and where the exception leads to no end within `GRACE_S`, the process exits at once, which loses nothing either.
+Ctrl-C, SIGTERM and SIGHUP end a command with a one-line message. Its output is kept, so that a restart continues.
+Signals raise an exception, which closes open resources. During an import, which an exception would leave incomplete,
+or if the program has not ended after `GRACE_S`, the process exits at once, also without loss.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ def main() -> int:
     own = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
     for number in own:
         signal.signal(number, _interrupt)
-    from .cli import main as run  # takes seconds, with the handlers in place
+    from .cli import main as run  # takes seconds, so import after the handlers are set
 
     code = run()
     for number in own:
-        signal.signal(number, lambda *signalled: os._exit(code))  # all is done and printed
+        signal.signal(number, lambda *signalled: os._exit(code))  # everything is done and printed
     return code
 
 
@@ -62,7 +62,7 @@ def _importing(frame: FrameType | None) -> bool:
 
 @contextmanager
 def starting_workers() -> Iterator[None]:
-    """Let processes that are started in the block leave Ctrl-C and SIGHUP, which all of a terminal get, to this one."""
+    """Let processes started in the block ignore Ctrl-C and SIGHUP, which a terminal sends to all; this process handles them."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
     try:
         yield
@@ -71,7 +71,7 @@ def starting_workers() -> Iterator[None]:
 
 
 def end_with_parent() -> None:
-    """Make this process, a worker, end as soon as the one that started it has ended, however that did."""
+    """Make this worker process end as soon as its parent has ended for any reason."""
     import multiprocessing
 
     parent = multiprocessing.parent_process()

@@ -1,4 +1,4 @@
-"""Standard output and error of the command line: written in any encoding, and to readers that go."""
+"""Standard output and error of the command line: handles any encoding and closed pipes."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import sys
 IN_ASCII = dict(
     zip("↑↓±×·–—…²µ•→°", ("^", "v", "+/-", "x", "-", "-", "--", "...", "^2", "u", "*", "->", " deg"))
 )
-"""What our output has beyond ASCII, for terminals that have no more."""
+"""ASCII replacements of the characters in headbench's output, for ASCII terminals."""
 
 
 def prepare_streams() -> None:
-    """Let standard output and error write in ASCII what their encoding lacks, where they would raise otherwise."""
+    """Let standard output and error replace characters that their encoding lacks instead of raising an error."""
     codecs.register_error("headbench", _in_ascii)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -23,12 +23,12 @@ def prepare_streams() -> None:
 
 
 def on_terminal() -> bool:
-    """Whether standard output is a terminal, which a person reads."""
+    """Whether standard output is a terminal."""
     return sys.stdout.isatty()
 
 
 def _in_ascii(error: UnicodeError) -> tuple[str, int]:
-    """Handle characters that an encoding lacks: ours by `IN_ASCII`, others as JSON escapes them."""
+    """Error handler for characters that an encoding lacks: replace them by `IN_ASCII`, or by JSON escapes."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     lacking = error.object[error.start : error.end]
@@ -36,11 +36,11 @@ def _in_ascii(error: UnicodeError) -> tuple[str, int]:
 
 
 def show(text: str = "", end: str = "\n") -> None:
-    """Print the result of a command. A reader that has gone (``headbench compare … | head -1``) changes no exit code."""
+    """Print the result of a command. A closed pipe (``headbench compare … | head -1``) does not change the exit code."""
     try:
         print(text, end=end, flush=True)
     except OSError as error:
-        # What is still buffered must not fail again when the interpreter ends.
+        # Buffered output must not fail again when the interpreter exits.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):
             error.filename = "standard output"

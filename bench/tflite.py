@@ -14,7 +14,7 @@ def open_network(path: Path, expected: str, remedy: str) -> Any:
     Parameters
     ----------
     expected, remedy : str
-        What the file is, and where it is found, for messages.
+        Description of the file, and where to get it, for messages.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Reads what earlier versions of headbench stored: the only place that knows older formats.
+"""Reads files of earlier versions of headbench; older formats are handled only here.
 
-Version 1 of ``run.json`` and of rows had no conditions. A method's name carried them ("ours+1-4"), and the manifest said in
-fields of its own what a sweep or a curve had changed.
+Version 1 of ``run.json`` and of rows had no conditions. They were part of the method's name ("ours+1-4"), and separate fields
+of the manifest described the changes of a sweep or a curve.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def upgraded_rows(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def upgraded_manifest(record: dict[str, Any]) -> dict[str, Any]:
-    """The content of ``run.json`` in version 2; of another version as it is, which the reader checks."""
+    """Convert the content of ``run.json`` to version 2; other versions are returned unchanged and checked by the reader."""
     if record.get("format") != 1 or not isinstance(record.get("methods"), list):
         return record
     renewed = {**record, "format": 2}
@@ -34,7 +34,7 @@ def upgraded_manifest(record: dict[str, Any]) -> dict[str, Any]:
         entry = dict(entry)
         derived = entry.pop("derived", None) or {}
         name, _, condition = str(entry.get("name")).partition(CONDITION_MARK)
-        if not (source or curve):  # the mark is part of a name
+        if not (source or curve):  # the separator is part of a name
             name, condition = str(entry.get("name")), ""
         entry |= {"name": name, "condition": condition}
         methods.append(entry)

@@ -14,9 +14,9 @@ from ..bench.rows import ALL, FRAME, LEFT_OUT, Rows
 
 @dataclass(frozen=True)
 class Aggregate:
-    """A mean; if it is missing, ``value`` is None and ``reason`` states why. Beside a value, ``reason`` says what was left out.
+    """A mean; if it is missing, ``value`` is None and ``reason`` states why. With a value, ``reason`` lists what was left out.
 
-    ``spread`` is the standard deviation of the mean from seed to seed; None with one seed.
+    ``spread`` is the standard deviation of the mean over seeds; None with one seed.
     """
 
     status: Literal["ok", "missing", "failed"]
@@ -28,13 +28,13 @@ class Aggregate:
 def whole_images(rows: Rows, method: str, metric: str, task: str) -> pd.DataFrame:
     """One metric of one method over whole images and all seeds; ``task`` "" for one of the avatar as a whole.
 
-    Frames that the metric left out are not among them, unless all are.
+    Frames that the metric left out are excluded, unless it left out all.
     """
     return _judged(rows.select(method=method, metric=metric, task=task, region=FULL, seeds=ALL))
 
 
 def _judged(found: pd.DataFrame) -> pd.DataFrame:
-    """Rows without those of frames that their metric left out, unless all are."""
+    """Rows without frames that their metric left out, unless it left out all."""
     missing = (found["status"] == "missing").to_numpy()
     if not missing.any():
         return found
@@ -82,7 +82,7 @@ def subject_means(rows: pd.DataFrame) -> dict[str, float]:
 def means_by_seed(rows: pd.DataFrame) -> dict[int, dict[str, float]]:
     """Means over the frames of a sequence, then over sequences, by seed and subject, both sorted.
 
-    Not by pandas, whose grouping of a few hundred rows takes twenty times as long.
+    Without pandas, whose grouping of a few hundred rows takes twenty times as long.
     """
     frames: dict[tuple[int, str, str], list[float]] = {}
     columns = (rows[name].tolist() for name in ("seed", "subject", "sequence", "value"))

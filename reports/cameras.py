@@ -1,7 +1,7 @@
-"""Which cameras of self-reenactment the methods were trained on, by what runs record.
+"""Finds which cameras of self-reenactment the methods were trained on, from the records of runs.
 
 Self-reenactment is scored at all cameras, of which most have training frames. Values at those and at held-out cameras differ by
-several dB, so tables show them apart.
+several dB, so tables show them separately.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ SPLIT_TASK = "self_reenactment"
 
 
 def explained(keys: Collection[FrameKey], unseen: Collection[tuple[str, str]]) -> str:
-    """What seen and unseen cameras of the frames ``keys`` are, and how many of each are scored, if as many for every subject."""
+    """Describe seen and unseen cameras of the frames ``keys``, with their number if it is equal for every subject."""
     cameras = {(key.subject, key.camera) for key in keys}
     subjects = {subject for subject, _ in cameras}
     counts = {
@@ -29,7 +29,7 @@ def explained(keys: Collection[FrameKey], unseen: Collection[tuple[str, str]]) -
 def unseen_cameras(
     manifests: Sequence[Manifest], keys: Collection[FrameKey]
 ) -> tuple[frozenset[tuple[str, str]], str]:
-    """The (subject, camera) without training frames among those of self-reenactment; none and a reason where unknown.
+    """The (subject, camera) pairs of self-reenactment without training frames; none and a reason if unknown.
 
     The reason is one sentence, for captions.
     """
@@ -60,12 +60,12 @@ def _one_column(why: str) -> str:
 
 
 def _seen(manifest: Manifest, clip: ClipRecord, cameras: set[str]) -> set[str] | None:
-    """Those of a subject's ``cameras`` that are trained on; None if a record does not say so."""
+    """The training cameras among a subject's ``cameras``; None if they are not recorded."""
     if clip.training_cameras:
         return cameras & {*clip.training_cameras}
-    # Records from before the cameras were written: novel views are the frames of all held-out cameras.
+    # Older records have no cameras: novel views are the frames of all held-out cameras.
     views = manifest.protocols.get("novel_view")
     own = [key for key in views.keys if key.subject == clip.subject] if views else []
     if len(own) != clip.splits.get("novel_view", 0):
-        return None  # Some frames alone were scored, perhaps not of every held-out camera.
+        return None  # Only some frames were scored, perhaps not of every held-out camera.
     return cameras - {key.camera for key in own}

@@ -1,4 +1,4 @@
-"""Coded avatars of a run as two columns of their methods: megabytes through one codec, and what the codec costs."""
+"""Adds two columns for coded avatars to their methods: megabytes with one codec, and the loss of quality by the codec."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ CODED_CHANGE = MetricSpec(
 
 
 def with_coded(manifest: Manifest, rows: Rows) -> tuple[Manifest, Rows]:
-    """Record and rows of a run whose cells of the condition `CODED` are values of `STORAGE_CODED` and `CODED_CHANGE` of the plain methods.
+    """Convert cells of the condition `CODED` to values of `STORAGE_CODED` and `CODED_CHANGE` of the plain methods.
 
-    A run without this condition, or one that derives from another run, is not changed.
+    A run without this condition, or one that is derived from another run, is not changed.
     """
     labels = coded_labels(manifest)
     if not labels:
@@ -61,17 +61,17 @@ def with_coded(manifest: Manifest, rows: Rows) -> tuple[Manifest, Rows]:
 
 
 def coded_labels(manifest: Manifest) -> dict[str, str]:
-    """Label of the coded avatars by the method's name; empty for a run that derives from another one."""
+    """Label of the coded avatars by the method's name; empty for a run that is derived from another one."""
     if manifest.configuration.source:
         return {}
     return {record.name: record.label for record in manifest.methods if record.condition == CODED}
 
 
 def check_codecs(manifests: Sequence[Manifest], file: Path) -> None:
-    """Refuse runs whose methods are coded differently.
+    """Refuse runs whose methods use different codecs.
 
-    The files of plain methods must be as trained, without a codec, and coded ones must have gone through one codec with
-    the same steps. Runs that did not record codecs are not refused. Raises `InputError`, naming ``file``.
+    Plain methods must have files as trained, without a codec, and all coded ones the same codec with
+    the same steps. Runs that did not record codecs are accepted. Raises `InputError`, naming ``file``.
     """
     trained: dict[str, str] = {}
     coded: dict[str, str] = {}
@@ -101,7 +101,7 @@ def _rows(rows: Rows, record: MethodRecord, labels: Mapping[str, str]) -> list[R
             changes = [
                 _change(rows, record.label, coded, task, *place) for task in TASKS if task in rows.tasks
             ]
-            # A missing one first: the lower of one task would hide that the other is not known.
+            # Missing ones first: the minimum over one task would hide that the other is unknown.
             change = min(
                 changes, key=lambda each: (math.isfinite(each[0]), each[0]), default=(math.nan, NO_FRAMES)
             )
@@ -117,7 +117,7 @@ def _rows(rows: Rows, record: MethodRecord, labels: Mapping[str, str]) -> list[R
 def _change(
     rows: Rows, label: str, coded: str | None, task: str, subject: str, seed: int
 ) -> tuple[float, str]:
-    """Change of `QUALITY` in a task by coding and "", or NaN and the reason."""
+    """Change of `QUALITY` in a task by the codec and "", or NaN and the reason."""
     before, after = (_value(rows, of, QUALITY, task, subject, seed) for of in (label, coded))
     return after[0] - before[0], after[1] or before[1]
 

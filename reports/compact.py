@@ -1,4 +1,4 @@
-"""A table as pages show it: best rows first, columns without any value as a sentence."""
+"""Tables for pages: best rows first, with columns without values replaced by a sentence."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from .tables import Column, Table, TableCell, TableRow
 def compact(table: Table) -> Table:
     """Sort the rows of each group by the first column that has values, best first, and leave out columns without any.
 
-    A column that is left out becomes a sentence of the caption, with its first reason. A column in which a method failed
-    stays. Notes that no cell refers to any more are dropped.
+    A column that is left out becomes a sentence in the caption, with its first reason. Columns in which a method failed
+    are kept. Notes that no cell refers to are removed.
     """
     kept = [index for index in range(len(table.columns)) if _has_content(table, index)]
     if not kept:
@@ -58,7 +58,7 @@ def _has_content(table: Table, index: int) -> bool:
 
 
 def _place(cell: TableCell, column: Column) -> float:
-    """Key by which rows are sorted: the value, negative where higher is better; rows without a value last."""
+    """Sort key of rows: the value, negated if higher is better; rows without a value last."""
     if cell.value is None:
         return inf
     return -cell.value if column.higher_is_better else cell.value

@@ -12,10 +12,11 @@ from ..bench.specs import MetricSpec
 from .aggregate import whole_images
 
 OTHERS_LIMIT = 0.1
-"""Cores used by other processes in total above which a time is marked.
+"""Times are marked if other processes used more than this number of cores in total.
 
-A frame whose threads wait for each other takes at most a tenth longer where one of their cores is busy for a tenth of the time.
-Consecutive measurements on an idle machine differ as much.
+If one core is busy with other processes for a tenth of the time, a frame with synchronised threads takes at most a tenth
+longer.
+Consecutive measurements on an idle machine differ by as much.
 """
 
 
@@ -39,7 +40,7 @@ class Conditions:
 
     @classmethod
     def of(cls, rows: pd.DataFrame) -> Conditions:
-        """Those of measured rows, at least one."""
+        """Conditions of measured rows, at least one."""
         recorded = rows[rows["threads"] > 0]
         places = frozenset((str(m), int(t)) for m, t in zip(recorded["machine"], recorded["threads"]))
         others = rows["other_cores"].astype(float).dropna()
@@ -47,12 +48,12 @@ class Conditions:
 
     @property
     def loaded(self) -> bool:
-        """Whether others used more than `OTHERS_LIMIT`."""
+        """Whether other processes used more than `OTHERS_LIMIT`."""
         return self.others > OTHERS_LIMIT
 
     @property
     def text(self) -> str:
-        """Machines and threads in words; "" where they were not recorded."""
+        """Machines and threads as text; "" if they were not recorded."""
         return "; ".join(
             f"{machine} with {threads} thread{'s' * (threads > 1)}"
             for machine, threads in sorted(self.places)
@@ -62,7 +63,7 @@ class Conditions:
 def conditions(
     rows: Rows, metrics: Sequence[MetricSpec], methods: Sequence[str]
 ) -> dict[str, dict[str, Conditions]]:
-    """Conditions of each metric that depends on the machine, by metric and method, of methods that have a value of it."""
+    """Conditions of each machine-dependent metric, by metric and method, for methods with a value."""
     found: dict[str, dict[str, Conditions]] = {}
     for metric in metrics:
         if metric.machine_bound and not metric.per_frame:
@@ -77,7 +78,7 @@ def marks(
 ) -> dict[tuple[str, str], str]:
     """The note for each metric and method whose time is not comparable with the others of its column.
 
-    The load is the highest of the column, so that its methods share a note.
+    The note states the highest load in the column, so that its methods share a note.
     """
     notes = {}
     for metric, by_method in found.items():
@@ -110,7 +111,7 @@ def suspects(rows: Rows, methods: Sequence[str]) -> dict[tuple[str, str, str], s
 
 
 def note_of(by_method: Mapping[str, Conditions]) -> str:
-    """One line on times of methods that are not comparable, by `marks`; "" if all are."""
+    """One line on methods whose times are not comparable, by `marks`; "" if all are comparable."""
     methods: dict[str, list[str]] = {}
     for (_, method), note in marks({"": by_method}, ()).items():
         methods.setdefault(note, []).append(method)
@@ -135,7 +136,7 @@ def titled_note(title: str, by_method: Mapping[str, Conditions]) -> str:
 
 
 def measured_on(by_method: Mapping[str, Conditions], trivial: Sequence[str], machine: str) -> str:
-    """Machines and threads of the methods that are compared; ``machine`` where those were not recorded."""
+    """Machines and threads of the compared methods; ``machine`` if they were not recorded."""
     compared = {method: each for method, each in by_method.items() if method not in trivial} or by_method
     texts: dict[str, None] = {}
     for each in compared.values():

@@ -44,7 +44,7 @@ def write_contact_sheet(run_folder: Path, frames_per_task: int = FRAMES_PER_TASK
 
 @dataclass(frozen=True)
 class ComparedFrame:
-    """One frame at the size it is shown, ``section`` is its heading."""
+    """One frame at its displayed size; ``section`` is its heading."""
 
     section: str
     labels: Sequence[str]  # short lines to its left (sequence, timestep, camera)
@@ -65,9 +65,9 @@ class ComparedFrame:
         captions: Mapping[str, str],
         width: int = PANEL_WIDTH,
     ) -> ComparedFrame:
-        """Resize images to a width: wider ones are reduced to it (by area), narrower ones enlarged by a whole
-        factor as far as they fit, each pixel a square. Raises `InputError` for a render that has not the size
-        of the ground truth.
+        """Resize images to a width: wider ones are reduced to it (by area), narrower ones enlarged by the largest
+        integer factor that fits (nearest neighbour). Raises `InputError` for a render that differs in size from
+        the ground truth.
         """
         height, own = ground_truth.shape[:2]
         factor = width // own or width / own
@@ -82,7 +82,7 @@ class ComparedFrame:
                 expected, found = (f"shape {one.shape}" for one in (ground_truth, image))
                 raise InputError("contact sheet", f"render of {method}", expected, found)
             shown[method] = _resized(image, size)
-            # Reduced after the difference: reducing before it would average errors of opposite sign away.
+            # Reduced after the difference, since errors of opposite sign would cancel if reduced before.
             errors[method] = _resized(np.abs(image.astype(np.float32) - ground_truth).mean(axis=2), size)
         return cls(section, labels, _resized(ground_truth, size), shown, errors, captions)
 
@@ -98,8 +98,8 @@ def contact_sheet(
 ) -> None:
     """Draw the sheet and write it as a PNG, atomically: ground truth, then a render and an error map for each method.
 
-    Error maps are on one scale for the whole sheet: a round number at or above the 99th percentile of the errors.
-    Larger errors have the top colour.
+    All error maps of the sheet share a scale: a round number at or above the 99th percentile of the errors.
+    Larger errors are clipped.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def contact_sheet(
     methods : Sequence[str]
         Columns, in order.
     scaled_by : Sequence[str]
-        Methods whose errors set the scale (default: all), so that a trivial baseline does not darken
+        Methods whose errors determine the scale (default: all), so that a trivial baseline does not darken
         the others.
     """
     if not frames:
@@ -138,7 +138,7 @@ def contact_sheet(
 def compared_frame(
     data: RunData, task: str, key: FrameKey, methods: Sequence[str], width: int = PANEL_WIDTH
 ) -> ComparedFrame:
-    """One frame of a run with the renders of some ``methods``, and their values of the run's first metric of frames."""
+    """One frame of a run with the renders of some ``methods``, and their values of the run's first frame metric."""
     metric = next((m for m in data.metrics if m.per_frame), None)
     renders: dict[str, ByteArray | str] = {}
     captions: dict[str, str] = {}

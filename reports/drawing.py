@@ -25,18 +25,18 @@ GAP, MARGIN, MARKED = 8, 24, 3
 TITLE, TEXT, SMALL = 20, 15, 13
 """Sizes of text, pixels."""
 SMALLEST_WIDTH = 760
-"""Pixels that a sheet's own text needs."""
+"""Minimum width for a sheet's text, pixels."""
 DPI = 100
 LONGEST = 2**16 - 1
-"""Pixels of a side that matplotlib draws at most; a longer sheet becomes smaller."""
+"""Maximum side that matplotlib draws, pixels; longer sheets are scaled down."""
 WHITE: ByteArray = np.full((12, 12, 3), 255, np.uint8)
 
 
 @dataclass(frozen=True)
 class Tile:
-    """An (H, W, 3) 8-bit image at the size it is shown, or the reason why it is missing.
+    """An (H, W, 3) 8-bit image at its displayed size, or the reason why it is missing.
 
-    ``mark`` is the colour of a broad line around it; "" for a hairline (white images need an edge on white paper).
+    ``mark`` is the colour of a wide border; "" for a hairline (white images need an edge on a white page).
     """
 
     picture: ByteArray | str
@@ -54,7 +54,7 @@ class TileRow:
 
 @dataclass(frozen=True)
 class SheetSection:
-    """Rows under a heading, with a head over each column."""
+    """Rows under a heading, with a title over each column."""
 
     title: str
     heads: Sequence[str]
@@ -77,25 +77,25 @@ class _Paper:
     def text(
         self, left: float, text: str, size: int, colour: str = INK, *, drop: int = 0, width: int | None = None
     ) -> None:
-        """Write one line, its top ``drop`` below the current height, cut to about ``width``."""
+        """Write one line of text, its top ``drop`` below the current height, truncated to about ``width``."""
         limit = len(text) if width is None else _characters(width, size)
         text = text if len(text) <= limit else text[: limit - 1] + "…"
         points = size * 72 / DPI
         self.axes.text(left, self.y + drop, text, size=points, color=colour, va="top", parse_math=False)
 
     def fill(self, left: int, width: int, height: int, colour: str, *, drop: int = 0) -> None:
-        """Colour a rectangle."""
+        """Fill a rectangle."""
         rgb = np.rint(255 * np.array(to_rgb(colour))).astype(np.uint8)
         self.images.append((left, self.y + drop, np.tile(rgb, (height, width, 1))))
 
     def framed(self, left: int, image: ByteArray, colour: str, line: int) -> None:
-        """Put an image with a line around it, outside its pixels."""
+        """Place an image with a border outside of its pixels."""
         height, width = image.shape[:2]
         self.fill(left - line, width + 2 * line, height + 2 * line, colour, drop=-line)
         self.images.append((left, self.y, image))
 
     def tile(self, left: int, tile: Tile, width: int, height: int) -> None:
-        """An image, or a grey box with its reason, as much of it as fits."""
+        """Draw an image, or a grey box with as much of its reason as fits."""
         if isinstance(tile.picture, str):
             self.axes.add_patch(Rectangle((left, self.y), width, height, color=BOX, linewidth=0))
             fit, lines = _characters(width - 16, SMALL), max(1, (height - 8) // (SMALL + 4))
@@ -109,7 +109,7 @@ class _Paper:
             self.text(left, tile.caption, SMALL, MUTED, drop=height + 3, width=width)
 
     def save(self, path: Path) -> None:
-        """Write the paper down to the current height as a PNG, atomically."""
+        """Write the page down to the current height as a PNG, atomically."""
         scale = min(1.0, LONGEST / max(self.width, self.y))
         self.figure.set_size_inches(self.width / DPI, self.y / DPI)
         self.figure.set_dpi(scale * DPI)
@@ -147,7 +147,7 @@ def write_sheet(
     error_scale : tuple[int, str] | None
         Value of the brightest colour of error maps and the text after it, for a colour bar.
     pairs : bool
-        Reduce the gap between columns 1 and 2, 3 and 4, ...
+        Use a smaller gap between columns 1 and 2, 3 and 4, ...
     label_width : int
         Width of the row labels on the left, pixels.
     """

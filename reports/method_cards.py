@@ -18,7 +18,7 @@ MEASURED = Path(__file__).with_name("measured.json")
 
 @dataclass(frozen=True)
 class PrintedFigures:
-    """What a paper printed for a method; ``own``: whether it is the method's own paper. Values by "task/metric", as printed."""
+    """Published values of a method; ``own``: whether by the method's own paper. Values by "task/metric", as printed."""
 
     paper: str
     table: str
@@ -29,7 +29,7 @@ class PrintedFigures:
 
 
 def printed_figures(spec: MethodSpec) -> list[PrintedFigures]:
-    """Rows of a method in all stored tables that were read or quoted in full texts, those of its own paper first; without ablations."""
+    """Rows of a method in all stored tables of grades A and B, those of its own paper first, without ablations."""
     numbers = {*re.findall(r"\d{4}\.\d{4,5}", spec.source)}
     found = []
     for name, paper in papers().items():
@@ -45,7 +45,7 @@ def printed_figures(spec: MethodSpec) -> list[PrintedFigures]:
 
 @dataclass(frozen=True)
 class MeasuredFigures:
-    """What headbench measured for a method in the suite. Values by "task/metric", as displayed."""
+    """Values of a method measured in the suite, by "task/metric", as displayed."""
 
     suite: str
     data: str
@@ -53,7 +53,7 @@ class MeasuredFigures:
 
 
 def measured_figures(name: str) -> MeasuredFigures | None:
-    """Those of the method of a name; None for one that is not in the suite."""
+    """Values of the named method; None if it is not in the suite."""
     if not MEASURED.is_file():
         return None
     stored = read_json(MEASURED)
@@ -101,13 +101,13 @@ UNITS = {"fps": "FPS"}
 
 
 def figure_text(figures: PrintedFigures) -> str:
-    """PSNR and speed of a printed row in words, with who printed them."""
+    """PSNR and speed of a published row as text, with the source."""
     by = "claimed" if figures.own else "run by others"
     return f"{_shown(figures.values)} ({by}: {figures.paper}, {figures.table}, {figures.data}, grade {figures.grade})"
 
 
 def measured_text(figures: MeasuredFigures) -> str:
-    """PSNR and speed of the suite in words."""
+    """PSNR and speed in the suite as text."""
     return f"{_shown(figures.values)} (by headbench, {figures.suite}: {figures.data})"
 
 

@@ -1,4 +1,4 @@
-"""Tables that papers printed, as data: a file for each paper in `published`. Light: pandas is not imported here."""
+"""Published tables of papers as data, one file per paper in `published`. Light to import: without pandas."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ OF_AVATARS = {
     "fps": ("Speed", "FPS", True),
     "training_time": ("Training", "s", False),
 }
-"""Metrics that papers print: label, unit, and whether higher values are better; first those of a task, then the others."""
+"""Metrics in papers: label, unit, and whether higher values are better; first those of a task, then the others."""
 
 COMPARABLE = ("A", "B")
-"""Grades of tables that are printed beside measurements."""
+"""Grades of tables that are shown next to measurements."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,9 @@ class PrintedRow:
     values : dict[str, str]
         As printed, by ``task/metric``, or ``metric`` for one of the avatar as a whole.
     method : str
-        Name of the method here; "" if it is none of the registered ones.
+        Name of the registered method; "" if it is not registered.
     settings : dict[str, Any]
-        Settings that a measured method of this row has, by dotted name.
+        Settings of a measured method that match this row, by dotted name.
     """
 
     name: str
@@ -79,7 +79,7 @@ class PrintedRow:
                 raise ValueError(f"values, {key}: a number as printed, in quotes; found {value!r}")
 
     def is_of(self, record: MethodRecord) -> bool:
-        """Whether a measured method, as in a run's manifest, is the one of this row."""
+        """Whether a measured method, as in a run's manifest, matches this row."""
 
         def setting(name: str) -> Any:
             value: Any = record.config
@@ -97,11 +97,11 @@ class PrintedTable:
     Attributes
     ----------
     table : str
-        What the paper calls it, such as "Table 3", "Table 3 (left part)", or what it is of where its number was not read.
+        Name in the paper, such as "Table 3" or "Table 3 (left part)", or a description if its number was not read.
     data : str
         Subjects or data set.
     conditions : str
-        What the figures depend on: size, split, mask, definitions of metrics, iterations, hardware.
+        Conditions of the values: size, split, mask, definitions of metrics, iterations, hardware.
     grade : Literal['A', 'B', 'C']
         How it was read. "A": in the paper's full text or supplement, or in its authors' repository; "B": as the full text of
         another paper quotes it; "C": in a summary.
@@ -119,14 +119,14 @@ class PrintedTable:
     rows: tuple[PrintedRow, ...]
 
     def __post_init__(self) -> None:
-        """Refuse tables without rows, and two rows of one name."""
+        """Refuse tables without rows or with duplicate names of rows."""
         names = [row.name for row in self.rows]
         if not names or len(set(names)) != len(names):
             raise ValueError(f"rows: at least one, each name once; found {', '.join(names) or 'none'}")
 
     @property
     def number(self) -> str:
-        """Number in the paper; where it is not known, what the table is called."""
+        """Number in the paper or, if unknown, name of the table."""
         found = re.match(r"Tables? ([0-9A-Z]+)", self.table)
         return found[1] if found else self.table
 
@@ -136,7 +136,7 @@ class PrintedTable:
         return tuple(dict.fromkeys(key for row in self.rows for key in row.values))
 
     def decimals(self, metric: str) -> int:
-        """Most decimals that a value of a metric is printed with."""
+        """Maximum number of printed decimals of a metric."""
         values = [v for row in self.rows for key, v in row.values.items() if key.rpartition("/")[2] == metric]
         return max(len(value.partition(".")[2]) for value in values)
 
@@ -159,7 +159,7 @@ class Paper:
 
     @property
     def citation(self) -> str:
-        """Title, venue where it is known, and number."""
+        """Title, venue if known, and arXiv number."""
         venue = [] if self.venue == "arXiv" or self.venue.startswith("not stated") else [self.venue]
         return ", ".join([self.title, *venue, *([f"arXiv {self.arxiv}"] if self.arxiv is not None else [])])
 
@@ -178,7 +178,7 @@ def paper_named(name: str) -> Paper:
 
 
 def printed_tables(name: str, number: str | None) -> tuple[PrintedTable, ...]:
-    """The tables of a paper that may stand beside measurements, or the one of a number. Raises `InputError` if there is none."""
+    """The tables of a paper that may be shown next to measurements, or one by number. Raises `InputError` if there is none."""
     tables = [table for table in paper_named(name).tables if table.grade in COMPARABLE]
     found = [table for table in tables if number is None or table.number == number]
     if not found:

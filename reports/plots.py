@@ -19,14 +19,14 @@ from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 from ..bench.io.files import atomic_path
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999933")
-"""Colours by Okabe and Ito, distinguishable with colour vision deficiency, and an olive by Tol in place of their yellow."""
+"""Colour-blind-safe palette of Okabe and Ito, with an olive by Tol instead of their yellow."""
 MARKERS = "osD^vPX"
-"""Shapes of points by method, of another number than the colours, so that more methods differ in one of the two."""
+"""Markers by method; their number differs from that of the colours, which gives more distinct combinations."""
 GREY, LIGHT_GREY = "#6e6e6e", "#cdcdcd"
 SMALL = 8
 """Size of text next to plots, in points."""
 CHARACTERS = 14
-"""Number of characters of that size in an inch of width."""
+"""Number of characters of that size per inch of width."""
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Measured tables in the form of a printed one, with its rows below."""
+"""Measured tables in the form of a published table, with its rows below."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from .writers import column_name
 
 
 def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
-    """A table with the columns of a printed one: measured methods, then the printed rows, which are not ranked.
+    """A table with the columns of a published one: measured methods, then the published rows, which are not ranked.
 
-    Values are means over all cameras, as papers print them. Methods have the names that the paper gives them. Raises
+    Values are means over all cameras, as in papers. Methods have the names used in the paper. Raises
     `InputError` if the runs have no task of the table.
     """
     metrics = _metrics(runs, printed)
@@ -57,7 +57,7 @@ def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
 
 
 def _metrics(runs: RunSet, printed: PrintedTable) -> list[MetricSpec]:
-    """The metrics of a printed table with its decimals, whether the runs have them or not."""
+    """The metrics of a published table with its decimals, even if the runs lack them."""
     known = {spec.name: spec for spec in runs.metrics}
     used = {key.rpartition("/")[2]: bool(key.rpartition("/")[0]) for key in printed.keys}
     found = []

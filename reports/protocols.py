@@ -1,4 +1,4 @@
-"""Stored rows under named protocols, and what each difference between protocols is worth."""
+"""Evaluates stored rows under named protocols, and the effect of each difference between protocols."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from .tables import AVERAGED
 from .writers import pipe_table
 
 QUALITY = {"psnr": 2, "lpips": 4}
-"""Metrics whose change is tabled, and their decimals."""
+"""Metrics whose changes are tabulated, and their decimals."""
 
 
 def under(runs: RunSet, name: str, protocol: NamedProtocol) -> RunSet:
-    """Runs as a protocol scores them: its frames, pixels, definitions of metrics and means.
+    """Runs under a protocol: its frames, pixels, metric definitions and means.
 
-    Raises `InputError` for what the runs or their captures lack: a task, cameras, a sequence, a region, a metric profile.
+    Raises `InputError` if the runs or their captures lack a task, cameras, a sequence, a region or a metric profile.
     """
     source = runs.runs[0].folder.rows
     tasks = tuple(task for task in protocol.tasks if task in runs.tasks)
@@ -49,7 +49,7 @@ def under(runs: RunSet, name: str, protocol: NamedProtocol) -> RunSet:
         rows = rows.as_one_sequence()
     if protocol.pooled is not None:
         rows = rows.pooled(protocol.pooled, {spec.name for spec in metrics if spec.unit == "dB"})
-    # With one mean over all frames, their sequences and timesteps are not those of the rows any more.
+    # With one mean over all frames, sequences and timesteps of rows no longer identify frames.
     found = {task: frozenset(own) for task, own in keys.items()} if protocol.average == "sequences" else {}
     shown = " ".join([f"Protocol {name}: {protocol.title}.", *differences(runs, protocol)])
     present = tuple(spec for spec in metrics if spec.name in rows.metrics)
@@ -65,7 +65,7 @@ def _averaged(protocol: NamedProtocol) -> str:
 def _frames(runs: RunSet, task: str, wanted: TaskFrames, name: str) -> list[FrameKey]:
     """The frames of a task. Raises `InputError` if there are none of its cameras or sequences."""
     source, keys = runs.runs[0].folder.rows, sorted(runs.keys[task])
-    if wanted.cameras != "all" and task != "novel_view":  # whose cameras are unseen
+    if wanted.cameras != "all" and task != "novel_view":  # cameras of novel views are unseen
         unseen, reason = unseen_cameras([run.manifest for run in runs.runs], keys)
         inside = [
             key for key in keys if ((key.subject, key.camera) in unseen) == (wanted.cameras == "unseen")
@@ -112,7 +112,7 @@ def _metrics(runs: RunSet, name: str, protocol: NamedProtocol) -> tuple[list[Met
 
 
 def differences(runs: RunSet, protocol: NamedProtocol) -> list[str]:
-    """How runs differ from what the published figures of a protocol were obtained with: sentences."""
+    """Sentences on the differences of runs from the conditions of a protocol's published values."""
     found = []
     synthetic = all(synthetic_settings(clip) for run in runs.runs for clip in run.manifest.clips)
     subjects = len({clip.subject for run in runs.runs for clip in run.manifest.clips})
@@ -147,7 +147,7 @@ class ProtocolsSettings:
 
 
 USUAL = "usual"
-"""What every choice is compared with: all frames and pixels, the mean over frames, the canonical metrics."""
+"""Reference for every choice: all frames and pixels, the mean over frames, the canonical metrics."""
 NAMED = "protocol "
 
 
@@ -173,9 +173,9 @@ def choices(runs: RunSet) -> dict[str, NamedProtocol]:
 
 
 def protocols_command(settings: ProtocolsSettings, progress: Progress) -> CommandResult:
-    """Table what each choice of a protocol is worth in dB and LPIPS, for every method of runs.
+    """Tabulate the effect of each choice of a protocol in dB and LPIPS, for every method of runs.
 
-    Raises `InputError` for runs that do not belong together, and for unknown methods.
+    Raises `InputError` for runs that cannot be combined, and for unknown methods.
     """
     if settings.out is not None:
         check_writable(Path(settings.out), "--out")
@@ -257,5 +257,5 @@ def _text(
 
 
 def chosen(runs: RunSet, name: str | None) -> RunSet:
-    """The runs under the protocol of a name, None for as they are."""
+    """The runs under a named protocol; unchanged for None."""
     return runs if name is None else under(runs, name, protocol_named(name))

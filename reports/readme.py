@@ -79,10 +79,10 @@ DROPS, ABLATIONS = "drops", "ablations"
 PROFILES, FACES = "profiles", "faces"
 """Stored results of one of its subjects: by the definitions of all protocols, and by metrics of faces."""
 RATES = "rates"
-"""Stored sweeps over steps of the codec, one for each of some of its subjects."""
+"""Stored sweeps over codec steps, one each for some of its subjects."""
 OURS = "ours"
 FURTHER = "further"
-"""Stored runs of methods that the plan of the suite does not have, on some of its subjects; each named as that subject's run."""
+"""Stored runs of methods outside of the suite's plan, on some of its subjects; each named as that subject's run."""
 CURVES = "curves"
 """Stored curves on some subjects of the suite, in a folder for each quantity of `CURVE_UNITS`."""
 CURVE_PICTURE = "docs/pictures/curve-{}.png"
@@ -92,7 +92,7 @@ SUBJECTS = "subjects.jpg"
 SHOWN_METHODS, PANEL = ("ga", "gbs", OURS), 150
 RESULTS = "results.md"
 MEASURED = "reports/measured.json"
-"""Figures of the suite for cards of methods (`method_cards`)."""
+"""Values of the suite for cards of methods (`method_cards`)."""
 PAGES = {
     "demo": "docs/explanation/results.md",
     SUITE: "README.md",
@@ -133,7 +133,7 @@ def publish_demo(out: Path, root: Path) -> None:
     """Copy manifest, rows and contact sheet of a run to the repository ``root``, and write its block."""
     target = RunFolder(root / GALLERY)
     _copy(RunFolder(out), target)
-    # A page's picture, not a measurement: a lossy copy a third the size.
+    # An image for a page, not for measurements: a lossy copy of a third of the size.
     path, sheet = target.root / PICTURE, read_png(RunFolder(out).contact_sheet)
     write_bytes(path, encode_image(sheet, path.suffix, (cv2.IMWRITE_JPEG_QUALITY, 90), place=path))
     _write(root / PAGES["demo"], "demo", demo_block(target.root))
@@ -240,7 +240,7 @@ def _write(page: Path, name: str, block: str) -> None:
 
 
 DEMO_DIGITS = ("psnr=1", "ssim=3", "lpips=3", "fps=0")
-"""Of the demo's table: further ones change with the processor, as the page states below the table."""
+"""Decimals of the demo's table; further ones depend on the processor, as the page states below the table."""
 
 
 def demo_block(gallery: Path) -> str:
@@ -263,7 +263,7 @@ def _minutes(run_folder: Path, metric: str = "training_time") -> list[tuple[str,
     """
     rows = Rows.read(RunFolder(run_folder).rows)
     times = rows.select(method=ALL, condition=ALL, metric=metric, task="", region=FULL, seeds=ALL)
-    trained = times[times["condition"] != CODED]  # which is derived from a trained avatar
+    trained = times[times["condition"] != CODED]  # derived from a trained avatar
     ended = trained["status"] == "ok"
     return [
         (str(m), float(v) if ok else None) for m, v, ok in zip(trained["method"], trained["value"], ended)
@@ -295,7 +295,7 @@ def measured(folder: Path) -> dict[str, Any]:
 
 
 def protocols_block(folder: Path) -> str:
-    """What the choices of an evaluation are worth on stored runs of the suite, for two methods: Markdown."""
+    """Effects of evaluation choices on stored runs of the suite, for two methods: Markdown."""
     return _worth_of_choices(suite_runs(folder))
 
 
@@ -353,13 +353,13 @@ def drops_block(folder: Path) -> str:
 
 @cache
 def _read(*runs: Path) -> RunSet:
-    """Stored runs, which several blocks are made of."""
+    """Stored runs, cached for several blocks."""
     return RunSet.read(runs)
 
 
 @cache
 def _choices(runs: tuple[Path, ...]) -> CommandResult:
-    """What the choices of an evaluation are worth for `COMPARED`; both tables of the suite's runs are made of it."""
+    """Effects of evaluation choices for `COMPARED`, for both tables of the suite's runs."""
     return protocols_command(ProtocolsSettings(tuple(map(str, runs)), COMPARED), no_progress)
 
 
@@ -431,7 +431,7 @@ def suite_block(root: Path) -> str:
     seeds = suite_runs(folder, SEEDS_RUN)
     plain = runs.only([*runs.ranked]).shared
     subjects = runs.rows.subjects_of(runs.methods)
-    # Conditions on fewer subjects would shorten the table of all methods.
+    # Conditions with fewer subjects would reduce the subjects of the table of all methods.
     conditions = [
         n for n in (f"{OURS}+{EQUAL}", f"gbs+{AS_TRACKED}") if subjects.get(n, set()) >= plain.rows.subjects
     ]

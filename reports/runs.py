@@ -28,14 +28,14 @@ from .tables import AVERAGED
 
 
 def synthetic_settings(clip: ClipRecord) -> dict[str, Any]:
-    """Settings of the capture that a clip is from, if it is synthetic; else empty."""
+    """Settings of a clip's capture if it is synthetic; otherwise empty."""
     first = clip.steps[0] if clip.steps else {}
     return dict(first.get("parameters", {}).get("synthetic", {}))
 
 
 @dataclass(frozen=True)
 class RunData:
-    """A finished run, read; names in the order of its configuration. Images are read on demand."""
+    """A loaded finished run; names are in the order of its configuration. Images are read on demand."""
 
     folder: RunFolder
     manifest: Manifest
@@ -70,7 +70,7 @@ class RunData:
 
     @property
     def machine(self) -> str:
-        """The processor that speed was measured on, and the device if it was another."""
+        """The processor used to measure speed, and the device if it differs."""
         processor = str(self.manifest.machine.get("processor", ""))
         device = self.manifest.configuration.device
         return processor if device == "cpu" else f"{device}, {processor}"
@@ -101,7 +101,7 @@ class RunData:
         return self._clips[key.subject].image(key)
 
     def reason(self, method: str, task: str, key: FrameKey) -> str:
-        """Reason why a method has no render of a frame, as far as it is recorded in the rows."""
+        """Reason why a method has no render of a frame, if recorded in the rows."""
         seeds = (self.seed,)
         own = self.rows.select(
             method=method, metric=ALL, task=task, region=FULL, seeds=seeds, subject=key.subject
@@ -110,7 +110,7 @@ class RunData:
         return "not rendered" if failed.empty else str(failed.iloc[0]["reason"])
 
     def value(self, metric: str, method: str, task: str, key: FrameKey) -> float | None:
-        """Return a metric of the whole image shown, or None if it was not measured."""
+        """Return a metric of the displayed whole image, or None if it was not measured."""
         return self._by_frame.get((metric, method, task, *key))
 
     @property
@@ -151,19 +151,19 @@ class RunData:
 
 
 LONGEST_DIFFERENCE = 48
-"""Characters of settings in a label; more than that and the run's folder names the method."""
+"""Maximum characters of settings in a label; otherwise the label has the run's folder."""
 
 
 @dataclass(frozen=True)
 class FrameSelection:
-    """A part of the frames: one region of the head instead of the whole frame, and some sequences (none named: all)."""
+    """A part of the frames: one region of the head instead of the whole frame, and some sequences (empty: all)."""
 
     region: str = FULL
     sequences: tuple[str, ...] = ()
 
     @property
     def text(self) -> str:
-        """In words; "" for whole frames of all sequences."""
+        """Description; "" for whole frames of all sequences."""
         region = "" if self.region == FULL else f"Region: {self.region}."
         return " ".join(
             filter(None, [region, f"Sequences: {', '.join(self.sequences)}." if self.sequences else ""])
@@ -219,12 +219,12 @@ class RunSet:
 
     @classmethod
     def joined(cls, runs: tuple[RunData, ...]) -> RunSet:
-        """Runs that were read, with one protocol and labels of their own; see `read`."""
+        """Combine loaded runs, with one protocol and new labels; see `read`."""
         return cls.of_runs(_with_one_protocol(runs), training_labels(runs))
 
     @classmethod
     def of_runs(cls, runs: tuple[RunData, ...], labels: Sequence[Mapping[str, str]]) -> RunSet:
-        """Runs that were read, with the label of each run's methods by name. Raises `InputError` as `read` does.
+        """Combine loaded runs, with given labels of each run's methods. Raises `InputError` as `read` does.
 
         Coded avatars are columns of their methods, see `with_coded`.
         """
@@ -247,7 +247,7 @@ class RunSet:
         return cls(runs, rows, _metrics(runs), tasks, records, trivial, keys, shown)
 
     def of(self, part: FrameSelection) -> RunSet:
-        """A part of the frames of runs that were read whole.
+        """Select a part of the frames of completely loaded runs.
 
         Raises `InputError` for a region or a sequence that they do not have.
         """
@@ -264,7 +264,7 @@ class RunSet:
 
     @cached_property
     def by_camera(self) -> Self:
-        """The same runs with self-reenactment at seen and at unseen cameras as two tasks, or as one where unknown or by a protocol."""
+        """Split self-reenactment into seen and unseen cameras as two tasks, unless they are unknown or a protocol applies."""
         if SPLIT_TASK not in self.tasks or self.protocol:
             return self
         keys = self.keys[SPLIT_TASK]
@@ -284,7 +284,7 @@ class RunSet:
 
     @property
     def shared(self) -> Self:
-        """The same runs with those subjects alone that every label has rows of."""
+        """Restrict the runs to subjects for which every label has rows."""
         cells = self.rows.subjects_of(self.methods)
         kept = frozenset.intersection(*cells.values()) if cells else frozenset()
         expected = {key.subject for own in self.keys.values() for key in own}
@@ -295,12 +295,12 @@ class RunSet:
 
     @property
     def without_conditions(self) -> Self:
-        """The same runs, whose methods under conditions are ranked as methods of their own."""
+        """The same runs, with methods under conditions ranked as separate methods."""
         records = {label: replace(record, condition="") for label, record in self.records.items()}
         return replace(self, records=records)
 
     def only(self, labels: Sequence[str]) -> RunSet:
-        """The same runs with some of their methods."""
+        """Restrict the runs to some of their methods."""
         records = {label: record for label, record in self.records.items() if label in labels}
         trivial = tuple(label for label in self.trivial if label in records)
         return replace(self, rows=self.rows.of_methods(labels), records=records, trivial=trivial)
@@ -312,12 +312,12 @@ class RunSet:
 
     @property
     def ranked(self) -> tuple[str, ...]:
-        """Labels of methods that are neither trivial baselines nor changed by a condition, in order."""
+        """Labels of methods that are neither trivial baselines nor under a condition, in order."""
         return tuple(label for label in self.records if label not in (*self.trivial, *self.changed))
 
     @property
     def changed(self) -> tuple[str, ...]:
-        """Labels of methods under a condition; empty if all are, as in a curve."""
+        """Labels of methods under a condition; empty if all methods are, as in a curve."""
         changed = tuple(label for label, record in self.records.items() if record.condition)
         return changed if {*changed, *self.trivial} < {*self.records} else ()
 
@@ -336,7 +336,7 @@ class RunSet:
 
     @property
     def mixed_code(self) -> tuple[str, ...]:
-        """A sentence on methods of this package whose code changed between the runs without a change of their version."""
+        """A sentence on methods of this package whose code, but not version, changed between the runs."""
         codes: dict[str, set[str]] = {}
         for run in self.runs:
             for record in run.manifest.methods:
@@ -354,7 +354,7 @@ class RunSet:
 
     @property
     def machine(self) -> str:
-        """Machines that speed was measured on."""
+        """Machines used to measure speed."""
         return "; ".join(dict.fromkeys(run.machine for run in self.runs))
 
 
@@ -368,7 +368,7 @@ def _of_part(rows: Rows, part: FrameSelection, file: Path) -> Rows:
 
 
 def _with_one_protocol(runs: tuple[RunData, ...]) -> tuple[RunData, ...]:
-    """The runs, whose rows have the protocol of all subjects together; see `joined_protocol`."""
+    """The runs, with rows under the joint protocol of all subjects; see `joined_protocol`."""
     whole: dict[str, str] = {}
     for task in dict.fromkeys(task for run in runs for task in run.tasks):
         own = [run for run in runs if task in run.tasks]
@@ -385,9 +385,9 @@ def _with_one_protocol(runs: tuple[RunData, ...]) -> tuple[RunData, ...]:
 
 
 def joined_subjects(runs: Sequence[RunData]) -> list[RunData]:
-    """Several runs of different subjects as one run of all, in a list; the runs themselves if two share a subject.
+    """Join runs of different subjects into one, returned in a list; the runs are unchanged if two share a subject.
 
-    Raises `InputError` for runs of different subjects that do not have the same methods, settings, metrics and kind of protocol.
+    Raises `InputError` for runs of different subjects with different methods, settings, metrics or kinds of protocol.
     """
     subjects = [subject for run in runs for subject in run.rows.subjects]
     if len(runs) < 2 or len(set(subjects)) < len(subjects):
@@ -429,7 +429,7 @@ def _metrics(runs: Sequence[RunData]) -> tuple[MetricSpec, ...]:
 
 @dataclass
 class _Training:
-    """A method with its settings, the runs that it is in, by index, and its subjects and seeds there."""
+    """A method with its settings, the indices of its runs, and its subjects and seeds there."""
 
     record: MethodRecord
     runs: list[int]
@@ -437,7 +437,7 @@ class _Training:
 
 
 def _same_training(one: MethodRecord, other: MethodRecord) -> bool:
-    """Whether two records are of one training; methods of this package state by their version what their code gives."""
+    """Whether two records are of the same training; for methods of this package, the version identifies the code."""
     native = not is_outside(one.implementation)
     return one == (replace(other, code=one.code) if native else other)
 
@@ -465,7 +465,7 @@ def training_labels(runs: Sequence[RunData]) -> list[dict[str, str]]:
 
 
 def _names(name: str, records: Sequence[MethodRecord], folders: Sequence[Path]) -> list[str]:
-    """A name for each training of a method, from differing settings or else from their folders."""
+    """A name for each training of a method, from differing settings or from folders."""
     if len(records) == 1:
         return [name]
     flat = [_flat(asdict(record)) for record in records]

@@ -27,7 +27,7 @@ MARKDOWN_RANKS = {1: ("**", "**"), 2: ("<ins>", "</ins>"), 3: ("*", "*")}
 
 
 def to_markdown(table: Table) -> str:
-    """Write a pipe table, aligned so that it also reads well unrendered. Header: tasks, first body row: metrics.
+    """Write a pipe table, aligned to be readable as plain text. Header: tasks, first body row: metrics.
 
     First bold, second underlined (``<ins>``), third italic.
     """
@@ -165,7 +165,7 @@ BODY
 \end{table*}
 """
 NARROW = 8
-"""Columns up to which a table keeps the distance between them."""
+"""Maximum number of columns with the default column separation."""
 
 
 def to_latex(table: Table) -> str:
@@ -229,7 +229,7 @@ def _latex_cell(cell: TableCell) -> str:
 
 
 def to_html(table: Table) -> str:
-    """Write one page that needs no script, font or network, the best rows first. Values in full precision stand in tooltips."""
+    """Write one page without scripts, fonts or network access, the best rows first. Tooltips have values in full precision."""
     heading = " and ".join(task.title.lower() if i else task.title for i, task in enumerate(table.tasks))
     return render_page("table.html", table=table, heading=heading or TITLES.get(table.name, "Comparison"))
 
@@ -249,7 +249,7 @@ def render_page(template: str, **content: Any) -> str:
 
 @cache
 def _templates() -> Environment:
-    """The templates, each of which is compiled when it is first used."""
+    """The templates, compiled on first use."""
     from jinja2 import Environment, FileSystemLoader
 
     folders = [HERE, HERE / "leaderboard", HERE / "page"]
@@ -287,7 +287,7 @@ def to_csv(table: Table) -> str:
 def csv_text(lines: Iterable[Sequence[object]]) -> str:
     """Write lines as CSV, None as an empty cell.
 
-    Text that a spreadsheet would take for a formula has an apostrophe in front, as OWASP advises ("CSV Injection").
+    Text that a spreadsheet would interpret as a formula is prefixed by an apostrophe, as OWASP recommends ("CSV Injection").
     """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
@@ -325,9 +325,9 @@ WRITERS: dict[str, tuple[str, Callable[[Table], str]]] = {
     "html": ("html", to_html),
     "json": ("json", to_json),
 }
-"""By name of the format: suffix of its files, and the writer."""
+"""File suffix and writer by name of the format."""
 
 
 def _spans(table: Table) -> list[tuple[str, int]]:
-    """Titles over the columns, each with how many neighbouring columns it is of."""
+    """Titles over the columns, each with the number of columns that it spans."""
     return [(title, len(list(members))) for title, members in groupby(table.columns, key=lambda c: c.title)]

@@ -14,25 +14,25 @@ from .naming import Render, composited
 SAMPLE = 8
 """Number of frames checked per subject and task, evenly spaced."""
 TOLERANCE = 24.0
-"""Largest difference of the background's colour, of 255 in a channel.
+"""Maximum difference of the background's colour, in 8-bit levels of a channel.
 
-In the demo it is 0 in each frame of its five methods and two trivial baselines, since less than half of the pixels differ
-(at most 18 %, of `mean-image`); black on white differs by 255.
+In the demo it is 0 in each frame of the five methods and two trivial baselines, since less than half of the pixels differ
+(at most 18 %, for `mean-image`); black instead of white differs by 255.
 """
 EXACT = 2
-"""Difference, of 255, up to which a pixel of the ground truth shows the background's colour."""
+"""Maximum difference, in 8-bit levels, of ground-truth pixels that count as background."""
 CORNER = 8
 """A corner is a square of the image's shorter side divided by this."""
 LEAST = 0.005
-"""Part of an image's pixels that must be background; frames with less are not judged."""
+"""Minimum share of background pixels; frames with fewer are not checked."""
 
 
 def check_background(clip: Clip, renders: Mapping[FrameKey, Render]) -> None:
-    """Compare the background of renders of one task with the clip's, over a sample of their frames.
+    """Compare the background of renders of one task with the clip's, on a sample of frames.
 
-    The colour of a frame's background is the median over the pixels that are certainly background, see
-    `certain_background`; a poor method may miss it in some frames, so that more than half of the sample must
-    differ. Raises `InputError` if it differs by more than `TOLERANCE`.
+    The background colour of a frame is the median over the pixels of `certain_background`. Since a poor method may
+    fail in some frames, `InputError` is raised only if more than half of the sample differs by more than
+    `TOLERANCE`.
     """
     declared = 255 * np.asarray(clip.background, dtype=np.float64)
     keys = sorted(renders)
@@ -56,15 +56,15 @@ def check_background(clip: Clip, renders: Mapping[FrameKey, Render]) -> None:
 
 
 def background_colour(clip: Clip, key: FrameKey, image: ByteArray) -> FloatArray | None:
-    """(3,) median colour, 0 to 255, of an image's background; None where too little of the frame is certainly background."""
+    """(3,) median background colour of an image, 0 to 255; None with too few pixels that are certainly background."""
     ground = certain_background(clip, key)
     return np.median(image[ground], axis=0) if ground.mean() >= LEAST else None
 
 
 def certain_background(clip: Clip, key: FrameKey) -> BoolArray:
-    """(H, W) pixels in which the ground truth shows the clip's background and nothing else.
+    """(H, W) mask of the pixels in which the ground truth shows only the clip's background.
 
-    They have its colour and lie outside of the mask; without a mask, in a corner of the image.
+    These pixels have its colour and are outside of the mask or, without a mask, in a corner of the image.
     """
     truth, mask = clip.image(key), clip.mask(key)
     plain = np.asarray((np.abs(truth - 255 * np.asarray(clip.background)) <= EXACT).all(axis=-1))

@@ -29,13 +29,13 @@ INDEX = "bundle.json"
 MAX_FILES = 200_000
 MAX_BYTES = 8 * 2**30
 MAX_RATIO = 200
-"""How many times its own size a bundle may hold; JSON shrinks to a thirtieth."""
+"""Maximum ratio of unpacked to packed size; JSON is compressed by a factor of 30."""
 
 _CELL = r"[^/\\]+/[^/\\]+/seed-\d+"
 _NAMES = re.compile(
     rf"run\.json|rows\.parquet|{PROTOCOLS}/[^/\\]+\.json|{_CELL}/({'|'.join(STAGES)})\.json|{_CELL}/renders/[^/\\]+/[^/\\]+\.png"
 )
-_TIME = (1980, 1, 1, 0, 0, 0)  # of every file, so that the same results make the same bytes
+_TIME = (1980, 1, 1, 0, 0, 0)  # of every file, so that equal results give equal bytes
 _MODE = 0o100644 << 16
 
 
@@ -70,8 +70,8 @@ class Bundle:
 def write_bundle(settings: BundleSettings, progress: Progress = no_progress) -> CommandResult:
     """Write a bundle of a finished run.
 
-    Raises `InputError` for a run that is not finished, methods that it does not have, and frames that are missing or
-    not as they were rendered.
+    Raises `InputError` for a run that is not finished, unknown methods, and frames that are missing or
+    differ from their digests.
     """
     folder, out = RunFolder(Path(settings.run)), Path(settings.out)
     check_writable(out, "--out")
@@ -123,7 +123,7 @@ def without_paths(manifest: Manifest, methods: tuple[str, ...]) -> Manifest:
         key: named(value) if key in {name.rpartition(".")[2] for name in manifest.paths or {}} else value
         for key, value in config.reader_settings.items()
     }
-    # A configuration may name a method by its module.
+    # Methods in a configuration may be named by their module.
     ran = list(dict.fromkeys(method.name for method in manifest.methods))
     asked = dict(zip(ran, config.methods)) if len(ran) == len(config.methods) else {}
     labels = {method.label for method in manifest.methods if method.name in methods}
@@ -170,9 +170,9 @@ def _cell_files(
 
 
 def check_results(folder: RunFolder, manifest: Manifest) -> Rows:
-    """The rows of a finished run, checked: only frames of its protocols, each once, whose hashes are those of their content.
+    """The rows of a finished run, checked: only frames of its protocols, without duplicates, and with valid protocol hashes.
 
-    Raises `InputError` for rows or protocols that are not.
+    Raises `InputError` for invalid rows or protocols.
     """
     manifest.check_done(folder.manifest)
     for record in manifest.protocols.values():
@@ -207,7 +207,7 @@ def read_bundle(path: Path, into: Path) -> Bundle:
     Raises
     ------
     InputError
-        The file is not a bundle, files differ from their list or do not belong to a bundle, or the
+        The file is not a bundle, its files differ from their list or are of an unexpected kind, or the
         content exceeds the size or number of files allowed in a bundle.
     """
     bounds = {"members": MAX_FILES, "spare_bytes": 0, "per_byte": MAX_RATIO}

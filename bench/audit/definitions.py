@@ -1,4 +1,4 @@
-"""Compares what a record says of registered metrics and methods with the registry."""
+"""Compares the recorded definitions of metrics and methods with the registry."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class Mismatch:
 def known_metrics(config: RunConfig | None = None) -> dict[str, MetricSpec]:
     """Registered definitions by name, those of profiles and conditions included.
 
-    Of ``config``, metrics that it names by their module are included too; the caller has checked that it may import them.
+    Metrics that ``config`` names by their module are included too; the caller has checked that they may be imported.
     """
     found: dict[str, MetricSpec] = {}
-    # Conditions first: they may give a registered name to what they measure in another way.
+    # Conditions first: they may redefine registered names.
     for plugin in discover("conditions").values():
         found |= {} if plugin.spec is None else {metric.name: metric for metric in plugin.spec.metrics}
     found |= {
@@ -61,7 +61,7 @@ def known_methods() -> dict[str, MethodSpec]:
 
 
 def method_of(name: str, known: Mapping[str, MethodSpec]) -> MethodSpec | None:
-    """The registered method with a name, with or without a label of its settings, such as "ours (static)"."""
+    """The registered method of a name, which may include a label of settings, such as "ours (static)"."""
     return known.get(name) or known.get(name.partition(" (")[0])
 
 

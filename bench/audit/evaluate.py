@@ -45,11 +45,11 @@ class NoAvatar:
     """Placeholder for the avatar, which a folder of images lacks; metrics of avatars are not computed."""
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """There is nothing to render."""
+        """Not available."""
         raise HeadbenchError("images of a folder have no avatar")
 
     def files(self) -> Sequence[Path]:
-        """There is nothing to store."""
+        """No files."""
         return []
 
 
@@ -59,7 +59,7 @@ def images_method(label: str, version: str) -> ResolvedMethod:
 
 
 def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress) -> CommandResult:
-    """Check everything, bring the images into the layout of a run, score them, write rows, manifest and reports.
+    """Check everything, copy the images to the layout of a run, score them, write rows, manifest and reports.
 
     The text is the table, together with the run named by ``like``.
 
@@ -197,7 +197,7 @@ def find_images(
     names: str = "",
     config: RunConfig | None = None,
 ) -> dict[tuple[str, FrameKey], Render]:
-    """Find the image of every frame of every protocol, by task and key, with checks except of the pixels.
+    """Find the image of every frame of every protocol, by task and key; all checks except those of pixels are made.
 
     Parameters
     ----------
@@ -254,7 +254,7 @@ def find_images(
 
 
 def _places(folder: Path, task: str, key: FrameKey, subjects: int) -> list[Path]:
-    """Possible paths of the image of a frame, in descending precedence."""
+    """Possible paths of a frame's image, in order of precedence."""
     name = Cell(folder).render(task, key).name
     roots = [folder / key.subject] + ([folder] if subjects == 1 else [])
     return [place / name for root in roots for place in (root / "renders" / task, root / task, root)]

@@ -29,9 +29,9 @@ MAP_REMEDY = "Name the images one by one with --names MAP.csv (columns file, seq
 
 
 class Render(NamedTuple):
-    """An image of a frame. With ``alpha`` it is on black; else on the background.
+    """An image of a frame, on black if it has ``alpha``, otherwise on the background.
 
-    Coverage is the fourth channel of ``alpha`` if that is the image itself, else its red channel.
+    Coverage is the fourth channel of ``alpha`` if this is the image itself, otherwise its red channel.
     """
 
     image: Path
@@ -46,7 +46,7 @@ Listing = Mapping[str, Sequence[tuple[int, str]]]
 def named_renders(names: str, folder: Path, config: RunConfig, clips: Sequence[Clip]) -> Renders:
     """Image of each frame by ``names``: a method whose program numbers its renders, or the path of a CSV file.
 
-    The images of a subject are in a folder named after it, or with one subject in ``folder``. See `MethodSpec.renders`.
+    The images of a subject are in a folder named after it or, with a single subject, in ``folder``. See `MethodSpec.renders`.
 
     Raises
     ------
@@ -79,9 +79,9 @@ def image_name(task: str, key: FrameKey) -> PurePosixPath:
 
 
 def check_truth(clip: Clip, renders: Renders, keys: Iterable[FrameKey], count: int = 8) -> None:
-    """Compare the ground truth stored with renders with the clip's, at some frames; on black if renders are.
+    """Compare the ground truth stored with renders with the clip's in some frames, on black if the renders are on black.
 
-    Raises `InputError` if they differ by more than `TRUTH_RMS`: renders of other frames, or of another
+    Raises `InputError` if they differ by more than `TRUTH_RMS`, as for renders of other frames or on another
     background.
     """
     chosen = [key for key in sorted(keys) if key in renders and renders[key].truth is not None]
@@ -112,11 +112,11 @@ def check_truth(clip: Clip, renders: Renders, keys: Iterable[FrameKey], count: i
 
 
 TRUTH_RMS = 1.5
-"""Of 255: more than what rounding does."""
+"""In 8-bit levels; above rounding errors."""
 
 
 def composited(render: Render, background: Sequence[float]) -> ByteArray:
-    """(H, W, 3) pixels of a render on black, put on ``background`` by its coverage."""
+    """Composite the (H, W, 3) pixels of a render on black over ``background``, by its coverage."""
     assert render.alpha is not None
     image = read_png(render.image).astype(np.float32)
     if render.alpha == render.image:
@@ -131,12 +131,12 @@ def composited(render: Render, background: Sequence[float]) -> ByteArray:
 
 
 def every_frame(clip: Clip) -> set[FrameKey]:
-    """Frames of all splits, and those left out."""
+    """Frames of all splits, and excluded ones."""
     return {key for keys in clip.splits.values() for key in keys} | set(clip.excluded)
 
 
 def _listed(path: Path, folder: Path, clips: Sequence[Clip]) -> Renders:
-    """Images that a CSV file names, relative to ``folder``; a column ``subject`` is needed with several captures."""
+    """Images listed in a CSV file, relative to ``folder``; with several captures it needs a column ``subject``."""
     text = read_text(path, "CSV", MAX_MAP_BYTES)
     needed = {*COLUMNS, *(["subject"] if len(clips) > 1 else [])}
     with reading(path, "a CSV file"):

@@ -21,21 +21,22 @@ from ..specs import MetricSpec
 from .verify import KEY, captured_again
 
 MOST_PIXELS = 2 * 10**10
-"""Of the captures that are made again for a training; those of the suite have a hundredth."""
+"""Maximum pixels of captures that are regenerated for a training; those of the suite have a hundredth."""
 TOLERANCES = {"psnr": 0.25, "ssim": 0.002, "lpips": 0.002}
-"""Largest difference of a method's mean with the same seed on another machine.
+"""Maximum difference of a method's mean with the same seed on another machine.
 
-A training repeated on one machine gives equal bits. Over instruction sets, means of the demo differed by up to 0.20 dB of PSNR
+Repeated trainings on one machine are bit-identical. Across instruction sets, means of the demo differed by up to 0.20 dB of
+PSNR
 and 0.001 of SSIM, those of a run of 150 iterations with and without vector instructions by up to 0.05 dB, 0.0009 of SSIM and
 0.0002 of LPIPS.
 """
 STORAGE_TOLERANCE = 0.01
-"""Relative; the storage in the same trials differed by up to 0.001."""
+"""Maximum relative difference of storage; in the same trials it differed by up to 0.001."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far a metric of all methods of a bundle agrees with another training.
+    """Agreement of a metric, over all methods of a bundle, with another training.
 
     Attributes
     ----------
@@ -52,7 +53,7 @@ class Agreement:
 
     @property
     def agrees(self) -> bool:
-        """Whether means differ by the tolerance at most."""
+        """Whether means differ by no more than the tolerance."""
         return self.mean <= self.tolerance
 
     def __str__(self) -> str:
@@ -70,15 +71,15 @@ def train_again(
     execution: Execution | None = None,
     progress: Progress = no_progress,
 ) -> RunFolder:
-    """Run the configuration of an unpacked bundle into ``out``, on captures made again; continue if it was interrupted.
+    """Run the configuration of an unpacked bundle into ``out``, on regenerated captures; continue if it was interrupted.
 
-    Methods of other packages run isolated, see `RunConfig.isolation`.
+    Methods of other packages are isolated, see `RunConfig.isolation`.
 
     Raises
     ------
     InputError
-        Nothing was trained for the bundle; its captures cannot be made again or are others; or it names modules or programs,
-        which are only run with `RunOptions.trust`.
+        Nothing was trained for the bundle; its captures cannot be regenerated or differ; or it names modules or programs,
+        which require `RunOptions.trust`.
     """
     manifest = folder.read_manifest()
     config = manifest.configuration
@@ -98,7 +99,7 @@ def train_again(
 
 
 def agreements(rows: Rows, again: Rows, metrics: Mapping[str, MetricSpec]) -> list[Agreement]:
-    """Compare rows with those of another training, metric by metric; metrics that depend on the machine are left out."""
+    """Compare rows with those of another training by metric, except metrics that depend on the machine."""
     tables = []
     for each in (rows, again):
         table = each.select(method=ALL, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
@@ -128,8 +129,7 @@ def agreements(rows: Rows, again: Rows, metrics: Mapping[str, MetricSpec]) -> li
 def results_again(out: Path, manifest: Manifest) -> Rows | None:
     """Rows of a finished training of `train_again` into ``out``; None if there is none.
 
-    Raises `InputError` for a damaged run, and one of other settings than the bundle's methods, or that scored others than
-    the frames and captures of its protocols.
+    Raises `InputError` for a damaged run, and for one with other settings, frames or captures than the bundle.
     """
     folder = RunFolder(out / "run")
     if not folder.manifest.is_file():

@@ -43,10 +43,10 @@ from .settings import VerifySettings
 KEY = ["method", "condition", "seed", "task", *FRAME, "region", "metric"]
 SHOWN = 20
 PIXELS_PER_BYTE = 100
-"""Of the captures that are made again for a bundle; its renders have about one of a byte, a run scores a tenth of them at
-least."""
+"""Maximum pixels of regenerated captures per byte of a bundle; its renders have about one per byte, and a run scores at
+least a tenth of the captured pixels."""
 TRAINING = "settings, budget, seeds, versions, processor time and memory of the training"
-"""Claims that only another training can confirm."""
+"""Claims that only a repeated training can confirm."""
 FINDINGS = "findings.json"
 TEMPORARY_FILES = "temporary"
 
@@ -60,11 +60,11 @@ class Findings:
     mismatches : list[Mismatch]
         Differences from the record or from the registry.
     files, values : int
-        Number of digests and values that were computed again.
+        Number of digests and values that were recomputed.
     recomputed : list[str]
-        Metrics of frames whose values were computed again.
+        Frame metrics whose values were recomputed.
     unverified : dict[str, str]
-        Why something could not be checked, by its name.
+        Reasons why items could not be checked, by name.
     """
 
     mismatches: list[Mismatch] = field(default_factory=list)
@@ -83,7 +83,7 @@ class Findings:
 
     @property
     def not_verified(self) -> str:
-        """A sentence that names everything that was not verified, by reason; "" for nothing."""
+        """A sentence that lists everything that was not verified, by reason; "" if there is nothing."""
         reasons: dict[str, list[str]] = {}
         for name, reason in self.unverified.items():
             reasons.setdefault(reason, []).append(name)
@@ -105,16 +105,16 @@ class Findings:
 
 
 Renders = Mapping[str, Mapping[str, str]]
-"""Digests of rendered frames by subject and path, by the name of what rendered them."""
+"""Digests of rendered frames by subject and path, for each name: label and seed of a method."""
 
 
 def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> CommandResult:
     """Verify runs and bundles; not passed if anything differs.
 
     Recomputed: fingerprints of the captures, hashes of the protocols, fingerprint of each avatar's inputs,
-    digests of frames and avatar files, every metric of frames and those of avatars that are not bound to a machine.
+    digests of frames and avatar files, every frame metric, and avatar metrics that do not depend on the machine.
     Definitions of registered metrics and methods are compared with the registry.
-    A value may differ by a tenth of the last digit that tables show, for networks that round otherwise elsewhere.
+    Values may differ by a tenth of the last displayed digit, since networks round differently on other machines.
 
     A folder that is not a finished run, or a capture that cannot be opened, is a finding with exit code 3.
     """
@@ -148,7 +148,7 @@ def verify_run(settings: VerifySettings, progress: Progress = no_progress) -> Co
 
 @contextmanager
 def _scratch_folder(out: str | None) -> Iterator[Path]:
-    """An empty folder for temporary files, in ``out`` if it is given, where what a killed process left is removed.
+    """An empty folder for temporary files, in ``out`` if given; leftovers of killed processes are removed.
 
     The command has locked ``out``.
     """
@@ -216,20 +216,20 @@ def verify(
             findings.unverified[f"version {record.version} of {record.label}"] = (
                 f"version {spec.version} is here"
             )
-    if bundle is not None:  # its temporary place says nothing
+    if bundle is not None:  # its temporary path is not informative
         root = f"{folder.root}/"
         findings.mismatches = [replace(m, file=m.file.removeprefix(root)) for m in findings.mismatches]
     return Verified(folder, manifest, findings, _renders(folder, manifest))
 
 
 def _renders(folder: RunFolder, manifest: Manifest) -> Renders:
-    """Digests of the frames of every method and seed: of their pixels, or the recorded ones of files that are not there."""
+    """Digests of the frames of every method and seed: of their pixels, or the recorded ones for missing files."""
     found: dict[str, dict[str, str]] = {}
     known, seeds = known_methods(), manifest.configuration.seeds
     for method, seed, clip in product(manifest.methods, seeds, manifest.clips):
         spec = method_of(method.name, known)
         if spec is not None and spec.trivial and seed != seeds[0]:
-            continue  # baselines have the same frames with every seed
+            continue  # frames of baselines do not depend on the seed
         cell = folder.cell(clip.subject, method.label, seed)
         state = cell.step(DIGESTS)
         files = {} if state is None else state.get("files", {})
@@ -241,7 +241,7 @@ def _renders(folder: RunFolder, manifest: Manifest) -> Renders:
 
 
 def _pixels(path: Path) -> str:
-    """Digest of an image's pixels, which another compression leaves as they are; "" where there is none."""
+    """Digest of an image's pixels, independent of the file's compression; "" if there is no image."""
     try:
         return digest(read_png(path))
     except InputError:
@@ -249,7 +249,7 @@ def _pixels(path: Path) -> str:
 
 
 def equal_renders(renders: Renders) -> dict[str, tuple[str, ...]]:
-    """Sentences on frames with equal files, each with the names of what has them."""
+    """Sentences on equal frames, each with the names of the renders that have them."""
     same: dict[frozenset[tuple[str, str]], list[str]] = {}
     for name, digests in renders.items():
         if digests:
@@ -266,10 +266,10 @@ def equal_renders(renders: Renders) -> dict[str, tuple[str, ...]]:
 
 
 def lacking_frames(rows: Rows, manifest: Manifest) -> list[tuple[str, str, str]]:
-    """Values that rows lack of the frames of their protocols: where, number expected and number found.
+    """Values missing in the rows for frames of their protocols: location, expected and found number.
 
-    Every method has a value, or the reason why it has none, for each frame, seed and metric; one row without a frame stands
-    for all frames of a method that failed.
+    Every method has a value or a reason for each frame, seed and metric; one row without a frame stands for all frames of a
+    failed method.
     """
     lacking = []
     per_frame = [metric.name for metric in manifest.metrics if metric.per_frame]
@@ -298,7 +298,7 @@ def lacking_frames(rows: Rows, manifest: Manifest) -> list[tuple[str, str, str]]
 
 
 def captured_again(manifest: Manifest, out: Path, limit: int, progress: Progress) -> Path:
-    """Regenerate the synthetic captures of a run from their clips, in a folder below ``out``, once; ``limit`` bounds their pixels.
+    """Regenerate the synthetic captures of a run once, in a folder below ``out``, with at most ``limit`` pixels.
 
     Raises `InputError` for a capture that is not synthetic, not of the procedural head, or larger.
     """
@@ -343,7 +343,7 @@ class _Opened:
         """Open the captures of a run; ``images``: it is a bundle, which holds no avatars."""
         folder = RunFolder(run)
         manifest = folder.read_manifest()
-        # Otherwise there are images alone, of a bundle or scored by `evaluate`.
+        # Otherwise there are only images, of a bundle or scored by `evaluate`.
         avatars = not images and any(method.implementation for method in manifest.methods)
         used: tuple[Plugins, ...] = ("methods", "metrics") if avatars else ("metrics",)
         config, clips = open_run_clips(
@@ -373,7 +373,7 @@ def _verified(
     execution: Execution | None,
     progress: Progress,
 ) -> Findings:
-    """Findings in the captures, the protocols and the cells of a run."""
+    """Verify the captures, protocols and cells of a run."""
     opened = _Opened.read(folder.root, options, scratch, images=images)
     found = Findings([*_clips(opened), *_protocols(opened)])
     if found.mismatches:
@@ -445,7 +445,7 @@ def verify_cell(task: Task, report: Any) -> None:
 def _open_capture(
     run: str, options: tuple[tuple[str, Any], ...], images: bool, capture: int, root: str
 ) -> _Opened:
-    """One capture of a run; cells of a capture follow each other in a process."""
+    """One capture of a run, cached, since a process verifies the cells of a capture in succession."""
     scratch = Path(tempfile.mkdtemp(prefix="adapted-", dir=root))
     return _Opened.read(Path(run), RunOptions(**dict(options)), scratch, images=images, only=capture)
 
@@ -484,7 +484,7 @@ def _verify_cell(job: Job, opened: _Opened) -> Findings:
     digests = {**(state.get("files", {}) if state and trained else {}), **recorded_frames(job)}
     changed = list(_files(job, digests, found))
     found.mismatches += changed
-    coded = job.condition.derive == CODED_VARIANT  # which methods read as their own
+    coded = job.condition.derive == CODED_VARIANT  # which methods read like their own avatars
     if not method.implementation or (job.condition.derive and not coded):
         avatar: Avatar = NoAvatar()
     else:
@@ -506,7 +506,7 @@ def _verify_cell(job: Job, opened: _Opened) -> Findings:
 
 
 def _files(job: Job, digests: Mapping[str, str], found: Findings) -> Iterator[Mismatch]:
-    """Digests of frames and avatar files; every scored frame has to have one."""
+    """Check digests of frames and avatar files; every scored frame must have one."""
     record = str(job.cell.folder / f"{DIGESTS}.json")
     for path in job.frame_paths:
         if job.cell.name(path) not in digests:
@@ -549,7 +549,7 @@ def _measure_again(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> p
 def _values(
     job: Job, again: pd.DataFrame, own: pd.DataFrame, opened: _Opened, found: Findings
 ) -> Iterator[Mismatch]:
-    """Compare the rows of a cell with rows that were measured again."""
+    """Compare the rows of a cell with newly measured rows."""
     file = str(opened.folder.rows)
     recorded, new_rows = _by_place(own), _by_place(again)
     if len(recorded) != len(own):
@@ -565,7 +565,7 @@ def _values(
     for name, table in again.groupby("metric"):
         if (table["status"] == "ok").any():
             found.recomputed.append(str(name))
-        else:  # nowhere here; a value that single frames cannot have is a mismatch
+        else:  # in no region here; a value that single frames cannot have is a mismatch
             reason = str(table["reason"].iloc[0]).rstrip(".") or "not measured here"
             found.unverified[str(name)] = reason
             stable.pop(str(name))

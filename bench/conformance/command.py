@@ -54,7 +54,7 @@ class CheckPluginSettings:
 
 
 KINDS: dict[Group, str] = {"methods": "method", "datasets": "reader", "metrics": "metric"}
-TIMESTEPS = 4  # of the capture made on the spot
+TIMESTEPS = 4  # of the generated capture
 
 
 def check_plugin(settings: CheckPluginSettings, progress: Progress = no_progress) -> CommandResult:
@@ -70,14 +70,14 @@ def check_plugin(settings: CheckPluginSettings, progress: Progress = no_progress
     elif isinstance(spec, DatasetSpec):
         if settings.data is None:
             raise InputError("command line", "--data", "a capture in the layout of the reader", "none")
-        from .readers import check_reader  # which takes long to import
+        from .readers import check_reader  # slow to import
 
         breaches = check_reader(spec, Path(settings.data), values)
     else:
         if values:
             raise InputError("command line", "--set", "no settings: a metric has none", "a setting")
         breaches = check_metric(spec)
-    breaches = list(dict.fromkeys(breaches))  # one fault may be met by several checks
+    breaches = list(dict.fromkeys(breaches))  # several checks may find the same fault
     verdict = f"{spec.name}: a {kind} that keeps its contract"
     if breaches:
         count = "1 breach" if len(breaches) == 1 else f"{len(breaches)} breaches"
@@ -87,7 +87,7 @@ def check_plugin(settings: CheckPluginSettings, progress: Progress = no_progress
 
 
 def _find(settings: CheckPluginSettings) -> tuple[MethodSpec | DatasetSpec | MetricSpec, str]:
-    """The specification that the settings name, and what it is of."""
+    """The spec named by the settings, and its kind."""
     groups = [group for group in KINDS if settings.kind in (None, group)]
     name = settings.plugin
     if ":" in name:
@@ -122,7 +122,7 @@ def _check_method(
 
 
 def _clip(settings: CheckPluginSettings, folder: Path, progress: Progress) -> Clip:
-    from ..engine import captures  # which takes long to import
+    from ..engine import captures  # slow to import
 
     data = settings.data
     if data is None:
@@ -134,7 +134,7 @@ def _clip(settings: CheckPluginSettings, folder: Path, progress: Progress) -> Cl
 
 
 def _adapted(clip: Clip, method: ResolvedMethod, folder: Path) -> Clip:
-    """The clip in the form that the method declares to need, as in a run."""
+    """The clip adapted to the method, as in a run."""
     needs = MethodNeeds.of(method.spec)
     planned = plan(clip, needs, {})
     return clip if planned is None else apply(planned, needs, folder / "adapted", "adapting").clip

@@ -1,4 +1,4 @@
-"""Check that a method keeps its contract. An exception of a plug-in is reported as a breach, not raised."""
+"""Check that a method fulfils its contract. An exception of a plug-in is reported as a violation, not raised."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def attempt(breaches: list[str], what: str) -> Iterator[None]:
 
 
 def described(error: Exception) -> str:
-    """The exception in one line, with the place that raised it."""
+    """The exception in one line, with the line of code that raised it."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     message = " ".join(str(error).split())
     return f"{type(error).__name__}: {message} ({Path(last.filename).name}, line {last.lineno})"
@@ -118,7 +118,7 @@ def _render_breaches(avatar: Avatar, loaded: Avatar, clip: Clip) -> Iterator[str
     uncovered = black.alpha < 1e-3
     if uncovered.any() and np.abs(black.rgb[uncovered]).max() > 0.01:
         yield "the requested background is not visible where alpha is 0"
-    # An avatar that knows no head model (an image, a folder of frames) has nothing to refuse.
+    # An avatar without a head model (an image, a folder of frames) has nothing to refuse.
     if hasattr(avatar, "splats"):
         other = replace(pose, head_model="some other model")
         yield from refusal(lambda: avatar.render(camera, other), "a pose of another head model")

@@ -1,4 +1,4 @@
-"""Check that a metric keeps the contract of `MetricSpec` and its protocol in `contracts`."""
+"""Check that a metric fulfils the contract of `MetricSpec` and its protocol in `contracts`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SIZE = (96, 80)
 NOISE = (4.0, 16.0, 64.0)
 """Standard deviations, in levels, of increasing noise."""
 TOLERANCE = 1e-4
-"""Relative difference allowed between single and batched values, whose sums may use another order."""
+"""Relative tolerance between single and batched values, since the order of sums may differ."""
 
 Compare = Callable[[ByteArray, ByteArray], float]
 
@@ -139,7 +139,7 @@ def _input_breaches(compare: Compare, spec: MetricSpec) -> Iterator[str]:
     unfit: Any = np.full(truth.shape, np.nan, np.float32)
     for a, b, name in ((unfit, truth, "image"), (truth, unfit, "ground truth")):
         value = math.nan
-        with suppress(Exception):  # refused, in whatever way
+        with suppress(Exception):  # any exception is a refusal
             value = float(compare(a, b))
         if math.isfinite(value):
             yield f"a float {name} of NaN gives {value:.6g} instead of an error"
@@ -202,7 +202,7 @@ def _avatar_breaches(metric: Any, spec: MetricSpec) -> Iterator[str]:
         try:
             measured = metric(_GreyAvatar(Path(folder)), list(zip(cameras, poses)))
         except UnavailableError:
-            return  # has no number for so plain an avatar, and states why
+            return  # the metric does not apply to this minimal avatar, and gives the reason
         yield from _measurement_breaches(measured, spec, detail_may_lack=True)
 
 
@@ -211,7 +211,7 @@ def _training_breaches(metric: Any, spec: MetricSpec) -> Iterator[str]:
     try:
         yield from _measurement_breaches(metric(record), spec)
     except UnavailableError:
-        pass  # asks for what only its own method records
+        pass  # needs values that only its own method records
     yield from refusal(lambda: metric({}), "a record without any entry", expected=UnavailableError)
 
 

@@ -1,4 +1,4 @@
-"""Check that a reader keeps the contract of `DatasetSpec` and `Clip`."""
+"""Check that a reader fulfils the contract of `DatasetSpec` and `Clip`."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def _poses(clip: Clip) -> Iterator[str]:
             found.append(f"subject and timestep {where} are {pose.subject!r} and {pose.timestep}")
         if found:
             yield from found
-            return  # the others have the same
+            return  # the other parameters are the same
 
 
 def _splits(clip: Clip) -> Iterator[str]:
@@ -258,7 +258,7 @@ def _spread(count: int) -> list[int]:
 
 
 def _repeated(read: Read, path: Path, clips: Sequence[Clip]) -> Iterator[str]:
-    """Breaches of what must be equal when the capture is read again, here and from another location."""
+    """Violations found by reading the capture again, here and from another location."""
     before = [clip.fingerprint for clip in clips]
     if [clip.fingerprint for clip in read(path)] != before:
         yield "the fingerprint differs when the capture is read again"

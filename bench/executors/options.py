@@ -18,7 +18,7 @@ DEPENDENT = (
     DependentOptions(("restarts",), "executor", ("processes", "slurm")),
     DependentOptions(("poll_s", "slurm"), "executor", ("slurm",)),
 )
-"""Settings of `Execution` that only some executors have."""
+"""Settings of `Execution` that apply to some executors only."""
 
 
 def chosen_execution(
@@ -28,7 +28,7 @@ def chosen_execution(
     workers: int | None,
     source: str,
 ) -> Execution:
-    """Settings of an executor, with those of ``--set`` and the options ``--executor`` and ``--workers`` laid over them.
+    """Settings of an executor, overridden by ``--set`` and by the options ``--executor`` and ``--workers``.
 
     Parameters
     ----------
@@ -48,7 +48,9 @@ def chosen_execution(
     """
     options = {"executor": executor, "workers": workers}
     options = {key: value for key, value in options.items() if value is not None}
-    values = merge(settings, options) if isinstance(settings, Mapping) else settings  # which `build` refuses
+    values = (
+        merge(settings, options) if isinstance(settings, Mapping) else settings
+    )  # otherwise `build` refuses them
     execution = build(Execution, values, source, "execution.")
     given = {key: f"--set execution.{key}" for key in assigned} | {key: f"--{key}" for key in options}
     check_dependent(DEPENDENT, given, execution)

@@ -66,7 +66,7 @@ def read_outcome(task: Path) -> TaskOutcome | None:
 
 
 def write_outcome(task: Path, outcome: TaskOutcome) -> None:
-    """Write it, atomically."""
+    """Write the file atomically."""
     write_json(outcome_path(task), outcome)
 
 

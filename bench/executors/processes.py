@@ -29,7 +29,7 @@ class _Process:
     task: Task | None = None
 
     def stop(self) -> None:
-        """Close the connection, at which the worker ends, and kill it if it has not ended after `STOP_S`."""
+        """Close the connection, which ends the worker, and kill the worker if it is still alive after `STOP_S`."""
         self.connection.close()
         self.process.join(STOP_S)
         if self.process.is_alive():
@@ -137,7 +137,7 @@ def _serve(connection: Connection) -> None:
 
 @contextmanager
 def _threads(count: int | None) -> Iterator[None]:
-    """Set the number of threads of processes started in the block: libraries read it when they are imported."""
+    """Set the number of threads of processes started in the block; libraries read it when they are imported."""
     before = os.environ.get("OMP_NUM_THREADS")
     if count is not None:
         os.environ["OMP_NUM_THREADS"] = str(count)

@@ -1,4 +1,4 @@
-"""Runs a command that has no cells as one task of an executor."""
+"""Runs a command without cells as a single task of an executor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the cells of a run are executed: in this process, in worker processes, or as jobs of a cluster."""
+"""Settings for executing the cells of a run: in this process, in worker processes, or as cluster jobs."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def is_speed(metric: MetricSpec) -> bool:
 
 
 def import_submitit() -> Any:
-    """Import the package submitit, which would otherwise close the log files that are open. Raises `UnavailableError`."""
+    """Import submitit without letting it close open log files. Raises `UnavailableError`."""
     level = "SUBMITIT_LOG_LEVEL"
     before = os.environ.get(level)
     os.environ[level] = "NOCONFIG"

@@ -48,7 +48,7 @@ STUCK = {"PartitionTimeLimit", "PartitionNodeLimit", "BadConstraints", "JobHeldA
 WAITING = "jobs wait for %s, which does not resolve by itself. To change their settings, end them by `scancel --name %s` and start again"
 _THREADS = (
     "export OMP_NUM_THREADS=$SLURM_CPUS_PER_TASK",
-    "export SRUN_CPUS_PER_TASK=$SLURM_CPUS_PER_TASK",  # which srun took from the job itself before Slurm 22.05
+    "export SRUN_CPUS_PER_TASK=$SLURM_CPUS_PER_TASK",  # before Slurm 22.05, srun used the job's value itself
 )
 _JOB = re.compile(r"\d+(_\d+)?")
 
@@ -182,9 +182,9 @@ class Slurm:
         state, reason, code = end_of(job.number)
         if state in FINAL and not (job.earlier and state == "CANCELLED"):  # a restart requests it again
             return TaskResult(job.task, f"job {job.number} {FINAL[state]}", again=False)
-        if code in FULL_DISK and not job.earlier:  # there may be room since; see `worker.run_job`
+        if code in FULL_DISK and not job.earlier:  # there may be space by now; see `worker.run_job`
             raise OSError(code, f"{os.strerror(code)} (job {job.number})", str(job.task.folder))
-        check_room(self._root)  # a job that could not even open its log leaves no reason
+        check_room(self._root)  # a job that could not open its log leaves no reason
         return TaskResult(job.task, f"job {job.number} ended as {state}{reason}")
 
     def _submit(self, tasks: Sequence[Task]) -> list[str]:
@@ -258,7 +258,7 @@ class Queued(NamedTuple):
 
     @property
     def shown(self) -> str:
-        """For people."""
+        """Description for messages."""
         return f"{self.state} ({self.reason})"
 
 
@@ -269,7 +269,7 @@ def queue() -> Mapping[str, Queued]:
 
 
 def end_of(number: str) -> _State:
-    """How a job ended, as long as Slurm remembers it."""
+    """Final state of a job, while Slurm keeps its record."""
     try:
         text = _ask("scontrol", "show", "job", number)
     except HeadbenchError:

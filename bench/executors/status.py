@@ -29,7 +29,7 @@ State = Literal["waiting", "running", "done", "failed"]
 STATES: tuple[State, ...] = ("waiting", "running", "done", "failed")
 SPEED = "for its speed to be measured"
 SHOWN = 30
-"""Cells that are shown by name."""
+"""Maximum number of cells listed by name."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class CellState:
 
     @property
     def name(self) -> str:
-        """As logs name it."""
+        """Name in logs."""
         return f"{self.subject} {self.method} seed {self.seed}"
 
 
@@ -91,9 +91,7 @@ def time_left(cells: Sequence[CellState]) -> tuple[float | None, bool]:
 
     The estimate uses the finished cells of each method.
 
-    The time to measure speed is not known in advance.
-
-    None if nothing is left, or nothing is known.
+    The time for measuring speed is not included. None if nothing is left, or no estimate is possible.
     """
     took: dict[str, list[float]] = {}
     for cell in cells:

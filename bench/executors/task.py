@@ -48,7 +48,7 @@ class Task:
 
     @classmethod
     def of(cls, root: Path, place: str, function: str, **arguments: Any) -> Task:
-        """Make a task of this process."""
+        """Create a task of this process."""
         path = tuple(os.path.abspath(entry) for entry in sys.path)
         return cls(str(root.resolve()), place, function, arguments, os.getcwd(), path)
 

@@ -87,11 +87,11 @@ def run_job(task: Task) -> None:
         if error.errno not in FULL_DISK:
             raise
         print(f"{error.filename}: {error.strerror}", file=sys.stderr, flush=True)
-        os._exit(error.errno)  # the disk may be full for its outcome and log
+        os._exit(error.errno)  # the disk may be too full for its outcome and log
 
 
 def _continued(task: Task) -> Any:
-    """The job that submitit submits again after a timeout: the same one, which resumes."""
+    """The job that submitit resubmits after a timeout: the same job, which resumes."""
     from submitit.helpers import DelayedSubmission
 
     return DelayedSubmission(run_job, task)
@@ -115,7 +115,7 @@ def job_id() -> str:
 
 @contextmanager
 def _output_to(folder: Path) -> Iterator[None]:
-    """Send what the process and its children print, native code included, to the task's log while the block runs."""
+    """Redirect all output of the process and its children, including native code, to the task's log within the block."""
     from ..io.files import no_link
 
     sys.stdout.flush()

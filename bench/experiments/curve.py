@@ -1,4 +1,4 @@
-"""``headbench run curve``: quality over training time, cameras, timesteps, pictures or tracking error, as conditions of one run."""
+"""``headbench run curve``: quality over training time, cameras, timesteps, images or tracking error, as conditions of a run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 METRICS: tuple[str, ...] = ("psnr", "ssim", "lpips", "storage", "primitives")
 """Metrics of a curve, independent of the run's, as defined by the canonical profile."""
 COSTS = ("training_processor", "training_time", "training_memory")
-"""What the trainings took, measured besides."""
+"""Training costs that are measured as well."""
 
 
 def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> CommandResult:
@@ -80,9 +80,9 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
 def conditions(
     settings: CurveSettings, methods: Sequence[ResolvedMethod], clips: Sequence[Clip]
 ) -> Iterator[Condition]:
-    """Conditions of the trainings, the full one first, which start-up time, such as imports, affects least.
+    """Conditions of the trainings; the full one is first, since start-up time, such as imports, affects it least.
 
-    Of parts with the same amount, only the largest is used.
+    Of fractions with the same amount, only the largest is used.
     """
     if settings.over == "tracking_error":
         for level in settings.tracking_errors:
@@ -119,7 +119,7 @@ def conditions(
 
 
 def _pictures(counts: Sequence[int], clips: Sequence[Clip]) -> Iterator[Condition]:
-    """Conditions of numbers of pictures; of those that no capture exceeds, only the largest."""
+    """Conditions of numbers of images; of numbers that no capture exceeds, only the largest."""
     whole = max(len(clip.splits["train"]) for clip in clips)
     seen = set()
     for count in counts:
@@ -161,7 +161,7 @@ def _wanted(settings: CurveSettings, source: RunFolder) -> list[ResolvedMethod]:
 
 
 def _drop_interrupted(out: Path) -> None:
-    """Remove files of interrupted trainings, so that they start over and their time is known."""
+    """Remove files of interrupted trainings, so that they restart and their time can be measured."""
     for record in sorted(out.glob("*/*/seed-*/fit.json")):
         cell = Cell(record.parent)
         state = cell.step("fit")

@@ -39,7 +39,7 @@ from .viewpoints import Viewpoint, common_target, turntable
 
 log = logging.getLogger(__name__)
 NO_VARIATION = 1e-9
-"""A component whose deviation is below this share of the largest one is rounding, not expression."""
+"""Components whose standard deviation is below this fraction of the largest are rounding errors."""
 VIEWS_PER_SAMPLE = 2
 
 
@@ -52,10 +52,10 @@ class PoseComponents:
     mean, low, high : FloatArray
         (E + 3,) mean and range of expression and jaw.
     directions : FloatArray
-        (D, E + 3) change of both along each component by one standard deviation, by falling deviation. D is less than
-        requested if the training poses span less.
+        (D, E + 3) change of both by one standard deviation along each component, by decreasing deviation. D is less than
+        requested if the training poses span fewer dimensions.
     reach : FloatArray
-        (2, D) least and largest number of standard deviations of a training pose along each component.
+        (2, D) minimum and maximum over training poses along each component, in standard deviations.
     """
 
     mean: FloatArray
@@ -66,12 +66,12 @@ class PoseComponents:
 
     @classmethod
     def of(cls, poses: Sequence[HeadPose], dimensions: int) -> PoseComponents:
-        """Components of some poses."""
+        """Compute the components of some poses."""
         values = np.array([np.concatenate([pose.expression, pose.jaw]) for pose in poses], np.float64)
         mean, jaw = values.mean(axis=0), np.arange(values.shape[1]) >= values.shape[1] - 3
         variances = values.var(axis=0)
         scale = np.where(jaw, np.sqrt(variances[jaw].sum()), np.sqrt(variances[~jaw].sum()))
-        scale[scale < NO_VARIATION] = 1.0  # what never changes is in no component
+        scale[scale < NO_VARIATION] = 1.0  # constant coefficients are in no component
         _, singular, axes = np.linalg.svd((values - mean) / scale, full_matrices=False)
         deviations = singular / np.sqrt(max(len(values) - 1, 1))
         kept = np.flatnonzero(deviations > NO_VARIATION)[:dimensions]
@@ -85,16 +85,16 @@ class PoseComponents:
         )
 
     def at(self, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(E,) expression and (3,) jaw at (D,) standard deviations along the components, within the range of training."""
+        """(E,) expression and (3,) jaw at (D,) standard deviations along the components, clamped to the range of training."""
         inside = np.clip(sigmas, *self.reach)
         values = np.clip(self.mean + inside @ self.directions, self.low, self.high)
         return values[:-3], values[-3:]
 
 
 def joint_samples(count: int, dimensions: int, sigmas: float) -> FloatArray:
-    """(count, dimensions) standard normal numbers, at most ``sigmas`` from 0: a Latin hypercube, the same every time.
+    """(count, dimensions) deterministic Latin hypercube sample of the standard normal distribution, within ``sigmas`` of 0.
 
-    Each number of a dimension is the middle quantile of another of ``count`` parts of equal probability, in random order
+    In each dimension, the values are the middle quantiles of ``count`` parts of equal probability, in random order
     (McKay, Beckman, Conover, Technometrics 21(2), 1979).
     """
     rng = np.random.default_rng(0)
@@ -108,7 +108,7 @@ def training_poses(clip: Clip) -> list[HeadPose]:
 
 
 def typical_pose(poses: Sequence[HeadPose]) -> HeadPose:
-    """The pose whose expression is nearest to the mean expression: a real one, so that all its parts fit together."""
+    """The recorded pose whose expression is nearest to the mean; a real pose, so that its parts are consistent."""
     expressions = np.array([pose.expression for pose in poses], np.float64)
     return poses[int(np.argmin(np.linalg.norm(expressions - expressions.mean(axis=0), axis=1)))]
 
@@ -117,7 +117,7 @@ TYPICAL, PATH = "typical", "path"
 
 
 class PlannedFrame(NamedTuple):
-    """A pose in a view, which is numbered. Poses are named "typical", "sample-01" and so on, and "path"."""
+    """A pose in a numbered view. Poses are named "typical", "sample-01" and so on, and "path"."""
 
     name: str
     number: int
@@ -126,10 +126,10 @@ class PlannedFrame(NamedTuple):
 
 
 def sampled_poses(clip: Clip, dimensions: int, samples: int, sigmas: float) -> list[HeadPose]:
-    """The typical training pose, then poses with jointly sampled expression and jaw; all else stays the typical one's.
+    """The typical training pose, then copies of it with jointly sampled expression and jaw.
 
-    Taken from training timesteps alone. Poses belong to no timestep, so that no avatar answers with tracking it
-    refined for one. Without variation in training there is no sample.
+    Only training timesteps are used. Poses have no timestep, so that avatars cannot use tracking that they refined for
+    it. Without variation in training there is no sample.
     """
     poses = training_poses(clip)
     base = replace(typical_pose(poses), timestep=None)
@@ -142,7 +142,7 @@ def sampled_poses(clip: Clip, dimensions: int, samples: int, sigmas: float) -> l
 
 
 def path_poses(poses: Sequence[HeadPose], count: int) -> list[HeadPose]:
-    """A smooth sequence from the first of some poses through the next two, which slows down at each of them."""
+    """A smooth sequence from the first pose through the next two, slowing down at each of them."""
     ends = [np.concatenate([pose.expression, pose.jaw]) for pose in poses[:3]]
     found = []
     for place in np.linspace(0.0, len(ends) - 1, count) if len(ends) > 1 else ():
@@ -154,7 +154,7 @@ def path_poses(poses: Sequence[HeadPose], count: int) -> list[HeadPose]:
 
 
 def _with(pose: HeadPose, expression: FloatArray, jaw: FloatArray) -> HeadPose:
-    """The pose with another expression and jaw, in its numbers' precision."""
+    """The pose with another expression and jaw, in the same precision."""
     return replace(pose, expression=expression.astype(pose.expression.dtype), jaw=jaw.astype(pose.jaw.dtype))
 
 
@@ -168,9 +168,9 @@ LIMITS = {
 
 @dataclass(frozen=True, eq=False)
 class ExtremesPlan:
-    """Views and poses that the avatars of one clip are rendered with.
+    """Views and poses in which the avatars of one clip are rendered.
 
-    The typical pose is seen in every view, each sample in `VIEWS_PER_SAMPLE`, and the path in the view from the front.
+    The typical pose is rendered in every view, each sample in `VIEWS_PER_SAMPLE`, and the path in the front view.
     """
 
     views: Sequence[Viewpoint]
@@ -181,7 +181,7 @@ class ExtremesPlan:
     def of(
         cls, clip: Clip, views: int, beyond: float, dimensions: int, samples: int, sigmas: float, path: int
     ) -> ExtremesPlan:
-        """Choose views and poses for a clip, from its training frames alone."""
+        """Choose views and poses for a clip from its training frames only."""
         cameras = [clip.cameras[name] for name in sorted({key.camera for key in clip.splits["train"]})]
         chosen = turntable(cameras, common_target(cameras, head_center(clip)), views, beyond)
         poses = sampled_poses(clip, dimensions, samples, sigmas)
@@ -197,7 +197,7 @@ class ExtremesPlan:
 
 
 def head_center(clip: Clip) -> FloatArray:
-    """(3,) centre of the head in its typical training pose, metres: the middle of the extent of its vertices."""
+    """(3,) centre of the head's bounding box in its typical training pose, metres."""
     head, pose = clip.head, typical_pose(training_poses(clip))
     coefficients = np.asarray(clip.shape, np.float64)
     shaped = head.template + head.shape_basis[..., : len(coefficients)] @ coefficients
@@ -215,10 +215,10 @@ def protocols(jobs: Sequence[Job], **parameters: Any) -> dict[str, Protocol]:
 def drive(
     job: Job, avatar: Avatar, progress: Progress, **parameters: Any
 ) -> tuple[Rows, dict[str, Any], list[Path]]:
-    """Render and judge every frame of the plan; the registered change "extremes".
+    """Render and evaluate every frame of the plan; the registered change "extremes".
 
-    The details have the record of the avatar: views, frames, truth and findings. The files are the frames that the contact
-    sheet shows and the truth of each.
+    The details are the record of the avatar: views, frames, truth and results. The files are the frames of the contact
+    sheet and their truth.
     """
     plan = ExtremesPlan.of(job.form.clip, **parameters)
     files: list[Path] = []
@@ -240,7 +240,7 @@ def _shown(job: Job, plan: ExtremesPlan) -> ShownFrames:
 
 
 def _truth(job: Job) -> tuple[TruthPictures | None, str]:
-    """The truth of a cell's subject, or None and the reason why there is none."""
+    """The truth of a cell's subject, or None and the reason."""
     try:
         return TruthPictures.of(job), ""
     except UnavailableError as error:
@@ -254,7 +254,7 @@ def _key(job: Job, plan: ExtremesPlan, frame: PlannedFrame) -> FrameKey:
 def _judged(
     job: Job, avatar: Avatar, plan: ExtremesPlan, files: list[Path], report: Progress
 ) -> tuple[list[JudgedFrame], dict[str, Any]]:
-    """Frames and the avatar's record. The typical pose comes first, since it is the reference of all others in its view."""
+    """Frames and the avatar's record. The typical pose comes first, as the reference for the others in its view."""
     background = [float(v) for v in job.form.clip.background]
     truths, missing = _truth(job)
     scores = TruthJudge(job.device)

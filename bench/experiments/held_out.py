@@ -32,9 +32,9 @@ TIMESTEPS: TaskName = "self_reenactment"
 
 @dataclass(frozen=True, eq=False)
 class HeldOutClip:
-    """A `Clip` whose splits are parts of another's training split; no other frame of that can be read.
+    """A `Clip` whose splits are parts of another clip's training split; other frames cannot be read.
 
-    "novel_view" has the frames of the held-out camera, "self_reenactment" those of the held-out timesteps, in all
+    "novel_view" has the frames of the held-out camera, "self_reenactment" those of the held-out timesteps in all
     training cameras.
     """
 
@@ -121,23 +121,23 @@ def hold_out(clip: Clip, config: RunConfig | None = None, *, camera: str = "", e
 
 
 def fewer_cameras(clip: Clip, config: RunConfig | None = None, *, part: str) -> Clip:
-    """A clip with a part of its training cameras, one at least.
+    """A clip with a fraction of its training cameras, at least one.
 
-    The first is the one nearest to the mean position of all, each further one that farthest from those taken (Gonzalez,
-    "Clustering to minimize the maximum intercluster distance", 1985), so that fewer are among more.
+    The first is the camera nearest to the mean position, each further one that farthest from those already selected (Gonzalez,
+    "Clustering to minimize the maximum intercluster distance", 1985), so that smaller selections are subsets of larger ones.
     """
     names = _spread(clip.cameras, sorted({key.camera for key in clip.splits["train"]}))
     return _reduced(clip, "cameras", names[: count_of(len(names), part)])
 
 
 def fewer_timesteps(clip: Clip, config: RunConfig | None = None, *, part: str) -> Clip:
-    """A clip with a part of its training timesteps, one at least, spread evenly."""
+    """A clip with a fraction of its training timesteps, at least one, evenly spaced."""
     timesteps = sorted({key.timestep for key in clip.splits["train"]})
     return _reduced(clip, "timesteps", evenly(timesteps, count_of(len(timesteps), part)))
 
 
 def fewer_pictures(clip: Clip, config: RunConfig | None = None, *, count: int) -> Clip:
-    """A clip with a number of its training frames: timesteps spread evenly, cameras as in `fewer_cameras`, in turn."""
+    """A clip with a number of its training frames: timesteps evenly spaced, cameras in turn, ordered as in `fewer_cameras`."""
     train = clip.splits["train"]
     if not isinstance(count, int) or count < 1:
         raise InputError("conditions", "count", "a whole number from 1", repr(count))
@@ -147,7 +147,7 @@ def fewer_pictures(clip: Clip, config: RunConfig | None = None, *, count: int) -
         left[key.timestep].append(key)
     chosen: list[FrameKey] = []
     while len(chosen) < min(count, len(train)):
-        # One frame of each timestep before a second of any.
+        # One frame of each timestep before a second frame of any timestep.
         open_ones = [timestep for timestep, keys in left.items() if keys]
         for timestep in evenly(open_ones, min(count - len(chosen), len(open_ones))):
             wanted = cameras[len(chosen) % len(cameras) :] + cameras[: len(chosen) % len(cameras)]
@@ -163,7 +163,7 @@ def fewer_pictures(clip: Clip, config: RunConfig | None = None, *, count: int) -
 
 
 def count_of(whole: int, part: str) -> int:
-    """Number of items in a part of a total, at least one."""
+    """Number of items in a fraction of a total, at least one."""
     try:
         return max(1, round(whole * part_of_text(part, "part")))
     except ValueError as error:
@@ -171,14 +171,14 @@ def count_of(whole: int, part: str) -> int:
 
 
 def _reduced(clip: Clip, what: str, chosen: Sequence[Any]) -> Clip:
-    """A clip whose training frames are those of some cameras or timesteps; held-out frames stay."""
+    """A clip with the training frames of some cameras or timesteps; held-out frames are unchanged."""
     train = clip.splits["train"]
     keys = [key for key in train if getattr(key, what.removesuffix("s")) in chosen]
     return _with_frames(clip, keys, {what: list(chosen)})
 
 
 def _with_frames(clip: Clip, keys: Sequence[FrameKey], chosen: dict[str, list[Any]]) -> Clip:
-    """A clip with these training frames alone; ``chosen`` is the record, whose first entry identifies them."""
+    """A clip with only these training frames; ``chosen`` is the record, whose first entry identifies them."""
     if len(keys) == len(clip.splits["train"]):
         return clip
     step = StepRecord("reduce_training", {**chosen, "count": len(keys)}, clip.fingerprint)
@@ -192,13 +192,13 @@ def _with_frames(clip: Clip, keys: Sequence[FrameKey], chosen: dict[str, list[An
 
 
 def _as_held_out(clip: Clip) -> HeldOutClip:
-    """A clip of which only the frames of its splits can be read."""
+    """A clip that allows reading only the frames of its splits."""
     own = {f.name: getattr(clip, f.name) for f in fields(HeldOutClip) if f.name != "source"}
     return HeldOutClip(source=clip, **own)
 
 
 def _spread(cameras: Mapping[str, Camera], names: Sequence[str]) -> list[str]:
-    """Names of cameras, each as far as possible from those before it."""
+    """Names of cameras in farthest-point order."""
     centers = np.array([cameras[name].center for name in names])
     order = [int(np.linalg.norm(centers - centers.mean(0), axis=1).argmin())]
     distances = np.full(len(names), np.inf)

@@ -1,15 +1,14 @@
-"""How far the appearance of a driven avatar stays its subject's own, without ground truth or a licensed network.
+"""Preservation of a subject's appearance in a driven avatar, without ground truth or a licensed network.
 
-The parts of a head that expressions do not move (scalp and hair, ears, temples, as far as the camera sees them) should
-look as in the subject's recordings whoever drives the avatar. The tracked mesh says where they are: the colour at
-every such vertex is compared with the median colour at the same vertex over the subject's recorded frames in the same
-camera. The mean CIEDE2000 difference over the vertices is the number: 0 is equal, 1 just noticeable, the difference of
-two people's hair or skin above 10.
+The parts of a head that expressions do not move (visible scalp and hair, ears, temples) should look as in the subject's
+recordings, independent of the driver. The tracked mesh locates them: the colour at every such vertex is compared with the
+median colour at the same vertex over the subject's recorded frames in the same camera. The metric is the mean CIEDE2000
+difference over the vertices: 0 is equal, 1 is just noticeable, and hair or skin of two people differ by more than 10.
 
-It does not see the face proper, whose appearance changes with expression; nor shape, but for its outline; nor people who
-look alike. It contains what the avatar lacks against recordings anyway and the change of shading with the head's
-rotation: the same number of the subject's own held-out recordings (`own`) says how much that is, that of the driver's
-recordings (`source`) what a complete exchange of identity would give.
+It ignores the face itself, whose appearance changes with expression, and shape except for the outline, and cannot
+distinguish people who look alike. It includes general rendering errors and the change of shading with the head's rotation.
+For comparison, its value for the subject's own held-out recordings (`own`) estimates these, and its value for the driver's
+recordings (`source`) is that of a complete exchange of identity.
 """
 
 from __future__ import annotations
@@ -39,21 +38,21 @@ from .extremes import training_poses
 from .stability import LimitCheck
 
 STEADY_M = 0.0005
-"""A vertex that training expressions move by less (one standard deviation of each) counts as unmoved."""
+"""Vertices that training expressions (one standard deviation of each) move by less than this count as static."""
 RIGID_WEIGHT = 0.99
 FACING = 0.35
-"""Least cosine between a vertex' normal and the direction to the camera; more grazing ones are left out."""
+"""Minimum cosine between a vertex normal and the direction to the camera; grazing views are left out."""
 SMOOTHING = 0.01
-"""Deviation of the Gaussian that images are smoothed by, as a share of the head's height in the image."""
+"""Standard deviation of the Gaussian blur of images, relative to the head's height in the image."""
 LEAST_VERTICES = 20
 NO_APPEARANCE = "no recorded frames of that camera, or no parts that expressions do not move"
 HIDDEN = ("teeth", "tongue", "eyeball", "lips", "mouth")
-"""Regions by part of their name that lie behind others, or open and close over them."""
+"""Parts of names of regions that are behind others, or open and close over them."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigidVertices:
-    """The (N,) vertices of a clip's head that follow its rigid motion alone: (N, 3) points and unit normals in the rest
+    """The (N,) vertices of a clip's head that only move rigidly: (N, 3) points and unit normals in the rest
     pose, and its (3,) root and neck joints, metres."""
 
     indices: IntArray
@@ -64,13 +63,13 @@ class RigidVertices:
 
     @classmethod
     def of(cls, clip: Clip) -> RigidVertices:
-        """Find them from the head model and the training expressions."""
+        """Find the vertices from the head model and the training expressions."""
         expressions = [pose.expression for pose in training_poses(clip)]
         return cls.at(clip, np.flatnonzero(_steady(clip.head, expressions)))
 
     @classmethod
     def at(cls, clip: Clip, indices: IntArray) -> RigidVertices:
-        """Those at given vertices."""
+        """Restrict to given vertices."""
         head = clip.head
         coefficients = np.asarray(clip.shape, np.float64)
         shaped = (
@@ -80,7 +79,7 @@ class RigidVertices:
         return cls(indices, shaped[indices], _normals(shaped, head.faces)[indices], root, neck)
 
     def posed(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:
-        """(N, 3) points and normals of a pose: the head turns about the neck joint, the whole about the root."""
+        """(N, 3) points and normals of a pose: the head rotates about the neck joint, and everything about the root."""
         root, neck = (cv2.Rodrigues(np.asarray(r, np.float64))[0] for r in (pose.rotation, pose.neck))
         local = (self.points - self.neck) @ neck.T + self.neck
         points = (local - self.root) @ root.T + self.root + pose.translation
@@ -89,14 +88,14 @@ class RigidVertices:
 
 @dataclass(frozen=True, eq=False)
 class RecordedAppearance:
-    """The colours of a subject's steady parts in one camera; Lab, (N, 3), not a number where none was seen."""
+    """Lab colours of a subject's static parts in one camera, (N, 3); NaN for vertices that were not visible."""
 
     parts: RigidVertices
     colours: FloatArray
 
     @classmethod
     def recorded(cls, clip: Clip, camera: str, count: int) -> RecordedAppearance | None:
-        """The median over up to ``count`` recorded frames of training timesteps; None where the camera has too few."""
+        """The median over up to ``count`` recorded frames of training timesteps; None if the camera has too few."""
         recorded = [*clip.splits.get("train", ()), *clip.splits.get("novel_view", ())]
         keys = sorted(key for key in recorded if key.camera == camera)
         parts = RigidVertices.of(clip)
@@ -109,7 +108,7 @@ class RecordedAppearance:
         return cls(parts, median)
 
     def difference(self, colours: FloatArray) -> float | None:
-        """Mean CIEDE2000 difference over the vertices that both have seen; None where they are too few."""
+        """Mean CIEDE2000 difference over the vertices visible in both; None if there are too few."""
         both = np.isfinite(self.colours).all(axis=1) & np.isfinite(colours).all(axis=1)
         if both.sum() < LEAST_VERTICES:
             return None
@@ -119,7 +118,7 @@ class RecordedAppearance:
 def identity(
     appearance: RecordedAppearance | None, frame: Frame, camera: Camera, pose: HeadPose
 ) -> LimitCheck:
-    """The identity of a driven frame, without a limit: how much is too much depends on who drives whom."""
+    """The identity metric of a driven frame; it has no limit, since acceptable values depend on target and driver."""
     if appearance is None or not np.isfinite(frame.rgb).all():
         absent = "not finite" if appearance is not None else NO_APPEARANCE
         return LimitCheck("identity", None, 0.0, math.inf, absent)
@@ -130,9 +129,9 @@ def identity(
 def of_recording(
     appearance: RecordedAppearance, clip: Clip, keys: Sequence[FrameKey], count: int
 ) -> float | None:
-    """Mean identity of recorded frames of any subject, up to ``count`` of them; None where none has it.
+    """Mean identity metric of up to ``count`` recorded frames of any subject; None if no frame has a value.
 
-    The vertices are those of ``appearance``, where this clip's head has them.
+    The vertices are those of ``appearance`` that this clip's head has.
     """
     if not keys or len(clip.head.template) <= appearance.parts.indices.max():
         return None
@@ -142,20 +141,20 @@ def of_recording(
 
 
 def mean_known(values: Sequence[float | None]) -> float | None:
-    """Mean of the values that are there; None without any."""
+    """Mean of the available values; None without any."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
 
 
 def _colours_of(clip: Clip, parts: RigidVertices, key: FrameKey) -> FloatArray:
-    """(N, 3) Lab colours of a clip's steady parts in a recorded frame."""
+    """(N, 3) Lab colours of a clip's static parts in a recorded frame."""
     return sample(clip.image(key), clip.cameras[key.camera], *parts.posed(clip.poses[key.timestep]))
 
 
 def sample(image: ByteArray, camera: Camera, points: FloatArray, normals: FloatArray) -> FloatArray:
-    """(N, 3) Lab colours of points in an (H, W, 3) 8-bit image, not a number for those that the camera does not see.
+    """(N, 3) Lab colours of points in an (H, W, 3) 8-bit image; NaN for points that face away or are outside of it.
 
-    What lies in front of a point that faces the camera is not known; the steady parts are convex but for ears.
+    Occlusion is not tested; the static parts are convex except for the ears.
     """
     motion = np.asarray(camera.world_to_camera, np.float64)
     local = points @ motion[:3, :3].T + motion[:3, 3]
@@ -176,7 +175,7 @@ def sample(image: ByteArray, camera: Camera, points: FloatArray, normals: FloatA
 
 
 def _steady(head: HeadAsset, expressions: Sequence[FloatArray]) -> BoolArray:
-    """(V,) whether a vertex is neither moved by expressions nor by jaw and eyes, and lies open to sight."""
+    """(V,) mask of exposed vertices that neither expressions nor jaw and eyes move."""
     deviations = np.std(np.asarray(expressions, np.float64), axis=0)
     basis = head.expression_basis[..., : len(deviations)]
     steady: BoolArray = np.linalg.norm(basis * deviations, axis=(1, 2)) < STEADY_M
@@ -188,7 +187,7 @@ def _steady(head: HeadAsset, expressions: Sequence[FloatArray]) -> BoolArray:
 
 
 def _normals(points: FloatArray, faces: IntArray) -> FloatArray:
-    """(V, 3) unit normals, each face weighing by its area."""
+    """(V, 3) unit normals, averaged over faces by area."""
     a, b, c = (points[faces[:, corner]] for corner in range(3))
     across = np.cross(b - a, c - a)
     normals = np.zeros_like(points)

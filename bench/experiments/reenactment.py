@@ -57,10 +57,10 @@ AT_ORIGIN = RigidMean(np.eye(3), np.eye(3), np.zeros(3))
 
 
 def retarget(pose: HeadPose, source: RigidMean, target: RigidMean, subject: str) -> HeadPose:
-    """Retarget a pose of the source to the target.
+    """Retarget a pose from the source to the target.
 
-    The head turns and moves, seen from its own mean pose, as the source's does from its own, so that the axes of
-    the two captures need not agree. Expression, jaw, eyes and eyelids are kept. The pose belongs to no timestep.
+    The motion of the head relative to its mean pose is that of the source's head relative to its own, so that the axes of
+    the captures may differ. Expression, jaw, eyes and eyelids are kept. The pose has no timestep.
     """
     rotation = target.rotation @ source.rotation.T @ _matrix(pose.rotation)
     neck = target.neck @ source.neck.T @ _matrix(pose.neck)
@@ -95,13 +95,13 @@ def _mean_rotation(rotations: Sequence[FloatArray]) -> FloatArray:
 TASK: Literal["cross_reenactment"] = "cross_reenactment"
 REFERENCE_FRAMES = 12
 OWN_LIMITS = Limits(coverage=(0.67, 1.5), translucent_rise=0.15)
-"""Against the median over the avatar's own training poses in the same view; the head turns and moves."""
+"""Relative to the median over the avatar's own training poses in the same view, since the head moves."""
 LIMITS = asdict(OWN_LIMITS)
 
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """One avatar and the source that drives it, both in the form that the method takes; ``keys``: one frame a timestep."""
+    """An avatar and the source that drives it, both adapted to the method; ``keys``: one frame per timestep."""
 
     job: Job
     source: Job
@@ -148,7 +148,7 @@ def drive(
 
 
 def _pairs(job: Job, source: str | None, camera: str | None, frames: int | None) -> list[Driven]:
-    """The avatar of a cell with everyone who drives it."""
+    """The avatar of a cell with all its drivers."""
     clip = job.form.clip
     view = view_camera(clip, camera)
     pairs = []
@@ -210,7 +210,7 @@ def _judged(
 def _identity(
     driven: Driven, appearance: RecordedAppearance | None, frames: Sequence[JudgedFrame]
 ) -> dict[str, float | None] | None:
-    """Mean identity of the driven frames, between that of the subject's and that of the source's own recordings."""
+    """Mean identity metric of the driven frames, with those of the subject's and of the source's recordings."""
     if appearance is None:
         return None
     target, source = driven.job.form.clip, driven.source.form.clip
@@ -225,7 +225,7 @@ def _identity(
 
 
 def _sources(job: Job, source: str | None) -> Sequence[Job]:
-    """Cells of the job's method whose clips drive: of every capture of the run, or of a separate capture."""
+    """Cells of the job's method whose clips are drivers: of all captures of the run, or of a separate capture."""
     config = job.config
     assert config is not None
     if source is not None:
@@ -239,7 +239,7 @@ def _sources(job: Job, source: str | None) -> Sequence[Job]:
 
 
 def view_camera(clip: Clip, wanted: str | None) -> Camera:
-    """The camera of a name; None: the first that is held out, else the first. Raises `InputError` for an unknown name."""
+    """The camera of a name; None: the first held-out one, or else the first. Raises `InputError` for an unknown name."""
     if wanted is None:
         keys = clip.splits.get("novel_view") or clip.splits["train"]
         return clip.cameras[min(key.camera for key in keys)]
@@ -249,7 +249,7 @@ def view_camera(clip: Clip, wanted: str | None) -> Camera:
 
 
 def _performance(clip: Clip, camera: str, count: int | None) -> list[FrameKey]:
-    """Held-out frames, one a timestep: in this camera where there is one, so that source and target look alike."""
+    """Held-out frames, one per timestep, in this camera if available, so that source and target have the same view."""
     chosen: dict[int, FrameKey] = {}
     for key in sorted(clip.splits.get("self_reenactment", ())):
         if key.timestep not in chosen or key.camera == camera:

@@ -1,4 +1,4 @@
-"""``headbench run extremes`` and ``headbench run reenact``: avatars of a run driven beyond it, as a condition of a run with a source."""
+"""``headbench run extremes`` and ``headbench run reenact``: tests of a run's avatars beyond its test frames."""
 
 from __future__ import annotations
 

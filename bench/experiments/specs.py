@@ -94,7 +94,7 @@ MEASURES = (
     MetricSpec("largest_splat", "Largest splat", "share of the height", False, 3, ""),
     MetricSpec("mean_opacity", "Mean opacity", "ratio", True, 3, ""),
 )
-"""What `stability.Measures` has of a frame, against limits."""
+"""Metrics of `stability.Measures`, with limits."""
 
 AGAINST_TRUTH = (
     MetricSpec("psnr", "PSNR", "dB", True, 2, ""),
@@ -106,7 +106,7 @@ AGAINST_TRUTH = (
     MetricSpec("response", "Response", "ratio", True, 2, "", kind="avatar"),
     MetricSpec("flicker", "Flicker", "levels", False, 3, "", kind="avatar"),
 )
-"""What `truth.TruthJudge` and `surface.surface` have of a frame, against limits that follow from the truth."""
+"""Metrics of `truth.TruthJudge` and `surface.surface`, with limits derived from the truth."""
 
 EXTREMES = ConditionSpec(
     name="extremes",

@@ -1,7 +1,7 @@
 """Robustness tests: measures of one frame without ground truth, their limits, and the files of a test.
 
-Every limit of these measures is relative to a frame of the same avatar that is not extreme, so that hair, which is translucent, or a
-low resolution, whose edges are, does not count against it.
+Every limit is relative to a frame of the same avatar that is not extreme, so that translucent hair, or translucent edges at
+low resolution, do not count against the avatar.
 """
 
 from __future__ import annotations
@@ -45,43 +45,41 @@ SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class Measures:
-    """What one frame shows; without splats there are no measures of them.
+    """Measures of one frame; those of splats are None for avatars without splats.
 
-    The radius of the largest splat on screen with an opacity of at least 0.05 is three deviations along its longest
-    axis, projected, as a share of the image's height.
+    The radius of the largest splat on screen with an opacity of at least 0.05 is three standard deviations along its longest
+    axis, projected, relative to the image's height.
     """
 
-    non_finite: (
-        float  # share of the colours, the alpha and the splats' numbers that are infinite or not a number
-    )
+    non_finite: float  # share of non-finite values in colours, alpha and splats
     coverage: float  # sum of alpha over the pixels
-    translucent: float  # of the pixels with alpha above 0.05, the share below 0.95
+    translucent: float  # share of alpha below 0.95 among pixels with alpha above 0.05
     largest_splat: float | None = None
     mean_opacity: float | None = None
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How far a frame may differ from its reference."""
+    """Maximum differences of a frame from its reference."""
 
-    coverage: tuple[float, float] = (0.8, 1.25)  # least and largest ratio of the coverages
-    translucent_rise: float = 0.1  # by how much the translucent share may rise
-    splat_growth: float = 2.0  # how many times the reference's radius the largest splat may have
-    splat_share: float = 0.1  # of the image's height, which the largest splat may have in any case
-    opacity: tuple[float, float] = (0.67, 1.5)  # least and largest ratio of the mean opacities
+    coverage: tuple[float, float] = (0.8, 1.25)  # minimum and maximum ratio of coverages
+    translucent_rise: float = 0.1  # maximum increase of the translucent share
+    splat_growth: float = 2.0  # maximum ratio of the radii of the largest splats
+    splat_share: float = 0.1  # radius, relative to the image's height, that is always allowed
+    opacity: tuple[float, float] = (0.67, 1.5)  # minimum and maximum ratio of mean opacities
 
 
 EXPRESSION_LIMITS = Limits()
-"""Against the mean expression in the same view: a silhouette that hardly moves."""
+"""Relative to the mean expression in the same view, whose silhouette is nearly the same."""
 
 VIEW_LIMITS = Limits(coverage=(0.5, 2.0), translucent_rise=0.2)
-"""Against the median over interpolated views: a head is larger from the side than from the front."""
+"""Relative to the median over interpolated views, since a head is larger from the side than from the front."""
 
 
 @dataclass(frozen=True)
 class LimitCheck:
-    """One measure of one frame over a region, and its limits. ``value`` is None where it cannot be measured, ``absent`` says
-    why."""
+    """One measure of one frame over a region, and its limits. ``value`` is None if it cannot be measured, for the reason
+    ``absent``."""
 
     measure: str
     value: float | None
@@ -92,7 +90,7 @@ class LimitCheck:
 
     @property
     def passed(self) -> bool:
-        """Whether the limits hold; a value that is not a number breaks them."""
+        """Whether the limits are met; NaN violates them."""
         return self.value is None or self.lower <= self.value <= self.upper
 
     @property
@@ -109,7 +107,7 @@ class LimitCheck:
 
     @property
     def worst_first(self) -> float:
-        """Orders values: the nearest to a limit, or the farthest beyond it, first; of errors without limits the largest."""
+        """Sort key, worst first: farthest beyond or nearest to a limit; without limits, the largest error."""
         value = math.nan if self.value is None else self.value
         if self.lower == -math.inf and self.upper == math.inf:
             return -value
@@ -122,7 +120,7 @@ class LimitCheck:
 
 
 def measure(frame: Frame, camera: Camera, splats: Splats | None = None) -> Measures:
-    """Measure one frame. ``splats`` has means, scales, quats, opacities as numpy arrays, or is None."""
+    """Measure one frame. ``splats`` has means, scales, quats and opacities as numpy arrays, or is None."""
     alpha = np.asarray(frame.alpha, np.float64)
     arrays = [np.asarray(frame.rgb), alpha]
     covered = alpha > COVERED
@@ -144,9 +142,9 @@ def measure(frame: Frame, camera: Camera, splats: Splats | None = None) -> Measu
 
 
 def _largest_splat(means: FloatArray, scales: FloatArray, opacities: FloatArray, camera: Camera) -> float:
-    """Projected radius of the largest visible splat as a share of the image's height; 0 where none is on screen.
+    """Projected radius of the largest visible splat, relative to the image's height; 0 if none is on screen.
 
-    A perspective projection along the axis is taken for the size, which is exact at the image's centre.
+    The size is that of a perspective projection along the axis, which is exact at the image's centre.
     """
     motion = np.asarray(camera.world_to_camera, np.float64)
     focal = np.diag(camera.K)[:2]
@@ -160,16 +158,16 @@ def _largest_splat(means: FloatArray, scales: FloatArray, opacities: FloatArray,
 
 
 def typical(measures: Sequence[Measures]) -> Measures:
-    """Median of each measure; None where one is."""
+    """Median of each measure; None if one value is None."""
     columns = zip(*map(astuple, measures))
     return Measures(*(None if None in column else float(np.median(column)) for column in columns))  # type: ignore[arg-type]
 
 
 def judge(found: Measures, reference: Measures, limits: Limits) -> list[LimitCheck]:
-    """Compare a frame with its limits; one check a measure, in the order of `Measures`.
+    """Compare a frame with its limits; one check per measure, in the order of `Measures`.
 
-    Coverage and mean opacity are given as ratios to the reference. A reference that shows nothing makes the ratio
-    infinite, or 1 where the frame shows nothing either.
+    Coverage and mean opacity are ratios to the reference. With an empty reference the ratio is infinite, or 1 if the
+    frame is empty, too.
     """
     largest = max(limits.splat_share, limits.splat_growth * (reference.largest_splat or 0.0))
     return [
@@ -191,7 +189,7 @@ def _ratio(value: float | None, reference: float | None) -> float | None:
 
 @dataclass(frozen=True)
 class JudgedFrame:
-    """A rendered frame, its checks, and those of its change from another frame, which not every frame has."""
+    """A rendered frame, its checks, and optional checks of its change from another frame."""
 
     key: FrameKey
     checks: Sequence[LimitCheck]
@@ -199,12 +197,12 @@ class JudgedFrame:
 
     @property
     def broken(self) -> list[LimitCheck]:
-        """The limits that do not hold."""
+        """The violated limits."""
         return [check for check in (*self.checks, *self.changes) if not check.passed]
 
 
 class ShownFrames(NamedTuple):
-    """What an avatar is rendered for, as its protocol has it."""
+    """Content of the protocol of rendered frames."""
 
     job: Job
     clips: Sequence[Clip]
@@ -214,7 +212,7 @@ class ShownFrames(NamedTuple):
 
 
 def protocols_of(task: TaskWithoutTruth, shown: Sequence[ShownFrames]) -> dict[str, Protocol]:
-    """The protocols of some avatars; those of methods with equal needs are shown the same frames, and so share one."""
+    """The protocols of some avatars; methods with equal needs render the same frames and share a protocol."""
     named: dict[str, list[ShownFrames]] = {}
     for each in shown:
         named.setdefault(protocol_name(task, MethodNeeds.of(each.job.method.spec)), []).append(each)
@@ -233,9 +231,9 @@ def protocols_of(task: TaskWithoutTruth, shown: Sequence[ShownFrames]) -> dict[s
 def judged_rows(
     job: Job, keys: Sequence[FrameKey], judged: Callable[[], tuple[list[JudgedFrame], dict[str, Any]]]
 ) -> tuple[list[Row], dict[str, Any]]:
-    """The rows of an avatar, and its record: a summary, and what ``judged``, which renders and judges, adds to it.
+    """The rows of an avatar, and its record: a summary and the entries of ``judged``, which renders and evaluates.
 
-    An avatar that cannot be rendered so (`UnavailableError`) has missing rows, and its record says why.
+    An avatar that cannot be rendered (`UnavailableError`) has missing rows, and its record has the reason.
     """
     (protocol,) = job.protocols.values()
     try:
@@ -253,18 +251,18 @@ def judged_rows(
 def render_measured(
     avatar: Avatar, camera: Camera, pose: HeadPose, background: Sequence[float], splats: Splats | None = None
 ) -> tuple[Frame, Measures]:
-    """Render a frame and measure it, with the ``splats`` of that pose where they are known."""
+    """Render and measure a frame, with the ``splats`` of its pose if they are known."""
     frame = avatar.render(camera, pose, background)
     return frame, measure(frame, camera, splats_of(avatar, pose) if splats is None else splats)
 
 
 def splats_of(avatar: Avatar, pose: HeadPose) -> Splats | None:
-    """Splats of a pose where the avatar is one of splats, else None."""
+    """Splats of a pose for splat avatars, else None."""
     return avatar.splats(pose) if isinstance(avatar, SplatAvatar) else None
 
 
 def write_frame(path: Path, frame: Frame) -> list[Path]:
-    """Write the frame as 8-bit PNG; one that is not finite leaves no file, since any level would hide it."""
+    """Write the frame as 8-bit PNG, unless it has non-finite values, which a PNG would hide."""
     if np.isfinite(frame.rgb).all():
         write_png(path, quantise(frame.rgb), RENDER)
         return [path]
@@ -273,9 +271,9 @@ def write_frame(path: Path, frame: Frame) -> list[Path]:
 
 
 def _rows(job: Job, protocol: Protocol, frames: Sequence[JudgedFrame]) -> list[Row]:
-    """Rows as every measurement leaves them; a broken limit has status "failed" and says which.
+    """Rows of the checks; a violated limit has status "failed" with its name.
 
-    Changes have one row for the avatar: the mean over its frames, which fails if one of them does.
+    Changes have one row per avatar: the mean over its frames, which fails if one of them fails.
     """
     method = job.method.spec
     whose = (method.name, method.version, job.seed)
@@ -305,7 +303,7 @@ def _by_name(checks: Iterable[LimitCheck]) -> dict[str, list[LimitCheck]]:
 
 
 def _summary(job: Job, frames: Sequence[JudgedFrame]) -> dict[str, Any]:
-    """How many frames of an avatar there are, which break limits, and mean, worst value and failed frames of every measure."""
+    """Number of frames of an avatar, frames that violate limits, and mean, worst value and failed frames of each measure."""
     broken = [frame for frame in frames if frame.broken]
     by_measure = _by_name(check for frame in frames for check in (*frame.checks, *frame.changes))
     return {
@@ -320,7 +318,7 @@ def _summary(job: Job, frames: Sequence[JudgedFrame]) -> dict[str, Any]:
 
 
 def _measured(checks: Sequence[LimitCheck]) -> dict[str, float | int | None]:
-    """Mean, worst and number of finite values of a measure, and how many break a limit."""
+    """Mean, worst and number of finite values of a measure, and number of values that violate a limit."""
     known = [check for check in checks if check.value is not None and math.isfinite(check.value)]
     return {
         "mean": float(np.mean([check.value for check in known])) if known else None,

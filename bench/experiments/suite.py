@@ -49,8 +49,8 @@ REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
 def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandResult:
     """Run the benchmark suite: ten synthetic subjects, all methods, tables by region and part.
 
-    Every subject has a run of its own, with conditions; subjects are worked on one after another, and the tables of ``results.md``
-    are written after each. Images of twice the size have captures and runs of their own, since a mean over subjects has one size.
+    Every subject has its own run, with conditions. Subjects run one after another, and the tables of ``results.md`` are written
+    after each. Images of twice the size have separate captures and runs, since means over subjects need equal sizes.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
 
 
 def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:
-    """All but the plain comparison. A condition without methods would be one of all methods, so such ones are left out."""
+    """All conditions except the plain comparison. Those without methods are omitted, since they would apply to all methods."""
     resolved = resolve_methods(config)
     specs = {method.spec.name: method.spec for method in resolved}
     tracked = settings.tracked_of(tuple(specs))
@@ -155,7 +155,7 @@ def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:
 
 
 def _ablations(option: str, asked: Sequence[str], specs: dict[str, MethodSpec]) -> list[Condition]:
-    """The requested ablations in the order of the method's spec. Raises `InputError` for unknown ones, and without the method."""
+    """The requested ablations in the order of the method's spec. Raises `InputError` for unknown ones or a missing method."""
     if not asked:
         return []
     if OURS not in specs:

@@ -11,20 +11,20 @@ from ..executors.options import ExecutionOptions
 from ..listing import presets_of_methods
 
 SEED = 39_000
-"""Of the suite's captures. Settings of methods are chosen on captures of seeds below 10,000 (`docs/explanation/statistics.md`)."""
+"""Seed of the suite's captures. Methods are tuned on captures with seeds below 10,000 (`docs/explanation/statistics.md`)."""
 
 ALL, NONE = "all", "none"
 
 TRACKED, LEVEL, AS_TRACKED, EQUAL = "tracked", "tracking-{:g}", "as-tracked", "equal-iterations"
-"""Names of conditions: tracking estimated from the images; simulated tracking errors of a level; the capture's own tracking for a
-method that otherwise gets it converted; as many iterations as `EQUAL_TO` has."""
+"""Names of conditions: tracking estimated from images; a level of simulated tracking errors; the capture's own tracking
+without conversion; the same number of iterations as `EQUAL_TO`."""
 EQUAL_TO = "ga"
 TRACKED_METHODS = ("ga", "gbs", "ours", "ours-plus")
-"""Methods that have the first two conditions where none are named."""
+"""Default methods of the first two conditions."""
 
 RUN, LARGE_RUN, SEEDS_RUN = "run", "run-large", "run-seeds"
-"""Folders of a suite's runs, each with a folder for each subject; those of the second have images of twice the size, those of the
-third other training seeds."""
+"""Folders of a suite's runs, each with one folder per subject. Runs in the second have images of twice the size, those in
+the third other training seeds."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class SuiteSettings(ExecutionOptions):
         return presets_of_methods()
 
     def tracked_of(self, methods: tuple[str, ...]) -> tuple[str, ...]:
-        """Names of the methods that have the condition `TRACKED`, among those that run."""
+        """Names of the run's methods with the condition `TRACKED`."""
         if self.tracked:
             return tuple(name for name in self.tracked if name != NONE)
         return tuple(name for name in TRACKED_METHODS if name in methods)

@@ -1,4 +1,4 @@
-"""Depth and normals of the face that an avatar shows, against those of the true head."""
+"""Errors of an avatar's depth and normals in the face, compared with the true head."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ NOT_SHOWN = "the avatar shows nothing where the face is"
 def surface(depth: FloatArray | None, truth: TrueFrame, camera: Camera) -> list[LimitCheck]:
     """Mean errors of depth (mm) and normals (degrees) over the pixels of the face that the avatar covers.
 
-    Pixels of the face that the avatar does not show do not count; their number is in the overlap of masks. There are no limits: translucent splats show a mean depth behind the skin, which images do not determine.
+    Pixels of the face that the avatar does not cover are ignored here; they reduce the overlap of masks. There are no limits:
+    translucent splats show a mean depth behind the skin, which images do not determine.
 
     Parameters
     ----------
     depth : FloatArray | None
         (H, W) metres along the camera's axis, NaN where nothing is shown; None for an avatar that gives none.
     truth : TrueFrame
-        With its depth.
+        Truth with depth.
     camera : Camera
-        That of the (H, W) pictures.
+        Camera of the (H, W) images.
     """
     if depth is None:
         return absent_surface(NO_DEPTH)
@@ -48,7 +49,7 @@ def surface(depth: FloatArray | None, truth: TrueFrame, camera: Camera) -> list[
 
 
 def absent_surface(reason: str) -> list[LimitCheck]:
-    """The measures of a frame that cannot be measured."""
+    """The measures of a frame without depth, with the reason."""
     return [_measured(name, None, reason) for name in MEASURED]
 
 
@@ -57,7 +58,7 @@ def _measured(name: str, value: float | None, reason: str = "") -> LimitCheck:
 
 
 def normals(depth: FloatArray, camera: Camera) -> FloatArray:
-    """(H, W, 3) unit normals towards the camera of an (H, W) map of depth, by central differences; NaN beside what has none."""
+    """(H, W, 3) unit normals, facing the camera, of an (H, W) depth map, by central differences; NaN next to missing depth."""
     rows, columns = np.indices(depth.shape) + 0.5
     rays = np.stack([columns, rows, np.ones_like(rows)], axis=2) @ np.linalg.inv(camera.K).T
     points = depth[..., None] * rays

@@ -79,7 +79,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Comm
 
 
 def variant(method: MethodSpec, trained: Path, out: Path, clip: Clip, device: str, *, name: str) -> Avatar:
-    """Make the variant of a trained avatar that has a name, see `MethodSpec.variants`; the registered change "variant".
+    """Create a named variant of a trained avatar, see `MethodSpec.variants`; the registered change "variant".
 
     Raises `InputError` if the avatar has no such variant.
     """

@@ -16,13 +16,13 @@ from ..registry import get, resolve
 
 
 def tracking_error(steps: Sequence[Mapping[str, Any]]) -> float | None:
-    """The level of tracking error that a synthetic capture was made with, by the steps of its clip; None for a recording."""
+    """Tracking error level of a synthetic capture, from the steps of its clip; None for a recording."""
     made = steps[0].get("parameters", {}).get("synthetic") if steps else None
     return float(made.get("tracking_error", 0.0)) if made else None
 
 
 def with_tracking_error(clip: Clip, config: RunConfig, *, level: float) -> Clip:
-    """The clip from a capture with the same pictures and another level of tracking error, made in ``config.out``.
+    """The clip of a capture with the same images and another level of tracking error, which is made in ``config.out``.
 
     Raises `InputError` for a capture that is not synthetic.
     """
@@ -31,7 +31,9 @@ def with_tracking_error(clip: Clip, config: RunConfig, *, level: float) -> Clip:
         expected = "a synthetic capture, to track with other errors"
         raise InputError(config.data, "--over", expected, "a recording")
     data = Path(config.data)
-    pictures = data if (data / "synthesis.json").is_file() else data.parent  # of one subject's folder, or all
+    pictures = (
+        data if (data / "synthesis.json").is_file() else data.parent
+    )  # folder of one subject, or of all
     capture = Path(config.out) / f"capture-tracking-{level:g}"
     arguments = {**synthesis_arguments(steps, clip.subject), "tracking_error": level}
     make = resolve(get("datasets", "synthetic").implementation)

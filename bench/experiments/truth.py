@@ -1,7 +1,7 @@
-"""Comparison of an avatar in new poses and views with the ground truth that a synthetic capture has for them.
+"""Comparison of an avatar in new poses and views with the ground truth of a synthetic capture.
 
-No limit is a number of decibels that fits one capture. The truth itself gives the limits of each frame: what a blurred copy of it
-scores, and how far it is from the subject's typical pose or from the frame before.
+Limits are not fixed numbers of decibels, which would fit only one capture. They are derived from each frame's truth: the
+score of a blurred copy, and its difference from the subject's typical pose or from the previous frame.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ from .surface import FACE, NO_FACE, absent_surface
 FOLDER = "truth"
 POSE_FIELDS = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids")
 LEAST_CHANGE = 2.0
-"""Change of the truth, root mean square in 8-bit levels, below which it says little of how an avatar changes."""
+"""Minimum change of the truth, root mean square in 8-bit levels, for evaluating the change of an avatar."""
 NOT_FINITE = "the frame is not finite"
 
 
 @dataclass(frozen=True)
 class TruthLimits:
-    """How far a frame may be from the truth.
+    """Limits on the difference of a frame from the truth.
 
     Attributes
     ----------
     blur, blur_beyond : float
-        PSNR and LPIPS are at least those of the truth blurred by a Gaussian of this share of the image's height; the second
-        in views beyond the training cameras, where no training frame shows the hair.
+        PSNR and LPIPS must be at least as good as for the truth after a Gaussian blur relative to the image's height; the
+        second is for views beyond the training cameras, where no training frame shows the hair.
     iou : float
-        Least overlap of alpha and the true mask.
+        Minimum overlap of alpha and the true mask.
     colour : float
-        Largest CIEDE2000 difference of the face's mean colours.
+        Maximum CIEDE2000 difference of the face's mean colours.
     response : float
-        Least part of the truth's change from the typical pose that the avatar shows.
+        Minimum fraction of the truth's change from the typical pose that the avatar shows.
     flicker : float
-        Largest flicker in units of the truth's change, which is the flicker of an avatar that stands still.
+        Maximum flicker relative to the truth's change, which is the flicker of a static avatar.
     """
 
     blur: float = 0.015
@@ -65,9 +65,9 @@ TRUTH_LIMITS = TruthLimits()
 
 
 class TruthPictures:
-    """Pictures of a `GroundTruth`, kept in a folder under names that follow from what they show.
+    """Renders of a `GroundTruth`, cached in a folder under names derived from their content.
 
-    Methods share them. ``height`` is that of the pictures, pixels: a method that works on larger images is compared at the
+    Methods share them. ``height`` is their height in pixels: methods that use larger images are compared at the
     capture's size.
     """
 
@@ -76,7 +76,7 @@ class TruthPictures:
 
     @classmethod
     def of(cls, job: Job) -> TruthPictures:
-        """Those of a cell's subject in the head model of its method. Raises `UnavailableError` where there is no truth."""
+        """The truth of a cell's subject in the head model of its method. Raises `UnavailableError` if there is none."""
         clip = job.form.clip
         place = f"truth of {clip.fingerprint}"
         if place not in job.kept:
@@ -85,22 +85,22 @@ class TruthPictures:
 
     @property
     def fingerprint(self) -> str:
-        """Hex digest of what the pictures depend on besides camera and pose."""
+        """Hex digest of everything that the renders depend on besides camera and pose."""
         return self._source.fingerprint
 
     def missing(self, frames: Iterable[tuple[Camera, HeadPose]]) -> int:
-        """How many pictures of some frames are not in the folder."""
+        """Number of frames whose renders are not in the folder."""
         files = {self._files(self.view(camera), pose) for camera, pose in frames}
         return sum(not (picture.exists() and mask.exists()) for picture, mask in files)
 
     def at(self, camera: Camera, pose: HeadPose) -> tuple[TrueFrame, tuple[Path, Path]]:
-        """The truth of a frame, rendered unless it is in the folder, and its files: picture, and mask and face."""
+        """The truth of a frame, rendered if it is not in the folder, and its files: image, mask and face."""
         view = self.view(camera)
         files = picture, masks = self._files(view, pose)
         try:
             mask, face, _ = np.moveaxis(read_png(masks), 2, 0)
             truth = TrueFrame(read_png(picture), mask, face > 0)
-        except InputError:  # not there, or damaged
+        except InputError:  # missing or damaged
             truth = self._source.render(view, pose)
             layers = [truth.mask, 255 * truth.face.astype(np.uint8), np.zeros_like(truth.mask)]
             write_png(picture, truth.rgb, SYNTHETIC)
@@ -108,7 +108,7 @@ class TruthPictures:
         return truth._replace(depth=self._source.depth(view, pose)), files
 
     def view(self, camera: Camera) -> Camera:
-        """A camera at the size of the pictures."""
+        """A camera at the size of the renders."""
         return camera.resized(round(camera.width * self._height / camera.height), self._height)
 
     def _files(self, view: Camera, pose: HeadPose) -> tuple[Path, Path]:
@@ -127,7 +127,7 @@ class TruthPair(NamedTuple):
 
     @classmethod
     def of(cls, frame: Frame, truth: TrueFrame) -> TruthPair | None:
-        """None for a frame that is not finite."""
+        """None for a frame with non-finite values."""
         rgb, alpha = np.asarray(frame.rgb, np.float32), np.asarray(frame.alpha, np.float32)
         if not (np.isfinite(rgb).all() and np.isfinite(alpha).all()):
             return None
@@ -141,7 +141,7 @@ class TruthPair(NamedTuple):
 
 
 class TruthJudge:
-    """Measures frames against the truth, each with its limit. A metric that is not available is missing, with the reason."""
+    """Compares frames with the truth and its limits. Unavailable metrics are missing, with the reason."""
 
     def __init__(self, device: str = "cpu") -> None:
         self._psnr, self._lpips, self._flicker = (
@@ -167,10 +167,10 @@ class TruthJudge:
         return [*checks, self._overlap(frame), self._colour(frame)]
 
     def response(self, frame: TruthPair | None, reference: TruthPair | None) -> LimitCheck:
-        """Part of the truth's change between two poses in one view that the avatar shows.
+        """Fraction of the truth's change between two poses in one view that the avatar shows.
 
         The slope of the least-squares line through 0 of the avatar's differences over the truth's, over the pixels of the face
-        in either frame: 0 for an avatar that does not move, 1 for one that moves as the truth, whatever both frames share.
+        in either frame: 0 for a static avatar, 1 for one that moves as the truth, regardless of errors common to both frames.
         """
         if frame is None or reference is None:
             return _absent("response", FULL, NOT_FINITE)
@@ -183,7 +183,7 @@ class TruthJudge:
         return LimitCheck("response", slope, TRUTH_LIMITS.response, math.inf)
 
     def flicker(self, frame: TruthPair | None, before: TruthPair | None) -> LimitCheck:
-        """The metric `flicker` of two neighbours in time."""
+        """The metric `flicker` of two consecutive frames."""
         if frame is None or before is None:
             return _absent("flicker", FULL, NOT_FINITE)
         value = self._flicker(frame.picture, frame.truth.rgb, before.picture, before.truth.rgb)
@@ -207,7 +207,7 @@ class TruthJudge:
         return scores
 
     def _overlap(self, frame: TruthPair) -> LimitCheck:
-        """Intersection over union of alpha and true mask, with parts of pixels."""
+        """Intersection over union of alpha and true mask, with fractional coverage."""
         true = frame.truth.mask / 255.0
         union = float(np.maximum(frame.alpha, true).sum())
         value = float(np.minimum(frame.alpha, true).sum()) / union if union else 1.0
@@ -237,7 +237,7 @@ def _absent(name: str, region: str, reason: str) -> LimitCheck:
 
 
 def without_truth(reason: str) -> tuple[list[LimitCheck], LimitCheck, LimitCheck]:
-    """Appearance, response and flicker of a frame that there is no truth for."""
+    """Missing appearance, response and flicker of a frame without truth."""
     appearance = [_absent(name, region, reason) for name, region in APPEARANCE]
     appearance += absent_surface(reason)
     return appearance, _absent("response", FULL, reason), _absent("flicker", FULL, reason)

@@ -12,9 +12,9 @@ from ..errors import InputError
 
 NEAR_M = 1e-6
 NEAR_AXES = 1e-3
-"""Weight of the distance from the head's centre against that from the axes of cameras, which may be one or parallel."""
+"""Weight of the distance to the head's centre relative to the axes of cameras, which may be a single axis or parallel."""
 LEAST_SPREAD = 0.15
-"""Ratio of the singular values of the cameras' right axes from which on they determine the upward direction."""
+"""Minimum ratio of singular values of the cameras' right axes for deriving the upward direction from them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +30,11 @@ class Viewpoint:
 def turntable(
     cameras: Sequence[Camera], center: FloatArray, count: int, beyond_degrees: float
 ) -> list[Viewpoint]:
-    """Views around a head through the directions of its training cameras, in even steps of azimuth, ordered by it.
+    """Views around a head through the directions of its training cameras, in even steps and order of azimuth.
 
     Between two cameras that are neighbours in azimuth, the direction from the head is interpolated along the great
-    circle, the distance and the focal lengths linearly. Beyond the outermost two, elevation and distance stay theirs.
-    Where the cameras stand all around, with no gap wider than twice ``beyond_degrees``, no view is extrapolated.
+    circle, the distance and the focal lengths linearly. Beyond the outermost two, elevation and distance are constant.
+    If the cameras surround the head, with no gap wider than twice ``beyond_degrees``, no view is extrapolated.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def turntable(
     count : int
         Number of views, at least 1.
     beyond_degrees : float
-        Angle of views beyond the outermost cameras on either side, in [0, 180).
+        Maximum angle of views beyond the outermost cameras on either side, in [0, 180).
     """
     if not cameras:
         raise InputError("turntable", "cameras", "at least one", "none")
@@ -62,12 +62,12 @@ def turntable(
     azimuths = np.degrees(np.arctan2(local[:, 0], local[:, 2]))
 
     order = np.argsort(azimuths, kind="stable")
-    # The arc that holds all azimuths but the widest gap between two of them.
+    # The arc that covers all azimuths except the widest gap between two of them.
     gaps = np.diff(azimuths[order], append=azimuths[order[0]] + 360.0)
     widest = int(np.argmax(gaps))
     arc = float(360.0 - gaps[widest])
     order = np.roll(order, -(widest + 1))
-    degrees = (azimuths[order] - azimuths[order[0]]) % 360.0  # from the first of the arc on, rising
+    degrees = (azimuths[order] - azimuths[order[0]]) % 360.0  # relative to the start of the arc, increasing
     if 360.0 - arc <= 2.0 * beyond_degrees:
         order, degrees = np.append(order, order[0]), np.append(degrees, 360.0)
         steps = np.arange(count) * 360.0 / count
@@ -103,9 +103,9 @@ def turntable(
 
 
 def common_target(cameras: Sequence[Camera], center: FloatArray) -> FloatArray:
-    """(3,) point that cameras look at: the nearest to all of their axes, and of those nearly as near, to ``center`` (3,), metres.
+    """(3,) point that the cameras face, metres: nearest to all of their axes; if ambiguous, the one nearest to ``center`` (3,).
 
-    Views that face it have the training pictures' section of the scene.
+    Views that face it have the framing of the training images.
     """
     matrix, wanted = NEAR_AXES * np.eye(3), NEAR_AXES * np.asarray(center, np.float64)
     for camera in cameras:
@@ -116,10 +116,10 @@ def common_target(cameras: Sequence[Camera], center: FloatArray) -> FloatArray:
 
 
 def look_at(position: FloatArray, target: FloatArray, up: FloatArray) -> FloatArray:
-    """(4, 4) world-to-camera motion, OpenCV axes, of a camera that has ``target`` on its axis and ``up`` upwards."""
+    """(4, 4) world-to-camera motion, OpenCV axes, of a camera that faces ``target`` with ``up`` upwards."""
     forward = (target - position) / np.linalg.norm(target - position)
     right = np.cross(forward, up)
-    if np.linalg.norm(right) < 1e-9:  # straight from above or below: any right will do
+    if np.linalg.norm(right) < 1e-9:  # straight from above or below: any right axis is valid
         right = np.cross(forward, np.roll(up, 1) + np.array([1e-3, 0.0, 0.0]))
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
@@ -133,7 +133,7 @@ def _axes(cameras: Sequence[Camera], directions: FloatArray) -> FloatArray:
     up = _up(cameras)
     front = directions.mean(axis=0)
     front = front - (front @ up) * up
-    if np.linalg.norm(front) < 1e-6:  # all around: any camera's direction serves
+    if np.linalg.norm(front) < 1e-6:  # all around: use the direction of any camera
         front = directions[0] - (directions[0] @ up) * up
     if np.linalg.norm(front) < 1e-6:
         front = np.cross(cameras[0].world_to_camera[0, :3], up)
@@ -142,9 +142,9 @@ def _axes(cameras: Sequence[Camera], directions: FloatArray) -> FloatArray:
 
 
 def _up(cameras: Sequence[Camera]) -> FloatArray:
-    """(3,) the world's upward direction: normal to the rows of the images, since cameras pitch but hardly roll.
+    """(3,) upward direction of the world: normal to the image rows, since cameras pitch but hardly roll.
 
-    Of cameras side by side it is the mean of their own upward directions.
+    For cameras with parallel rows it is the mean of their own upward directions.
     """
     mean = -np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0)
     if np.linalg.norm(mean) < 1e-6:

@@ -115,14 +115,14 @@ def read_results(root: Path) -> Results:
 
 
 def _lacking(own: pd.DataFrame, frames: int, seeds: set[int]) -> str:
-    """Why these rows have no number; "" if they have one."""
+    """Reason why these rows have no number; "" if they have one."""
     bad = own[own["status"] != "ok"]
     if len(bad):
         first = bad.iloc[0]
         return f"{first['status']}: {' '.join(str(first['reason']).split())}"
     if not own["value"].map(lambda value: abs(value) < float("inf")).all():
         return "a value that is not finite"
-    if (own["region"] != FULL).all():  # seen in some frames only, which ones is the truth's matter
+    if (own["region"] != FULL).all():  # visible in some frames only, which the ground truth determines
         frames = own.groupby(FRAME).ngroups
     if own.duplicated(["seed", *FRAME]).any():
         return "frames measured twice"
@@ -141,7 +141,7 @@ LAST_DIGITS = 10
 MACHINE_SHARE = 0.3
 KEPT_DIGITS = 3
 MACHINE = ("processor", "cores", "device")
-"""Entries of the environment that must be equal for speeds to be comparable."""
+"""Environment entries that must be equal for speeds to be comparable."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ class Baseline:
     ) -> Baseline:
         """Make the baseline of some results, keeping the tolerances of an ``earlier`` one.
 
-        Raises `InputError` if a number is missing that is not unavailable, since the baseline would hide that
+        Raises `InputError` if a number is missing that could be available, since the baseline would hide that
         later.
         """
         if results.problems or not results.values:

@@ -20,7 +20,7 @@ def compare_with_baseline(run: Path, baseline: Path, settings: BaselineOptions) 
     for option, path in (("--junit", settings.junit), ("--markdown", settings.markdown)):
         if path is not None:
             check_writable(Path(path), option)
-            Path(path).unlink(missing_ok=True)  # a report of an earlier run would pass for this one's
+            Path(path).unlink(missing_ok=True)  # a report of an earlier run could be mistaken for this one's
     if settings.update:
         check_writable(baseline, "--baseline")
     try:
@@ -35,7 +35,7 @@ def compare_with_baseline(run: Path, baseline: Path, settings: BaselineOptions) 
 
 
 def _write_reports(settings: BaselineOptions, junit: str, markdown: str) -> None:
-    """Write the reports asked for."""
+    """Write the requested reports."""
     for path, text in ((settings.junit, junit), (settings.markdown, markdown)):
         if path is not None:
             write_text(Path(path), text)

@@ -1,4 +1,4 @@
-"""ZIP files from outside: the sizes that their directory declares are checked before anything is unpacked."""
+"""Reads untrusted ZIP files: the declared sizes are checked before anything is unpacked."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def open_archive(
         if len(entries) > members or len({entry.filename for entry in entries}) < len(entries):
             raise InputError(path, "", f"at most {members} members, each name once", f"{len(entries)}")
         for entry in entries:
-            # Other methods take memory without bound.
+            # Other compression methods need unbounded memory.
             if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 found = f"compression {entry.compress_type}"
                 raise InputError(path, entry.filename, "stored or deflated", found)

@@ -1,4 +1,4 @@
-"""Arrays of npz and npy files from outside: sizes are checked before memory is taken, numbers before they are used."""
+"""Reads arrays of untrusted npz and npy files: sizes are checked before allocation, values before use."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from .archives import open_archive
 from .files import atomic_path, open_regular, reading
 
 MOST_BYTES, MOST_PER_BYTE = 2**28, 20
-"""All arrays of a file may take 256 MiB, and 20 bytes for each byte of the file: ten times any head model, which
-compresses well, and tracked parameters of any length, which do not."""
+"""Maximum bytes of all arrays of a file: 256 MiB plus 20 per byte of the file. This is ten times any head model, which
+compresses well, and admits tracked parameters of any length, which do not."""
 
 MAX_MEMBERS = 1000
 MAX_MAGNITUDE = 1e4
@@ -49,7 +49,7 @@ class Member:
     most : float | None
         Largest magnitude. Floating-point numbers must be finite in any case.
     least : float | None
-        Smallest number; without it that is ``-most``.
+        Smallest number; ``-most`` by default.
     dtype : str
         Required type; "" allows any type of ``kinds``.
     optional : bool
@@ -65,7 +65,7 @@ class Member:
 
 
 TEXT = Member("U", ())
-"""One text."""
+"""A single text."""
 
 
 def read_arrays(
@@ -88,14 +88,14 @@ def cached_arrays(
     make: Callable[[], Mapping[str, np.ndarray]],
     sizes: Mapping[str, int] | None = None,
 ) -> dict[str, np.ndarray]:
-    """The arrays that an earlier call stored with the same ``mark``, or those that ``make`` returns, which are stored.
+    """Return cached arrays with the same ``mark``, or store and return those of ``make``.
 
     Parameters
     ----------
     mark : str
         Digest of everything that the arrays depend on.
     members, sizes : Mapping
-        As for `read_arrays`. A file that cannot be read so is made again.
+        As for `read_arrays`. An invalid file is made again.
     """
     kept = stored_arrays(path, mark, members, sizes)
     if kept is None:
@@ -107,7 +107,7 @@ def cached_arrays(
 def stored_arrays(
     path: Path, mark: str, members: Mapping[str, Member], sizes: Mapping[str, int] | None = None
 ) -> dict[str, np.ndarray] | None:
-    """The arrays that `store_arrays` wrote with the same ``mark``; None if there are none that can be read."""
+    """The arrays that `store_arrays` wrote with the same ``mark``; None if there are none or they cannot be read."""
     if path.exists():
         try:
             kept = read_arrays(path, {_MARK: TEXT, **members}, sizes)
@@ -187,9 +187,9 @@ def _check(
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """Read every member of an npz: numbers, truth values and text in the machine's byte order.
 
-    Sizes are taken from the headers and compared with each other, with the file's and with `MOST_BYTES` before
-    anything is unpacked; nothing is ever unpickled. Raises `InputError` for a file that is missing, damaged, too
-    large, or anything else than an npz of such arrays.
+    Sizes are read from the headers and checked against each other, the file's size and `MOST_BYTES` before
+    anything is unpacked; nothing is unpickled. Raises `InputError` for a file that is missing, damaged, too
+    large, or not an npz of such arrays.
     """
     bounds = {"members": MAX_MEMBERS, "spare_bytes": MOST_BYTES, "per_byte": MOST_PER_BYTE}
     content: dict[str, np.ndarray] = {}
@@ -223,8 +223,8 @@ def _array(path: Path, name: str, stream: IO[bytes], size: int) -> np.ndarray:
     stream.seek(0)
     with reading(path, "an array in npy format", name):
         values = np.lib.format.read_array(stream, allow_pickle=False, max_header_size=MAX_HEADER)
-        if dtype.kind == "U":  # numbers that are no characters would raise wherever the text is used
+        if dtype.kind == "U":  # invalid code points would raise wherever the text is used
             "".join(values.ravel().tolist()).encode()
-        if dtype.kind == "b":  # other bytes than 0 and 1 would count as several
+        if dtype.kind == "b":  # bytes other than 0 and 1 would have several values
             values = values.view(np.uint8) != 0
         return values.astype(dtype.newbyteorder("="), copy=False)

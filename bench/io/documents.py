@@ -1,4 +1,4 @@
-"""Text, JSON and YAML from outside: bounded in size and nesting, every key once, checked against dataclasses.
+"""Reads untrusted text, JSON and YAML: limited in size and nesting, without duplicate keys, checked against dataclasses.
 
 A document that breaks a rule raises an `InputError` with the file, the dotted key, the expected and the found
 value. Non-finite numbers are refused everywhere: JSON has none, and a missing value is written as null.
@@ -34,9 +34,9 @@ MAX_JSON_BYTES = 64 * 2**20
 """The JSON of the largest known capture, with 50,000 frames, has 35 MB. Objects take up to 25 times their
 text."""
 MAX_RECORD_BYTES = 8 * 2**20
-"""Of what a run writes about itself, which may come from a stranger; the record of the largest known run has 78 KB."""
+"""Maximum size of a run's records, which may be untrusted; the record of the largest known run has 78 KB."""
 MAX_YAML_BYTES = 4 * 2**20
-"""YAML is written by people, or lists frames to leave out; its parser is slower than JSON's."""
+"""YAML files are written by hand, or list excluded frames; the parser is slower than JSON's."""
 MAX_DEPTH = 64
 
 _TAG = "tag:yaml.org,2002:"
@@ -48,13 +48,13 @@ def read_json(path: Path, limit: int | None = None) -> dict[str, Any]:
     """Read a JSON file whose top level is an object.
 
     Raises `InputError` for a file that is missing, cannot be read, is larger than ``limit`` bytes (default: `MAX_JSON_BYTES`),
-    does not parse, nests deeper than `MAX_DEPTH`, repeats a key, holds a number that is not finite, or something else than an object.
+    is invalid, nests deeper than `MAX_DEPTH`, has duplicate keys or non-finite numbers, or is not an object.
     """
     return parse_json(read_text(path, "JSON", MAX_JSON_BYTES if limit is None else limit), path)
 
 
 def parse_json(text: str | bytes, source: Source, key: str = "") -> dict[str, Any]:
-    """Read JSON that stands in ``key`` of some file, as `read_json` does."""
+    """Parse JSON from ``key`` of some file; errors as for `read_json`."""
     try:
         value = json.loads(text, object_pairs_hook=_object, parse_constant=float)
         if isinstance(value, (dict, list)):
@@ -112,8 +112,8 @@ def checked(value: Any, kind: type[T], source: Source, prefix: str = "", *, fore
     from pydantic import ValidationError
 
     try:
-        # JSON knows neither tuples nor keys other than text, so this mode alone takes lists for tuples without
-        # taking text for numbers.
+        # JSON has no tuples and only text keys, so only this mode accepts lists as tuples without accepting text
+        # as numbers.
         text = json.dumps(value, allow_nan=False)
         extra = "ignore" if foreign else "forbid"
         return _validator(kind).validate_json(text, strict=True, extra=extra)  # type: ignore[arg-type]
@@ -136,7 +136,7 @@ _REPR.maxlevel = 2
 @functools.cache
 def _validator(kind: Any) -> SchemaValidator:
     """A validator that stops at the first bad item of a collection. Errors of all items of 1 MB of JSON take up to 3 GB."""
-    from pydantic import TypeAdapter  # takes a third of the command line's own start
+    from pydantic import TypeAdapter  # takes a third of the start-up time of the command line
     from pydantic_core import SchemaValidator
 
     return SchemaValidator(_fail_fast(TypeAdapter(kind).core_schema))
@@ -154,7 +154,7 @@ def _fail_fast(schema: Any) -> Any:
 
 
 class _Refused(ValueError):
-    """A rule of this module that a document breaks."""
+    """A document violates a rule of this module."""
 
     def __init__(self, expected: str, found: str, key: str = ""):
         self.expected, self.found, self.key = expected, found, key
@@ -162,7 +162,7 @@ class _Refused(ValueError):
 
 
 def read_text(path: Path, what: str, limit: int) -> str:
-    """Read a text file in UTF-8, with or without a byte order mark; line ends are left as they are.
+    """Read a UTF-8 text file, with or without a byte order mark; line ends are not changed.
 
     ``what`` names the format in errors. Raises `InputError` for a file that is missing, cannot be read, is larger than
     ``limit`` bytes, or has another encoding.
@@ -175,7 +175,7 @@ def read_text(path: Path, what: str, limit: int) -> str:
 
 
 def refuse_utf16(content: bytes, source: Source, expected: str) -> None:
-    """Raise `InputError` for text whose first bytes show that it is UTF-16 or UTF-32, as some editors save it."""
+    """Raise `InputError` for text that starts as UTF-16 or UTF-32, in which some editors save files."""
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or b"\0" in content[:4]:
         raise InputError(source, "", expected, "UTF-16 or UTF-32", "Save it as UTF-8.")
 
@@ -190,7 +190,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _check_tree(value: Any) -> None:
-    """Bound the nesting and refuse numbers too large to be finite."""
+    """Limit the nesting and refuse non-finite numbers."""
     level = [value]
     for _ in range(MAX_DEPTH + 1):
         below: list[Any] = []
@@ -240,7 +240,7 @@ def _parse_yaml(text: str, source: Source, key: str, *, literal: bool) -> Any:
 
 
 def _value(node: yaml.Node, source: Source, key: str, literal: bool) -> Any:
-    """The value of a node, its dotted key given."""
+    """The value of a node at a dotted key."""
     tag = node.tag.removeprefix(_TAG)
     if isinstance(node, yaml.SequenceNode) and tag == "seq":
         return [_value(item, source, f"{key}[{i}]", literal) for i, item in enumerate(node.value)]
@@ -251,7 +251,7 @@ def _value(node: yaml.Node, source: Source, key: str, literal: bool) -> Any:
             name = _value(name_node, source, key, literal)
             if not isinstance(name, (str, int)) or isinstance(name, bool):
                 raise InputError(source, key, "names, in quotes where YAML takes them otherwise", shown(name))
-            if str(name) in seen:  # 5 and "5" are one key to a reader of JSON
+            if str(name) in seen:  # 5 and "5" are the same key in JSON
                 raise InputError(source, key, "each key once", f"{_REPR.repr(name)} again{_line(name_node)}")
             seen.add(str(name))
             result[name] = _value(value_node, source, f"{key}.{name}" if key else str(name), literal)
@@ -300,7 +300,7 @@ def _line(node: yaml.Node) -> str:
 
 
 def _refuse(error: Any, kind: Any, source: Source, prefix: str) -> NoReturn:
-    """Raise the first fault that pydantic found, as an `InputError`."""
+    """Raise the first error of pydantic as an `InputError`."""
     place = [part for part in error["loc"] if part != "[key]"]
     key = prefix.rstrip(".")
     for part in place:

@@ -27,10 +27,10 @@ import numpy as np
 from ..errors import HeadbenchError, InputError, UnavailableError
 
 MAX_NAME_BYTES = 120
-"""Longest name of a subject, a sequence or a camera; a file name made of several has to fit into 255 bytes."""
+"""Maximum length of a subject, sequence or camera name; file names combine several and are limited to 255 bytes."""
 
 GROUP_FILES, GROUP_SECONDS, FLUSHES = 64, 2.0, 16
-"""Maximum files of a group, maximum waiting time of the first one, and files that are flushed at once."""
+"""Maximum number of files in a group, maximum delay of the first one, and files flushed at once."""
 
 ROOM_BYTES = 64 * 2**10
 """Less free space than this counts as a full disk."""
@@ -44,16 +44,16 @@ os.umask(_UMASK)
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Give a temporary name beside ``path``; rename it to ``path`` if the block ends without an error.
+    """Yield a temporary name beside ``path``; rename it to ``path`` if the block ends without an error.
 
-    The content is on disk before the rename, and every earlier rename as well: after a power cut no file is there
-    half, and none without those written before it. The temporary name keeps the suffix, since many writers choose
-    their format by it. A link at ``path`` is replaced, not followed.
+    The content and all earlier renames are flushed to disk before the rename: after a power failure there are no
+    partial files, and no file without those written before it. The temporary name keeps the suffix, since many writers
+    choose their format by it. A link at ``path`` is replaced, not followed.
 
     Raises
     ------
     InputError
-        A link puts the folder outside of the one given to `output_inside`.
+        The folder is, through a link, outside of the one given to `output_inside`.
     OSError
         The file cannot be written; ``filename`` is ``path``.
     """
@@ -72,9 +72,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def grouped_writes() -> Iterator[None]:
-    """Flush and rename what the block writes with `atomic_path` in groups, which takes about half the time.
+    """Flush and rename files written by `atomic_path` in the block in groups, in about half the time.
 
-    For loops over many small files, which must not read back in the block what they wrote in it.
+    For loops over many small files; the block must not read the files that it wrote.
     """
     _writes.groups += 1
     try:
@@ -101,8 +101,8 @@ class _Write:
 
     def rename(self) -> None:
         with _naming(self), self.stream:
-            # mkstemp makes private files, and so do some writers; results are to be read by whoever may read the folder.
-            if os.stat(self.temporary).st_nlink == 1:  # not a file that lies elsewhere as well
+            # mkstemp and some writers create private files; results should be readable by anyone who can read the folder.
+            if os.stat(self.temporary).st_nlink == 1:  # not a hard link to another file
                 os.chmod(self.temporary, 0o666 & ~_UMASK)
             os.replace(self.temporary, self.path)
 
@@ -143,7 +143,7 @@ class _Writes:
                 self.commit()
 
     def commit(self) -> None:
-        """Flush the waiting files and the earlier renames, all at once: the disk then takes them in one go."""
+        """Flush the waiting files and the earlier renames together, which the disk handles at once."""
         with self.lock:
             writes, self.waiting = self.waiting, []
             try:
@@ -158,7 +158,7 @@ class _Writes:
 
     def flush(self, *writes: _Write) -> None:
         with self.lock:
-            folders, self.folders = self.folders, set()  # one that fails is not tried again by later writes
+            folders, self.folders = self.folders, set()  # a failed one is not retried by later writes
             tasks = [partial(_flush_file, write) for write in writes]
             tasks += [partial(_flush_folder, folder) for folder in folders]
             if len(tasks) > 1:
@@ -175,14 +175,14 @@ _writes = _Writes()
 
 def _flush_file(write: _Write) -> None:
     with _naming(write):
-        _flush(write.temporary)  # by its name: some writers replace the file that they are given
+        _flush(write.temporary)  # by name, since some writers replace the file
 
 
 def _flush_folder(folder: Path) -> None:
     try:
         _flush(folder)
     except OSError as error:
-        # A file system that flushes no folders, a folder that may not be listed, one removed since.
+        # The file system cannot flush folders, or the folder is not readable or was removed.
         if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.ENOENT):
             error.filename = str(folder)
             raise
@@ -198,7 +198,7 @@ def _flush(path: Path) -> None:
 
 
 def _make_folder(folder: Path) -> None:
-    """Make a folder with its parents; their names are flushed with the first file in it."""
+    """Create a folder and its parents, which are flushed with the first file in it."""
     missing = list(takewhile(lambda path: not path.exists(), (folder, *folder.parents)))
     folder.mkdir(parents=True, exist_ok=True)
     with _writes.lock:
@@ -206,7 +206,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _start(path: Path) -> _Write:
-    """A new file beside ``path``, open and locked, which shows other processes that its process is alive."""
+    """Create a file beside ``path``, open and locked; the lock shows other processes that its process is alive."""
     if path.parent not in _searched:
         _searched.add(path.parent)
         with os.scandir(path.parent) as entries:
@@ -220,7 +220,7 @@ def _start(path: Path) -> _Write:
         stream = FileIO(handle, "r+")
         if _lock(stream) is not False and os.fstat(handle).st_nlink:
             return _Write(stream, Path(name), path)
-        stream.close()  # taken for a dead one's between its making and its lock
+        stream.close()  # removed as a dead process's file before it was locked
 
 
 def remove_dead_temporaries(folder: Path) -> None:
@@ -230,7 +230,7 @@ def remove_dead_temporaries(folder: Path) -> None:
 
 
 _searched: set[Path] = set()
-"""Folders in which this process has looked for temporary files of dead ones."""
+"""Folders already searched for temporary files of dead processes."""
 
 
 def _remove_dead(paths: Iterable[str]) -> None:
@@ -240,14 +240,14 @@ def _remove_dead(paths: Iterable[str]) -> None:
         try:
             stream = FileIO(path, "r+", opener=no_link)
         except (OSError, InputError):
-            continue  # finished meanwhile, or not a temporary file of headbench
+            continue  # already finished, or not a temporary file of headbench
         with stream:
             if _lock(stream):
                 Path(path).unlink(missing_ok=True)
 
 
 def _lock(stream: FileIO) -> bool | None:
-    """Lock an open file; False where another process has, None where the file system knows no locks."""
+    """Lock an open file; False if another process holds the lock, None if the file system has no locks."""
     try:
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -262,8 +262,8 @@ _roots: list[Path] = []
 
 @contextmanager
 def output_inside(root: Path) -> Iterator[None]:
-    """Refuse to write through links out of ``root``, which may come from another user, while the block
-    runs."""
+    """Within the block, refuse to write through links that point out of ``root``, which may be another user's
+    folder."""
     _roots.append(root)
     try:
         yield
@@ -272,7 +272,7 @@ def output_inside(root: Path) -> Iterator[None]:
 
 
 def check_inside(folder: Path) -> None:
-    """Raise `InputError` for a folder below one of `output_inside`'s that is a link out of it, or lies behind one."""
+    """Raise `InputError` for a folder below one of `output_inside` that is, or is behind, a link out of it."""
     given = os.path.abspath(folder)
     for root in _roots:
         if _below(given, os.path.abspath(root)):
@@ -283,7 +283,7 @@ def check_inside(folder: Path) -> None:
 
 
 def refuse_links(folder: Path) -> None:
-    """Raise `InputError` for links that lead out of a folder that others than `atomic_path` are to write in."""
+    """Raise `InputError` for links that point out of a folder that is not written by `atomic_path`."""
     check_inside(folder)
     for root, folders, names in os.walk(folder):
         for path in (os.path.join(root, name) for name in (*folders, *names)):
@@ -320,7 +320,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file atomically, keys in the order given, numpy scalars and arrays as numbers and lists.
 
-    Raises `ValueError` for a number that is not finite: no reader would take it.
+    Raises `ValueError` for a non-finite number, which JSON cannot represent.
     """
     write_text(path, json.dumps(value, indent=1, default=to_jsonable, allow_nan=False) + "\n")
 
@@ -367,16 +367,16 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     "a cell of a run": ("fit.json",),
     "an avatar": ("avatar.json", "subject.npz"),
 }
-"""What marks a folder as one of a kind: patterns of files and folders in it."""
+"""Patterns of files and folders that identify a kind of folder."""
 RESULTS = {"rows.parquet", "headbench.json", "measure.json", "head_model.npz", "avatar.json"}
-"""Files that hold results or captures and that no option names to be written."""
+"""Files with results or captures, which are never the target of an option."""
 
 
 def check_kind(folder: Path, *kinds: str) -> None:
-    """Check, before anything is written, that the folder of ``--out`` holds nothing of another kind.
+    """Check, before anything is written, that the folder of ``--out`` has no content of another kind.
 
-    ``kinds``, out of `KINDS`, are those that the command writes and may therefore continue. Raises
-    `InputError` that names the file by which another kind was recognised.
+    ``kinds`` (of `KINDS`) are those that the command writes and may therefore continue. Raises
+    `InputError` with the file by which another kind was recognised.
     """
     for kind, patterns in KINDS.items():
         marks = (path for pattern in patterns for path in folder.glob(pattern)) if kind not in kinds else ()
@@ -388,7 +388,7 @@ def check_kind(folder: Path, *kinds: str) -> None:
 
 @contextmanager
 def removed_if_empty(folder: Path) -> Iterator[None]:
-    """When the block ends, remove the folder and its parents if the block made them and they are empty."""
+    """At the end of the block, remove the folder and its parents if the block created them and they are empty."""
     made = list(takewhile(lambda path: not path.exists(), (folder, *folder.parents)))
     try:
         yield
@@ -399,7 +399,7 @@ def removed_if_empty(folder: Path) -> Iterator[None]:
 
 
 def check_room(folder: Path) -> None:
-    """Write a little in a folder. Raises `OSError` with the folder's name if the disk is full."""
+    """Write a small file in a folder. Raises `OSError` with the folder's name if the disk is full."""
     try:
         with tempfile.TemporaryFile(dir=folder, prefix=TEMPORARY) as stream:
             stream.write(bytes(ROOM_BYTES))
@@ -423,7 +423,7 @@ def _writable(path: Path, option: str, what: str) -> Iterator[None]:
 
 def _try_to_write(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    # Such a file has no name where the system can do without.
+    # On systems that support it, this file has no name.
     with tempfile.TemporaryFile(dir=folder, prefix=TEMPORARY):
         pass
 
@@ -437,7 +437,7 @@ def _check_target(path: Path) -> None:
     except OSError as error:
         if error.errno != errno.ELOOP:
             raise
-        return  # a link to itself, which is replaced as other links are
+        return  # a link to itself, which is replaced like any link
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(mode):
@@ -446,10 +446,10 @@ def _check_target(path: Path) -> None:
 
 @contextmanager
 def reading(path: str | os.PathLike[str], expected: str, key: str = "", remedy: str = "") -> Iterator[None]:
-    """Turn any exception of a library that reads a file into one `InputError` with the library's words.
+    """Convert any exception of a library that reads a file into an `InputError` with its message.
 
-    Errors of headbench and a full disk are not converted. The block should only call the library, since an
-    error of the program in it would be reported as one of the file.
+    Errors of headbench and a full disk are not converted. The block should only call the library, since other
+    errors in it would be reported as errors of the file.
 
     Parameters
     ----------
@@ -458,7 +458,7 @@ def reading(path: str | os.PathLike[str], expected: str, key: str = "", remedy: 
     expected : str
         Kind of file, such as "a NumPy archive".
     remedy : str
-        What to do about a file that cannot be read.
+        Remedy for a file that cannot be read.
     """
     try:
         yield
@@ -471,7 +471,7 @@ def reading(path: str | os.PathLike[str], expected: str, key: str = "", remedy: 
 
 
 def _words(error: Exception) -> str:
-    """What an exception says, in one line."""
+    """The message of an exception as one line."""
     if isinstance(error, FileNotFoundError):
         return "no such file"
     if isinstance(error, MemoryError):
@@ -486,7 +486,7 @@ def _words(error: Exception) -> str:
 def open_regular(path: Path, expected: str) -> Iterator[BinaryIO]:
     """Open a file for reading bytes. Raises `InputError`, which names what was ``expected``, for anything else.
 
-    A pipe or a device of that name, which might never end, is refused without being waited for.
+    Pipes and devices, which might never end, are refused immediately.
     """
     with reading(path, expected):
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
@@ -509,7 +509,7 @@ def read_bytes(path: Path, expected: str, limit: int) -> bytes:
 
 
 def check_name(name: str, file: str | os.PathLike[str], key: str) -> str:
-    """Return a name if it can be one part of a path; it comes from outside, and folders are named after it.
+    """Return an untrusted name if it is valid as one part of a path, since folders are named after it.
 
     Raises `InputError` for an empty name, one that starts with a dot or is longer than `MAX_NAME_BYTES`, and
     one with a slash, a backslash, a colon or a control character, which could refer to another folder.
@@ -522,26 +522,26 @@ def check_name(name: str, file: str | os.PathLike[str], key: str) -> str:
 
 
 def with_slashes(path: str) -> str:
-    """A relative path out of a file, with slashes for the backslashes that programs on Windows write."""
+    """A relative path from a file, with the backslashes of Windows programs converted to slashes."""
     return path.replace("\\", "/")
 
 
 def is_system_file(name: str) -> bool:
-    """Whether an operating system left a file of that name, as ``.DS_Store`` or ``._a.png``."""
+    """Whether a file name is one that operating systems create, such as ``.DS_Store`` or ``._a.png``."""
     return name.startswith("._") or name.lower() in (".ds_store", "thumbs.db", "desktop.ini", "__macosx")
 
 
 def entries(folder: Path, pattern: str = "*") -> list[Path]:
     """Entries of a folder that match a pattern, sorted, without hidden files and files of operating systems.
 
-    For reading; empty where the folder does not exist.
+    For reading; empty if the folder does not exist.
     """
     return [path for path in user_files(folder, pattern) if not path.name.startswith(".")]
 
 
 def user_files(folder: Path, pattern: str = "*") -> list[Path]:
-    """As `entries`, including hidden files other than those of interrupted writes: content a command must not
-    mix with."""
+    """As `entries`, including hidden files except those of interrupted writes: existing content that a command must
+    keep separate."""
     found = sorted(path for path in folder.glob(pattern) if not is_system_file(path.name))
     return [path for path in found if not path.name.startswith(TEMPORARY)]
 
@@ -549,7 +549,7 @@ def user_files(folder: Path, pattern: str = "*") -> list[Path]:
 def expand_home(text: str, source: str) -> str:
     """Replace ``~`` or ``~user`` at the start of a path by the home folder, as a shell does; leave other text alone.
 
-    Raises `InputError`, naming the ``source`` of the path, where the home folder is not known.
+    Raises `InputError`, naming the ``source`` of the path, if the home folder is unknown.
     """
     if not re.match(r"~($|[\w.-]*/)", text):
         return text

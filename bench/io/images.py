@@ -1,7 +1,7 @@
-"""Decoding and encoding of images, in one place. Files are checked against bounds before pixels are decoded.
+"""Decoding and encoding of images. Files are checked against limits before pixels are decoded.
 
-Pixels are read as they are stored, since intrinsics refer to stored pixels: orientation tags, colour profiles
-and gamma are ignored. Colour tables are applied. Alpha channels are those of PNG: RGBA, grey with alpha, or a
+Pixels are read as stored, since intrinsics refer to stored pixels: orientation tags, colour profiles
+and gamma are ignored. Palettes are applied. Alpha channels are those of PNG: RGBA, grey with alpha, or a
 tRNS chunk.
 """
 
@@ -24,23 +24,23 @@ from .files import open_regular, write_bytes
 from .provenance import mark_png
 
 MAX_PIXELS = 2**25
-"""Of an image, as in 8192 x 4096: a header of a few bytes can declare any size, and decoding takes its memory."""
+"""Maximum size of an image, as in 8192 x 4096: a small header can declare any size, and decoding allocates its memory."""
 MAX_EXTRA = 2**26
-"""Bytes of a file besides 8 for each pixel: colour profiles, previews. Holes in a file take no room on a disk."""
+"""Maximum bytes of a file beyond 8 per pixel, for colour profiles and previews. Sparse files take no space on disk."""
 MAX_SCANS = 100
-"""Of a progressive JPEG, which has about ten: a few bytes ask for a pass over all pixels."""
+"""Maximum scans of a progressive JPEG, which has about ten: a few bytes can cause a pass over all pixels."""
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by colour type (PNG specification, 11.2.2)
 _PNG_TABLE = 3
 _PNG_CHUNKS = 2**16  # a PNG of `MAX_PIXELS` in chunks of 8 kB has a quarter of that
-_DEFLATE_RATIO = 1040  # bytes out of one that went in are 1032 at most
+_DEFLATE_RATIO = 1040  # the maximum of deflate is 1032 bytes out per byte in
 _JPEG_START, _JPEG_END, _JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", b"\xff\xda"
-# Start-of-frame markers: SOF0..SOF15 but DHT (C4), JPG (C8) and DAC (CC), which share the range.
+# Start-of-frame markers: SOF0..SOF15 except DHT (C4), JPG (C8) and DAC (CC), which share the range.
 _JPEG_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_JPEG_TAIL_BYTES = 64  # some encoders pad behind the end marker
-_JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]", re.DOTALL)  # none of the data of a scan looks like it
+_JPEG_TAIL_BYTES = 64  # some encoders add padding after the end marker
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]", re.DOTALL)  # does not occur in the data of a scan
 _FOREIGN = {
     rb"RIFF....WEBP": "WebP",
     rb"II\*\x00|MM\x00\*|II\+\x00|MM\x00\+": "TIFF",
@@ -69,7 +69,7 @@ class ImageInfo:
     format: str = field(default="", compare=False)
     """"PNG" or "JPEG"."""
     table: bool = field(default=False, compare=False)
-    """Whether pixels are stored as indices into a table of colours."""
+    """Whether pixels are stored as palette indices."""
 
     @property
     def has_alpha(self) -> bool:
@@ -80,9 +80,9 @@ class ImageInfo:
 def probe_image(path: Path, *, decode: bool = False) -> ImageInfo:
     """Read the size of a PNG or JPEG and check that the file is complete.
 
-    Costs a few small reads; ``decode`` decodes the pixels too and so finds damage in the middle. Bytes behind the end
+    Needs only a few small reads; ``decode`` also decodes the pixels, which detects damage in the middle. Bytes after the end
     of the image are ignored. Raises `InputError` for a missing, empty, foreign or truncated file, more than 8 bits per
-    channel, an animation, a JPEG of CMYK, more than `MAX_PIXELS`, and more pixels than the file has bytes for.
+    channel, an animation, a CMYK JPEG, more than `MAX_PIXELS`, and more pixels than the file can contain.
     """
     with open_regular(path, "an image file") as stream:
         info, end = _probe(path, stream)
@@ -108,7 +108,7 @@ def read_pixels(path: Path, size: tuple[int, int] | None = None) -> ByteArray:
     Raises
     ------
     InputError
-        `probe_image` refuses the file, it has another size, or it is too damaged to be decoded.
+        The file is refused by `probe_image`, has another size, or is too damaged to be decoded.
     """
     with open_regular(path, "an image file") as stream:
         info, end = _probe(path, stream)
@@ -124,7 +124,7 @@ def _decode(path: Path, stream: BinaryIO, info: ImageInfo, end: int) -> ByteArra
     if info.format == "JPEG" and content.count(_JPEG_SCAN) > MAX_SCANS:
         raise InputError(path, "", f"a JPEG of at most {MAX_SCANS} scans", f"{content.count(_JPEG_SCAN)}")
     try:
-        # This flag alone leaves pixels where they are; in grey or colour OpenCV turns them by an orientation tag.
+        # Only with this flag does OpenCV ignore orientation tags.
         pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise InputError(path, "", "an image that decodes", f"damaged data ({error.err})"[:200]) from error
@@ -134,12 +134,12 @@ def _decode(path: Path, stream: BinaryIO, info: ImageInfo, end: int) -> ByteArra
     if info.channels == 2 and levels.ndim == 2:
         return _grey_with_alpha(levels, content)
     if info.channels == 3 and levels.shape[2:] == (4,):
-        return np.ascontiguousarray(levels[..., :3])  # a table whose colours are all opaque
+        return np.ascontiguousarray(levels[..., :3])  # a palette of opaque colours
     return levels
 
 
 def _grey_with_alpha(grey: ByteArray, content: bytes) -> ByteArray:
-    """Apply the chunk tRNS of a grey PNG, one level that is transparent; OpenCV ignores it."""
+    """Apply the chunk tRNS of a grey PNG (one transparent level), which OpenCV ignores."""
     depth, stream = content[24], io.BytesIO(content)
     next(name for name, _ in _chunks(stream) if name == b"tRNS")
     level = int.from_bytes(stream.read(2), "big") % 2**depth * 255 // (2**depth - 1)
@@ -191,7 +191,7 @@ def _probe_png(path: Path, stream: BinaryIO, head: bytes) -> ImageInfo:
 
 
 def _chunks(stream: BinaryIO) -> Iterator[tuple[bytes, int]]:
-    """Name and length of the chunks of a PNG, the stream being at their data, until one is no chunk."""
+    """Name and length of each chunk of a PNG, with the stream at its data, up to the first invalid chunk."""
     place = len(_PNG_SIGNATURE)
     for _ in range(_PNG_CHUNKS):
         stream.seek(place)
@@ -218,7 +218,7 @@ def _probe_jpeg(path: Path, stream: BinaryIO) -> ImageInfo:
         marker, length = struct.unpack(">xBH", segment)
         if segment[0] != 0xFF:
             break
-        if marker == 0xFF:  # fill bytes may stand before a marker
+        if marker == 0xFF:  # a marker may have fill bytes before it
             stream.seek(-3, 1)
             continue
         if marker in _JPEG_FRAME_MARKERS:
@@ -240,7 +240,7 @@ def _probe_jpeg(path: Path, stream: BinaryIO) -> ImageInfo:
 def _end_of_jpeg(path: Path, stream: BinaryIO, size: int) -> int:
     if _JPEG_END in _tail(stream, _JPEG_TAIL_BYTES):
         return size
-    stream.seek(0)  # cameras and telephones append previews and videos
+    stream.seek(0)  # cameras and phones append previews and videos
     content = stream.read()
     place = len(_JPEG_START)
     while match := _JPEG_MARKER.search(content, place):
@@ -258,11 +258,11 @@ def _tail(stream: BinaryIO, size: int) -> bytes:
 
 
 def quantise(rgb: FloatArray) -> ByteArray:
-    """Round colours in [0, 1] to 8 bits, to the nearest level; what lies outside is clamped.
+    """Round colours in [0, 1] to the nearest 8-bit level; values outside are clamped.
 
     Truncating (``rgb * 255`` cast to an integer) would darken by half a level on average. Raises `InputError`
-    for a non-finite colour, since any level chosen for it would hide a fault of the renderer, and for an
-    array that is not floating point.
+    for a non-finite colour, since any level would hide a bug of the renderer, and for an array that is not
+    floating point.
     """
     if not np.issubdtype(rgb.dtype, np.floating):
         raise InputError("render", "rgb", "a floating-point array in [0, 1]", str(rgb.dtype))
@@ -292,7 +292,7 @@ def encode_image(image: ByteArray, suffix: str, options: Sequence[int] = (), *, 
 
 
 def write_png(path: Path, image: ByteArray, kind: str = "") -> bytes:
-    """Write an (H, W, 3) 8-bit sRGB image, atomically; return what was written.
+    """Write an (H, W, 3) 8-bit sRGB image atomically; return the file's content.
 
     ``kind`` marks it, see `provenance`; "" for frames that metrics are computed from.
     """

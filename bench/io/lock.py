@@ -1,4 +1,4 @@
-"""One process at a time in a folder: two processes that write the same frames and rows would mix their
+"""Locks folders, since two processes that write the same frames and rows would mix their
 results."""
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from .files import (
 )
 
 LOCK_FILE = "run.lock"
-_MOST = 1000  # characters of a lock file that are read
+_MOST = 1000  # maximum characters of a lock file
 
 
 @contextmanager
 def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
-    """Keep other processes out of ``folder`` while the block writes in it; the lock file names the owner.
+    """Lock ``folder`` within the block; the lock file names the owner.
 
-    The lock is the system's (``flock``) and ends with its process: a file left by a killed process locks
-    nobody out. Under it, temporary files of dead processes are removed, and nothing is written through links
-    that lead out of the folder. ``beside`` puts the lock file beside the folder, which may have to be empty.
-    A new folder in which nothing was written is removed.
+    The lock is a system lock (``flock``), which ends with its process: the file of a killed process locks
+    nobody out. While locked, temporary files of dead processes are removed, and nothing is written through links
+    out of the folder. ``beside`` creates the lock file beside the folder, for folders that must be empty.
+    A new folder without content is removed.
 
     Raises
     ------
@@ -60,7 +60,9 @@ def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
             try:
                 flush_renames()
             finally:
-                path.unlink(missing_ok=True)  # while still locked: whoever waits sees that the file has gone
+                path.unlink(
+                    missing_ok=True
+                )  # while still locked, so that waiting processes see that the file is gone
                 stream.close()
 
 
@@ -92,11 +94,11 @@ def _acquire(path: Path) -> IO[str]:
             raise InputError(path, "", "a folder that no other process works in", owner, remedy) from None
         if _is_still(path, stream):
             return stream
-        stream.close()  # the owner before us removed the file between our opening and locking it
+        stream.close()  # the previous owner removed the file before it was locked here
 
 
 def _is_still(path: Path, stream: IO[str]) -> bool:
-    """Whether the open file is the one that lies at ``path`` now."""
+    """Whether the open file is still the one at ``path``."""
     try:
         return os.path.samestat(path.stat(), os.fstat(stream.fileno()))
     except FileNotFoundError:
@@ -104,7 +106,7 @@ def _is_still(path: Path, stream: IO[str]) -> bool:
 
 
 def _described(text: str) -> str:
-    """Description of the owner; the file may be incomplete or of another program."""
+    """Description of the owner; the file may be incomplete or from another program."""
     try:
         owner = json.loads(text)
         return f"process {int(owner['process'])} on {owner['host']}, since {owner['since']}"

@@ -1,8 +1,8 @@
 """Provenance marks: exported files declare that a program generated their content.
 
 The term is IPTC's digital source type (https://cv.iptc.org/newscodes/digitalsourcetype/), which image archives and social
-networks read. In images it stands in XMP beside the pixels, which stay as they are. Frames that metrics are computed from
-carry none: their digests are recorded.
+networks read. In images it is XMP metadata; the pixels are not changed. Frames for metrics have no mark, since their
+digests are recorded.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from importlib.metadata import version
 RENDER = "trainedAlgorithmicMedia"
 """Made by a model trained on recordings: a render of an avatar."""
 COMPOSITE = "compositeWithTrainedAlgorithmicMedia"
-"""Renders beside other pictures: sheets, pages, videos with the captured image."""
+"""Renders with other images: sheets, pages, videos with the captured image."""
 SYNTHETIC = "algorithmicMedia"
 """Made by a program without training data: a synthetic capture."""
 
@@ -26,7 +26,7 @@ _XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <Iptc4xmpExt:DigitalSourceType>{source}</Iptc4xmpExt:DigitalSourceType>
 </rdf:Description></rdf:RDF></x:xmpmeta>
 <?xpacket end="r"?>"""
-_HEADER = 33  # bytes of a PNG's signature and IHDR chunk, which come first
+_HEADER = 33  # bytes of a PNG's signature and IHDR chunk, which are first
 
 
 def tool() -> str:
@@ -35,22 +35,22 @@ def tool() -> str:
 
 
 def source_type(kind: str) -> str:
-    """IPTC's address of one of the terms above."""
+    """IPTC's URI of one of the terms above."""
     return _SCHEME + kind
 
 
 def note(kind: str) -> str:
-    """For formats without fields for it: what made the file, in one line."""
+    """Provenance as one line, for formats without suitable metadata."""
     return f"{tool()}; digital source type {source_type(kind)}"
 
 
 def xmp(kind: str) -> str:
-    """An XMP packet: of a file, or of the files beside it."""
+    """An XMP packet for a file, or for the files beside it."""
     return _XMP.format(tool=tool(), source=source_type(kind))
 
 
 def mark_png(content: bytes, kind: str) -> bytes:
-    """A PNG file with an XMP packet behind its header (an iTXt chunk); everything else to the byte as it was."""
+    """Insert an XMP packet (an iTXt chunk) after the header of a PNG file; all other bytes are unchanged."""
     chunk = b"iTXt" + b"XML:com.adobe.xmp" + bytes(5) + xmp(kind).encode()
     framed = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
     return content[:_HEADER] + framed + content[_HEADER:]

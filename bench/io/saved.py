@@ -13,21 +13,21 @@ from .unpickle import plain_content
 EXPECTED = "a file of torch.save with a dictionary of numpy arrays"
 REMEDY = "The file was not read. Save numpy arrays and numbers, as the tracker's own program does."
 MAX_BYTES = 2**26
-"""Of a pickle; a tracker's file has 0.01 MB."""
+"""Maximum size of a pickle; a tracker's file has 0.01 MB."""
 MAX_MEMBERS = 100
 LEVELS = 2
-"""Of dictionaries."""
+"""Maximum nesting of dictionaries."""
 
 
 def read_saved(path: str | PathLike[str]) -> dict[str, Any]:
-    """Read a dictionary of numpy arrays, possibly with dictionaries of arrays inside, in a file of ``torch.save``.
+    """Read a dictionary of numpy arrays, possibly nested, from a file of ``torch.save``.
 
-    The layout is the archive of PyTorch 1.6 and later. Tensors are refused, as are all other names than NumPy's arrays.
+    The layout is the archive of PyTorch 1.6 and later. Tensors are refused, as are all objects other than NumPy arrays.
 
     Returns
     -------
     dict[str, Any]
-        As `read_pickle`; dictionaries inside are plain ones with text as keys.
+        As `read_pickle`; nested dictionaries are plain ones with text keys.
 
     Raises
     ------

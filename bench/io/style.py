@@ -1,4 +1,4 @@
-"""The style that the pages of every package share, and what a content security policy says of it."""
+"""The shared style of HTML pages, and its source expression for content security policies."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Read the arrays in a pickle without executing anything in the file.
 
-A pickle is a program that may call whatever it can import. FLAME and its masks come as Python-2 pickles full of chumpy
-and scipy objects, and trackers write files of ``torch.save``, so every name in the stream is looked up in a closed table
-of stand-ins. A stand-in keeps what it is given; arrays are made at the end, of raw bytes whose number has to be what their
-types and shapes say.
+A pickle is a program that may call anything it can import. FLAME and its masks are Python-2 pickles with chumpy and scipy
+objects, and trackers write files of ``torch.save``, so names in the stream are resolved only in a fixed table of stand-in
+classes. A stand-in stores its arguments; arrays are created at the end, from raw bytes whose number must match their types
+and shapes.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from .files import read_bytes, reading
 EXPECTED = "a pickled dictionary of numpy, scipy.sparse and chumpy arrays"
 REMEDY = "The file was not read. Get the model from its official source."
 MAX_BYTES = 2**30
-"""Of a file; the largest of FLAME has 0.1 GB."""
+"""Maximum size of a file; the largest of FLAME has 0.1 GB."""
 MAX_DENSE_BYTES = 40_000_000
-"""Of all sparse matrices of a file, made dense: a few bytes can declare any shape. A joint regressor has 200,000."""
+"""Maximum entries of all dense forms of sparse matrices: a few bytes can declare any shape. A joint regressor has 200,000."""
 MAX_DIMENSIONS = 8
 
 _DATA = (np.ndarray, str, bytes, int, float, complex, type(None), list, tuple, dict)
@@ -37,7 +37,7 @@ _DATA = (np.ndarray, str, bytes, int, float, complex, type(None), list, tuple, d
 def read_pickle(path: str | PathLike[str]) -> dict[str, Any]:
     """Read a pickled dictionary of arrays: a FLAME model or ``FLAME_masks.pkl``.
 
-    Python-2 strings are taken as latin1; chumpy and scipy.sparse objects become dense arrays.
+    Python-2 strings are decoded as latin1; chumpy and scipy.sparse objects become dense arrays.
 
     Returns
     -------
@@ -55,7 +55,7 @@ def read_pickle(path: str | PathLike[str]) -> dict[str, Any]:
 
 
 def plain_content(path: Path, stream: bytes, expected: str, remedy: str, levels: int = 1) -> dict[str, Any]:
-    """The dictionary in the bytes of a pickle, as `read_pickle` returns it, and dictionaries inside it, ``levels`` in all.
+    """The dictionary in the bytes of a pickle, as `read_pickle` returns it, with up to ``levels`` nested levels.
 
     Raises `InputError` as `read_pickle` does, with ``path``, ``expected`` (the kind of file) and ``remedy``.
     """
@@ -65,14 +65,14 @@ def plain_content(path: Path, stream: bytes, expected: str, remedy: str, levels:
 
 
 class _Arrays:
-    """Makes arrays of stand-ins, each once however many names it has, and of at most ``left`` bytes together."""
+    """Converts stand-ins to arrays, each once even if shared, with at most ``left`` bytes in total."""
 
     def __init__(self, left: int) -> None:
         self._left = left
         self._made: dict[int, Any] = {}
 
     def plain(self, content: Any, levels: int) -> dict[str, Any]:
-        """A dictionary of the stream with arrays for stand-ins, also in dictionaries inside, ``levels`` deep."""
+        """Convert the stand-ins in a dictionary to arrays, including nested dictionaries up to ``levels`` deep."""
         if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
             raise ValueError(f"a {type(content).__name__.lstrip('_').lower()}, not a dictionary with names")
         for value in content.values():
@@ -93,7 +93,7 @@ class _Arrays:
 
 
 class _StandIn:
-    """An object of the stream: its arguments and its state."""
+    """An object in the stream: its arguments and its state."""
 
     arguments: tuple[Any, ...]
     state: Any
@@ -185,12 +185,12 @@ class _Sparse(_StandIn):
 
 
 def _from_bytes(raw: Any, dtype: _DType, shape: tuple[int, ...], order: Any) -> np.ndarray:
-    """An array from its bytes, whose number has to be just what dtype and shape say."""
-    content = raw.encode("latin1") if isinstance(raw, str) else raw  # Python 2's bytes are read as latin1
+    """An array from its bytes, whose number must match dtype and shape exactly."""
+    content = raw.encode("latin1") if isinstance(raw, str) else raw  # bytes of Python 2 are decoded as latin1
     values = np.frombuffer(content, dtype.resolve())
     if len(shape) > MAX_DIMENSIONS or math.prod(shape) != values.size:
         raise ValueError(f"{len(content)} bytes for an array of shape {shape}")
-    # A copy that may be written to.
+    # A writable copy.
     return np.array(values.reshape(shape, order=order), dtype=values.dtype.newbyteorder("="), order="C")
 
 
@@ -245,13 +245,13 @@ def _load_state(unpickler: Any) -> None:
 
 
 def _load_bytes(unpickler: Any) -> None:
-    """A bytearray, which Python would make of the length that is declared before it is read."""
+    """A bytearray; Python would allocate the declared length before reading."""
     (size,) = struct.unpack("<Q", unpickler.read(8))
     unpickler.append(unpickler.read(size))
 
 
 def _with_plain_keys(load: Callable[[Any], None], keys: slice) -> Callable[[Any], None]:
-    """Entries of dictionaries with text and numbers as keys: the hash of nested tuples can take for ever."""
+    """Add entries to dictionaries, with only text and numbers as keys: hashing nested tuples can take forever."""
 
     def checked(unpickler: Any) -> None:
         for key in unpickler.stack[keys]:
@@ -267,8 +267,8 @@ def _refuse(unpickler: Any) -> None:
     raise pickle.UnpicklingError("an operation that files of FLAME do not need")
 
 
-# The unpickler written in Python: the one in C allocates whatever memo size the stream names, so that nine
-# bytes can ask for gigabytes. Arrays are single operations, hence nothing is lost in speed.
+# The Python unpickler: the C version allocates any memo size that the stream declares, so that nine bytes can
+# allocate gigabytes. Arrays are single operations, so this is not slower.
 _PythonUnpickler: Any = vars(pickle)["_Unpickler"]
 _OPERATIONS: dict[int, Callable[[Any], None]] = {
     **_PythonUnpickler.dispatch,
@@ -278,16 +278,14 @@ _OPERATIONS: dict[int, Callable[[Any], None]] = {
     pickle.SETITEMS[0]: _with_plain_keys(_PythonUnpickler.load_setitems, slice(0, None, 2)),
     pickle.DICT[0]: _with_plain_keys(_PythonUnpickler.load_dict, slice(0, None, 2)),
     **dict.fromkeys((pickle.EXT1[0], pickle.EXT2[0], pickle.EXT4[0]), _refuse),
-    pickle.EMPTY_SET[
-        0
-    ]: _PythonUnpickler.load_empty_list,  # a set would hash what it holds; nothing reads any
+    pickle.EMPTY_SET[0]: _PythonUnpickler.load_empty_list,  # a set would hash its members; sets are not used
     pickle.ADDITEMS[0]: _PythonUnpickler.load_appends,
     pickle.FROZENSET[0]: _PythonUnpickler.load_list,
 }
 
 
 class _ClosedUnpickler(_PythonUnpickler):
-    """Resolves names in a closed table and nowhere else."""
+    """Resolves names only in a fixed table."""
 
     dispatch = _OPERATIONS
 

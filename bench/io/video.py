@@ -73,13 +73,13 @@ def write_video(path: Path, frames: Iterable[ByteArray], fps: float) -> str:
 
 
 def _check_whole(path: Path, written: Path, count: int) -> None:
-    """Raise an error where a video has fewer frames than were written: OpenCV does not report a full disk."""
+    """Raise an error if a video has fewer frames than were written, since OpenCV does not report a full disk."""
     capture = cv2.VideoCapture(str(written), cv2.CAP_FFMPEG)
     found = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
     complete = capture.isOpened() and found == count
     capture.release()
     if not complete:
-        with written.open("ab") as stream:  # fails with the system's reason, if that persists
+        with written.open("ab") as stream:  # raises the system's error, if it persists
             stream.write(bytes(ROOM_BYTES))
             stream.flush()
             os.fsync(stream.fileno())
@@ -101,25 +101,25 @@ def browser_encoder(path: Path = Path("video.webm")) -> Any:
 
 
 class _Encoding(NamedTuple):
-    """How a container for browsers is written by PyAV."""
+    """PyAV settings of a video container for browsers."""
 
     container: str
     encoder: str
     options: dict[str, str]
     pixels: str
     multiple: int
-    """Width and height have to be multiples of this."""
+    """Width and height must be multiples of this."""
 
 
 ENCODINGS = {
     ".webm": _Encoding("webm", "libvpx-vp9", {"crf": "16", "b": "0"}, "yuv444p", 1),
     ".mp4": _Encoding("mp4", "libx264", {"crf": "16"}, "yuv420p", 2),
 }
-"""Videos for browsers by the ending of their names: VP9 without subsampling of colours, and H.264, which has it."""
+"""Videos for browsers by file suffix: VP9 without chroma subsampling, and H.264 with it."""
 
 
 def write_browser_video(path: Path, frames: Iterable[ByteArray], fps: float, kind: str) -> None:
-    """Write (H, W, 3) RGB frames of one size as a video of constant quality, see `ENCODINGS`; an ending out of these.
+    """Write (H, W, 3) RGB frames of one size as a video of constant quality, with a suffix of `ENCODINGS`.
 
     ``kind`` marks it in the tag COMMENT, see `provenance`.
 
@@ -184,7 +184,7 @@ def encode_h264(path: Path, frames: Iterable[ByteArray], size: tuple[int, int], 
                 process.stdin.write(frame.tobytes())
             process.stdin.close()
         except BrokenPipeError:
-            pass  # it ended, and says why
+            pass  # it has ended, and its message gives the reason
         except BaseException:
             process.kill()
             raise

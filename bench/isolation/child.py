@@ -54,7 +54,7 @@ class StoredHead:
 
 
 class RemoteClip:
-    """A `Clip` whose training images are requested from the run; it has no others."""
+    """A `Clip` that requests training images from the run; it has no other images."""
 
     def __init__(self, fields: Mapping[str, Any], connection: Connection):
         self.__dict__.update(fields)
@@ -83,7 +83,7 @@ def main(descriptor: int) -> None:
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)
     for number in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # the run decides when this process ends
+        signal.signal(number, signal.SIG_IGN)  # the run ends this process
     connection = Connection(descriptor)
     limits, _ = receive(connection)
     sys.path[:] = limits["path"]
@@ -99,14 +99,14 @@ def main(descriptor: int) -> None:
             if served is None:
                 served = _Method(connection, arguments.pop("method"))
             values, arrays = getattr(served, arguments.pop("call"))(**arguments)
-        except Exception as error:  # noqa: BLE001  # whatever a method raises is reported to the run
+        except Exception as error:  # noqa: BLE001  # any error of a method is reported to the run
             send(connection, _described(error))
         else:
             send(connection, {"done": values}, arrays)
 
 
 class _Method:
-    """What the run can call, by name."""
+    """Functions that the run can call, by name."""
 
     def __init__(self, connection: Connection, resolved: Any):
         self._connection, self._method = connection, resolved.create()
@@ -176,7 +176,7 @@ class _Forwarded(logging.Handler):
 
 
 def _described(error: Exception) -> dict[str, Any]:
-    """An error as a message; the parts of the errors that the run tells apart are kept."""
+    """An error as a message, with the parts of error types that the run distinguishes."""
     if isinstance(error, InputError):
         parts = [error.file, error.key, error.expected, error.found, error.remedy]
     elif isinstance(error, UnavailableError):

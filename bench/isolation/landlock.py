@@ -1,4 +1,4 @@
-"""Restricts the files, network addresses and processes that this process can reach, by Linux' Landlock."""
+"""Restricts this process's access to files, network and other processes by Landlock (Linux)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _PATH_BENEATH, _NO_NEW_PRIVILEGES = 1, 38
 _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR = 1, 2, 4, 8
 _TRUNCATE, _IOCTL = 1 << 14, 1 << 15
 _FILE_RIGHTS = _EXECUTE | _WRITE_FILE | _READ_FILE | _TRUNCATE | _IOCTL
-"""Those that a rule for a single file may have."""
+"""Rights that a rule for a single file may have."""
 _READ = _EXECUTE | _READ_FILE | _READ_DIR
 _RIGHTS = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 5: (1 << 16) - 1}
-"""All rights to files that a version knows; versions between have those of the one before."""
+"""All file rights by Landlock version; versions in between have those of the previous one."""
 _NETWORK = 0b11  # binding and connecting TCP sockets, from version 4
 _SCOPES = 0b11  # abstract Unix sockets and signals, from version 6
 SYSTEM = (
@@ -37,7 +37,7 @@ SYSTEM = (
 )
 """Folders that programs and libraries are read from."""
 DEVICES = ("null", "zero", "full", "random", "urandom", "tty", "shm", "nvidia*", "dri", "kfd")
-"""Devices of programs, shared memory of their own processes, and GPUs; disks are none of them."""
+"""Allowed devices: standard devices, shared memory and GPUs, but no disks."""
 
 
 def devices() -> list[Path]:
@@ -53,17 +53,17 @@ def landlock_version() -> int:
 
 
 def restrict(read: Iterable[str | Path], write: Iterable[str | Path]) -> int:
-    """Restrict this process and all that it starts, for good.
+    """Restrict this process and all processes that it starts, permanently.
 
     Parameters
     ----------
     read, write : Iterable[str | Path]
-        Files and folders that can be read and executed, and those that can be changed, too. Missing ones are skipped.
+        Files and folders that can be read and executed, and those that can also be changed. Missing ones are skipped.
 
     Returns
     -------
     int
-        Version of Landlock that restricts it. Before version 4 TCP is not restricted, before version 6 signals are not.
+        Version of Landlock in effect. TCP is restricted from version 4, signals from version 6.
         0: the kernel has no Landlock and nothing is restricted.
     """
     version = landlock_version()
@@ -97,7 +97,7 @@ def without(roots: Iterable[Path], hidden: Iterable[Path]) -> Iterator[Path]:
         if any(root.is_relative_to(path) for path in hidden):
             continue
         if any(path.is_relative_to(root) for path in hidden):
-            with suppress(PermissionError):  # what cannot be listed is left out
+            with suppress(PermissionError):  # folders that cannot be listed are left out
                 yield from without([entry for entry in root.iterdir() if not entry.is_symlink()], hidden)
         else:
             yield root

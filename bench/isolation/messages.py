@@ -1,7 +1,7 @@
 """Messages between a run and the process of an isolated method.
 
-A message is a line of JSON, followed by the bytes of the arrays that it announces. What the process of the method sends is
-read as data and bounded in size; nothing of it is unpickled.
+A message is a line of JSON, followed by the bytes of the arrays that it declares. Messages from the method's process are
+read as data with limited size and never unpickled.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ..errors import HeadbenchError
 
 LARGEST_LINE = 1 << 24
 LARGEST_ARRAYS = 1 << 31
-"""Bytes of a message's line and of its arrays; an image of 8,192 x 8,192 pixels in float32 has 0.8 GB."""
+"""Maximum bytes of a message's line and of its arrays; an image of 8,192 x 8,192 pixels in float32 has 0.8 GB."""
 _TYPES = ("uint8", "bool", "float32", "float64", "int32", "int64")
 
 Message = dict[str, Any]
@@ -37,9 +37,9 @@ def send(connection: Connection, message: Mapping[str, Any], arrays: Arrays | No
 
 
 def receive(connection: Connection) -> tuple[Message, dict[str, NDArray[Any]]]:
-    """The next message and its arrays, which cannot be written to.
+    """The next message and its read-only arrays.
 
-    Raises `HeadbenchError` for anything else than a message, and `EOFError` where the other side has ended.
+    Raises `HeadbenchError` for anything but a message, and `EOFError` if the other side has ended.
     """
     line = _bytes(connection, LARGEST_LINE)
     try:

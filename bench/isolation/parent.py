@@ -1,7 +1,7 @@
-"""Runs a method in processes of its own that hold no test image.
+"""Runs a method in separate processes without access to test images.
 
-``fit`` runs in a process that is given the clip without images and requests those of training frames one by one; ``render``
-runs in another one, which is given cameras, poses and the folder of the avatar. Where the kernel has Landlock, neither can
+``fit`` runs in a process that receives the clip without images and requests those of training frames one by one; ``render``
+runs in another one, which receives cameras, poses and the folder of the avatar. If the kernel has Landlock, neither can
 read the capture, the rest of the run or the memory of other processes, change files outside its folder, or open TCP
 connections. The page SECURITY.md states what this does not prevent.
 """
@@ -44,11 +44,11 @@ from .landlock import SYSTEM, devices, without
 from .messages import Arrays, receive, send
 
 GRACE_S = 10.0
-"""Seconds that a process has for ending after its connection is closed."""
+"""Seconds for a process to end after its connection is closed."""
 
 
 class IsolatedMethod:
-    """A `Method` whose code runs in processes of its own.
+    """A `Method` whose code runs in separate processes.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class IsolatedMethod:
     out : Path
         Folder of its avatar, the only one that the method can write to.
     hidden : Sequence[Path]
-        Files and folders that its processes cannot read: the captures and the run.
+        Files and folders that its processes must not read: the captures and the run.
     """
 
     def __init__(self, resolved: Any, out: Path, hidden: Sequence[Path] = ()):
@@ -72,7 +72,7 @@ class IsolatedMethod:
             process.call("check", clip, clip=None if clip is None else described(clip), budget=budget)
 
     def prepare(self, device: str) -> None:
-        """Start the process of the training and let it import and compile what it needs."""
+        """Start the training process, which imports and compiles what it needs."""
         self._out.mkdir(parents=True, exist_ok=True)
         self._prepared = self._process(write=(self._out,)).__enter__()
         self._prepared.call("prepare", device=device)
@@ -104,7 +104,7 @@ class IsolatedMethod:
             process.call("fit", clip, progress, **values)
 
     def load(self, path: Path, *, device: str) -> IsolatedAvatar:
-        """Start a process that has read the avatar and renders it."""
+        """Start a process that loads the avatar and renders it."""
         process = self._process(read=(path,)).__enter__()
         try:
             found, _ = process.call("load", path=str(path), device=device)
@@ -119,20 +119,20 @@ class IsolatedMethod:
 
 
 class IsolatedAvatar:
-    """An `Avatar` in a process of its own, which ends with it."""
+    """An `Avatar` in a separate process, which ends with it."""
 
     def __init__(
         self, process: _Process, folder: Path, files: Sequence[str], shared: Sequence[str] | None, codec: str
     ):
         self.process, self._files, self.codec = process, tuple(map(Path, files)), codec
-        if shared is not None:  # then it is a `SharingAvatar`
+        if shared is not None:  # makes this a `SharingAvatar`
             self.shared_files = lambda: tuple(map(Path, shared))
         for path in self._files:
             if not path.resolve().is_relative_to(folder.resolve()):
                 raise InputError(folder, "files()", "files in the folder of the avatar", str(path))
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """Render one frame; the values are those that the process sent."""
+        """Render one frame; the values are returned as the process sent them."""
         asked: dict[str, Any] = {
             "camera": camera,
             "pose": pose,
@@ -145,13 +145,13 @@ class IsolatedAvatar:
             raise HeadbenchError(f"the avatar's frame has no {error}") from error
 
     def files(self) -> Sequence[Path]:
-        """Files in the folder of the avatar that it names as needed."""
+        """Files in the avatar's folder that it declares as needed."""
         return self._files
 
     def measured(
         self, metric: Callable[..., Any], workload: Sequence[tuple[Camera, HeadPose]]
     ) -> Measurement:
-        """Measure the avatar in its process, so that the transport of frames is not part of their time."""
+        """Measure the avatar in its process, so that times exclude the transfer of frames."""
         found, _ = self.process.call("measure", metric=metric, workload=list(workload))
         value, details = found
         return Measurement(float(value), {str(name): float(each) for name, each in details.items()})
@@ -165,7 +165,7 @@ class IsolatedAvatar:
 
 
 class IsolatedSplats(IsolatedAvatar):
-    """A `SplatAvatar` in a process of its own."""
+    """A `SplatAvatar` in a separate process."""
 
     def splats(self, pose: HeadPose, camera: Camera | None = None) -> Any:
         """Splats of a pose."""
@@ -174,7 +174,7 @@ class IsolatedSplats(IsolatedAvatar):
 
 
 class _Process:
-    """A process of a method, started by `__enter__`; ``hidden`` paths can be read only where ``read`` and ``write`` name them."""
+    """A process of a method, started by `__enter__`. ``hidden`` paths are inaccessible, except for ``read`` and ``write``."""
 
     running: ClassVar[set[int]] = set()
     """Ids of all such processes."""
@@ -208,13 +208,13 @@ class _Process:
                 pass_fds=[other.fileno()],
                 env=environment,
                 stdin=subprocess.DEVNULL,
-                stdout=2,  # what a plug-in prints is not part of the output of the command
+                stdout=2,  # output of a plug-in is not part of the command's output
                 start_new_session=True,
             )
         other.close()
         self.running.add(self._started.pid)
         self._connection = Connection(own.detach())
-        # Settings have defaults, so that a plug-in itself names files here.
+        # Settings have defaults, so these paths may come from the plug-in itself.
         named = [
             *_texts(self._resolved.config),
             *(os.environ[n] for n in os.environ if n.startswith("HEADBENCH_")),
@@ -241,7 +241,7 @@ class _Process:
                 started.wait(GRACE_S if not error or error[0] is None else 0.1)
         finally:
             with suppress(ProcessLookupError, PermissionError):
-                os.killpg(started.pid, signal.SIGKILL)  # with all that it started in its session
+                os.killpg(started.pid, signal.SIGKILL)  # with all processes in its session
             started.wait()
             end_orphans(self.running)
             self.running.discard(started.pid)
@@ -259,7 +259,7 @@ class _Process:
         ChangedInputError
             The method changed limits, priority or processors of this process.
         HeadbenchError
-            The method raised an error, sent something else than the messages agreed on, or its process ended.
+            The method raised an error or sent an invalid message, or its process ended.
         """
         if self._started is None:
             raise HeadbenchError("the process of the method has ended")
@@ -339,7 +339,7 @@ def described(clip: Clip) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """A value with dictionaries instead of other mappings, which cannot be pickled."""
+    """Convert mappings to dictionaries, since other mappings cannot be pickled."""
     if isinstance(value, Mapping):
         return {key: _plain(each) for key, each in value.items()}
     if is_dataclass(value) and not isinstance(value, type):
@@ -359,7 +359,7 @@ def _raised(kind: str, parts: Sequence[Any]) -> Exception:
 
 
 def _priorities() -> tuple[Any, ...]:
-    """What any process of the same user can change of this one, and other processes inherit."""
+    """Properties of this process that any process of the same user can change, and that child processes inherit."""
     limits = [
         resource.getrlimit(getattr(resource, name)) for name in dir(resource) if name.startswith("RLIMIT_")
     ]

@@ -1,7 +1,7 @@
-"""Which form of an operation runs. No other file asks a tensor for its device, or whether a kernel takes it.
+"""Chooses between the torch definition and the compiled kernel of an operation; no other module checks devices of tensors.
 
-The definition of an operation is a function of torch tensors that runs on every device and in float64. At most one
-compiled form stands beside it, for float32 in host memory.
+The definition of an operation is a function of torch tensors that runs on every device and in float64. It may have one
+compiled form, for float32 in host memory.
 """
 
 from __future__ import annotations
@@ -24,34 +24,34 @@ def is_cuda(device: object) -> bool:
 
 
 def on_host(values: Tensor) -> bool:
-    """Whether a tensor is in host memory, where numpy and kernels reach it."""
+    """Whether a tensor is in host memory, accessible to numpy and kernels."""
     return str(values.device) == "cpu"
 
 
 def is_float32(values: Tensor) -> bool:
-    """Whether a tensor has the dtype that compiled forms take."""
+    """Whether a tensor has the dtype of compiled forms."""
     return str(values.dtype) == "torch.float32"
 
 
 def fits(kernel: Kernel, values: Tensor) -> bool:
-    """Whether the kernel is there and takes a tensor like this one; where it is missing, a warning is logged once."""
+    """Whether the kernel is available and accepts this tensor; if it is missing, a warning is logged once."""
     return on_host(values) and is_float32(values) and kernel.load_or_warn() is not None
 
 
 def pinned(values: Tensor, device: object) -> Tensor:
-    """Host memory that the device copies by itself; from other memory the host would copy it first."""
+    """Copy to pinned host memory for asynchronous copies to a CUDA device; unchanged for other devices."""
     return values.pin_memory() if is_cuda(device) else values
 
 
 def to_device(values: Tensor, device: object) -> Tensor:
-    """Host memory on a device; the host does not wait for the copy."""
+    """Copy host memory to a device, asynchronously for CUDA."""
     return pinned(values, device).to(device, non_blocking=True)
 
 
 class Operation(Generic[P, Result]):
-    """A function of tensors that has a definition and may have a compiled form. Decorates the definition.
+    """Decorates the definition of a function of tensors, which may have a compiled form.
 
-    The compiled form runs where `fits` says so of the first tensor: the first argument, or its first element if that is a
+    The compiled form runs if `fits` is true for the first tensor: the first argument, or its first element if that is a
     tuple.
 
     Attributes
@@ -66,7 +66,7 @@ class Operation(Generic[P, Result]):
         self.kernel_form: Callable[P, Result] | None = None
 
     def compiled(self, kernel: Kernel) -> Callable[[Callable[P, Result]], Callable[P, Result]]:
-        """Decorate the compiled form, which calls functions of ``kernel``."""
+        """Decorate the compiled form, which uses ``kernel``."""
 
         def register(form: Callable[P, Result]) -> Callable[P, Result]:
             self.kernel_form, self._kernel = form, kernel
@@ -75,7 +75,7 @@ class Operation(Generic[P, Result]):
         return register
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> Result:
-        """Run the form that suits the first tensor."""
+        """Run the form for the first tensor."""
         first: Any = args[0]
         while isinstance(first, tuple):
             first = first[0]

@@ -1,4 +1,4 @@
-"""Compiled kernels that may be missing, as where there was no C++ compiler at installation."""
+"""Loads compiled kernels, which may be missing, for example without a C++ compiler at installation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Kernel:
     label : str
         Name of the kernel in messages.
     substitute : str
-        What is used without the kernel; "" if nothing replaces it and its users raise an error.
+        Replacement used without the kernel; "" if there is none and its users raise an error.
     """
 
     def __init__(self, module: str, label: str, substitute: str = "") -> None:
@@ -34,33 +34,33 @@ class Kernel:
 
     @cached_property
     def imported(self) -> ModuleType | ImportError:
-        """The module, or why it cannot be imported."""
+        """The module, or the reason why it cannot be imported."""
         try:
             return importlib.import_module(self.module)
         except ImportError as error:
             return error
 
     def load(self) -> ModuleType:
-        """The module. Raises `UnavailableError` where it is missing."""
+        """The module. Raises `UnavailableError` if it is missing."""
         if isinstance(self.imported, ImportError):
             raise UnavailableError(f"{self.label} is not available: {self.imported}.", self.remedy)
         return self.imported
 
     def load_or_warn(self) -> ModuleType | None:
-        """The module; None where it is missing, and then one warning per process says why."""
+        """The module; None if it is missing, with one warning per process that gives the reason."""
         if isinstance(self.imported, ImportError):
             _warn_once(self.label, str(self.imported), self.remedy)
             return None
         return self.imported
 
     def need(self) -> Need:
-        """Whether this machine has it, for ``needs`` of a spec; not required where a substitute works meanwhile."""
+        """The kernel as a requirement for ``needs`` of a spec; optional if there is a substitute."""
         found = "" if isinstance(self.imported, ImportError) else ", ".join(self.instruction_sets) or "there"
         return Need(self.label, found, self.remedy, required=self.required)
 
     @cached_property
     def instruction_sets(self) -> tuple[str, ...]:
-        """Variants that run on this machine, the fastest first; empty where the module is missing."""
+        """Variants that run on this machine, the fastest first; empty if the module is missing."""
         found = self.imported
         return () if isinstance(found, ImportError) else tuple(found.instruction_sets())
 

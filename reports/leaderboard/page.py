@@ -24,12 +24,12 @@ from .submissions import RANKED, STATES, Submission, placeless, qualified, read_
 
 HEADS = ("Bundle", "By", "State", "Methods", "Comment", "headbench", "Machine", "SHA-256")
 RECOMPUTED = "recomputed"
-"""Folder of trainings, below that of the page."""
+"""Folder of repeated trainings, below that of the page."""
 
 
 @dataclass(frozen=True)
 class Board:
-    """Submissions that measured the same, and their table."""
+    """Submissions with the same protocols, and their table."""
 
     title: str
     table: Table
@@ -66,7 +66,7 @@ class Board:
 
     @property
     def remarks(self) -> list[str]:
-        """Sentences on equal renders, on what was found and on what was not verified."""
+        """Sentences on equal renders, differences, and unverified values."""
         files: dict[str, list[str]] = {}
         for each in self.submissions:
             for remark in each.remarks:
@@ -77,8 +77,8 @@ class Board:
 def build(settings: LeaderboardSettings, progress: Progress = no_progress) -> CommandResult:
     """Write ``leaderboard.md`` and ``leaderboard.html``.
 
-    A bundle that is not as it lists itself is in no table, and the page says why. Raises `InputError` for a folder without
-    sound bundles, and for names of --recompute that it does not have.
+    Invalid bundles are in no table, and the page gives the reason. Raises `InputError` for a folder without
+    valid bundles, and for unknown names of --recompute.
     """
     folder, out, execution = Path(settings.folder), Path(settings.out), settings.execution
     check_executor(execution, "cpu")
@@ -124,14 +124,14 @@ def build(settings: LeaderboardSettings, progress: Progress = no_progress) -> Co
 
 
 def _summary(submissions: Sequence[Submission], boards: Sequence[Board]) -> str:
-    """One sentence: how many bundles and tables, and by what their values are supported."""
+    """A sentence with the number of bundles and tables, and the support for their values."""
     states = [f"{n} {state.lower()}" for state, n in Counter(each.state for each in submissions).items()]
     bundles, tables = counted(len(submissions), "bundle"), counted(len(boards), "table")
     return f"{bundles} in {tables}, one for each set of frames: {', '.join(states)}."
 
 
 def _boards(submissions: Sequence[Submission]) -> list[Board]:
-    """A table for each set of protocols, those with most submissions first."""
+    """A table for each set of protocols, those with the most submissions first."""
     groups: dict[tuple[tuple[str, str], ...], list[Submission]] = {}
     for submission in submissions:
         groups.setdefault(submission.measured, []).append(submission)

@@ -1,4 +1,4 @@
-"""Bundles of a leaderboard, each with what is known of its values."""
+"""Bundles of a leaderboard, each with the verification of its values."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ RANKED: tuple[State, ...] = ("recomputed", "verified")
 
 @dataclass(frozen=True)
 class Submission:
-    """A bundle, unpacked, the SHA-256 of its file, and what is known of it.
+    """An unpacked bundle, the SHA-256 of its file, and the results of its verification.
 
-    ``run`` has registered metrics alone, by their registered definitions; ``lacking`` names values that are missing, ``trouble``
-    says why something could not be verified.
+    ``run`` has only registered metrics, with their registered definitions; ``lacking`` names missing values, and ``trouble``
+    is the reason if something could not be verified.
     """
 
     file: Path
@@ -67,7 +67,7 @@ class Submission:
 
     @property
     def state(self) -> State:
-        """What supports its values."""
+        """Support for its values."""
         if self.lacking:
             return "incomplete"
         of_frames = {metric.name for metric in self.run.metrics if metric.per_frame}
@@ -85,7 +85,7 @@ class Submission:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences on what was found and what was not verified."""
+        """Sentences on differences and unverified values."""
         mismatches = map(str, self.findings.mismatches)
         found = [*self.lacking, *(text for text in mismatches if not text.endswith(self.lacking or ("\0",)))]
         more = [f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else []
@@ -99,7 +99,7 @@ class Submission:
 
 
 def read_submission(file: Path, into: Path) -> Submission:
-    """Unpack a bundle into ``into`` and check it. Raises `InputError` for one whose values belong into no table."""
+    """Unpack a bundle into ``into`` and check it. Raises `InputError` if its values cannot be in a table."""
     bundle, folder = read_bundle(file, into), RunFolder(into)
     manifest = folder.read_manifest()
     rows = check_results(folder, manifest)
@@ -121,7 +121,7 @@ def read_submission(file: Path, into: Path) -> Submission:
 
 
 def _with_suspects(rows: Rows, metrics: Sequence[MetricSpec]) -> Rows:
-    """The rows, marked by the limits of the registered metrics alone."""
+    """The rows, with suspect values marked by the limits of registered metrics only."""
     limits = {metric.name: metric.suspect_above for metric in metrics if metric.suspect_above is not None}
     return rows.with_suspects(limits, FULL)
 
@@ -135,14 +135,14 @@ def verified(
     execution: Execution,
     progress: Progress,
 ) -> Submission:
-    """The submission with all that can be verified.
+    """Verify as much of the submission as possible.
 
     Parameters
     ----------
     kept : Path
-        Folder of trainings that are repeated, or were in an earlier call.
+        Folder of repeated trainings, from this or an earlier call.
     recompute : bool
-        Train again; otherwise only an earlier training is compared.
+        Train again; otherwise only an existing training is compared.
     """
     trouble: list[str] = []
     folder, again = submission.run.folder, kept / submission.digest[:12]
@@ -162,9 +162,7 @@ def verified(
             metrics = {metric.name: metric for metric in submission.run.metrics}
             own = folder.rows_by_condition(folder.read_manifest())
             submission = replace(submission, agreed=tuple(agreements(own, rows, metrics)))
-            if (
-                submission.state == "recomputed"
-            ):  # what is ranked is what was trained here, not what comes close to it
+            if submission.state == "recomputed":  # values trained here are ranked, not the submitted ones
                 values = submission.run.rows.with_values(
                     rows.labelled().of_metrics(sorted(submission.supported))
                 )
@@ -176,7 +174,7 @@ def verified(
 
 
 def qualified(submissions: Sequence[Submission]) -> list[dict[str, str]]:
-    """Label of each submission's methods, by name: method, author and bundle; with a digest where they look alike."""
+    """Label of each submission's methods, by name: method, author and bundle; with a digest if they are not unique."""
     names = [
         {method: f"{method} [{each.bundle.by}/{each.file.stem}]" for method in each.run.methods}
         for each in submissions

@@ -1,4 +1,4 @@
-"""The part "Which method for a budget" of a page: choices, their costs, and the answer for every set of them that limits leave."""
+"""The section "Which method for a budget" of a page: choices, their costs, and the answer for each set within limits."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from ..runs import RunData, RunSet
 from ..statistics.comparisons import PairwiseTests
 
 MOST_SETS = 4000
-"""Sets of choices whose answer is in a page."""
+"""Maximum number of sets of choices with answers in a page."""
 
 
 def budget_of(runs: RunSet, read: tuple[RunData, ...], marks: Mapping[str, int]) -> dict[str, Any]:
-    """Content of the part for runs, which were ``read``, or the ``reason`` why it has none; ``answers`` are for the script.
+    """Content of the section for loaded runs (``read``), or the ``reason`` why it is empty; ``answers`` are for the script.
 
     Task and metric are those of `RecommendSettings`, or the first that the runs have. ``marks`` are numbers of marks by label.
     """
@@ -49,7 +49,7 @@ def budget_of(runs: RunSet, read: tuple[RunData, ...], marks: Mapping[str, int])
         return {"reason": f"It takes {error.expected}; found: {error.found}.", "answers": None}
     subjects, spec = found.subjects, found.metric
     means = {label: fmean(choice.quality.values()) for label, choice in found.by_label.items()}
-    # Of equal ones the first, as in `best_of`.
+    # The first in case of ties, as in `best_of`.
     names = sorted(means, key=lambda label: -found.sign * means[label])
     costs = {
         cost: [
@@ -100,7 +100,7 @@ def _shown(cost: float | None, marked: bool) -> str:
 
 
 def _left_out(read: Choices, best: str) -> list[str]:
-    """How far recommendations hold on subjects that were left out, or why this is not known."""
+    """Accuracy of recommendations on left-out subjects, or the reason why it is unknown."""
     choices, subjects, sign = read.by_label, read.subjects, read.sign
     if len(subjects) < 2:
         unknown = "it is not known whether a recommendation holds for other people"
@@ -114,7 +114,7 @@ def _left_out(read: Choices, best: str) -> list[str]:
 def _answers(
     read: Choices, names: Sequence[str], costs: Sequence[Sequence[float | None]]
 ) -> dict[str, list[str] | dict[str, int]]:
-    """What can be said of the best of each set of choices: ``sentences``, and by set the index of its sentence.
+    """Statements on the best of each set of choices: ``sentences``, and the index of the sentence by set.
 
     A set is a number in hexadecimal digits whose bit i is 1 if it has the choice i. The largest sets come first if there are more
     than `MOST_SETS`.
@@ -133,9 +133,9 @@ def _answers(
 
 
 def sets_within(count: int, costs: Sequence[Sequence[float | None]]) -> set[int]:
-    """Every set of ``count`` choices that limits can leave, none empty; the choice i is bit i.
+    """All non-empty sets of ``count`` choices that limits can produce; choice i is bit i.
 
-    ``costs`` has for each kind of cost that of each choice; one that is unknown (None) exceeds every limit.
+    ``costs`` has, for each kind of cost, the cost of each choice; an unknown cost (None) exceeds every limit.
     """
     every = (1 << count) - 1
     found = {every}

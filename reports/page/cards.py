@@ -1,4 +1,4 @@
-"""Cards of methods: what each is, by whom, and how it ran here."""
+"""Cards of methods: description, authors, and results of the runs."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ..runs import RunSet
 def cards_of(runs: RunSet) -> list[dict[str, Any]]:
     """A card for each method, trivial baselines last.
 
-    Summary, source and citation are those of the registered method of the same name and implementation; a method that is
-    not registered here has none. ``anchor`` is the name of the card in the page.
+    Summary, source and citation are those of the registered method of the same name and implementation; other methods
+    have none. ``anchor`` is the name of the card in the page.
     """
     specs = {name: plugin.spec for name, plugin in discover("methods").items()}
     cards = []

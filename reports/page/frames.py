@@ -27,7 +27,7 @@ WORST = 5
 LOSSLESS, LOSSY = 101, 90
 """Qualities of OpenCV's WebP encoder; above 100 it keeps every pixel."""
 BATCH = 32
-"""Frames that are encoded before their bytes are counted."""
+"""Number of frames encoded at a time before their bytes are counted."""
 
 
 class ShownFrame(NamedTuple):
@@ -44,10 +44,10 @@ class ShownFrame(NamedTuple):
 
 @dataclass
 class Pictures:
-    """Pictures of frames: of each the ground truth's first, then each method's, as the base64 of a WebP or a reason.
+    """Images of frames: for each frame the ground truth, then each method, as a base64 WebP or a reason.
 
-    ``lossless`` are frames whose pictures keep every pixel. ``truth`` states why the ground truth is missing,
-    else "".
+    ``lossless`` are frames with lossless images. ``truth`` is the reason why the ground truth is missing,
+    or "".
     """
 
     shown: dict[ShownFrame, list[str | None]] = field(default_factory=dict)
@@ -59,7 +59,7 @@ class Pictures:
 
 
 def frame_values(runs: RunSet, metrics: Sequence[MetricSpec]) -> dict[tuple[str, str, ShownFrame], float]:
-    """Value by metric, label and frame of the whole images that are shown."""
+    """Values of the displayed whole images, by metric, label and frame."""
     found = {}
     for task in runs.tasks:
         for key in runs.keys[task]:
@@ -93,8 +93,8 @@ def worst_frames(
 
 
 def spread(frames: Sequence[ShownFrame]) -> Iterator[ShownFrame]:
-    """Frames in the order in which they are added: each task, subject, sequence and camera alike, evenly over time and
-    finer with every turn."""
+    """Frames in the order in which they are added: tasks, subjects, sequences and cameras in turn, evenly over time and
+    finer with every round."""
     ordered = sorted(frames, key=lambda f: (f.group, f.key.timestep))
     groups = [_refined([*members]) for _, members in groupby(ordered, key=lambda f: f.group)]
     return (frame for turn in zip_longest(*groups) for frame in turn if frame is not None)
@@ -111,12 +111,12 @@ def _refined(items: Sequence[ShownFrame]) -> list[ShownFrame]:
 
 
 def without_folders(text: str) -> str:
-    """One line in which absolute paths are cut to their last part: pages are shared."""
+    """One line with absolute paths shortened to their last part, since pages are shared."""
     return re.sub(r"(?<![\w./])(?:/[^\s/:,'\"]+)+/([^\s/:,'\"]+)", r"\1", " ".join(text.split()))
 
 
 def open_truth(runs: RunSet, options: RunOptions) -> tuple[dict[str, Clip], str]:
-    """The captures by subject of the first run that can be opened, or the reason if none can."""
+    """The captures, by subject, of the first run whose captures can be opened, or the reason if there is none."""
     reasons = []
     for run in runs.runs:
         try:
@@ -135,7 +135,7 @@ def encode(image: ByteArray, quality: int) -> str:
 def choose_pictures(
     runs: RunSet, worst: Sequence[ShownFrame], budget: int, options: RunOptions, progress: Progress
 ) -> Pictures:
-    """Encode the worst frames, then others while they fit in ``budget`` bytes of base64.
+    """Encode the worst frames, then others as long as they fit in ``budget`` bytes of base64.
 
     Raises `InputError` if the worst ones do not fit.
     """
@@ -184,7 +184,7 @@ def choose_pictures(
 
 @dataclass
 class _Source:
-    """Reads and encodes a frame's pictures, in any thread."""
+    """Reads and encodes a frame's images; thread-safe."""
 
     runs: RunSet
     clips: Mapping[str, Clip]

@@ -1,4 +1,4 @@
-"""What a page shows first: the best methods, in the frame in which they differ most."""
+"""The first images of a page: the best methods, in the frame in which they differ most."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .frames import Pictures, ShownFrame
 from .verdict import Values
 
 TILES = 3
-"""Methods beside the ground truth, such that four pictures fill a window."""
+"""Number of methods next to the ground truth, so that four images fill a window."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,10 @@ class Opening:
 def opening(
     runs: RunSet, best: Sequence[str], metrics: Sequence[MetricSpec], values: Values, pictures: Pictures
 ) -> Opening:
-    """Choose from the pictures of a page.
+    """Choose from the images of a page.
 
-    ``best`` are the ranked methods, best first. Of the first task, the frame is one with pictures of all that is shown in
-    which the first metric's values are farthest apart; if there is none, the first frame with any picture.
+    ``best`` are the ranked methods, best first. The frame is that of the first task, with images of all displayed methods, in
+    which values of the first metric differ most; if there is none, the first frame with any image.
     """
     place = {label: index + 1 for index, label in enumerate(runs.methods)}
     drawn = {

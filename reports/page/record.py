@@ -49,7 +49,7 @@ def record_of(run: RunData) -> dict[str, Any]:
 
 
 def _excluded(frames: dict[tuple[Any, ...], None]) -> list[tuple[str, str, str, str, str]]:
-    """Subject, sequence, timestep, how many cameras, reason."""
+    """Subject, sequence, timestep, number of cameras, reason."""
     moments: dict[tuple[Any, ...], int] = {}
     for subject, sequence, timestep, _, why in frames:
         moments[subject, sequence, timestep, why] = moments.get((subject, sequence, timestep, why), 0) + 1
@@ -57,7 +57,7 @@ def _excluded(frames: dict[tuple[Any, ...], None]) -> list[tuple[str, str, str, 
 
 
 def _without_folders(value: Any) -> Any:
-    """A value whose absolute paths are cut to their last part."""
+    """A value with absolute paths shortened to their last part."""
     if isinstance(value, dict):
         return {key: _without_folders(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -54,7 +54,7 @@ from .verdict import verdict
 HERE = Path(__file__).parent
 MEGABYTE = 10**6
 OPENING_SHARE = 0.97
-"""Part of the bytes for pictures that is left for all but a second copy of those that open the page."""
+"""Share of the bytes for images that excludes the second copy of the opening images."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class TitledTable:
 
 
 def write_page(run_folder: Path) -> list[Path]:
-    """Write ``report.html`` of a run that has just ended; return the file. Its process has loaded the run's plug-ins."""
+    """Write ``report.html`` of a run that has just ended; return the file. This process has loaded the run's plug-ins."""
     out = RunFolder(run_folder).page
     write_report(PageSettings((str(run_folder),), str(out), trust=True))
     return [out]
@@ -112,7 +112,7 @@ def page_text(
     *,
     apart: bool = False,
 ) -> tuple[str, Pictures, list[PictureFile]]:
-    """The page of runs, which were ``read``, its pictures, and the files of those that are not embedded in the page.
+    """The page of loaded runs (``read``), its images, and the files of images that are not embedded.
 
     Raises `InputError` if ``max_mb`` does not suffice.
     """
@@ -154,9 +154,9 @@ def page_text(
     room -= (
         ENTRY_BYTES * (1 + 2 * limit // FILE_BYTES) if apart else 0
     )  # two files together have more than that
-    entry = 8 * (len(runs.methods) + 2)  # bytes of a frame's entry in the list, without its pictures
+    entry = 8 * (len(runs.methods) + 2)  # bytes of a frame's entry in the list, without its images
     room -= entry * len(data["frames"])
-    # The pictures that open the page stand in it twice, so that they show before its script has run.
+    # The opening images are in the page twice, so that they are visible before the script has run.
     pictures = choose_pictures(runs, worst, int(room * OPENING_SHARE), settings, progress)
     best = [row.method for row in compact(parts[0].table).rows if not row.trivial]
     first = opening(runs, best, metrics, values, pictures)
@@ -178,7 +178,7 @@ def page_text(
 
 
 def _printed(runs: RunSet, name: str) -> list[TitledTable]:
-    """The runs in the form of the tables of a paper whose tasks they have. Raises `InputError` if there is none."""
+    """The runs in the form of a paper's tables with the same tasks. Raises `InputError` if there is none."""
     found, refused = [], None
     for table in printed_tables(name, None):
         try:
@@ -191,7 +191,7 @@ def _printed(runs: RunSet, name: str) -> list[TitledTable]:
 
 
 def _places(frame: ShownFrame, pictures: Pictures, images: list[str], reasons: list[str]) -> list[int]:
-    """Index of each picture of a frame among ``images``, -1 - index of its reason if it is missing."""
+    """Index of each image of a frame in ``images``; -1 - index of its reason if it is missing."""
     places = []
     for image, reason in zip(pictures.shown[frame], pictures.reasons[frame]):
         if image is not None:
@@ -235,7 +235,7 @@ def _tiles(
     values: dict[tuple[str, str, ShownFrame], float],
     pictures: Pictures,
 ) -> list[dict[str, Any]]:
-    """The opening pictures: ground truth and methods, each with its label, mark, value, and the picture or a reason."""
+    """The opening images: ground truth and methods, each with label, mark, value, and the image or a reason."""
     tiles: list[dict[str, Any]] = []
     if first.frame is None:
         return tiles
@@ -267,7 +267,7 @@ def _filled(
 ) -> str:
     size = f":root {{ --tiles: {max(1, len(tiles))}; --ratio: {content['ratio']}; }}\n"
     style = stylesheet() + content["own_style"] + size
-    # A page opened from a disk has no origin, so that 'self' matches nothing.
+    # A page opened from a file has no origin, so 'self' matches nothing.
     beside = " 'self' file:" if apart else ""
     hashes = " ".join(f"'{policy_hash(script)}'" for script in content["scripts"])
     policy = "; ".join(
@@ -292,7 +292,7 @@ def _filled(
 
 
 def _json(value: Any) -> str:
-    """JSON for a script element: it contains no "<"."""
+    """JSON for a script element, without "<"."""
     return json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":")).replace(
         "<", r"\u003c"
     )
@@ -403,7 +403,7 @@ def _cost(runs: RunSet, label: str, cost: str) -> float | None:
 
 
 FOREST = 120
-"""Half the width of a drawing of differences."""
+"""Half the width of a plot of differences."""
 
 
 def _comparisons(runs: RunSet) -> dict[str, Any]:
@@ -451,7 +451,7 @@ def _comparisons(runs: RunSet) -> dict[str, Any]:
 
 
 def _with_forest(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Add places of the subjects' differences, their mean and interval, on one axis for all lines."""
+    """Add positions of the subjects' differences, their mean and interval, on a common axis."""
     numbers = [
         number
         for line in lines

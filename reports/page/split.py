@@ -1,7 +1,7 @@
-"""The pictures of a page in separate files, each loaded when one of its pictures is viewed.
+"""The images of a page in separate files, each loaded when one of its images is viewed.
 
-A page opened from a disk may not read the pixels of image files, but it may run scripts, so the files are
-scripts that pass their pictures to the page. They are named by their content, so that a page never loads
+A page opened from a file cannot read the pixels of image files, but it can run scripts, so the files are
+scripts that pass their images to the page. They are named by their content, so that a page never loads
 those of another.
 """
 
@@ -18,14 +18,14 @@ from ...bench.io.files import check_inside, entries, write_text
 
 INDEX, FOLDER = "index.html", "pictures"
 FILE_BYTES = 2 * 10**6
-"""Target size of a file, such that it loads quickly from a slow disk or network."""
+"""Target size of a file, small enough to load quickly from a slow disk or network."""
 ENTRY_BYTES = 100
 """Maximum overhead of a file: its name on the page and the call in it."""
 
 
 @dataclass(frozen=True)
 class PictureFile:
-    """A file of consecutive pictures: its name below the page's folder, its text, how many pictures it holds."""
+    """A file of consecutive images: path in the page's folder, text, number of images."""
 
     name: str
     text: str
@@ -33,7 +33,7 @@ class PictureFile:
 
 
 def split(images: Sequence[str]) -> list[PictureFile]:
-    """Pictures, as base64, in files with at most `FILE_BYTES` of them, or with one picture."""
+    """Distribute base64 images over files of at most `FILE_BYTES`, or with a single image."""
     groups: list[list[str]] = []
     used = 0
     for image in images:
@@ -62,14 +62,14 @@ def check_folder(folder: Path) -> None:
 
 
 def write_pictures(folder: Path, files: Sequence[PictureFile]) -> None:
-    """Write the missing files; those of an earlier page stay until `remove_others`."""
+    """Write the missing files; those of an earlier page are kept until `remove_others`."""
     check_inside(folder / FOLDER)
     for file in files:
         write_text(folder / file.name, file.text)
 
 
 def remove_others(folder: Path, files: Sequence[PictureFile]) -> None:
-    """Remove the pictures of earlier pages."""
+    """Remove the images of earlier pages."""
     names = {file.name for file in files}
     for path in (folder / FOLDER).glob("*.js"):
         if f"{FOLDER}/{path.name}" not in names:

@@ -12,7 +12,7 @@ Curve = list[tuple[int, float]]
 
 
 def loss_curves(runs: RunSet) -> list[dict[str, Any]]:
-    """Of each method that recorded positive losses: its index among the methods, and iterations with losses.
+    """For each method that recorded positive losses: its index among the methods, and iterations with losses.
 
     Losses are divided by the first recorded one, and averaged over the subjects that recorded the same iterations as the
     first; seeds are those of the pictures. Damaged records are ignored.

@@ -1,4 +1,4 @@
-"""What a comparison shows, in words: title, one sentence for each task and for costs, and how far they reach."""
+"""Conclusions of a comparison as text: title, one sentence for each task and for costs, and their limitations."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ WORDS = [
     "twelve",
 ]
 NAMED = 3
-"""Methods that a title names, and that a sentence compares one by one."""
+"""Maximum number of methods named in a title, and compared one by one in a sentence."""
 MIDDLE = 0.9
 """Share of frames between the ends of a span."""
 
@@ -56,7 +56,7 @@ class Conclusions:
 
 
 def in_words(number: int) -> str:
-    """A number up to twelve as a word."""
+    """Spell out a number up to twelve."""
     return WORDS[number] if number < len(WORDS) else str(number)
 
 
@@ -68,7 +68,7 @@ def listed(names: Sequence[Any]) -> Markup:
 
 
 def title_of(runs: RunSet) -> str:
-    """The comparison that the runs are: methods, or how many, and subjects."""
+    """Description of the comparison: methods, or their number, and subjects."""
     names = runs.ranked or runs.methods
     what = "avatar methods" if runs.ranked else "baselines"
     methods = str(listed(names)) if len(names) <= NAMED else f"{in_words(len(names)).capitalize()} {what}"
@@ -151,7 +151,7 @@ def _amount(value: float, spec: MetricSpec) -> str:
 
 
 def _seen_from(leader: str, comparison: Mapping[str, Any]) -> dict[str, Any]:
-    """A comparison with the leader first; gains are positive where it is better."""
+    """A comparison with the leader first; gains are positive if it is better."""
     first, second = comparison["first"], comparison["second"]
     sign = (1 if first == leader else -1) * (1 if comparison["higher_is_better"] else -1)
     ends = [comparison[name] for name in ("low", "high")]
@@ -215,7 +215,7 @@ def _costs(runs: RunSet, names: Sequence[str]) -> list[Markup]:
 def _span(
     runs: RunSet, values: Values, spec: MetricSpec, task: str, leader: str, second: str
 ) -> Markup | None:
-    """The lead of the best method over the next one in single frames."""
+    """Difference of the best method to the next one in single frames."""
     sign = 1 if spec.higher_is_better else -1
     leads = []
     whole = SPLIT_TASK if task in (SEEN_CAMERAS, UNSEEN_CAMERAS) else task
@@ -234,7 +234,7 @@ def _span(
 
 
 def _limits(runs: RunSet, methods: int, spans: Sequence[Markup], untested: bool) -> list[Markup]:
-    """How far the sentences reach."""
+    """Limitations of the sentences."""
     if methods < 2:
         return []
     pairs, subjects = methods * (methods - 1) // 2, len(runs.rows.subjects)
@@ -260,7 +260,7 @@ def _limits(runs: RunSet, methods: int, spans: Sequence[Markup], untested: bool)
 
 
 def _facts(runs: RunSet) -> list[tuple[str, str]]:
-    """What was compared, in short lines."""
+    """Short lines describing the compared data."""
     cores = runs.runs[0].manifest.machine.get("cores", "")
     trivial = f"{in_words(len(runs.trivial))} trivial baseline{'s' * (len(runs.trivial) != 1)}"
     methods = ", ".join(runs.ranked)

@@ -32,8 +32,8 @@ def write_plot(
 ) -> None:
     """Draw quality over each cost (label by field of `ParetoPoint`) side by side and write a PNG, atomically.
 
-    Costs are on a logarithmic axis. Steps join the front of each series: the best quality of that series up to a cost.
-    Points that no point of any series beats are filled; squares are trained avatars.
+    Costs are on a logarithmic axis. Steps connect the front of each series: its best quality up to a cost.
+    Filled points are on the front of all series; squares are trained avatars.
     """
     shapes = ""
     if any(point.variant for point in points):
@@ -65,8 +65,8 @@ Curves = tuple[Sequence[RatePoint], Sequence[MetricSpec]]
 def write_rates(path: Path, curves: Mapping[str, Curves]) -> None:
     """Draw quality over megabytes for the steps of the codec: a curve for each method, a row for each task, a panel for each metric.
 
-    Each point has its step. Sizes are on a logarithmic axis; dashed lines are the quality of avatars as trained, whose size is not
-    shown.
+    Points are labelled with their step. Sizes are on a logarithmic axis; dashed lines are the quality of avatars as trained,
+    whose size is not shown.
     """
     names = list(dict.fromkeys(point.method for points, _ in curves.values() for point in points))
     subjects = {subject for points, _ in curves.values() for point in points for subject in point.megabytes}
@@ -142,7 +142,7 @@ def _draw(
 
 
 def label_points(axes: Axes, points: Sequence[ParetoPoint], cost: str, order: Sequence[int]) -> None:
-    """Write the names of variants next to their points, in an order of their indices, without overlaps."""
+    """Write the names of variants next to their points without overlaps, in the given order of indices."""
     scale = axes.get_figure(root=True).dpi / 72  # type: ignore[union-attr]
     costs = {i: getattr(point, cost) for i, point in enumerate(points)}
     places = {i: (value, points[i].quality) for i, value in costs.items() if value is not None}

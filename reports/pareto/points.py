@@ -13,10 +13,10 @@ from ..runs import RunData, check_same_protocol
 
 
 def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
-    """Indices of the points that no other point beats, by rising cost.
+    """Indices of the points on the Pareto front, by increasing cost.
 
-    One point beats another if it costs no more and is no worse, and is strictly better in one of the two. Equal
-    points do not beat each other. Lower costs and higher qualities are better; all numbers are finite.
+    One point dominates another if it costs no more and is no worse, and is strictly better in one of the two. Equal
+    points do not dominate each other. Lower costs and higher qualities are better; all numbers are finite.
     """
     front: list[int] = []
     for index in sorted(range(len(costs)), key=lambda i: (costs[i], -qualities[i])):

@@ -22,7 +22,7 @@ from .points import SIZE, pareto_front
 Curve = Sequence[tuple[float, float]]
 """Megabytes and quality at each step of the codec."""
 LEAST_POINTS = 3
-"""Number of steps that make a curve."""
+"""Minimum number of steps of a curve."""
 METRICS = ("psnr", "lpips")
 
 
@@ -103,21 +103,21 @@ def by_subject(run: RunData, label: str, metric: str, task: str) -> dict[str, fl
 
 
 def curve_of(points: Sequence[RatePoint], method: str, metric: str, subject: str) -> Curve:
-    """Megabytes and quality of a method's coded avatars of one subject, by rising size."""
+    """Megabytes and quality of a method's coded avatars of one subject, by increasing size."""
     own = [p for p in points if p.method == method and p.variant and subject in p.megabytes]
     values = [(p.megabytes[subject], p.quality[metric][subject]) for p in own if subject in p.quality[metric]]
     return sorted(values)
 
 
 def rate_difference(reference: Curve, other: Curve, *, higher_is_better: bool = True) -> float | None:
-    """Mean difference of ln(megabytes) at equal quality, over the qualities that both curves reach.
+    """Mean difference of ln(megabytes) at equal quality, over the common range of quality of both curves.
 
     Bjontegaard's difference of rates (G. Bjontegaard, "Calculation of average PSNR differences between RD-curves", ITU-T
     VCEG-M33, 2001) with piecewise cubic Hermite interpolation of the logarithm of the rate in place of one cubic, as in
-    ITU-T HSTP-VID-WPOM (2020), section 4.2. exp(result) - 1 is the BD-rate. Points that another point of the same curve
-    beats are left out, so that quality rises with the rate.
+    ITU-T HSTP-VID-WPOM (2020), section 4.2. exp(result) - 1 is the BD-rate. Points dominated by others of the same curve
+    are left out, so that quality increases with the rate.
 
-    None with fewer than `LEAST_POINTS` points on a curve, and for curves without a common quality.
+    None with fewer than `LEAST_POINTS` points on a curve, and for curves without a common range of quality.
     """
     rates = []
     for curve in (reference, other):

@@ -147,6 +147,6 @@ def _videos(shots: Sequence[Shot], settings: RenderSettings) -> list[Path]:
 
 
 def _pictured(shot: Shot, beside: bool) -> ByteArray:
-    """The frame as a video has it: as it was written, with the captured image on its left if requested."""
+    """A frame of a video: the render, with the captured image on its left if requested."""
     image = read_png(shot.path)
     return np.hstack([shot.captured(), image]) if beside and shot.captured else image

@@ -43,10 +43,10 @@ def robustness_report(folder: Path) -> CommandResult:
 def write_extremes_sheet(
     folder: Path, avatars: Sequence[Mapping[str, Any]], width: int = EXTREMES_WIDTH
 ) -> None:
-    """Draw the sheet of avatars that ``headbench run extremes`` rendered into a folder: a column a view, then the path.
+    """Draw the sheet of avatars that ``headbench run extremes`` rendered into a folder: a column per view, then the path.
 
-    The truth, where there is one, is above each render. Views beyond the training cameras have an orange frame, frames that
-    break a limit a red one. The typical pose comes first, sampled poses below it.
+    The truth, if available, is above each render. Views beyond the training cameras have an orange border, frames that
+    violate a limit a red one. The typical pose comes first, sampled poses below it.
     """
     write_sheet(
         folder / SHEET_FILE,
@@ -67,8 +67,8 @@ def write_reenact_sheet(
 ) -> None:
     """Draw the sheet of avatars that ``headbench run reenact`` rendered into a folder.
 
-    The source's frame above, the avatars it drives below: up to ``columns`` timesteps of each pair of target and
-    source, evenly spaced. A frame that breaks a limit has a red frame.
+    The source's frame is above the avatars that it drives, for up to ``columns`` evenly spaced timesteps of each pair of
+    target and source. Frames that violate a limit have a red border.
     """
 
     def pair(avatar: Mapping[str, Any]) -> tuple[str, str]:
@@ -110,7 +110,7 @@ def _extremes_sections(folder: Path, avatar: Mapping[str, Any], width: int) -> l
         (path if sequence == "path" else columns[camera]).append(frame)
 
     def rows(frames: Sequence[Mapping[str, Any] | None], label: str) -> list[TileRow]:
-        """The truth of some frames, if there is one, and below it their renders; None leaves a gap."""
+        """The truth of some frames, if available, with their renders below; None leaves a gap."""
         made = []
         for name, shown in (("truth", "truth"), ("render", "driven")):
             if all(frame is None or shown in frame for frame in frames):
@@ -141,7 +141,7 @@ def _extremes_sections(folder: Path, avatar: Mapping[str, Any], width: int) -> l
 
 
 def _picture(path: Path, width: int) -> Any:
-    """The image at a width, reduced by area; frames that were not finite have no file."""
+    """The image at a width, reduced by area; frames with non-finite values have no file."""
     if not path.exists():
         return "not finite"
     image = read_png(path)

@@ -24,7 +24,7 @@ def ablation_table(runs: RunSet, method: str, names: Mapping[str, str], *, cross
     runs : RunSet
         A run with only ``method`` itself and its ablations.
     method : str
-        Label of the method, of one under a condition of tracking for ablations under this condition.
+        Label of the method, including its condition of tracking for ablations under this condition.
     names : mapping of str
         Name of each ablation by its label.
     """
@@ -51,22 +51,21 @@ def difference_table(
     *,
     crossed: bool = False,
 ) -> Table:
-    """Paired differences, with those columns of the comparison table that do not depend on the machine.
+    """Paired differences, in the machine-independent columns of the comparison table.
 
-    ``crossed``: differences in novel views minus those in self-reenactment instead, which show whether a change helps in one
-    task more than in the other. Speeds are left out: those of runs made one after another differ by up
-    to a tenth without any difference of the method.
+    ``crossed``: differences in novel views minus those in self-reenactment, which show whether a change helps more in one of
+    the tasks. Speeds are left out, since those of consecutive runs of the same method differ by up to a tenth.
 
     Parameters
     ----------
     runs : RunSet
         A run with the labels of ``pairs`` alone.
     pairs : sequence of tuple of str
-        Labels whose difference is a row, first minus second.
+        Pairs of labels, with one row for each difference, first minus second.
     names : mapping of str
         Name of each row by the first label.
     title, meaning, family : str
-        Heading of the rows; sentence about the cells; what the tests of a column are corrected for.
+        Heading of the rows; sentence about the cells; family of the correction of a column's tests.
     """
     runs = runs.by_camera
     table = table_of(runs)
@@ -86,7 +85,7 @@ def difference_table(
             level=LEVEL,
         )
         if not column.task and all(each.difference is None for each in found):
-            continue  # of coded avatars, which conditions do not have
+            continue  # metrics of coded avatars, which conditions do not have
         shown.append(column)
         columns.append([_cell(each, column.digits) for each in found])
         tested += [each for each in found if each.p_holm is not None]
@@ -112,7 +111,7 @@ def _marking(tested: Sequence[PairedComparison], meaning: str, family: str) -> s
 def _cell(found: PairedComparison, digits: int) -> TableCell:
     if found.difference is None:
         return TableCell("missing", None, found.reason)
-    # A digit more than the table: differences are smaller than values.
+    # One digit more than the table, since differences are smaller than values.
     text = found.text(digits + 1)
     differs = found.p_holm is not None and found.p_holm <= LEVEL
     return TableCell("ok", found.difference, text, rank=1 if differs else None)

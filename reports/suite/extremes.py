@@ -1,4 +1,4 @@
-"""The avatars of a suite in new poses and views, from the records that ``headbench run extremes`` left in its runs."""
+"""Results of a suite's avatars in new poses and views, from the records of ``headbench run extremes`` in its runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..writers import pipe_table
 
 FOLDER = "extremes"
 KEPT = ("subject", "method", "seed", "frames", "frames_broken", "measures", "missing", "no_truth")
-"""Parts of an avatar's record that the table needs."""
+"""Parts of an avatar's record used in the table."""
 
 
 def read_extremes(runs: Sequence[Path]) -> list[dict[str, Any]]:
@@ -45,7 +45,7 @@ def extremes_section(avatars: Sequence[Mapping[str, Any]]) -> str:
             worst = [(each["mean"] or 0.0, each["worst"]) for each in found if each["worst"] is not None]
             if not means or not worst:
                 continue
-            # A measure whose worst value is its lowest is better where it is higher.
+            # If the worst value is the lowest, higher is better.
             lowest = sum(low <= mean for mean, low in worst) * 2 > len(worst)
             extreme = (min if lowest else max)(value for _, value in worst)
             counts = f"{sum(each['failed'] for each in found)} of {sum(each['frames'] for each in found)}"

@@ -68,16 +68,16 @@ def suite_runs(folder: Path, base: str = RUN) -> list[Path]:
 def suite_report(folder: Path, method: str) -> str:
     """Tables of a suite as Markdown: whole frames, each region, each held-out sequence, conditions, ablations, variance.
 
-    The primary endpoints are first; everything else is labelled as exploratory. Under each table are the paired differences of
-    every other method from ``method``, with intervals and tests. Those of the ablations and of conditions are such
-    differences, of whole frames and of the face, the former also in each held-out sequence.
+    The primary endpoints are first; everything else is labelled as exploratory. Each table is followed by the paired
+    differences of all other methods from ``method``, with intervals and tests. Ablations and conditions have such differences
+    for whole frames and the face; for whole frames also in each held-out sequence.
 
     Parameters
     ----------
     folder : Path
         Folder of the suite.
     method : str
-        Label of the method that others are compared with.
+        Label of the reference method.
     """
     runs, large, seeds = (suite_runs(folder, base) for base in (RUN, LARGE_RUN, SEEDS_RUN))
     text = _tables(RunSet.read(runs), method, primary=True)
@@ -158,7 +158,7 @@ def _ablation_sections(
 
 
 def _machines(runs: RunSet) -> str:
-    """Which processors trained which subjects: paired differences are within a subject, and so within one of them."""
+    """The processors used for each subject; paired differences are within a subject, and so on the same processor."""
     trained = runs.rows.select(
         method=ALL, condition=ALL, metric="training_time", task="", region=FULL, seeds=ALL
     )
@@ -167,7 +167,7 @@ def _machines(runs: RunSet) -> str:
         machines.setdefault(str(subject), set()).add(str(machine))
     known: dict[str, list[str]] = {}
     for subject, found in machines.items():
-        # A training that was interrupted has no time, and so no machine.
+        # An interrupted training has no time, and thus no machine.
         for machine in sorted(found - {""}) or ["unknown processors"]:
             known.setdefault(machine, []).append(subject)
     listed = [f"{machine}: subjects {', '.join(subjects)}" for machine, subjects in known.items()]
@@ -197,7 +197,7 @@ def _title(text: str, region: str, *chosen: str) -> str:
 
 
 def _section(title: str, runs: RunSet, method: str, note: str = "") -> str:
-    """A table and, where the method is among several, their differences from it, below a ``note``."""
+    """A table and, if the method is one of several, the differences of the others from it, below a ``note``."""
     text = f"## {title} (exploratory)\n\n{to_markdown(table_of(runs)).strip()}"
     if method not in runs.ranked or len(runs.ranked) < 2:
         return text

@@ -1,4 +1,4 @@
-"""Tables of methods under a condition of tracking: beside the plain methods, and as differences from them."""
+"""Tables of methods under a condition of tracking: next to the plain methods, and as differences from them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DROP_MEANING = f"{DROP} to a task: novel views minus that task."
 
 
 def drop_table(runs: RunSet) -> Table:
-    """PSNR of all tasks, and a last column for each other task: that of novel views minus that of the task."""
+    """PSNR of all tasks, and a last column for each other task: novel views minus that task."""
     table = table_of(runs, columns=Columns((METRIC,)))
     (first,) = (place for place, column in enumerate(table.columns) if column.task == NOVEL)
     others = [place for place in range(len(table.columns)) if place != first]
@@ -47,7 +47,7 @@ def _difference(row: TableRow, first: int, second: int, table: Table) -> TableCe
 
 
 def condition_table(runs: RunSet, changed: Mapping[str, str], title: str) -> Table:
-    """Differences that a condition makes, a row for each method.
+    """Effects of a condition, one row per method.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def condition_table(runs: RunSet, changed: Mapping[str, str], title: str) -> Tab
 def drops_by_tracking(runs: RunSet, titles: Mapping[str, str]) -> str:
     """PSNR of novel views minus that of self-reenactment as a Markdown table, a row for each condition of tracking and task.
 
-    Means and intervals are over those subjects that all methods under all conditions have; "" where no method has a condition.
+    Means and intervals are over the subjects that all methods have under all conditions; "" if no method has a condition.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How much results vary between subjects, and between trainings of one subject that differ in their seed alone."""
+"""Variation of results between subjects, and between trainings of one subject that differ only in their seed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ METRIC = "psnr"
 def variance_section(runs: RunSet, pair: tuple[str, str]) -> str:
     """A table of standard deviations as Markdown, a row for each method and task and for the difference of ``pair``; "" with one seed.
 
-    Between subjects: of the means over seeds. Within subjects: of the seeds about the mean of their subject, pooled over subjects
+    Between subjects: of the means over seeds. Within subjects: of seeds about the mean of their subject, pooled over subjects
     (the square root of the mean variance). Subjects without all seeds are left out.
     """
     runs = runs.by_camera
@@ -53,7 +53,7 @@ def variance_section(runs: RunSet, pair: tuple[str, str]) -> str:
 
 
 def variance_text(runs: Sequence[Path], seeds: Sequence[Path]) -> str:
-    """The variation of the difference of `PAIR` in one sentence, of those of the ``runs`` that were repeated with other ``seeds``; "" without."""
+    """A sentence on the variation of the difference of `PAIR` in the ``runs`` repeated with other ``seeds``, or ""."""
     names = [run.name for run in seeds]
     repeated = [run for run in runs if run.name in names]
     if not repeated:
@@ -83,7 +83,7 @@ def _difference(
 
 
 def components(by_seed: Mapping[int, Mapping[str, float]]) -> tuple[int, float, float, float] | None:
-    """Number of subjects that have every seed, mean, standard deviation between and within them; None with fewer than two of either."""
+    """Number of subjects with every seed, mean, standard deviations between and within; None with fewer than two of either."""
     subjects = sorted(set.intersection(*(set(means) for means in by_seed.values()))) if by_seed else []
     if len(by_seed) < 2 or len(subjects) < 2:
         return None

@@ -20,7 +20,7 @@ LABEL_PX = 22
 CAPTURED = "captured"
 LEAST_PX = 16
 HEAD_ASPECT = 0.75
-"""Width by height of a head: panels are arranged so that it is largest."""
+"""Aspect ratio of a head; the arrangement of panels maximises its size."""
 
 
 class DrawnPanes(NamedTuple):
@@ -103,7 +103,7 @@ def pose_of(shown: ShownAvatar, state: State, key: FrameKey | None) -> HeadPose:
 
 
 def moved(scene: Scene, shown: ShownAvatar, camera: Camera, key: FrameKey | None) -> Camera:
-    """Convert a camera to an avatar's world; for another subject it faces that one's head."""
+    """Convert a camera to an avatar's world; for another subject, relative to its head."""
     motion = np.eye(4)
     motion[:3, 3] = scene.first.center - shown.center
     there = Camera(camera.id, camera.width, camera.height, camera.K, camera.world_to_camera @ motion)
@@ -131,7 +131,7 @@ def splats_of(scene: Scene, shown: ShownAvatar, state: State, view: FreeView) ->
 
 
 def _frame(shown: ShownAvatar, state: State, key: FrameKey, place: tuple[int, int] | None) -> ByteArray:
-    """A frame of the capture as for metrics; with a place, drawn no larger than that."""
+    """A frame of the capture as for metrics; with a place, drawn at most at its size."""
     pose, camera = pose_of(shown, state, key), shown.form.clip.cameras[shown.form.key(key).camera]
     if place is None:
         return quantise(shown.form.restore(key, shown.avatar.render(camera, pose, state.background).rgb))
@@ -141,7 +141,7 @@ def _frame(shown: ShownAvatar, state: State, key: FrameKey, place: tuple[int, in
 
 
 def _fitted(image: ByteArray, place: tuple[int, int], ground: Sequence[int] | ByteArray) -> ByteArray:
-    """An image as large as its place allows, whole, in the middle; unchanged where it has the size."""
+    """Fit an image centred into its place; unchanged if it already has its size."""
     height, width = image.shape[:2]
     if (width, height) == place:
         return image

@@ -1,6 +1,6 @@
-"""What the viewer's server accepts: host names, origins, the token, and messages of bounded size and rate.
+"""Access control of the viewer's server: host names, origins, the token, and limits on size and rate of messages.
 
-viser has no settings for these; its server is one of the package websockets, which has. Importing this module needs both.
+viser has no settings for these; its server is based on the package websockets, which has. This module imports both.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ MAX_MESSAGE_BYTES = 16 * 1024
 """The messages of viser's page have some hundred bytes."""
 MAX_CONNECTIONS = 32
 MAX_MESSAGES_PER_S = 200
-"""The page sends one message for each image that it draws while something moves; faster senders wait."""
+"""During motion, the page sends one message for each image that it draws; faster senders are delayed."""
 
 Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 """A finite number."""
 Numbers = Annotated[list[Number], msgspec.Meta(max_length=3)]
-"""A list and no tuple: with a tuple in a union, msgspec 0.22 crashes in the garbage collector."""
+"""A list instead of a tuple: with a tuple in a union, msgspec 0.22 crashes in the garbage collector."""
 Text = Annotated[str, msgspec.Meta(max_length=1000)]
 
 
@@ -62,7 +62,7 @@ class ControlMessage(msgspec.Struct, tag="GuiUpdateMessage", tag_field="type"):
 _MESSAGE = msgspec.msgpack.Decoder(CameraMessage | ControlMessage)
 
 _HEADERS = {
-    "Content-Security-Policy": "frame-ancestors 'none'",  # no page can lay the viewer under its own buttons
+    "Content-Security-Policy": "frame-ancestors 'none'",  # prevents clickjacking
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",  # the address holds the token
     "X-Content-Type-Options": "nosniff",
@@ -70,9 +70,9 @@ _HEADERS = {
 
 
 class GuardedConnection(ServerConnection):
-    """A connection that gives viser only messages that the viewer's page sends, and no more than it can send.
+    """A connection that passes on to viser only messages of the viewer's page, at its maximum rate.
 
-    A browser that sends anything else is disconnected with the reason. viser handles all other messages too, such as uploads,
+    Browsers that send anything else are disconnected with the reason. viser would also handle other messages, such as uploads,
     which it keeps in memory, and messages to all other browsers.
     """
 
@@ -127,7 +127,7 @@ class Guard:
         return f"http://{host}:{port}" + (f"/{self.token}/" if self.token else "")
 
     def refusal(self, request: Request) -> str:
-        """Why a request is not answered; "" if it is.
+        """Reason for refusing a request; "" if it is accepted.
 
         A page of another site can send requests here from a browser on this machine. Its own name stands in ``Origin``, or, if
         its name was made to resolve to this machine's address (DNS rebinding), in ``Host``. Programs send no ``Origin``.
@@ -151,7 +151,7 @@ class Guard:
             return False
         if name == self.host.lower() or name in self.names or is_loopback(name):
             return True
-        # No name resolves to a number, so that rebinding cannot produce one; the address may be any of this machine's.
+        # DNS rebinding needs a host name, so numeric addresses are safe; this may be any address of this machine.
         return _is_wildcard(self.host) and _address(name) is not None
 
     @contextmanager
@@ -184,7 +184,7 @@ class Guard:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name or address is one of the loopback interface."""
+    """Whether a host name or address belongs to the loopback interface."""
     address = _address(host)
     return host == "localhost" if address is None else address.is_loopback
 

@@ -1,4 +1,4 @@
-"""A live signal of the viewer: lines of JSON on standard input or on a port of this machine, as poses of the head models shown."""
+"""Live signals for the viewer: lines of JSON from standard input or a local port, converted to poses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .settings import STANDARD_INPUT, ViewSettings
 log = logging.getLogger(__name__)
 
 DRIVER = "headbench.datasets.drive.live:LiveDriver"
-"""Takes lines to poses of a head model. By name, since this package imports no reader."""
+"""Converts lines to poses of a head model; referred to by name, since this package imports no reader."""
 LOOPBACK = "127.0.0.1"
 LONGEST_LINE = 2**20
 SILENCE_S = 60.0
@@ -30,7 +30,7 @@ SILENCE_S = 60.0
 
 
 class LivePoses:
-    """The pose of the latest line, for each head model. Lines that arrive while one is converted are skipped, but for the last.
+    """The pose of the latest line, for each head model. Of lines that arrive during a conversion, only the last is used.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class LivePoses:
         return self._poses.get(version)
 
     def put(self, line: str) -> None:
-        """A line has arrived."""
+        """Receive a line."""
         with self._arrived:
             self._line = line
             self._arrived.notify()
@@ -83,7 +83,7 @@ class LivePoses:
             try:
                 self._poses = {version: driver(line) for version, driver in self._drivers.items()}
             except Exception as error:  # the next line may be a good one
-                if text_of(error) != self._said:  # a signal of the wrong kind would repeat it with each line
+                if text_of(error) != self._said:  # an invalid signal would repeat the message for each line
                     self._said = text_of(error)
                     known = isinstance(error, HeadbenchError)
                     log.warning("%s", error if known else f"live signal: {self._said}", exc_info=not known)
@@ -115,14 +115,14 @@ def with_live_signal(scene: Scene, settings: ViewSettings) -> Iterator[Scene]:
 
 @contextmanager
 def standard_input(live: LivePoses) -> Iterator[None]:
-    """Read lines of standard input in a thread, which ends with them or with the process."""
+    """Read lines of standard input in a thread, which ends with the input or the process."""
     threading.Thread(target=_read, args=(sys.stdin.buffer, live), daemon=True).start()
     yield
 
 
 @contextmanager
 def local_port(live: LivePoses, port: int) -> Iterator[int]:
-    """Listen at a port of this machine, for programs of this machine alone, one at a time; yields the port (a free one for 0)."""
+    """Listen at a local port for one local program at a time; yield the port (a free one for 0)."""
     try:
         server = socket.create_server((LOOPBACK, port), backlog=1)
     except OSError as error:
@@ -147,7 +147,7 @@ def _serve(server: socket.socket, live: LivePoses, connected: list[socket.socket
             connection, _ = server.accept()
         except OSError:  # closed
             return
-        connection.settimeout(SILENCE_S)  # a program that sends nothing gives way to another
+        connection.settimeout(SILENCE_S)  # close idle connections, so that another program can connect
         connected[:] = [connection]
         with connection, connection.makefile("rb") as stream:
             _read(stream, live)
@@ -155,7 +155,7 @@ def _serve(server: socket.socket, live: LivePoses, connected: list[socket.socket
 
 
 def _read(stream: BinaryIO, live: LivePoses) -> None:
-    """Take lines until the end, or until the first that is no object of JSON: a browser's request is none."""
+    """Receive lines until the end or the first that is not a JSON object, such as a browser's request."""
     with suppress(OSError):
         while line := stream.readline(LONGEST_LINE):
             try:

@@ -109,7 +109,7 @@ class ControlPanel:
 
     @property
     def fps(self) -> float:
-        """Frames per second of a sequence that runs."""
+        """Frames per second of the running sequence."""
         return _within(self._fps)
 
     @property
@@ -123,7 +123,7 @@ class ControlPanel:
         return self._steps
 
     def advance(self, frames: int) -> None:
-        """Go on in the sequence, from the end to its start."""
+        """Advance the sequence, in a loop."""
         self._timestep.value = (self._timestep.value + frames) % len(self._steps)
 
     def show_times(self, text: str) -> None:
@@ -155,7 +155,7 @@ class ControlPanel:
 
 
 def _within(slider: Any) -> float:
-    """The value of a slider, in its range whatever the browser sent."""
+    """The value of a slider, clamped to its range, since the browser may send any value."""
     return min(max(slider.value, slider.min), slider.max)
 
 

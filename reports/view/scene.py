@@ -38,7 +38,7 @@ Recording = dict[int, dict[str, FrameKey]]
 
 @dataclass(frozen=True, eq=False)
 class ShownAvatar:
-    """An avatar, the clip it is compared on, and that clip in the form of its method.
+    """An avatar, its clip, and that clip adapted to its method.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class ShownAvatar:
 
     @cached_property
     def neutral(self) -> HeadPose:
-        """The face at rest, where the head is at the first training timestep."""
+        """The neutral face, with the head pose of the first training timestep."""
         pose = self.form.clip.poses[self.form.key(self._first).timestep]
         none = {name: np.zeros_like(getattr(pose, name)) for name in ("expression", "neck", "jaw", "eyes")}
         lids = None if pose.eyelids is None else np.zeros_like(pose.eyelids)
@@ -84,12 +84,12 @@ class ShownAvatar:
         return retarget(poses, self._means[key.subject], self._means[""], self.clip.subject)
 
     def live_pose(self) -> HeadPose:
-        """The latest pose of the live signal, where the head is on average; neutral before the first."""
+        """The latest pose of the live signal, at the mean head position; neutral before the first."""
         pose = self.live.pose(self.version) if self.live else None
         return self.neutral if pose is None else retarget(pose, AT_ORIGIN, self._means[""], self.clip.subject)
 
     def camera(self, view: Camera, key: FrameKey | None) -> Camera:
-        """A camera of the world of `clip` as the method sees the world at a timestep.
+        """Convert a camera from the world of `clip` to that of the method at a timestep.
 
         For a method with one video, the head is fixed and the camera moves.
         """

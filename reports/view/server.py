@@ -47,7 +47,7 @@ def view_avatars(settings: ViewSettings, progress: Progress = no_progress) -> Co
 
 @contextmanager
 def serving(scene: Scene, settings: ViewSettings) -> Iterator[Any]:
-    """A running server, which stops in the end; its ``address`` for browsers, and its ``sessions`` by client."""
+    """A running server, stopped at the end of the block: its ``address`` for browsers, and its ``sessions`` by client."""
     library = viser()
     from .guard import Guard  # needs packages that come with viser
 
@@ -58,10 +58,10 @@ def serving(scene: Scene, settings: ViewSettings) -> Iterator[Any]:
             "The connection is not encrypted.",
             settings.host,
         )
-    with redirect_stdout(io.StringIO()), guard.installed():  # it prints a banner
+    with redirect_stdout(io.StringIO()), guard.installed():  # viser prints a banner
         server = library.ViserServer(host=settings.host, port=settings.port, label="headbench", verbose=False)
     server.address = guard.address(server.get_port())
-    # It can open a tunnel to a public address on a browser's wish; no picture of anybody leaves this way.
+    # Disabled: any browser could request a tunnel to a public address, which would expose images of people.
     server.request_share_url = lambda verbose=True: None
     server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()
@@ -73,7 +73,7 @@ def serving(scene: Scene, settings: ViewSettings) -> Iterator[Any]:
     @server.on_client_connect
     def begin(client: Any) -> None:
         server.sessions[client.client_id] = Session(client, scene, settings.expressions, lock)
-        if client.client_id not in server.get_clients():  # it has gone meanwhile
+        if client.client_id not in server.get_clients():  # already disconnected
             end(client)
 
     @server.on_client_disconnect
@@ -102,7 +102,7 @@ def viser() -> Any:
 
 
 def check_port(host: str, port: int) -> None:
-    """Raise `InputError` for an address that cannot be listened at; viser would take another port."""
+    """Raise `InputError` if the server cannot listen at an address; viser would use another port."""
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         with socket.socket(family, socket.SOCK_STREAM) as trial:

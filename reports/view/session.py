@@ -1,4 +1,4 @@
-"""One browser at the viewer: draws the view of its controls and camera continuously."""
+"""The session of one browser: continuously draws the view of its controls and camera."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from .state import FreeView, State
 
 log = logging.getLogger(__name__)
 SCALE = 100.0
-"""Units of the browser's world in a metre: covariances travel as 16-bit floats, which would round those in square metres."""
+"""Units of the browser's world per metre: covariances are sent as 16-bit floats, which are too coarse in square metres."""
 DRAFT_S = 0.026
 """Time of a draft while something moves, so that 30 a second arrive; its size follows from the time of the last one."""
 TOLD_S = 0.5
 """Between two texts about drafts: the browser takes longer to set a text than to show a draft."""
 THREADS = "headbench.methods.shared.threads:torch_threads"
-"""Drafts take one thread: their steps are short, and threads that wait for each other lose to the browser on the same cores.
+"""Drafts use one thread: their steps are short, and synchronised threads are slowed down by the browser on the same cores.
 By name, since this package imports no method."""
 REST_S = 0.3
 """Time without a change after which the image is drawn in full."""
@@ -85,7 +85,7 @@ class Session:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop drawing; called when the browser has gone."""
+        """Stop drawing; called when the browser disconnects."""
         self._closed = True
         if self._scene.first.live is not None:
             self._scene.first.live.forget(self._changed.set)
@@ -132,7 +132,7 @@ class Session:
         for handle in self._handles.values():
             handle.visible = False
         whole = scale == 1.0
-        # With one thread the last digits differ, so that whole images are drawn as for metrics.
+        # With one thread the last digits differ, so full images are drawn as for metrics.
         with self._lock, nullcontext() if whole else self._threads(1):
             drawn = draw(self._scene, state, self._view(), self._size(), scale)
         between = time.perf_counter()
@@ -215,7 +215,7 @@ class Session:
         return FreeView(np.linalg.inv(to_world), float(np.clip(camera.fov, LEAST_FOV, MOST_FOV)))
 
     def _look_at_head(self) -> None:
-        """Start from the front, so near that the head fills the view as in a camera of the capture."""
+        """Start in front of the head, which fills the view as in a camera of the capture."""
         clip = self._scene.first.clip
         cameras = [clip.cameras[name] for name in sorted({key.camera for key in clip.splits["train"]})]
         front = turntable(cameras, self._scene.first.center, 1, 0.0)[0].camera
