@@ -1,4 +1,4 @@
-"""Commands of `methods`. Light: no implementation is imported."""
+"""Commands of `methods`; no implementation is imported."""
 
 from ..bench.specs import CommandSpec
 

@@ -48,7 +48,7 @@ _MEMBERS = {
     "uv": Member("f", ("F", 3, 2), MAX_MAGNITUDE, optional=True),
 }
 OPTIONAL = ("eyelid_basis", "uv")
-"""Arrays that a head may lack."""
+"""Optional arrays of a head."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +84,7 @@ class HeadArrays:
     expression_names : tuple[str, ...]
         Names of the expression directions, in order; () if they have none.
     uv : FloatArray | None
-        (F, 3, 2) texture coordinates of the triangles' corners, in [0, 1] where they have a place in the chart; None if the
-        model has no chart.
+        (F, 3, 2) texture coordinates of the triangles' corners, in [0, 1] inside the chart; None if the model has no chart.
     """
 
     version: str
@@ -165,8 +164,8 @@ class HeadArrays:
         return PosedSubject(self, shape, offset).meshes([pose])[0]
 
     def named_expressions(self) -> list[Expression]:
-        """The expressions that the model names; none for models like FLAME."""
-        from .names import named_expressions  # which are needed by few
+        """Named expressions of the model; none for models like FLAME."""
+        from .names import named_expressions  # imported here because few callers need it
 
         return named_expressions(self.version, self.expression_names, self.expression_basis.shape[2])
 
@@ -178,7 +177,7 @@ class HeadArrays:
         return digest(self.version, *arrays, *regions, dict(sorted(self.landmarks.items())))
 
     def _optional(self) -> dict[str, FloatArray]:
-        """Those of the arrays `OPTIONAL` that there are, by name."""
+        """Existing `OPTIONAL` arrays by name."""
         given = ((name, getattr(self, name)) for name in OPTIONAL)
         return {name: values for name, values in given if values is not None}
 
@@ -240,11 +239,11 @@ _FILE = {
 
 
 def save_head(path: Path, arrays: HeadArrays) -> None:
-    """Write a head as one npz file (no pickled objects), whole or not at all.
+    """Write a head atomically as one npz file without pickled objects.
 
-    Members: ``format``, ``version``, the array fields by name, those of `OPTIONAL` that there are,
-    ``region/<name>`` for each region, ``landmark_names`` and ``landmark_vertices``, ``expression_names`` if there are. Equal heads give equal bytes: the
-    file is uncompressed because compression depends on the library's version.
+    Members: ``format``, ``version``, the array fields by name, existing `OPTIONAL` arrays,
+    ``region/<name>`` for each region, ``landmark_names`` and ``landmark_vertices``, ``expression_names`` if there are any.
+    Equal heads give equal bytes: the file is uncompressed because compression depends on the library's version.
     """
     content: dict[str, np.ndarray] = {"format": np.array(FORMAT), "version": np.array(arrays.version)}
     content |= {name: np.asarray(getattr(arrays, name)) for name in STORED}
@@ -286,7 +285,7 @@ def read_head(path: Path) -> HeadArrays:
 def with_derived_regions(head: HeadArrays) -> HeadArrays:
     """The head with additional regions derived from existing ones, as VHAP does for ``FLAME_masks.pkl``.
 
-    * ``hair`` = scalp - (face and neck), where scalp, face and neck are known;
+    * ``hair`` = scalp - (face and neck), if the regions scalp, face and neck exist;
     * ``ears``, ``eyeballs`` = left and right together;
     * ``left_eye``, ``right_eye`` = eye region and eyeball of the side;
     * ``skin`` = everything but eyeballs, hair, lips, teeth and the boundary.
@@ -346,5 +345,5 @@ _in_memory: WeakValueDictionary[str, HeadArrays] = WeakValueDictionary()
 
 
 def in_memory(head: HeadArrays, fingerprint: str) -> HeadArrays:
-    """The head with the same fingerprint that is already in memory, else ``head``, since captures have copies of one head."""
+    """Deduplicate: the head with the same fingerprint that is already in memory, else ``head``."""
     return _in_memory.setdefault(fingerprint, head)

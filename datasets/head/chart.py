@@ -15,13 +15,13 @@ from ...bench.io.files import reading
 CHART_FILES = ("head_template_mesh.obj", "head_template.obj")
 """FLAME's mesh with texture coordinates, as VHAP and GaussianAvatars, and DECA, name it."""
 _MOST_BYTES = 2**24
-"""FLAME's have 1 MB. Lists of words take up to 60 times their text."""
+"""Maximum file size; FLAME's has 1 MB. Parsing takes up to 60 times the size of the text."""
 
 
 def read_chart(path: Path, faces: IntArray) -> FloatArray:
     """Texture coordinates of the corners of triangles, (F, 3, 2) float32.
 
-    The OBJ file may list the triangles in another order, begin each at another corner, and have more of them.
+    The OBJ file may order the triangles differently, begin each at another corner, and contain additional ones.
 
     Parameters
     ----------
@@ -31,8 +31,8 @@ def read_chart(path: Path, faces: IntArray) -> FloatArray:
     Raises
     ------
     InputError
-        The file is missing or damaged, has no texture coordinates or such that are not finite, a face that is no triangle, or
-        lacks a triangle of the head model.
+        The file is missing or damaged, lacks texture coordinates or a triangle of the head model, or has non-finite
+        coordinates or faces other than triangles.
     """
     text = read_text(path, "mesh", _MOST_BYTES)
     with reading(path, "an OBJ mesh of triangles with texture coordinates"):

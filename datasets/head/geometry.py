@@ -79,7 +79,7 @@ def fit_sphere(points: FloatArray) -> tuple[FloatArray, float]:
 
 
 def project(points: FloatArray, camera: Camera) -> FloatArray:
-    """(n, 2) pixels of points (n, 3) in the world; those of points behind the camera have no meaning."""
+    """(n, 2) pixels of points (n, 3) in the world; points behind the camera give meaningless pixels."""
     seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     pixels: FloatArray = (seen @ camera.K.T)[:, :2] / np.maximum(seen[:, 2:], 1e-6)
     return pixels

@@ -4,10 +4,10 @@
 order of the operations are those of the authors' code, https://github.com/google/GNM (``gnm/shape/gnm_xnp.py``,
 ``gnm_common.py``).
 
-Like FLAME it is a sum of bases, posed by linear blend skinning. What differs is translated without loss:
+Like FLAME it is a sum of bases, posed by linear blend skinning. The differences are converted without loss:
 
 * its joints are the neck, which is the root, the head and the eyes: they are FLAME's root, neck and eyes;
-* it has no jaw joint, because expressions move the lower teeth: FLAME's jaw is a joint that no vertex follows;
+* it has no jaw joint, because expressions move the lower teeth: FLAME's jaw becomes a joint without influence on any vertex;
 * its joints follow the identity alone, FLAME's the vertices: a regressor with the same joints is found here.
 """
 
@@ -27,12 +27,12 @@ from .arrays import JOINT_NAMES, HeadArrays
 JOINTS = ("neck", "head", "left_eye", "right_eye")
 """Names of the file's joints, in order; the parent of each is the one before it, that of both eyes the head."""
 PLACES = tuple(JOINT_NAMES.index(name) for name in ("root", "neck", "left_eye", "right_eye"))
-"""Of each of them, the joint of the layout that it becomes."""
+"""The corresponding joint of the layout for each of them."""
 
 MEMBER_WEIGHT = 1e-4
 """Weight in a vertex group above which a vertex is a member, as in the authors' code."""
 JOINT_TOLERANCE = 1e-8
-"""Metres by which a joint may be off per unit of a coefficient: a hundredth of a micrometre."""
+"""Tolerance of joint positions, metres per unit of a coefficient: a hundredth of a micrometre."""
 
 _RIDGE, _REFINEMENTS = 1e-10, 4
 _MOST_DIRECTIONS = 2000
@@ -77,8 +77,8 @@ def gnm_head(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> He
     -------
     HeadArrays
         Head whose vertices are those of GNM at equal coefficients, at any pose with ``rotation``, ``neck`` and ``eyes`` as
-        the rotations of GNM's neck, head and eyes. ``jaw`` moves nothing. It has no landmarks, which GNM has in another file. Skin,
-        eyes, teeth and tongue have charts of their own, which lie on each other.
+        the rotations of GNM's neck, head and eyes. ``jaw`` moves nothing. It has no landmarks, which GNM has in another file.
+        Skin, eyes, teeth and tongue have separate charts, which overlap.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def gnm_head(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> He
     regressor[JOINT_NAMES.index("jaw")] = regressor[JOINT_NAMES.index("neck")]
     for joint, place in enumerate(PLACES):
         weights[:, place] = content["skinning_weights"][joint]
-        if place:  # the layout has none for the root
+        if place:  # the layout has no pose correctives for the root
             block = correctives[9 * joint : 9 * joint + 9].reshape(9, vertices, 3)
             pose_basis[:, :, 9 * (place - 1) : 9 * place] = np.moveaxis(block, 0, 2)
     return HeadArrays(
@@ -156,7 +156,7 @@ def _regressor(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> 
     missing = wanted - matrix @ regressor.T
     if np.abs(missing).max() > JOINT_TOLERANCE:
         scale = np.linalg.norm(matrix, axis=1, keepdims=True)
-        scale[scale == 0] = 1  # a direction that moves nothing
+        scale[scale == 0] = 1  # a direction without effect
         matrix, wanted = matrix / scale, wanted / scale
         gram = matrix @ matrix.T
         gram[np.diag_indices(len(gram))] += _RIDGE
@@ -182,7 +182,7 @@ _REGIONS = {
     "teeth_lower": ("teeth", "lower_teeth_and_gums"),
     "tongue": ("tongue",),
 }
-"""Groups of the file whose common vertices are a region. A region with a missing group is left out."""
+"""Groups of the file whose intersection is a region. Regions with a missing group are left out."""
 _LIPS = ("upper_lip", "lower_lip")
 
 

@@ -35,7 +35,7 @@ LANDMARKS = tuple(f"ibug_{index:02d}" for index in range(68))
 
 JAW_SHAPE = "jawOpen"
 DROPPED_SHAPES = (JAW_SHAPE, "mouthClose")
-"""Shapes that are not in the expression basis: the jaw joint replaces the first, which the second only corrects."""
+"""Shapes excluded from the expression basis: the jaw joint replaces the first; the second only corrects the first."""
 
 _METRES = 0.01
 _SOFTNESS = 0.004  # metres; see hinge_weights

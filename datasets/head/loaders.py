@@ -45,7 +45,7 @@ def load_head(
     chart: str | PathLike[str] | None = None,
     version: str | None = None,
 ) -> HeadArrays:
-    """Load a head model. The kind of file is recognised by its content.
+    """Load a head model. The format is detected from the content.
 
     Files that belong to a FLAME pickle and are not given are searched for in `PLACES` under their usual names,
     ``FLAME_masks.pkl``, ``l_eyelid.npy`` and ``r_eyelid.npy``, ``head_template_mesh.obj`` or ``head_template.obj``, and
@@ -122,7 +122,7 @@ def _beside(path: Path, name: str) -> Path | None:
     """A file that belongs to a FLAME pickle, or None."""
     folders = dict.fromkeys(
         (path.parent, path.resolve().parent)
-    )  # the folder of a link, then that of the file
+    )  # the folder of a symbolic link, then that of its target
     files = (folder / place / name for folder in folders for place in PLACES)
     return next(filter(Path.is_file, files), None)
 
@@ -207,7 +207,7 @@ def _flame(path: Path, version: str) -> HeadArrays:
     if not len(tree):
         raise InputError(path, "kintree_table", "a row of parents", "none")
     parents = tree[0].astype(np.int64)
-    parents[:1] = -1  # the file has an unsigned -1 there
+    parents[:1] = -1  # the file has -1 as an unsigned number there
     return HeadArrays(
         version=version,
         template=array("v_template", "f", 2),

@@ -12,13 +12,13 @@ from .procedural.expressions import PAIRED, SEMANTIC_NAMES, SIDEWAYS, SINGLE
 from .procedural.versions import VERSIONS, semantic_to_coefficients
 
 SIDES = (("_left", "_right"), ("_L", "_R"))
-"""Endings of the names of two shapes that are mirror images."""
+"""Name suffixes of two mirrored shapes."""
 
 
 def named_expressions(version: str, names: Sequence[str], size: int) -> list[Expression]:
-    """The expressions that a head model names, left and right together; none for models like FLAME.
+    """Named expressions of a head model, with left and right combined; none for models like FLAME.
 
-    A blink that a model has as eyelid bases is not among them, since it is no expression coefficient.
+    Blinks represented by eyelid bases are not included, since they are no expression coefficients.
 
     Parameters
     ----------

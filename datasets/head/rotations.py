@@ -55,7 +55,7 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
 def rotation_of(axis_angle: FloatArray) -> Rotation:
     """SciPy's rotation of axis-angle vectors, (3,) or (N, 3).
 
-    They are copied, because SciPy refuses read-only arrays of doubles, which methods are given.
+    Vectors are copied because SciPy refuses read-only float64 arrays, which is what methods receive.
     """
     return Rotation.from_rotvec(np.array(axis_angle, np.float64))
 

@@ -69,7 +69,7 @@ class PosedSubject:
     def each(
         self, clip: Clip, timesteps: Sequence[int], size: int = BATCH
     ) -> Iterator[tuple[int, FloatArray]]:
-        """(timestep, (V, 3) mesh) of a clip's poses, ``size`` of them in memory."""
+        """Yield (timestep, (V, 3) mesh) for a clip's poses, computed in batches of ``size``."""
         poses = [clip.poses[timestep] for timestep in timesteps]
         return zip(timesteps, chain.from_iterable(self.batches(poses, size)))
 
@@ -90,7 +90,7 @@ class PosedSubject:
         )
 
     def translations(self, poses: Sequence[HeadPose], motions: FloatArray) -> FloatArray:
-        """(T, 3) translations, metres, with which poses that have none and the rotations of (T, 4, 4) ``motions`` move like these."""
+        """(T, 3) translations, metres, with which poses without translation reproduce (T, 4, 4) ``motions``."""
         return np.asarray(motions[:, :3, 3] - self.motions(poses)[:, :3, 3])
 
     def _arguments(self, poses: Sequence[HeadPose], size: int) -> Iterator[dict[str, torch.Tensor]]:
@@ -110,7 +110,7 @@ def pose_in_head_frame(pose: HeadPose) -> HeadPose:
 
 
 def resting(head: HeadAsset, subject: str = "") -> HeadPose:
-    """The neutral face of a head model, its head at the origin."""
+    """The neutral pose of a head model, at the origin."""
     expression, none = np.zeros(head.expression_basis.shape[2]), np.zeros(3)
     lids = None if head.eyelid_basis is None else np.zeros(head.eyelid_basis.shape[2])
     return HeadPose(head.version, expression, none, none, none, np.zeros(6), none, lids, subject)

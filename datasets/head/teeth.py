@@ -43,7 +43,7 @@ def with_teeth(arrays: HeadArrays) -> HeadArrays:
     Raises
     ------
     InputError
-        The head has teeth already, or no lip rings are given or found.
+        The head has teeth already, or lip rings are neither given nor found.
     """
     if "teeth" in arrays.regions:
         found = f"{len(arrays.regions['teeth'])} vertices"

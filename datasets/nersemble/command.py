@@ -48,7 +48,7 @@ def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progres
 
 
 def _check_named(settings: PrepareSettings, subjects: list[str]) -> None:
-    """Raise `InputError` if a name stands for subjects of which none exists."""
+    """Raise `InputError` if no subject of a named group exists."""
     from .recording import participants
 
     known = participants(Path(settings.root))
@@ -82,7 +82,7 @@ def _checked(plans: list[PreparationPlan]) -> CommandResult:
 def _done(
     results: list[SubjectResult], plans: list[PreparationPlan], settings: PrepareSettings
 ) -> CommandResult:
-    """Passed unless parameters were asked for and are missing."""
+    """Passed unless requested parameters are missing."""
     lines = _table(plans)
     for plan, result in zip(plans, results, strict=True):
         lines += ["", f"{result.subject}: {result.written} images written, {result.kept} there already."]
@@ -106,7 +106,7 @@ def _done(
 def record_nersemble(settings: RecordSettings, progress: Progress = no_progress) -> CommandResult:
     """Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to test `prepare`.
 
-    For synthetic captures, as they bring their own head model.
+    Only for synthetic captures, which contain their head model.
     """
     from ...bench.io.video import video_codec
     from ..clip import check_apart

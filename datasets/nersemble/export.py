@@ -1,7 +1,7 @@
 """Check of unions exported elsewhere, and joining for the paper's split.
 
 GaussianAvatars' download holds, per subject, a ``UNION10`` folder and its sequence folders, FREE among them;
-the union's own test sequence is another one.
+the union uses another test sequence.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ def read_frames(view: RecordedView, numbers: Sequence[int]) -> Iterator[RawFrame
         return
     masks = _decode_video(view.mask_video, view, numbers)
     for number, bgr, mask in zip(numbers, frames, masks):
-        # Masks are grey, and videos have that thrice.
+        # Masks are grey; videos store three equal channels.
         yield RawFrame(number, bgr, cv2.extractChannel(mask, 0).astype("uint8", copy=False))
 
 
@@ -114,7 +114,7 @@ def write_images(
             while running:
                 report = reports.get()
                 if isinstance(report, Future):
-                    report.result()  # raises what the stream raised
+                    report.result()  # re-raises the stream's exception
                     running -= 1
                 else:
                     done += 1
@@ -126,7 +126,7 @@ def write_images(
 
 
 def _run(stream: _Stream, reports: queue.SimpleQueue, stop: threading.Event) -> None:
-    """Work through a stream and report each image, until the end or the sign to stop."""
+    """Process a stream and report each image, until the end or until stopped."""
     job, index = stream.job, stream.index
     camera = job.cameras[index]
     correct = job.corrections.get(camera.id)
@@ -142,7 +142,9 @@ def _run(stream: _Stream, reports: queue.SimpleQueue, stop: threading.Event) -> 
         with writing(job.image_path(timestep, index)):
             if mask is not None:
                 write_image(job.mask_path(timestep, index), mask)
-            write_image(job.image_path(timestep, index), image)  # last: with its image a frame is whole
+            write_image(
+                job.image_path(timestep, index), image
+            )  # written last: its image marks a complete frame
         reports.put(f"{job.recorded.subject} {job.recorded.name}")
 
 

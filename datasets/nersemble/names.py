@@ -106,7 +106,7 @@ PAPER_SEQUENCES = (*UNION10_SEQUENCES, TEST_SEQUENCE)
 
 
 def union10_held_out(subject: str) -> str:
-    """Sequence that VHAP's union export holds out of ten: drawn by Python's generator, seeded with the subject.
+    """Held-out sequence of VHAP's union export of ten: drawn by Python's generator, seeded with the subject.
 
     ``subject`` is the id as text, leading zeros included.
     """

@@ -50,9 +50,9 @@ from .tracking import TRACKERS, Tracker
 
 MANIFEST, MARK = "synthesis.json", "provenance.xmp"
 TASKS = ".tasks"
-"""Folder of an executor's tasks, as long as a capture is not whole."""
+"""Folder of an executor's tasks while a capture is incomplete."""
 _VERSION = 3
-_SMALL = 400_000  # pixels in all that are rendered sooner than another process starts
+_SMALL = 400_000  # total pixels below which starting another process costs more time than rendering
 _README = """This folder holds synthetic recordings made by `headbench synth`.
 
 No person was recorded. Heads, skin, hair and performances are computed; subject numbers from 900 up, camera
@@ -104,7 +104,7 @@ def synthesize(
     head : str
         "procedural", or the file of a head model (npz of ICT-FaceKit).
     seed : int
-        Decides the heads and their performances.
+        Seed of the heads and their performances.
     tracking_noise : float
         Standard deviation of the error of each stored parameter, as a fraction of that parameter's
         own standard deviation over the subject's timesteps. Images show the exact poses.
@@ -115,18 +115,18 @@ def synthesize(
     tracker : Tracker
         Whether these errors are those of a tracker of single frames or of videos.
     hair_lag, camera_colour, motion_blur, mask_error, correctives : float
-        Levels, 0 to 4, of what recordings have beside tracking errors.
+        Levels, 0 to 4, of further imperfections of recordings.
     performance : Kind
         What the subject does: "natural", "full", "parts", "expressions" or "still". `headbench synth --help` describes them.
     dynamics : float
-        Scale of wrinkles and blush, 0 to 3: with 0 the skin has its colour at rest everywhere.
+        Scale of wrinkles and blush, 0 to 3: with 0 the skin keeps its colour at rest.
     edition : int
-        Edition of a capture that is made again; others than the present one are refused.
+        Edition of a capture to reproduce; only the current one is accepted.
     pictures : str | Path | None
         Folder of an earlier capture that differs only in its tracking. Its pictures are linked, or
         copied if links are not supported, instead of rendered.
     only : int | str | None
-        The one subject to make in this call, by place from 0 or by name; others of the capture may follow. None makes all.
+        The only subject to render in this call, by index from 0 or by name; None renders all.
     workers : int | None
         Number of rendering processes; by default one per core, or one for little work.
     execution : Execution | None
@@ -234,7 +234,7 @@ def _render_missing(
 
 
 _renderer: list[CaptureRenderer] = []
-"""This process's own, in a worker: spawned processes cannot be handed one."""
+"""The renderer of a worker process; it cannot be passed to spawned processes."""
 
 
 def _begin(out: Path, index: int, settings: SyntheticSettings) -> None:
@@ -253,7 +253,7 @@ def _run_all(out: Path, plans: Sequence[SubjectPlan], execution: Execution) -> N
     """Render the subjects with missing images by an executor. Raises `HeadbenchError` if one failed."""
     from ...bench.executors.schedule import Schedule
 
-    root = out.resolve() / TASKS  # which nothing reads as a capture
+    root = out.resolve() / TASKS  # not recognised as a capture
     by_name = {plan.person.name: plan for plan in plans if _left(plan)}
     tasks = [
         Task.of(
@@ -338,7 +338,7 @@ def _manifest(settings: SyntheticSettings, head: str) -> dict[str, Any]:
     return {
         "version": _VERSION,
         **settings.described(),
-        "head": Path(settings.head).name,  # the same file may lie elsewhere: its content counts, not its path
+        "head": Path(settings.head).name,  # the same file may have another path, so compare its content
         "size": list(settings.size),
         "head_fingerprint": head,
     }
@@ -349,13 +349,13 @@ def _check_pictures(pictures: Path, wanted: Mapping[str, Any]) -> None:
     manifest = pictures / MANIFEST
     found = read_json(manifest)
     tracking = {"tracking_error", "tracking_noise", "tracker"}
-    for key in {**wanted, **found}.keys() - tracking - {"head"}:  # the name of the head does not matter
+    for key in {**wanted, **found}.keys() - tracking - {"head"}:  # the name of the head is irrelevant
         if found.get(key) != wanted.get(key):
             raise InputError(manifest, key, f"{wanted.get(key)!r}, as asked for", f"{found.get(key)!r}")
 
 
 def _take_over(pictures: Path, out: Path, plans: Sequence[SubjectPlan]) -> None:
-    """Link the pictures and masks of another capture, or copy them to where they cannot be linked."""
+    """Link the images and masks of another capture, or copy them if links are not supported."""
     for plan in plans:
         for (sequence, timestep), camera in product(plan.moments(), plan.cameras):
             place = (sequence, timestep, camera)
@@ -374,7 +374,7 @@ def _take_over(pictures: Path, out: Path, plans: Sequence[SubjectPlan]) -> None:
 
 
 def _claim(out: Path, wanted: Mapping[str, Any]) -> None:
-    """Mark the folder as that of the capture with settings ``wanted``, or refuse the folder of another capture."""
+    """Mark the folder as belonging to the capture with settings ``wanted``; refuse the folder of another capture."""
     manifest, readme = out / MANIFEST, out / "README.txt"
     if manifest.exists():
         found = read_json(manifest)

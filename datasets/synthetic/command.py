@@ -80,7 +80,7 @@ def synth(settings: SynthSettings, progress: Progress) -> CommandResult:
     check_output_folder(out)
     with locked(out, beside=True):  # a capture is made in an empty folder
         size = parse_size(settings.size)
-        from .capture import synthesize  # which takes long to import
+        from .capture import synthesize  # slow to import
 
         values = {**settings.others, "out": out, "size": size}
         synthesize(**values, execution=execution, progress=progress)

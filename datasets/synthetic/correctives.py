@@ -1,9 +1,9 @@
-"""Corrective shapes of a subject, which the basis of the tracked head lacks.
+"""Corrective shapes of a subject that are not in the basis of the tracked head.
 
-Faces are not linear in their controls: where two act together, skin moves otherwise than by the sum of both. A corrective is a
+Faces are not linear in their controls: the effect of two together is not the sum of both. A corrective is a
 smooth displacement of the skin where its controls act, different for each subject, and is driven by the product of two controls
-or by the square of one. Pictures show it. The tracked mesh does not, even with exact tracking: no coefficients of the head
-model come closer to the skin, because what they could make of a corrective is taken off it.
+or by the square of one. Images show it. The tracked mesh does not, even with exact tracking: the component of a
+corrective in the span of the head model's basis is removed, so no coefficients come closer to the skin.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FACE_MM = 0.75
 """Root mean square displacement of the face by each corrective at level 1, where both of its controls are 1. A choice in the
 range of the errors of trackers."""
 _BROAD = 0.2
-"""Share of the largest displacement by its controls at which a corrective has half of its reach."""
+"""Fraction of the largest displacement by its controls at which a corrective has half its strength."""
 _PERIOD = 0.04
 """Metres between the lattice points of a field, for a head of average size."""
 
@@ -66,7 +66,7 @@ def make_correctives(
 
 
 def _beyond(basis: FloatArray, field: FloatArray, skin: FloatArray) -> FloatArray:
-    """(V, 3) what no coefficients of a ``basis`` (V, 3, E) make of a field on the ``skin`` (V,): its closest fit taken off."""
+    """(V, 3) residual of a field on the ``skin`` (V,) after its least-squares fit by a ``basis`` (V, 3, E)."""
     directions, left = basis[skin].reshape(-1, basis.shape[2]), field.copy()
     wanted = field[skin].ravel()
     found, *_ = np.linalg.lstsq(directions, wanted, rcond=None)

@@ -1,4 +1,4 @@
-"""Distances to points, polylines and polygons: the brushes that skin, hair and wrinkles are painted with."""
+"""Distances to points, polylines and polygons, and noise, from which skin, hair and wrinkles are painted."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def blob(points: FloatArray, center: FloatArray, radius: float | FloatArray) -> 
 
 
 def polyline_distance(points: FloatArray, line: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance to a polyline and the place of the nearest point on it.
+    """Distance to a polyline and the arc-length position of the nearest point on it.
 
     ``points`` (N, D), ``line`` (M, D) -> distances (N,) and arc-length shares (N,) in [0, 1].
     """

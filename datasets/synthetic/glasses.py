@@ -1,4 +1,4 @@
-"""Spectacle frames, which the tracked mesh lacks. They hang on the head joint; lenses are left out, as clear ones nearly are."""
+"""Spectacle frames, which are not in the tracked mesh. They follow the head joint; clear lenses are not modelled."""
 
 from __future__ import annotations
 

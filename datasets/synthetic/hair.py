@@ -21,7 +21,7 @@ from .skin import beard_share, brow_color, brow_curve
 
 @dataclass(frozen=True)
 class Style:
-    """A way to wear hair; lengths in metres.
+    """A hair style; lengths in metres.
 
     ``locks`` ribbons of ``width``, standing out by ``rise`` at the tip; ``cap`` is the thickness under them.
     ``fall`` pulls down, ``sweep`` away from the parting (at x = ``parting``), ``back`` backwards; ``curl`` is
@@ -102,7 +102,7 @@ def make_hair(
     style, s = STYLES[person.style], anatomy.scale
     share = hair_share(person, anatomy, points, ears)
     uneven = 1.0 + 0.35 * fractal_noise(points, 0.03 * s, person.seed + 81, 2)
-    # The cap rises where its colour is hair already, so that no skin stands out from the head.
+    # The cap rises only where its colour is that of hair, so that no raised skin is visible.
     cap = style.cap * s * smoothstep(share, _COLOURED, 1.0) * uneven
     rng = np.random.default_rng(person.seed + 82)
     chosen = _sample(points, faces, share, style.locks, rng)
@@ -117,7 +117,7 @@ def make_hair(
     layer = rng.uniform(0.3, 1.0, len(roots))
 
     limit = _face_limit(anatomy)
-    # Locks of the temples have their roots in front of the limit.
+    # Locks at the temples have roots in front of the limit.
     temple = roots[:, 1] < anatomy["glabella"][1] + 0.05 * s
     foremost = np.where(temple, roots[:, 2], -np.inf)
 
@@ -150,7 +150,7 @@ def make_hair(
         )
         away = place - (anatomy["vertex_top"] + np.array([0.0, 0.0, -0.03]) * s)
         wish += 0.35 * away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-        # Off the skull, hair hangs.
+        # Away from the skull, hair hangs down.
         free = smoothstep(place[:, 1], anatomy["nose_tip"][1] + 0.02 * s, anatomy["mouth"][1])[:, None]
         wish = (1.0 - free) * wish + free * np.array([0.0, -1.0, -0.10])
         wish -= (1.0 - free) * np.einsum("ni,ni->n", wish, normal)[:, None] * normal

@@ -26,15 +26,15 @@ _BUCKLED = (0.25, 0.75)  # depth of one that has: a constant, and a share of the
 _DEEPEST = 1.1
 
 FLUSH_SECONDS = {"cheeks": (0.9, 2.5), "anger": (0.9, 2.5), "nose": (0.6, 1.5), "lips_full": (0.4, 0.8)}
-"""Time constants with which blood comes and goes."""
-_REFILL = (0.0, 0.8)  # of skin that is pressed: pale at once, filled again within about two seconds
+"""Time constants of blood flow into and out of the skin."""
+_REFILL = (0.0, 0.8)  # pressed skin: pale immediately, refilled within about two seconds
 DRYING = 4.0
 """Seconds after which the wetness of lips has decayed to 1/e."""
 
 
 @dataclass(frozen=True, eq=False)
 class SkinState:
-    """Strengths of folds (G,) and of flushes (F,), and how wet the lips are, 0 to 1."""
+    """Strengths of folds (G,) and flushes (F,), and wetness of the lips, 0 to 1."""
 
     folds: FloatArray
     flushes: FloatArray
@@ -67,7 +67,7 @@ def over_time(activations: Sequence[Activations], seconds: float, person: Person
 
 
 def _kept(seconds: float, constant: float) -> float:
-    """Share of a difference that is left after ``seconds``; none is where there is no delay."""
+    """Fraction of a difference that remains after ``seconds``; 0 without delay."""
     return float(share_left(seconds, constant)) if constant else 0.0
 
 
@@ -83,7 +83,7 @@ _AGED = np.array(
 
 
 def coupled_strengths(a: Activations) -> FloatArray:
-    """(G,) strengths of the folds where muscles work together: most are products of controls."""
+    """(G,) strengths of the folds caused by several muscles: most are products of controls."""
     jaw = min(max(a["jaw_open"], 0.0), 1.0)
     smile = {side: min(max(a[f"smile_{side}"], 0.0), 1.2) for side in SIDES}
     down = {side: a[f"brow_down_{side}"] for side in SIDES}

@@ -19,21 +19,21 @@ from .performance import Activations, Performed
 FOLLOWED = ("head_nod", "head_turn", "head_tilt", "neck_nod", "neck_turn", "sway_x", "sway_y", "sway_z")
 """Controls that hair and neck follow."""
 RATE = 73.0
-"""Moments per second at which the past is sampled: NeRSemble's frame rate."""
+"""Rate at which past controls are sampled, per second: NeRSemble's frame rate."""
 _MEMORY = 2.0  # seconds, after which the slowest response is within 1e-3 of its limit
 _GRAVITY = 9.81
 HAIR_DAMPING = 0.5
 NECK_FREQUENCY, NECK_DAMPING = 4.0, 0.3
 """Natural frequency in hertz and damping ratio of the skin of the neck over the muscles."""
 NECK_SHARE = 0.3
-"""Part of the neck's lag that its skin shows: the rest is held by what lies under it."""
+"""Fraction of the neck's lag in its skin; the tissue below prevents the rest."""
 FREE_LENGTH = 0.15
-"""Distance from the root, metres, from which hair swings freely; closer, it is held by the head and by other hair."""
+"""Distance from the root, metres, beyond which hair swings freely; closer to the root, head and other hair hold it."""
 
 
 @dataclass(frozen=True)
 class Lagging:
-    """Controls of one moment as hair and neck follow them."""
+    """Delayed controls at one moment, for hair and for the neck."""
 
     hair: Activations
     neck: Activations
@@ -63,7 +63,7 @@ def shares(frequency: float, damping: float) -> FloatArray:
 
 
 def follow(performed: Performed, moment: float, amount: float, length: float) -> Lagging:
-    """The controls at a ``moment`` (seconds) as hair of ``length`` metres and the neck show them.
+    """Delayed controls at a ``moment`` (seconds) for hair of ``length`` metres and for the neck.
 
     ``amount`` scales the distance to the controls of that moment. Before a sequence the head is still.
     """
@@ -71,7 +71,7 @@ def follow(performed: Performed, moment: float, amount: float, length: float) ->
     now = {name: float(values[0]) for name, values in performed.curves(np.array([moment])).items()}
 
     def late(frequency: float, damping: float) -> Activations:
-        # Weights and controls stand on grids: the sums are exact.
+        # Weights and controls are rounded to grids, so the sums are exact.
         weights = shares(frequency, damping)
         found: Mapping[str, float] = {name: float((weights * past[name]).sum()) for name in FOLLOWED}
         moved = {name: now[name] + amount * (found[name] - now[name]) for name in FOLLOWED}

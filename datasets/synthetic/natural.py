@@ -39,7 +39,7 @@ SYNERGIES: tuple[Face, ...] = (
     both(mouth_stretch=1.0, lower_lip_down=0.7, smile=0.4),
     {"lip_roll": 1.0, "chin_raise": 0.6, "cheek_puff": 0.5},
 )
-"""Controls that act together, beside what a phrase asks for."""
+"""Synergies: controls that act together, in addition to those of a phrase."""
 ONE_SIDED: tuple[Face, ...] = (
     {"brow_down_left": 0.8, "squint_left": 0.7, "brow_outer_up_right": 0.3},
     {"cheek_raise_right": 1.0, "upper_lip_up_right": 0.7, "mouth_right": 0.3},
@@ -51,11 +51,11 @@ ONE_SIDED: tuple[Face, ...] = (
 COMPANY, COMPANY_SHARE = 1, (0.35, 0.8)
 """Number of synergies that accompany a phrase, and the range of their strengths."""
 OPENING = 0.15, (0.1, 0.5)
-"""Probability that the jaw opens with a phrase that says nothing of it, and the range of openings."""
+"""Probability that the jaw opens in a phrase that does not specify it, and the range of openings."""
 WIDER, WIDEST = 1.25, 1.35
 """Factor on the openings of phrases, and the largest opening."""
 WITH_JAW: Face = {**both(lower_lip_down=0.7), "funnel": 0.3}
-"""What an opening of the jaw adds to each control."""
+"""Increase of each control per opening of the jaw."""
 
 PHRASE_SECONDS = 0.85
 """Mean time from one target to the next; `_JITTER` of it at random."""
@@ -73,8 +73,8 @@ def face_curves(
 ) -> Curves:
     """Controls of a sequence of ``seconds`` at the moments ``time`` (T,): its phrases in random order, repeated as needed.
 
-    Every phrase has a strength and a company of other controls of its own, ``new`` of them not among those of training. The
-    jaw moves in strokes, and moves lips with it.
+    Every phrase has a random strength and random synergies, ``new`` of which do not occur in training. The jaw moves in
+    strokes and moves the lips.
     """
     count = max(1, round(seconds / PHRASE_SECONDS) - 1)
     order: list[int] = []
@@ -100,13 +100,13 @@ def face_curves(
 
 
 def _move_with_jaw(curves: Curves, opening: FloatArray) -> None:
-    """Add to lips what an opening of the jaw (T,) moves."""
+    """Add the motion of the lips that an opening (T,) of the jaw causes."""
     for name, share in WITH_JAW.items():
         curves[name] = curves[name] + share * opening
 
 
 def _in_company(phrase: Face, rng: np.random.Generator, new: int) -> dict[str, float]:
-    """A phrase at a random strength with random synergies, of which the stronger of two demands on a control counts."""
+    """A phrase at a random strength with random synergies; each control takes the larger of both values."""
     face = {name: rng.uniform(0.8, 1.0) * value for name, value in phrase.items()}
     probability, openings = OPENING
     opening = rng.uniform(*openings) if rng.random() < probability else 0.0
@@ -180,7 +180,7 @@ _BLINK_WIDTH = 0.110 / 2.355  # standard deviation of a blink of 110 ms at half 
 
 
 def blinks(time: FloatArray, seconds: float, gap: float, rng: np.random.Generator) -> FloatArray:
-    """(T,) how far the lids are closed by spontaneous blinks, irregular in time."""
+    """(T,) closure of the lids by spontaneous blinks at irregular times."""
     closed, moment = np.zeros(len(time)), gap * rng.uniform(0.0, 1.0)
     while moment < seconds:
         closed = np.maximum(closed, np.exp(-0.5 * ((time - moment) / _BLINK_WIDTH) ** 2))
@@ -195,7 +195,7 @@ _LONG = 0.12, 3.0  # share of large saccades, and their factor
 
 
 def gaze(time: FloatArray, seconds: float, rng: np.random.Generator) -> FloatArray:
-    """(T, 2) yaw and pitch of the eyes in radians, beside what a phrase asks for: fixations, and saccades between them."""
+    """(T, 2) yaw and pitch of the eyes, radians, added to those of a phrase: fixations and saccades."""
     moments, moment = [], 0.0
     while moment < seconds:
         moment += 0.15 + rng.gamma(2.0, (FIXATION_SECONDS - 0.15) / 2.0)

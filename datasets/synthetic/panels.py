@@ -1,4 +1,4 @@
-"""Rendering by the light of large panels: meshes and a camera to an image and a foreground mask.
+"""Renderer for meshes lit by large panels: image and foreground mask for a camera.
 
 Light is computed at the vertices once per pose for all cameras: from each of eight panels by rays to its whole area,
 from dim surroundings, and from other surfaces (one bounce). The colour of a pixel is albedo times light plus
@@ -29,11 +29,11 @@ SURROUNDINGS = (0.25, 0.25, 0.25)
 """Radiance of the surroundings outside the panels."""
 
 MIRRORS = ("eye",)
-"""Materials that show sharp reflections, whatever their roughness."""
+"""Materials with sharp reflections regardless of roughness."""
 
 _MOST_SAMPLES = 289
 _FILTER, _FILTER_REACH = 0.55, 2  # standard deviation and reach of the pixel filter, pixels
-_RAYS, _PATTERNS = 8, 256  # rays from a vertex to what surrounds it, and sets of them to draw from
+_RAYS, _PATTERNS = 8, 256  # rays from a vertex to its surroundings, and number of ray sets
 
 
 @dataclass(frozen=True)
@@ -140,9 +140,9 @@ def _panel(
 
 
 def window(camera: Camera, points: FloatArray) -> tuple[slice, slice]:
-    """Rows and columns of the image that hold all of ``points`` (n, 3), with room for the pixel filter.
+    """Rows and columns of the image that contain all ``points`` (n, 3), with a margin for the pixel filter.
 
-    The whole image where a point lies beside or behind the camera; empty where all lie outside.
+    The whole image if a point is beside or behind the camera; empty if all are outside.
     """
     # A row of all x, one of all y, one of all z: by columns this takes a sixth of the time of a whole render.
     seen = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
@@ -187,7 +187,7 @@ class PanelTracer:
         self._module: Any = KERNEL.load()
         self._instruction_set = instruction_set or KERNEL.instruction_sets[0]
         self._panels = np.zeros((MOST_PANELS, 5, 3), np.float32)
-        self._panels[:, 0] = 1e3  # those that are missing are far away, and without area
+        self._panels[:, 0] = 1e3  # missing ones are placed far away, without area
         for row, light in zip(self._panels, lights):
             row[:] = light.center, light.half_width, light.half_height, light.normal, light.radiance
         self._surroundings = np.asarray(surroundings, np.float32)
@@ -217,8 +217,10 @@ class PanelTracer:
         albedo: FloatArray | None = None,
         gloss: FloatArray | None = None,
     ) -> None:
-        """Give a mesh new positions, and what changed of colours and of ``gloss`` (n,), factors on the panels' reflections
-        (1 unless given; mirrors have none). Takes effect with the next image."""
+        """Set a mesh's positions and, if they changed, colours and ``gloss``. Takes effect with the next image.
+
+        ``gloss`` (n,) are factors on the panels' reflections: 1 unless given; mirrors have none.
+        """
         self._vertices[name] = vertices
         if albedo is not None:
             self._albedo[name] = albedo

@@ -1,4 +1,4 @@
-"""Eyeballs to be looked at: a finer ball than the tracked one, with cornea, iris and veins painted on."""
+"""Eyeballs and parts of the mouth to render. Eyeballs are finer than the tracked ones, with painted cornea, iris and veins."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ _TRACKED: Mapping[str, tuple[FloatArray, str]] = {
 
 @dataclass(frozen=True, eq=False)
 class MouthPart:
-    """A mesh in the mouth that the tracked mesh lacks.
+    """A mesh in the mouth that is not in the tracked mesh.
 
     ``vertices`` (n, 3) at rest and ``out`` (n, 3), the same with the tongue put out; ``weights`` (n, J) bind
     it to the joints; ``albedo`` (n, 3) is linear. ``lift`` is how far (metres) the way out arches over the
@@ -109,14 +109,14 @@ class MouthPart:
     lift: float = 0.0
 
     def at(self, tongue_out: float) -> FloatArray:
-        """Rest vertices for a tongue that is out by a share in [0, 1]."""
+        """Vertices at rest for a tongue put out by a fraction in [0, 1]."""
         arch = np.array([0.0, 4.0 * tongue_out * (1.0 - tongue_out) * self.lift, 0.0])
         return self.vertices + tongue_out * (self.out - self.vertices) + arch
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedPart:
-    """Triangles of the tracked mesh that are no skin: ``vertices`` (n,) numbers them, ``faces`` (m, 3) are local."""
+    """Non-skin triangles of the tracked mesh: ``vertices`` (n,) are its vertex indices, ``faces`` (m, 3) refer to these."""
 
     name: str
     vertices: IntArray
@@ -209,7 +209,7 @@ _BISECTIONS = 7
 def share_that_shows(parts: Sequence[MouthPart], anatomy: Anatomy, neutral: FloatArray) -> float:
     """The least ``tongue_out`` at which the tongue among ``parts`` hides `HIDES` of the neutral skin, to 1 %.
 
-    Tongue and lower lip both follow the jaw, so the closed mouth stands for the open one; the upper lip, which
+    Tongue and lower lip both follow the jaw, so the closed mouth is representative of the open one; the upper lip, which
     the tongue would then cross, is left out. Infinity for a subject without a tongue, or with one that stays
     behind the lips.
     """

@@ -12,11 +12,11 @@ from .hair import STYLES
 AGES = (20.0, 78.0)
 _GREY = "#c4c0ba"
 _SHORT = 0.05  # metres; of longer hair the hairline does not recede
-_TRAITS, _BLOCK = 5, 10  # traits that every ten subjects are spread over evenly
+_TRAITS, _BLOCK = 5, 10  # traits that are distributed evenly over every ten subjects
 
 
 def spread(seed: int, index: int) -> FloatArray:
-    """(5,) numbers in [0, 1): of every ten subjects of a seed, each has another tenth of each (a Latin hypercube).
+    """(5,) numbers in [0, 1): a Latin hypercube over every ten subjects of a seed.
 
     They are skin tone, age, hair style, beard and glasses.
     """

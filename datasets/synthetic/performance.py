@@ -222,7 +222,7 @@ SEQUENCES: Mapping[str, tuple[Face, ...]] = {
         {"jaw_side": 0.7, "jaw_open": 0.4},
         {"jaw_side": -0.7, "jaw_open": 0.4},
     ),
-    # Nothing here is new on its own; the combinations are.
+    # Only the combinations here are new, not the controls.
     "FREE": (
         {**both(smile=0.6), "gaze_left": 0.4},
         {"brow_inner_up": 0.7, "brow_outer_up_left": 1.0, "smile_right": 0.7},
@@ -243,7 +243,7 @@ BEYOND = 1.3
 
 
 def _beyond(face: Face) -> Face:
-    """More of everything that has no end of its own, unlike lids that close, eyes that turn, and the tongue."""
+    """Scale up all controls without a natural limit (lids, gaze and tongue have one)."""
     free = {name for name in EXPRESSION_CONTROLS if not name.startswith("blink")} | {"jaw_open", "jaw_side"}
     return {name: BEYOND * value if name in free else value for name, value in face.items()}
 
@@ -286,7 +286,7 @@ _PRIORITY = (
     *("FREE", "EMO-1-shout+laugh", "EXP-4-lips", "EMO-2-surprise+fear", "EXP-2-eyes", "EMO-4-disgust+happy"),
     *("EMO-3-angry+sad", "EXP-8-jaw-1", "EXP-5-mouth", "EXP-3-cheeks+nose", "EXP-9-jaw-2"),
 )
-_MINIMUM = 8  # timesteps below which another sequence is not worth opening
+_MINIMUM = 8  # minimum timesteps of an additional sequence
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,11 +353,11 @@ def perform(
     kind: Kind = "full",
     every: int = 1,
 ) -> Performed:
-    """Play a sequence, sampled at ``timesteps`` moments. The same seed gives the same performance.
+    """Sample a sequence at ``timesteps`` moments. The same seed gives the same performance.
 
     ``tongue_shows`` is the share in [0, 1] by which the tongue has to be out for a timestep to be labelled. A natural
     performance keeps every ``every``-th frame of a video of `natural.FRAME_RATE`; others distribute the moments evenly over
-    their phrases. What ``kind`` leaves out stays at rest; everything else moves as in the full performance.
+    their phrases. Controls that ``kind`` leaves out stay at rest; all others move as in the full performance.
     """
     names = [*SEQUENCES, *FREE_PARTS, SPEECH]
 
@@ -415,7 +415,7 @@ def _natural_curves(name: str, time: FloatArray, seconds: float, rng: np.random.
 
 
 def _middles(phrases: Sequence[Face], rng: np.random.Generator) -> FloatArray:
-    """Moments of the phrases, seconds; the first that is drawn of a performance."""
+    """Moments of the phrases, seconds; drawn before anything else of a performance."""
     return _PHRASE_SECONDS * np.arange(1, len(phrases) + 1) + rng.uniform(-0.08, 0.08, len(phrases))
 
 
@@ -425,7 +425,7 @@ def _moments(name: str, timesteps: int, seconds: float, rng: np.random.Generator
     time = (np.arange(timesteps) + 0.5) / timesteps * seconds
     for middle, phrase in zip(_middles(phrases, rng), phrases):
         if "tongue_out" in phrase:
-            # However few the timesteps, one shows the tongue: a capture without it would test no exclusion.
+            # At least one timestep shows the tongue, so that every capture tests exclusion.
             time[np.abs(time - middle).argmin()] = middle
     return time
 
@@ -531,7 +531,7 @@ def named_translation(
 
 
 def procedural_translation(head: HeadAsset) -> Translation:
-    """The procedural head speaks these controls itself; its coefficients are combinations of them."""
+    """Translation for the procedural head, whose coefficients are combinations of these controls."""
     expression, eyelids = semantic_to_coefficients(head.version)
     rows = [SEMANTIC_NAMES.index(control) for control in EXPRESSION_CONTROLS]
     return Translation(head.version, expression[rows], None if eyelids is None else eyelids[rows])

@@ -40,7 +40,7 @@ from .tracking import Tracker, with_tracking_error, with_tracking_noise
 from .volume import tracked_volume
 
 FIRST_SUBJECT = 900
-"""First number of synthetic subjects; participants of NeRSemble have smaller ones."""
+"""First number of synthetic subjects; NeRSemble's participants have smaller numbers."""
 
 _IDENTITY_SPREAD = 0.65  # standard deviations of the identity basis; 1 would draw rare faces too often
 _BUST = 0.213  # metres from the target down to the end of the bust, which lies below the image
@@ -57,7 +57,7 @@ EDITION = 3
 
 
 RESIDUALS = ("hair_lag", "camera_colour", "motion_blur", "mask_error", "correctives")
-"""Settings of what tracked parameters and calibrated cameras do not explain in recordings; each is a level, and 0 is without."""
+"""Settings of effects that tracked parameters and calibrated cameras do not explain; each is a level, and 0 disables it."""
 MOST_RESIDUAL = 4.0
 """Highest level of these settings."""
 
@@ -110,7 +110,7 @@ class SubjectPlan:
                 yield name, timestep
 
     def render_seed(self, sequence: str, timestep: int, camera: str) -> int:
-        """Seed of one image's sampling, the same however the work is divided."""
+        """Seed of one image's sampling, independent of the distribution of work."""
         return int(digest(self.settings.seed, self.person.name, sequence, timestep, camera)[:7], 16)
 
 
@@ -174,7 +174,7 @@ def plan_subject(out: Path, index: int, geometry: Geometry, settings: SyntheticS
 def _middle(anatomy: Anatomy, neutral: FloatArray, style: Style) -> FloatArray:
     """Target of the cameras: near the middle of the head with its hair, at rest, so high that the bust's end is not visible.
 
-    Only parts above the chin make the middle: neck and shoulders need not be in the frame from every side.
+    Only parts above the chin count: neck and shoulders need not be in the frame from every side.
     """
     skin = neutral[np.unique(anatomy.skin_faces)]
     above = skin[skin[:, 1] > anatomy["chin"][1]]
@@ -200,7 +200,7 @@ CAMERA_DISTANCE = 1.0  # metres from the head's middle
 _FRAME_HEIGHT = 0.394  # metres of the scene that the image's height shows at the head's middle
 _FRAME_WIDTH = 0.270
 
-# The order in which fewer cameras are taken: the frontal one, then those that spread most.
+# Order in which cameras are selected: the frontal one, then those farthest apart.
 _SPREAD = (8, 0, 15, 3, 12, 6, 5, 10, 1, 14, 7, 9, 2, 13, 4, 11)
 
 
@@ -242,7 +242,7 @@ def _look_at(azimuth: float, elevation: float, target: FloatArray) -> FloatArray
     rotation = on_grid(np.stack([right, np.cross(forward, right), forward]), ANGLE_BITS)
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
-    # Along the rounded axis, and summed in one order: the JSONs state these numbers to the last digit.
+    # From the rounded axis and with a fixed order of summation, since the JSONs contain all digits of these numbers.
     matrix[:3, 3] = -(rotation * (target - CAMERA_DISTANCE * rotation[2])).sum(axis=1) + 0.0
     return matrix
 

@@ -1,4 +1,4 @@
-"""What cameras and mattes add to the light of a frame: response of each camera, shutter, errors of masks at hair.
+"""Effects of cameras and matting: response of each camera, motion blur, mask errors at hair.
 
 The amounts are choices where no measurement is named.
 """
@@ -17,7 +17,7 @@ from ..rounding import COEFFICIENT_BITS, LENGTH_BITS, on_grid
 from .fields import fractal_noise
 
 SHUTTER_SECONDS = 0.003
-"""NeRSemble's time of exposure."""
+"""NeRSemble's exposure time."""
 APART_PIXELS, MOST = 0.25, 16
 """Largest motion between two sub-frames, pixels, unless there would be more sub-frames than that."""
 
@@ -31,7 +31,7 @@ _SOFT = _BETWEEN = (
     0.002  # metres of a matte's soft edge, and over which an outline of hair turns into one of skin
 )
 ROOM = 0.5
-"""Colour (sRGB) of what is behind the head, which a matte that is too wide shows."""
+"""Colour (sRGB) of the room behind the head, visible where a matte is too wide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Response:
     exponent: float
 
     def __call__(self, rgb: FloatArray) -> FloatArray:
-        """Linear light (..., 3) as the camera has it."""
+        """Apply the camera's response to linear light (..., 3)."""
         return self.gains * np.maximum(rgb, 0.0) ** self.exponent
 
 
@@ -73,7 +73,7 @@ def exposed(frames: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray
 
 
 def outline(camera: Camera, vertices: FloatArray, faces: IntArray) -> BoolArray:
-    """(H, W) whether triangles cover a pixel, without regard to what is before them."""
+    """(H, W) whether triangles cover a pixel, ignoring occlusion."""
     seen = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     pixels = seen @ camera.K.T
     # Pixel centres lie at halves; OpenCV takes them at whole numbers, here of sixteenths.
@@ -113,7 +113,7 @@ def matte(alpha: FloatArray, hair: FloatArray, level: float, metre: float, seed:
     core = _distance(alpha <= 0.5) > reach
     if not core.any():
         return alpha
-    inside = _distance(core) <= reach  # what is narrower than twice the reach is gone
+    inside = _distance(core) <= reach  # structures narrower than twice the reach are removed
     signed = np.where(inside, _distance(~inside) - 0.5, 0.5 - _distance(inside))
     rows, columns = np.indices(alpha.shape)
     place = np.stack([columns.ravel(), rows.ravel(), np.zeros(alpha.size)], axis=1).astype(np.float64)

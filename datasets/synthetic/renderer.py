@@ -1,4 +1,4 @@
-"""A subject's frames: what `panels` renders of it, developed to pictures and masks."""
+"""Renders a subject's frames with `panels` and converts them to 8-bit images and masks."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def develop(
 
 
 class CaptureRenderer:
-    """Renders the frames of one subject, on one thread: processes share the work better."""
+    """Renders the frames of one subject on one thread; processes scale better than threads."""
 
     def __init__(self, plan: SubjectPlan):
         self._plan = plan
@@ -87,7 +87,7 @@ class CaptureRenderer:
         return sub_frames(moved, float(self._plan.cameras[FRONTAL].K[0, 0]), CAMERA_DISTANCE, shutter)
 
     def pose_at(self, sequence: str, timestep: int, offset: float = 0.0) -> None:
-        """Move all meshes to where they are at a timestep, with the state of skin that the timesteps before led to.
+        """Pose all meshes for a timestep, with the state of the skin that results from previous timesteps.
 
         ``offset`` is the time from there in seconds: what moves in it is not the state of the skin.
         """

@@ -40,7 +40,7 @@ def paint_skin(
     red = person.skin * np.array([1.02, 0.66, 0.62])
     color = _mix(color, red, 0.55 * _flush(anatomy, points))
     color = _mix(color, person.skin * np.array([0.62, 0.52, 0.55]), 0.4 * _around_eyes(anatomy, points))
-    # Blotches, then pores: real skin is never even.
+    # Blotches, then pores.
     color *= (1.0 + 0.10 * fractal_noise(points, 0.03 * s, seed, 3))[:, None]
     color[:, 1:] *= (1.0 - 0.06 * fractal_noise(points, 0.012 * s, seed + 7, 3))[:, None]
     color *= (1.0 + 0.05 * value_noise(points / (0.0014 * s), seed + 8))[:, None]
@@ -294,7 +294,7 @@ def flush_strengths(a: Activations) -> FloatArray:
 def make_folds(
     person: Person, anatomy: Anatomy, points: FloatArray, lips: FloatArray, bare: FloatArray
 ) -> Folds:
-    """Lay the folds out on the neutral fine skin, (N, 3) points.
+    """Define the folds on the neutral fine skin, (N, 3) points.
 
     ``lips`` (N,) is the share of the lips' red; ``bare`` (N,) is 0 where hair hides the skin.
     """

@@ -25,7 +25,7 @@ from .skin import gloss_at_rest, make_folds, paint_skin, sagging
 from .volume import smoothed
 
 _STRETCH_GLOSS, _LEAST, _MOST = 3.0, 0.6, 1.25  # exponent of the stretch of area, and the range of the latter
-_WET = 1.2  # what wetness adds to the gloss of lips
+_WET = 1.2  # increase of the lips' gloss by wetness
 HEAD_JOINT, EYE_JOINTS = 1, (3, 4)
 _NECK_ROUNDS = 6  # of averaging over neighbours
 _ROUNDS = 4  # of splitting long edges
@@ -54,7 +54,7 @@ class RestMesh:
 
 @dataclass(frozen=True, eq=False)
 class LatePoses:
-    """Poses that hair and neck have where they follow the head late, see `lag`."""
+    """Delayed poses of hair and neck, see `lag`."""
 
     hair: HeadPose
     neck: HeadPose
@@ -140,7 +140,7 @@ class RenderedSubject:
             return self._model(shape=torch.from_numpy(self.shape), **arguments)[0].numpy()
 
     def _shown(self, pose: HeadPose, activations: Activations) -> FloatArray:
-        """(V, 3) vertices as pictures show them: with the shapes that the head model lacks."""
+        """(V, 3) vertices as rendered: with the shapes that the head model lacks."""
         if self._correctives is None:
             return self.tracked(pose)
         neutral = self.neutral + displacement(self._correctives, self._level, activations)

@@ -37,11 +37,11 @@ LID_SHARE = 0.5
 PERSISTENCE = 0.8
 """Correlation of the drift from one timestep to the next."""
 SHRINKAGE = (0.05, 0.3)
-"""Part of a coefficient that regularisation takes away, drawn for each coefficient."""
+"""Fraction by which regularisation shrinks a coefficient, drawn for each coefficient."""
 MIXING = 0.3
 """Norm of the leakage of a unit coefficient into the others."""
-_MOMENTS = 48  # poses that amplitudes are measured on
-_PROBE = 1e-2  # part of an error at which its displacement is measured: there it is linear
+_MOMENTS = 48  # number of poses on which amplitudes are measured
+_PROBE = 1e-2  # scale of an error at which its displacement is measured, in the linear range
 DRIFT = 0.2
 """Amplitude of the drift, in spreads of a parameter or relative to the range of a control."""
 LASTING, LASTING_DRIFT, JITTER = 0.35, 0.2, 0.1
@@ -119,7 +119,7 @@ def with_tracking_error(
     values = _values(poses)
     overall: dict[str, FloatArray] = {}
     for name, exact in values.items():
-        # A part of the spread of all, so that what hardly moves is not tracked exactly.
+        # Includes a fraction of the overall spread, so that nearly constant parameters have errors too.
         spread = np.maximum(exact.std(axis=0), 0.1 * exact.std() + 1e-4)
         overall[name] = spread * drift(exact.shape)
     overall["expression"] += _systematic(values["expression"], rng)
@@ -156,7 +156,7 @@ def with_tracking_error(
 
 
 def _systematic(expression: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """(T, E) what shrinkage and leakage between coefficients make of an expression, beyond itself."""
+    """(T, E) change of expression coefficients by shrinkage and leakage."""
     size = expression.shape[1]
     shrinkage = rng.uniform(*SHRINKAGE, size)
     mixing = rng.standard_normal((size, size)) * (MIXING / np.sqrt(size))

@@ -1,4 +1,4 @@
-"""Ground truth of a synthetic capture in poses and views that it has no pictures of."""
+"""Ground truth of a synthetic capture for poses and views without recorded images."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class SyntheticTruth:
     """The person of a synthetic capture, rendered in any pose and view; a `GroundTruth`.
 
     Shape, skin, hair, lights, samples a pixel, tone curve and errors of masks are the capture's, the
-    background is the clip's. The person has
-    held the expression for so long that blood and wrinkles are at rest, with the tongue inside. What depends on time
+    background is the clip's. Blood flow and wrinkles are in the steady state of the expression, and the tongue is inside.
+    Effects that depend on time
     (`--hair-lag`, `--motion-blur`) and the response of single cameras (`--camera-colour`) are left out.
 
     The pose is taken as it is. If the capture's tracking has errors, an avatar that was trained with them is compared with
@@ -98,7 +98,7 @@ class SyntheticTruth:
 
 
 def _settings(clip: Clip) -> SyntheticSettings:
-    """Settings that a clip's capture was made with. Raises `UnavailableError` unless these can be had again."""
+    """Settings that a clip's capture was made with. Raises `UnavailableError` if they cannot be reproduced."""
     recorded = clip.steps[0].parameters.get("synthetic") if clip.steps else None
     if not recorded:
         raise UnavailableError(

@@ -1,4 +1,4 @@
-"""Static offset of hair, beard and sagging skin, as from a tracker with vertex offsets such as VHAP.
+"""Static offset of hair, beard and sagging skin, like that of a tracker with vertex offsets such as VHAP.
 
 VHAP fits one offset a vertex to all frames under a Laplacian penalty: the hair's volume without its locks. Here it is a part of
 the mean thickness of hair over the head model's own vertices, smoothed over its edges.
@@ -16,7 +16,7 @@ from .hair import STYLES, ear_share, hair_share
 from .skin import beard_share, sagging
 
 FOUND = 0.8
-"""Part of the thickness that the offset shows: penalties draw it towards the head model."""
+"""Fraction of the thickness in the offset, which penalties reduce."""
 _ROUNDS = 6  # of averaging over neighbours
 _LOCKS = 0.6  # mean height of locks over the cap, as a part of their rise
 _BEARD = 0.35  # mean thickness of a beard, as a part of its length

@@ -14,6 +14,6 @@ _MADE_BY = (
 def tracking_code() -> str:
     """Digest of the Python files in the folders of the landmark network, the tracker and the reader of videos.
 
-    It is part of every mark of what an interrupted call leaves, so that another version of the code does not continue from it.
+    It is part of the key of stored results, so that another version of the code does not resume from them.
     """
     return "".join(map(code_digest, _MADE_BY))

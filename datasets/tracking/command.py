@@ -28,8 +28,8 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     """Track the head model of a capture in its images and write a capture with this tracking.
 
     Writes under ``settings.out`` the capture (images linked), ``track.json`` with every timestep's residuals and
-    ``overlay.png``. What is found meanwhile is stored there, so that a call after an interruption continues. Raises `InputError` before
-    the fit for a capture that cannot be tracked or written.
+    ``overlay.png``. Intermediate results are stored there, so that an interrupted call can be resumed.
+    Raises `InputError` before the fit for a capture that cannot be tracked or written.
     """
     from ..clip import check_apart
     from ..head.refit.rewrite import capture_plan, write_capture

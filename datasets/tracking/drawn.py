@@ -1,4 +1,4 @@
-"""Pictures of a head model's mean, painted by its regions, from which landmarks are learnt where no capture is given."""
+"""Renderings of the mean head, coloured by region, from which the landmark embedding is learnt if no capture is given."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PAINT = {
     "scalp": (0.25, 0.18, 0.13),
 }
 IRIS, IRIS_SHARE = (0.20, 0.15, 0.10), 0.15
-"""Colour of the front of an eyeball, and the part of its vertices that have it."""
+"""Colour of the front of an eyeball, and the fraction of its vertices with this colour."""
 
 
 def drawn_head(head: HeadAsset) -> Iterator[PicturedMesh]:

@@ -1,4 +1,4 @@
-"""Which points of a head model the landmarks of a network are."""
+"""Embedding of a network's landmarks on a head model."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from ..mesh_pictures import rasterize_mesh
 LEARNING_FRAMES = 120
 """Images of a capture from which an embedding is learnt."""
 MOST_SPREAD = 0.004
-"""Landmarks that slide on the mesh by more than this, median, are left out, metres."""
+"""Maximum median sliding of a landmark on the mesh, metres; others are left out."""
 FEWEST_LANDMARKS = 10
 FACING = 0.5
 """Least cosine between the normal of a landmark and the direction to the camera."""
-_FEWEST = 0.15  # part of the images in which a landmark has to hit the mesh
+_FEWEST = 0.15  # fraction of images in which a landmark must hit the mesh
 
 
 class Embedding(NamedTuple):
-    """Points of a head model that landmarks are."""
+    """Points of a head model that correspond to landmarks."""
 
     landmarks: IntArray
     """(L,) indices of the network's landmarks."""
@@ -38,7 +38,7 @@ class Embedding(NamedTuple):
 
 
 class PicturedMesh(NamedTuple):
-    """A picture of a head whose mesh is known."""
+    """An image of a head with known mesh."""
 
     image: ByteArray
     """(H, W, 3) 8-bit."""
@@ -63,7 +63,7 @@ def learn_embedding(
     pictures: Iterable[PicturedMesh],
     progress: Progress = no_progress,
 ) -> Embedding:
-    """Where the network's landmarks are on the mesh: medians over pictures.
+    """Positions of the network's landmarks on the mesh: medians over images.
 
     Raises `InputError` if the network finds hardly any landmark in the pictures.
     """

@@ -1,4 +1,4 @@
-"""``headbench track --with``: another tracker in the user's installation, and its result as a capture."""
+"""``headbench track --with``: runs another tracker in the user's installation and converts its result to a capture."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 def track_with_program(settings: TrackSettings, progress: Progress) -> CommandResult:
     """Run another tracker on the file of a video and make a capture of what it wrote.
 
-    Its files are in a folder of its name in ``settings.out``, the capture beside it. Started again, it continues after the last
-    step that was finished. Raises `InputError` before anything runs, and `ProgramError` for a program that fails.
+    Its files are in a folder of its name in ``settings.out``, the capture beside it. A repeated call resumes after the last
+    finished step. Raises `InputError` before anything runs, and `ProgramError` for a program that fails.
     """
     source, name = Path(settings.capture), settings.program
     if not is_video(source):

@@ -53,14 +53,14 @@ LEVELS = (
     BlurLevel(1.2, 5, 16.0),
     BlurLevel(0.7, 6, 4.0),
 )
-"""From coarse to fine. A narrow tolerance at the coarse ones would leave out the colours of what moves most."""
+"""From coarse to fine. A narrow tolerance at coarse levels would reject the points that move most."""
 SHARPEST = 0.7
 """Least blur, pixels."""
 WIDE_MM = 6.0
 """Blur that is subtracted from the images."""
 LANDMARK_WEIGHT, COLOUR_WEIGHT = 0.005, 0.1
-"""Weights of a landmark and of a colour beside the prior. They are small because errors of landmarks are the same at all
-timesteps and those of neighbouring points alike, so that sums over them claim too much."""
+"""Weights of a landmark and of a colour beside the prior. They are small because errors of landmarks are correlated over
+time and those of points in space, so that sums over them overstate certainty."""
 SHAPE_SPREAD = 0.3
 """Standard deviation of the prior of the identity coefficients; less than 1 for the same reason."""
 
@@ -101,7 +101,7 @@ class Fitted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Fitter:
-    """Data of a fit that does not change."""
+    """Constant data of a fit."""
 
     head: HeadAsset
     views: Views
@@ -170,7 +170,7 @@ class Fitter:
             per_metre = self.views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
             sigma = 1e-3 * LANDMARK_MM * per_metre
             square = (gap**2).sum(axis=2)
-            # All landmarks of an image may be wrong, where a network takes something else for a face.
+            # All landmarks of an image may be wrong if the network detects something else as a face.
             if leave_out:
                 near = np.sqrt(square) / sigma < MISTAKEN_MM / LANDMARK_MM
                 found &= ((found & near).sum(axis=1) > found.sum(axis=1) / 2)[:, None]
@@ -200,7 +200,7 @@ class Fitter:
         keep_shape: bool = False,
         progress: Progress = no_progress,
     ) -> Fitted:
-        """Steps on colours of points and on landmarks, at the blurs of `LEVELS`, with or without the shape.
+        """Steps on colours of points and landmarks at the blurs of `LEVELS`, with or without optimising the shape.
 
         ``stack`` holds the images of all timesteps, the cameras of each together.
         """

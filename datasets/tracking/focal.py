@@ -16,7 +16,7 @@ TRIED = tuple(np.geomspace(0.8, 5.0, 9))
 """Focal lengths relative to the longer side of the picture."""
 FRAMES = 16
 WEIGHT = 1.0
-"""Weight of a landmark beside the prior. That of tracking leaves residuals to the prior, which hide the perspective."""
+"""Weight of a landmark relative to the prior. With that of tracking, residuals due to the prior would hide perspective."""
 CLEAR = 1.02
 """Ratio of the residuals at both ends of `TRIED` to the least one from which the focal length counts as determined."""
 
@@ -32,7 +32,7 @@ class FocalLength(NamedTuple):
 
     @property
     def clear(self) -> bool:
-        """Whether the landmarks determine it."""
+        """Whether the landmarks determine the focal length."""
         best = int(self.residuals.argmin())
         return 0 < best < len(self.tried) - 1 and self.residuals[[0, -1]].min() > CLEAR * self.residuals[best]
 

@@ -1,4 +1,4 @@
-"""Landmarks in images: where they come from, and what they are points of."""
+"""Landmarks in images: sources, and corresponding points of the mesh."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ def known_rig_landmarks(
 ) -> ImageLandmarks:
     """Projections of vertices of the clip's own tracked mesh with the error of a landmark network, seeded.
 
-    They stand in for a network where its file is missing; only their error makes them a start that has to be refined. A
-    landmark is missing where the mesh hides it.
+    They replace a network whose file is missing; because of their error, tracking must still be refined. Landmarks
+    hidden by the mesh are missing.
     """
-    rng = np.random.default_rng([seed, 11, *clip.subject.encode()])  # each subject has an error of its own
+    rng = np.random.default_rng([seed, 11, *clip.subject.encode()])  # errors differ by subject
     vertices = rig_vertices(clip.head)
     views = Views([clip.cameras[name] for name in cameras])
     subject = PosedSubject.of(clip)

@@ -39,7 +39,7 @@ def found_in_images(
 
 
 class NetworkLandmarks:
-    """A source of landmarks: what the network finds in the images of some cameras of a clip.
+    """Landmark source: detections of the network in the images of some cameras of a clip.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class NetworkLandmarks:
         return ImageLandmarks(self._embedding.corners, self._embedding.weights, pixels)
 
     def _facing(self, found: FloatArray, camera: int) -> BoolArray | None:
-        """(L,) which landmarks face the camera; None if they do not form a face."""
+        """(L,) mask of landmarks that face the camera; None if they do not form a face."""
         K = self._views.intrinsics[camera]
         _, turn, shift = cv2.solvePnP(self._rest, found, K, None, flags=cv2.SOLVEPNP_SQPNP)
         rotation = cv2.Rodrigues(turn)[0]
@@ -108,8 +108,8 @@ def head_embedding(
     teacher: CaptureClip | None,
     progress: Progress = no_progress,
 ) -> Embedding:
-    """Where the network's landmarks are on a head model, learnt from a clip of another subject with exact tracking, or from drawings
-    of the head model.
+    """Embedding of the network's landmarks on a head model, learnt from a clip of another subject with exact tracking or from
+    renderings of the head model.
 
     Raises `InputError` if the clip has another head model.
     """

@@ -23,7 +23,7 @@ STEPS, LOG = "steps.json", "program.log"
 
 @dataclass(frozen=True)
 class WorkingFolder:
-    """Where a program works.
+    """Working folder of a program.
 
     Attributes
     ----------
@@ -216,7 +216,7 @@ def check_interpreter(name: str, python: str, option: str = "--python") -> Path:
     command = [str(path), "-c", f"import {', '.join(program.modules)}"]
     remedy = f"Give the interpreter of the environment that the page of {name} makes."
     expected = f"the modules {', '.join(program.modules)}"
-    with tempfile.TemporaryDirectory() as elsewhere:  # where the checkout itself is not found
+    with tempfile.TemporaryDirectory() as elsewhere:  # the checkout itself is not importable there
         try:
             found = subprocess.run(
                 command,
@@ -263,7 +263,7 @@ def run_steps(
         unchanged = unchanged and finished.get(step.name) == state and any(work.folder.glob(pattern))
         if unchanged:
             continue
-        for old in [*work.folder.glob(pattern)]:  # which would hide that the step writes nothing
+        for old in [*work.folder.glob(pattern)]:  # otherwise a step that writes nothing would go unnoticed
             shutil.rmtree(old) if old.is_dir() else old.unlink()
         note = f"{name}, {step.name}"
 

@@ -1,4 +1,4 @@
-"""Gauss-Newton steps for the poses of all timesteps and one shape: normal equations with the structure of an arrow."""
+"""Gauss-Newton steps for the poses of all timesteps and one shape: normal equations with an arrowhead matrix."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class HeadState(NamedTuple):
 
 
 class HeadPrior(NamedTuple):
-    """Expected magnitudes of the parameters; infinity leaves one free, 0 keeps it as it is."""
+    """Expected magnitudes of the parameters; infinity disables the prior, 0 fixes the parameter."""
 
     pose: FloatArray
     """(D,) standard deviations around 0."""
@@ -62,7 +62,7 @@ class NormalEquations:
         Parameters
         ----------
         damping : float
-            Part of the diagonal that is added to it.
+            Fraction of the diagonal that is added to it (Levenberg-Marquardt).
         """
         split = self._split
         deviations = np.concatenate([prior.pose, prior.shape])

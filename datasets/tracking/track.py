@@ -49,7 +49,7 @@ class TrackingReport:
     cameras: tuple[str, ...]
     residuals: tuple[TimestepResidual, ...]
     seconds: float
-    """Time of the fit, with reading images and without finding landmarks."""
+    """Time of the fit, including reading images but not landmark detection."""
 
     def to_json(self) -> dict[str, Any]:
         """The summary and every timestep as plain values."""
@@ -80,7 +80,7 @@ def check_cameras(clip: CaptureClip, cameras: Sequence[str]) -> None:
         raise InputError(f"clip of {clip.subject}", "cameras", expected, ", ".join(unknown) or "none")
 
 
-# The linear algebra is in many small matrices, for which threads cost more than they give.
+# The linear algebra uses many small matrices, for which threads cost more time than they save.
 @threadpool_limits.wrap(limits=1)
 def track(
     clip: CaptureClip,
@@ -187,7 +187,7 @@ def _fit_block(
     shape: FloatArray | None,
     progress: Progress,
 ) -> dict[str, np.ndarray]:
-    """The arrays of `_PART` of some timesteps, with a given shape or their own."""
+    """Fit some timesteps with a given or a newly estimated shape; returns the arrays of `_PART`."""
     begin = time.perf_counter()
     fitter = Fitter(clip.head, views, landmarks)
     images = [clip.image(clip.frame_at[timestep, name]) for timestep in part for name in cameras]

@@ -13,7 +13,7 @@ from ..head.geometry import triangle_areas, vertex_normals
 CELL = 4
 """Side of a cell of the depth buffer, pixels."""
 MARGIN = 0.002
-"""A point is hidden if something is nearer by more than this, metres, and by more than its surface slopes within a cell."""
+"""Depth tolerance, metres, in addition to the slope within a cell: a point is hidden if another surface is nearer by more."""
 FACING = 0.25
 """Least cosine between the normal of a point and the direction to the camera."""
 _SPACING = 0.003  # between the samples of a surface that fill the buffer, metres
@@ -77,7 +77,7 @@ class Views:
 
 
 class Occlusion:
-    """Which points of a mesh cameras see.
+    """Visibility of mesh points in cameras.
 
     The surface is sampled every few millimetres and the nearest depth in every cell of `CELL` pixels is kept. This is
     a hundred times faster than drawing the mesh and as exact as robust estimates need.

@@ -1,4 +1,4 @@
-"""The folder of what an interrupted ``headbench track`` continues from."""
+"""Folder of intermediate results, from which an interrupted ``headbench track`` resumes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Those of a video show the person. This folder can be deleted: the next call begi
 
 
 def check_work_folder(folder: Path) -> None:
-    """Raise `InputError` for anything at the place of the folder that `make_work_folder` did not make: it will be deleted."""
+    """Raise `InputError` if the path has something not created by `make_work_folder`, since it will be deleted."""
     if folder.is_symlink():
         found = "a link"
     elif folder.is_dir():

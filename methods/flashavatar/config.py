@@ -1,4 +1,4 @@
-"""Settings of FlashAvatar. Light: neither torch nor numpy is imported here.
+"""Settings of FlashAvatar; imports neither torch nor numpy.
 
 The defaults are those of the authors' program; iterations are on the scale of its 150,000.
 """
@@ -13,7 +13,7 @@ from ..shared.config import HarmonicsTraining, SurfaceSettings, check_at_least_o
 
 @dataclass(frozen=True)
 class FlashAvatarConfig(SurfaceSettings, HarmonicsTraining):
-    """FlashAvatar (CVPR 2024): splats on a mesh, moved, turned and scaled by a network of the tracked parameters.
+    """FlashAvatar (CVPR 2024): splats on a mesh, translated, rotated and scaled by a network of the tracked parameters.
 
     Attributes
     ----------
@@ -23,12 +23,12 @@ class FlashAvatarConfig(SurfaceSettings, HarmonicsTraining):
     layers : int
         Number of the network's hidden layers.
     zero_output : bool
-        Start with a last layer of zeros, so that the network changes nothing at first. The authors' program
-        starts it at random like the other layers.
+        Initialise the last layer with zeros, so that the network has no effect at first. The authors' program initialises it at
+        random, like the other layers.
     hyper_gaussians : int
         Number of latents that the network emits instead of the outputs, which are then conditional means of Gaussians
         that every splat has over outputs and latents (HyperGaussians, arXiv 2507.02803: 8 in the paper, 32 in the
-        program). They start at zero, whatever ``zero_output``, and have the rate ``network_lr``. 0: none.
+        program). They start at zero, whatever ``zero_output``, and have the rate ``network_lr``. 0 disables them.
     offset_m : float
         Maximum offset of a splat from its point on the surface along each axis of the head, metres.
     scale_variant : Literal['official', 'product']
@@ -36,8 +36,8 @@ class FlashAvatarConfig(SurfaceSettings, HarmonicsTraining):
         as the authors' program, which multiplies its logarithm by that: a size s in metres becomes s^c, with c
         from 1/e to e.
     mouth_weight : float
-        Weight of the Huber loss of the images times the mask of the mouth, for which up to half of ``mesh_cache_mb``
-        is used besides. 0 disables it, as does a head model without the region "lips".
+        Weight of the Huber loss within the mouth mask, whose cache uses up to another half of ``mesh_cache_mb``. 0
+        disables it, as does a head model without the region "lips".
     ssim_weight : float
         Weight of 1 - SSIM, which is added to the loss; 0 as published.
     """

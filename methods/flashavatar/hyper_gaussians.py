@@ -1,7 +1,8 @@
 """The last layer of HyperGaussians: Gaussians of every splat over output and latent, whose conditional means are the outputs.
 
 Serifi and Bühler, "HyperGaussians: High-Dimensional Gaussian Splatting for High-Fidelity Animatable Face Avatars", CVPR
-2026, arXiv 2507.02803; the parts that are stored and the start are those of the authors' code, https://github.com/gserifi/HyperGaussians.
+2026, arXiv 2507.02803; the stored parts and the initialisation are those of the authors' code,
+https://github.com/gserifi/HyperGaussians.
 
 A Gaussian has a mean (mu_o, mu_i) and a precision Lambda = L L^T in blocks of output and input, L = [[A, 0], [B, C]] with a
 positive diagonal of A. The mean of the output where the input is x is mu_o - Lambda_oo^-1 Lambda_oi (x - mu_i), which
@@ -19,7 +20,7 @@ from torch import Tensor
 from ..shared.tensor_files import check_sizes
 
 WIDTHS = {"offset": 3, "turn": 4, "size": 3}
-"""Columns of the outputs, each of which has a Gaussian of its own."""
+"""Columns of the outputs; each output has a separate Gaussian."""
 
 
 def gaussian_shapes(latent: int) -> dict[str, tuple[int]]:

@@ -1,4 +1,4 @@
-"""FlashAvatar: splats on a tracked mesh, changed by a network of the tracked parameters.
+"""FlashAvatar: splats on a tracked mesh, deformed by a network of the tracked parameters.
 
 Xiang et al., "FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Embedding", CVPR 2024, arXiv 2312.02214.
 
@@ -35,7 +35,7 @@ from .model import INPUTS, TrainedSplats, changed, layer_of_points, network_outp
 from .spec import FLASHAVATAR as SPEC
 
 BOUNDARY = "boundary"
-"""The region at the lower end of the neck, where the mesh ends: there is no texel of the authors' chart, and no splat."""
+"""Region at the lower end of the neck, where the mesh ends: the authors' chart has no texels there, so no splats."""
 MOUTH = "lips"
 """The region of the mask of the mouth."""
 HUBER = 0.1
@@ -95,7 +95,7 @@ class FlashAvatarTraining(SurfaceTrainer[FlashAvatarConfig]):
 
 
 def image_loss(image: Tensor, truth: Tensor, mouth: Tensor | None, config: FlashAvatarConfig) -> Tensor:
-    """Huber loss of an image, that of the images times the mask of the mouth with its weight, and 1 - SSIM with its own.
+    """Weighted sum of the Huber loss, the Huber loss within the mouth mask, and 1 - SSIM.
 
     Images are (H, W, 3) in [0, 1], the mask (H, W) bool. Both Huber losses are means over all pixels.
     """
@@ -135,7 +135,7 @@ class FlashAvatarAvatar(SurfaceAvatar[TrainedSplats]):
 
 
 class FlashAvatar(SurfaceMethod[FlashAvatarConfig, FlashAvatarAvatar]):
-    """The method: see the module."""
+    """See the module docstring."""
 
     name, version = SPEC.name, SPEC.version
     config_class, avatar_class, training_class = FlashAvatarConfig, FlashAvatarAvatar, FlashAvatarTraining

@@ -1,4 +1,4 @@
-"""The model of FlashAvatar: splats on a mesh, the network that moves, turns and scales them, and its file."""
+"""The model of FlashAvatar: splats on a mesh, the network that translates, rotates and scales them, and the avatar's file."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ RENDERING = ("frequencies", "layers", "hidden", *OPTIONAL, "offset_m", "scale_va
 """Settings that affect rendering; those in `OPTIONAL` are not stored if they are 0."""
 (FIRST,), (FIRST_BIAS,) = layer_names(1)
 OUTPUTS = (*WIDTHS.values(),)
-"""Columns of the network's outputs: offset, turn, change of size."""
+"""Columns of the network's outputs: offset, rotation, change of scale."""
 
 
 def network_sizes(config: FlashAvatarConfig, conditions: int) -> tuple[int, ...]:
@@ -110,7 +110,7 @@ class TrainedSplats(SurfaceSplats[FlashAvatarConfig]):
         return settings_of_text(FlashAvatarConfig, RENDERING, text, path, cls.KEY, OPTIONAL)
 
     def checked(self, path: Path, head: HeadAsset, device: str) -> TrainedSplats:
-        """See `SurfaceSplats.checked`; also bounds what the network makes of sizes, and inverses of Gaussians."""
+        """See `SurfaceSplats.checked`; also bounds the sizes that the network can produce, and the inverses of Gaussians."""
         found = super().checked(path, head, device)
         check_sizes(path, math.e * self.tensors["log_scales"])
         if self.settings.hyper_gaussians:

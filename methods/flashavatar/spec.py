@@ -1,4 +1,4 @@
-"""Spec of FlashAvatar. Light: the implementation is not imported."""
+"""Spec of FlashAvatar; the implementation is not imported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of GaussianAvatars. Light: neither torch nor numpy is imported here."""
+"""Settings of GaussianAvatars; imports neither torch nor numpy."""
 
 from __future__ import annotations
 

@@ -144,7 +144,7 @@ class GAAvatar(StoredSplatAvatar):
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GAAvatar:
-        """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
+        """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
 
         def exact(path: Path, head: HeadArrays) -> tuple[dict[str, Tensor], Tensor]:
             return read_ga_splats(path, len(head.faces), device)
@@ -171,7 +171,7 @@ class GAAvatar(StoredSplatAvatar):
 
 
 class GA(TrainedMethod[GAConfig, GAAvatar]):
-    """The method: see the module."""
+    """See the module docstring."""
 
     name, version = SPEC.name, SPEC.version
     config_class, avatar_class = GAConfig, GAAvatar

@@ -33,7 +33,7 @@ class GBSAvatar(StoredSplatAvatar):
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GBSAvatar:
-        """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
+        """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
 
         def exact(path: Path, head: HeadArrays) -> Stored:
             return read_avatar(path, len(head.faces), head.expression_basis.shape[2], device)

@@ -1,4 +1,4 @@
-"""Settings of GaussianBlendshapes. Light: neither torch nor numpy is imported here.
+"""Settings of GaussianBlendshapes; imports neither torch nor numpy.
 
 The defaults are the published values; times are on the scale of the published run of 40,000 iterations.
 """

@@ -24,7 +24,7 @@ from .training import GBSTraining
 
 
 class GBS(TrainedMethod[GBSConfig, GBSAvatar]):
-    """The method: see the module."""
+    """See the module docstring."""
 
     name, version = SPEC.name, SPEC.version
     config_class, avatar_class = GBSConfig, GBSAvatar

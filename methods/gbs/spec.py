@@ -1,4 +1,4 @@
-"""Spec of GaussianBlendshapes. Light: the implementation is not imported."""
+"""Spec of GaussianBlendshapes; the implementation is not imported."""
 
 from __future__ import annotations
 

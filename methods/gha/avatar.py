@@ -67,7 +67,7 @@ class GHAAvatar:
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GHAAvatar:
-        """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
+        """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
         readers = partial(read_avatar, device=device), partial(read_coded, device=device)
         files, shared, subject, (head, tensors) = read_stored(folder, AVATAR_FILE, *readers)
         driver = Driver(

@@ -1,4 +1,4 @@
-"""Settings of GHA. Light: neither torch nor numpy is imported here."""
+"""Settings of GHA; imports neither torch nor numpy."""
 
 from __future__ import annotations
 

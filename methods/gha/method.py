@@ -40,7 +40,7 @@ from .spec import GHA as SPEC
 
 
 class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
-    """The method: see the module.
+    """See the module docstring.
 
     Parameters
     ----------

@@ -66,7 +66,7 @@ class InstaAvatar:
 
     @classmethod
     def read(cls, folder: Path, device: str) -> InstaAvatar:
-        """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
+        """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
         head, coded = read_shared_head(folder), folder / COMPACT_FILE
         content = read_content(coded) if coded.exists() else None
         if content is not None:

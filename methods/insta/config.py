@@ -1,4 +1,4 @@
-"""Settings of INSTA. Light: neither torch nor numpy is imported here."""
+"""Settings of INSTA; imports neither torch nor numpy."""
 
 from __future__ import annotations
 

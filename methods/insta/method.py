@@ -19,7 +19,7 @@ from .training import InstaTraining
 
 
 class Insta(TrainedMethod[InstaConfig, InstaAvatar]):
-    """The method: see the module."""
+    """See the module docstring."""
 
     name, version = SPEC.name, SPEC.version
     config_class, avatar_class = InstaConfig, InstaAvatar

@@ -1,4 +1,4 @@
-"""Spec of INSTA. Light: the implementation is not imported."""
+"""Spec of INSTA; the implementation is not imported."""
 
 from __future__ import annotations
 

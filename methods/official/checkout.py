@@ -163,7 +163,7 @@ def inspect_program(method: str, config: INSTAOfficialConfig, repository: Reposi
 
 
 def _words(command: str) -> list[str]:
-    """Words of a command; none if a quotation mark is not closed."""
+    """Split a command into words; empty if a quotation mark is not closed."""
     try:
         return shlex.split(command)
     except ValueError:
@@ -173,7 +173,7 @@ def _words(command: str) -> list[str]:
 def _answer(
     command: Sequence[str], source: str, kind: str, errors: int = subprocess.STDOUT, remedy: str = ""
 ) -> tuple[str, str]:
-    """Output of a command within `PROBE_S`, and that to ``errors`` if they are apart.
+    """Output of a command run for at most `PROBE_S` and, if ``errors`` separates it, its stderr.
 
     Raises `InputError` if it does not end, or cannot be started; then ``kind`` says what was expected.
     """
@@ -329,7 +329,7 @@ def _probed(
 
 @dataclass(frozen=True)
 class _Probed:
-    """Answer of the interpreter."""
+    """Output of the interpreter."""
 
     python: str
     missing: dict[str, str]

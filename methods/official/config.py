@@ -1,4 +1,4 @@
-"""Settings shared by all official methods. Light: neither torch nor numpy is imported here."""
+"""Settings shared by all official methods; imports neither torch nor numpy."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def same_intrinsics(frame: Listed) -> Hashable:
 def in_parts(
     frames: Sequence[Listed], key: Callable[[Listed], Hashable], most: int
 ) -> Iterator[list[Listed]]:
-    """Frames with equal keys, at most ``most`` together, in order."""
+    """Groups of frames with equal keys, at most ``most`` each, in order."""
     groups: dict[Hashable, list[Listed]] = {}
     for frame in frames:
         groups.setdefault(key(frame), []).append(frame)

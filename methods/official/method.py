@@ -1,5 +1,4 @@
-"""Common code of official methods: check, export, train and render by the authors' program, read back by
-key."""
+"""Common code of official methods: check, export, train and render with the authors' program, and read back frames by key."""
 
 from __future__ import annotations
 
@@ -70,9 +69,9 @@ class OfficialMethod(ABC, Generic[Config]):
     variables: ClassVar[Mapping[str, str]] = {}
     """Environment variables of the authors' programs besides `process.environment`."""
     changes: tuple[Patch, ...] = ()
-    """Texts in their sources that every training replaces in memory, for what no option of theirs allows."""
+    """Source patches applied in memory in every training, where the authors' code has no option."""
     order_changes: ClassVar[tuple[Patch, ...]] = ()
-    """Texts replaced for a given order of the images, in code that draws images without a loader."""
+    """Source patches for a given order of images, for code that draws images without a loader."""
     iteration_line: ClassVar[str]
     """Regular expression of a line of their training: iterations done and, if it has them, the loss."""
     frame_line: ClassVar[str]
@@ -86,14 +85,14 @@ class OfficialMethod(ABC, Generic[Config]):
     render_files: ClassVar[str] = "*"
     """Pattern of the names of renders, since the program may write other files into their folder."""
     starts_launcher: ClassVar[bool] = True
-    """Whether a render command is started by the launcher of changed sources; False if the calls in it are."""
+    """Whether the launcher that patches sources starts the render command itself, rather than the calls in it."""
     excused: ClassVar[str] = ""
     """Regular expression of a line of a renderer that failed after all frames were rendered; "" for none."""
 
     def __init__(self, config: Config | None = None):
         self.config: Config = config or self.config_class()
 
-    # ------------------------------------------------------------------ what a repository needs
+    # ------------------------------------------------------------------ specific to a repository
 
     @abstractmethod
     def check_clip(self, clip: Clip, checkout: Checkout) -> None:
@@ -138,7 +137,7 @@ class OfficialMethod(ABC, Generic[Config]):
         return []
 
     def patches(self, head: HeadAsset, iterations: int, checkout: Checkout) -> list[Patch]:
-        """Texts in their sources that the CPU shim replaces in memory for a training with this number of iterations."""
+        """Source patches applied in memory with the CPU shim, for a training with this number of iterations."""
         return []
 
     def patches_to_render(self, folder: Path, checkout: Checkout) -> list[Patch]:
@@ -166,7 +165,7 @@ class OfficialMethod(ABC, Generic[Config]):
     def launched(
         self, command: Sequence[str], work: Workplace, patches: Sequence[Patch], order: Sequence[str] = ()
     ) -> list[str]:
-        """A command of theirs, run by the launcher if its sources have to be changed."""
+        """A command of the authors' code, run by the launcher if sources have to be patched."""
         shim = self.config.device != "cuda"
         if not (shim or patches or order):
             return list(command)
@@ -180,8 +179,8 @@ class OfficialMethod(ABC, Generic[Config]):
         return [*command[:count], *write_launcher(LAUNCHER, plan, work), *command[count:]]
 
     def _order(self, fit: Fit, work: Workplace) -> list[str]:
-        """Names of the images of each iteration in the order of the native method with this seed, with spaces between them; empty for
-        their order."""
+        """Space-separated image names of each iteration, in the native method's order with this seed; empty for the authors'
+        order."""
         if self.config.order == "published":
             return []
         images = read_json(work.root / EXPORTED)["images"]
@@ -206,7 +205,7 @@ class OfficialMethod(ABC, Generic[Config]):
         return differences + [f"{file}: {old!r} read as {new!r}" for file, old, new in patches]
 
     def repeated(self, seed: int) -> list[str]:
-        """A sentence for the record of code that fixes its seed."""
+        """Record entry for code with a fixed seed."""
         if not seed or self.config.order != "published":
             return []
         return [f"their code fixes the seed at 0; seed {seed} repeats the same training"]
@@ -271,7 +270,7 @@ class OfficialMethod(ABC, Generic[Config]):
         on_line: Callable[[str], None],
         held: IO[str],
     ) -> ProgramEnd:
-        """Run a command of theirs in the program's folder; see `process.run_program`."""
+        """Run a command of the authors' code in the program's folder; see `process.run_program`."""
         return run_program(
             command,
             work.program,

@@ -1,6 +1,6 @@
 """Renders lists of frames by calls of the authors' program, one after the other; run as a script.
 
-A call renders one list, whose frames share what the program fixes in a call: the image size, or the intrinsics. A plan
+A call renders one list of frames with equal image size or intrinsics, which the program fixes in a call. A plan
 (JSON) names the calls and where each leaves its renders, which are then named by the numbers of their frames. If a
 call writes the cameras of its renders, they are compared with the list first. This file requires only the standard
 library.

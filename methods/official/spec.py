@@ -1,4 +1,4 @@
-"""Specs of the official methods. Light: no implementation is imported."""
+"""Specs of the official methods; no implementation is imported."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ def _short_rates(splats: Mapping[str, Any], colours: Mapping[str, Any]) -> tuple
 
 
 def _lengths(**presets: int) -> dict[str, dict[str, Any]]:
-    """Presets with these numbers of iterations alone."""
+    """Presets that set only these numbers of iterations."""
     return {name: {"budget": {"iterations": iterations}} for name, iterations in presets.items()}
 
 
 def _lengths_of(native: MethodSpec) -> dict[str, dict[str, Any]]:
-    """Presets with the budgets of the native method alone."""
+    """Presets that set only the budgets of the native method."""
     return {name: {"budget": native.presets[name]["budget"]} for name in ("smoke", "demo", "fast", "paper")}
 
 
 def _paper_of(native: MethodSpec) -> dict[str, Any]:
-    """What the spec of the native method says of their paper, and what all official methods have in common."""
+    """Fields of the native method's spec about the paper, and fields common to all official methods."""
     return {
         "needs": "headbench.methods.official.needs:official",
         "native": False,
@@ -117,7 +117,7 @@ INSTA_OFFICIAL = MethodSpec(
     implementation="headbench.methods.official.insta.method:INSTAOfficial",
     config="headbench.methods.official.config:INSTAOfficialConfig",
     renders="headbench.methods.official.renders:insta",
-    # Their settings have no schedule to shorten.
+    # The authors' settings have no schedule to shorten.
     presets=_lengths_of(INSTA),
     monocular=True,
     **_paper_of(INSTA),

@@ -1,4 +1,4 @@
-"""The tracked mesh that is visible in the pixels of a frame, for masks that programs expect of a network."""
+"""The tracked mesh visible in the pixels of a frame, for masks that programs otherwise take from a network."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class VisibleSurface:
 
 
 class VisibleMesh:
-    """Casts rays at the mesh of a subject whose head stands still; the mesh of the last pose is kept."""
+    """Casts rays at the mesh of a subject in the head's frame; the mesh of the last pose is cached."""
 
     def __init__(self, head: HeadAsset, posed: PosedSubject):
         self._posed = posed

@@ -75,7 +75,7 @@ def six_numbers(turns: FloatArray) -> FloatArray:
 
 
 def at_rest(posed: PosedSubject, frames: Sequence[Listed]) -> list[Listed]:
-    """Frames whose cameras are relative to a head that does not move; poses are as they were."""
+    """Frames with cameras in the head's frame; poses are unchanged."""
     found = []
     for start in range(0, len(frames), BATCH):
         part = frames[start : start + BATCH]
@@ -185,7 +185,7 @@ class FlameSubject:
 
     @classmethod
     def whole(cls, head: HeadAsset, subject: Subject) -> FlameSubject:
-        """A head of another topology, with its teeth and its own numbers of vertices."""
+        """A head of another topology, with teeth and its own vertex numbering."""
         official = OfficialHead(head, np.arange(len(head.template)), np.asarray(head.faces))
         return cls(official, subject, PosedSubject(head, subject.shape, subject.static_offset))
 

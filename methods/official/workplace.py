@@ -1,4 +1,4 @@
-"""Folders of one call of the authors' program: what it is given, and what it may not be given."""
+"""Folders of one call of the authors' program: its input, and checks that it gets no held-out frames."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ class Listed:
 def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) -> None:
     """Verify that the program gets only training frames.
 
-    Every image in the program's folders is one that was exported for a training key, each equally often, or a
-    placeholder, which has a single pixel and shows no frame. `clip` gives no pixels of other frames
+    Every image in the program's folders must be exported for a training key, each equally often, or be a placeholder of a
+    single pixel, which shows no frame. `clip` gives no pixels of other frames
     (`headbench.bench.engine.guard.TrainingView`), so that none can have such a name.
 
     Raises `InputError` for an image of another frame, one that was not exported, and a missing one.

@@ -42,7 +42,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Real spherical harmonics of unit directions, (N, (degree+1)^2).
 
     Order and signs are those of 3DGS: degree by degree, m from -l to l, with the Condon-Shortley phase kept
-    (so the m = +-1 terms of degree 1 are -y and -x). Degrees above 3 are not stored by any tool of the field.
+    (so the m = +-1 terms of degree 1 are -y and -x). No common tool stores degrees above 3.
     """
     x, y, z = directions.unbind(1)
     terms = [torch.full_like(x, C0)]

@@ -22,7 +22,7 @@ _backend: ContextVar[str] = ContextVar("backend of compiled operations", default
 
 @contextmanager
 def backend(name: str) -> Iterator[None]:
-    """Use the variant of the kernel with a name in `instruction_sets`; by default the fastest."""
+    """Use the named variant of the kernel (see `instruction_sets`); by default the fastest."""
     token = _backend.set(name)
     try:
         yield

@@ -88,7 +88,7 @@ class Bounds(NamedTuple):
     high: Tensor
 
     def unit(self, points: Tensor) -> Tensor:
-        """Map the box to [0, 1]."""
+        """Map points in the box to [0, 1]."""
         return (points - self.low) / (self.high - self.low)
 
     def contains(self, points: Tensor) -> Tensor:
@@ -268,7 +268,7 @@ SAMPLES = 512
 
 @shader.compiled(KERNEL)
 def _shader(from_position: Tensor, of_direction: Tensor, last: Tensor, samples: int = SAMPLES) -> Shader:
-    """The contribution of the position is stored in 16 bits (`in_steps`), that of the direction is read from a table.
+    """The position's contribution is quantised to 16 bits (`in_steps`); the direction's is looked up in a table.
 
     Each coordinate of a direction contributes to the hidden layer through its own waves. The table is interpolated
     linearly: the error of a wave of the highest frequency, 8, is at most 8^2 / (2 SAMPLES^2) = 1e-4 of its amplitude,
@@ -286,7 +286,7 @@ def _shader(from_position: Tensor, of_direction: Tensor, last: Tensor, samples: 
 
 
 def in_steps(values: Tensor) -> tuple[Tensor, Tensor]:
-    """(N, H) int16 and (H,) float32 steps; the error is at most half a step, 1.5e-5 of the largest value of a column."""
+    """Quantise to (N, H) int16 with (H,) float32 steps; error at most half a step, 1.5e-5 of the largest value of a column."""
     largest = values.abs().amax(0) if len(values) else values.new_zeros(values.shape[1])
     steps = (largest / torch.iinfo(torch.int16).max).clamp_min(torch.finfo(values.dtype).tiny)
     return (values / steps).round_().to(torch.int16), steps
@@ -295,7 +295,7 @@ def in_steps(values: Tensor) -> tuple[Tensor, Tensor]:
 def direction_table(of_direction: Tensor, samples: int) -> Tensor:
     """(3 L, H): contribution of each coordinate to the hidden layer at L samples from -1 to 1, by (27, H) weights of `encode`."""
     along = torch.linspace(-1, 1, samples, dtype=torch.float64)
-    # Selects one coordinate in each wave.
+    # Selects one coordinate for each frequency.
     waves = encode(along[:, None].expand(-1, AXES)).unflatten(1, (-1, AXES))
     weights = of_direction.double().unflatten(0, (-1, AXES))
     return torch.einsum("lwa,wah->alh", waves, weights).flatten(0, 1).to(of_direction.dtype)

@@ -91,7 +91,7 @@ class OursAppearance:
             self._smoothing = factors.to(device)
 
     def splat_parameters(self, count: int) -> dict[str, tuple[Tensor, float]]:
-        """A colour added to that of the planes, if any; spherical harmonics if they replace the planes."""
+        """Per-splat colours added to those of the planes, if enabled; spherical harmonics if they replace the planes."""
         if self._config.color == "planes":
             rate = self._config.planes.residual_lr
             return {RESIDUAL: (torch.zeros(count, 3, device=self._device), rate)} if rate else {}
@@ -107,7 +107,7 @@ class OursAppearance:
         return {name: (value.to(self._device), rate) for name, (value, rate) in initial.items()}
 
     def stored(self, optimiser: Optimiser) -> dict[str, Tensor]:
-        """Trained `parameters` in the form of an avatar: the factors on directions are part of the weights."""
+        """Trained `parameters` as an avatar stores them: with the factors on directions folded into the weights."""
         return {name: optimiser[name] for name in self.parameters()} | self._network(optimiser)
 
     def begin(self, timeline: Timeline) -> None:

@@ -89,7 +89,7 @@ class OursAvatar(StoredSplatAvatar):
     def read(cls, folder: Path, device: str, *, exact: bool = False) -> OursAvatar:
         """Read an avatar from its folder; ``exact`` reads the files of a training even if there is a coded one.
 
-        Raises `InputError` for damaged or foreign files.
+        Raises `InputError` for damaged or incompatible files.
         """
         head = read_shared_head(folder)
         compact = folder / COMPACT_FILE
@@ -105,8 +105,8 @@ class OursAvatar(StoredSplatAvatar):
     def prepare(self, poses: Iterable[HeadPose], megabytes: float = 512.0) -> int:
         """Compute meshes, triangle frames, jaw weights and offsets of known poses beforehand, within a memory limit.
 
-        Frames of these poses are then rendered faster and bit-identical. This must be requested, so measured frame
-        times include these computations. Returns the number of poses within the limit; earlier results are discarded.
+        Frames of these poses are then rendered faster and bit-identical. It is not done by default, so measured frame times
+        include these computations. Returns the number of poses within the limit; earlier results are discarded.
         """
         self._known = KnownPoses(self._posed, int(megabytes * 2**20))
         return self._known.prepare(poses)

@@ -1,7 +1,7 @@
 """A plan of the sizes of an avatar of "ours", each with its evidence.
 
-Beside the sizes that methods have in common (`shared.capacity`): no jaw bases without jaw motion, no lines where nothing moves, no
-planes finer than the images. docs/explanation/methods/ours.md has measurements.
+In addition to the sizes common to all methods (`shared.capacity`): no jaw bases without jaw motion, no lines without motion,
+and no planes finer than the images. docs/explanation/methods/ours.md has measurements.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class _Planner(CapacityPlanner):
         self.within: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def kept(self, name: Planned) -> bool:
-        """Whether this size is not to be changed."""
+        """Whether the configuration excludes this size from planning."""
         return name in self._config.capacity.keep
 
     def lines(self) -> None:

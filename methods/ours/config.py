@@ -1,4 +1,4 @@
-"""Settings of "ours". Light: neither torch nor numpy is imported here."""
+"""Settings of "ours"; imports neither torch nor numpy."""
 
 from __future__ import annotations
 
@@ -78,8 +78,8 @@ class Lines:
     expressions, jaw_bases : int
         Number of leading expression coefficients (all, if there are fewer) and jaw bases with lines.
     jaw_bases_variant : Literal['paper', 'official']
-        "paper" takes jaw bases from training poses, seeded with the identity. "official" draws them
-        from held-out poses as the authors' program does: a leak, for comparison with it only.
+        "paper" takes jaw bases from training poses, seeded with the identity. "official" draws them from held-out poses like
+        the authors' program: a leak of test data, only for comparison with it.
     bounds : Literal['head', 'face']
         Box in which splats have dynamic opacity: the "face" region, as in the paper's supplement, or the
         "head" (whole mesh), as in the authors' program.

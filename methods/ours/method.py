@@ -35,7 +35,7 @@ from .storage import FIELD_FILE, write_field
 
 
 class Ours(TrainedMethod[OursConfig, OursAvatar]):
-    """The method: see the module."""
+    """See the module docstring."""
 
     name, version = OURS.name, OURS.version
     config_class, avatar_class = OursConfig, OursAvatar

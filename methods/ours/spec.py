@@ -1,4 +1,4 @@
-"""Specs of "ours" and "ours-plus". Light: the implementation is not imported."""
+"""Specs of "ours" and "ours-plus"; the implementation is not imported."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ADDITIONS: Mapping[str, Mapping[str, Any]] = {
     "fixed-positions": {"planes": {"move_splats": False}},
     "planned-sizes": {"capacity": {"mode": "auto"}},
 }
-"""What "ours-plus" adds to the published method, by name."""
+"""Additions of "ours-plus" to the published method, by name."""
 
 ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "no-lines": {"lines": {"enabled": False}},

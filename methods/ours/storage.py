@@ -1,4 +1,4 @@
-"""The exact file of an avatar of "ours": float32 tensors by name, checked whole when read."""
+"""The exact file of an avatar of "ours": float32 tensors by name, fully validated on reading."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class StoredField(NamedTuple):
 
 
 def save_field(path: Path, field: StoredField) -> None:
-    """Write the exact file of a field, whole or not at all."""
+    """Write the exact file of a field atomically."""
     write_tensors(path, field.tensors, {DYNAMIC: ",".join(field.dynamic)})
 
 
@@ -81,7 +81,7 @@ def read_field(path: Path, head: HeadAsset, device: str) -> StoredField:
 
 
 def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: HeadAsset) -> StoredField:
-    """Make a field of untrusted tensors and the comma-separated attributes that the lines change.
+    """Build a field from untrusted tensors and the comma-separated attributes that the lines change.
 
     Raises `InputError` if a tensor is missing, is not finite float32 or does not fit the others.
     """
@@ -103,7 +103,7 @@ def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: Head
 
 
 def _check_shapes(path: Path, tensors: Mapping[str, Tensor], head: HeadAsset, outputs: int) -> None:
-    """Raise `InputError` for the first tensor that does not fit the others, so that rendering cannot fail."""
+    """Raise `InputError` for the first tensor inconsistent with the others, so that rendering cannot fail."""
 
     def require(name: str, fits: bool, expected: str) -> None:
         if not fits:

@@ -1,4 +1,4 @@
-"""Settings of RGBAvatar. Light: neither torch nor numpy is imported here.
+"""Settings of RGBAvatar; imports neither torch nor numpy.
 
 The defaults are those of the authors' program for a monocular video (``config/offline.yaml``). Iterations are steps of the optimiser,
 each over a batch; the program counts images, ten for each step.
@@ -14,16 +14,16 @@ from ..shared.config import SurfaceSettings, check_at_least_one
 INPUTS = ("expression", "neck", "jaw", "eyes", "eyelids", "translation")
 """Tracked parameters that the weights may depend on."""
 PUBLISHED_SAMPLES = 60_000
-"""Number of splats for which the published size at the start is given: texels of 256 x 256 that show FLAME, rounded."""
+"""Number of splats to which the published initial size refers: texels of 256 x 256 covered by FLAME, rounded."""
 LOCAL = 150
-"""Number of newest images that ``online`` draws from, see `OnlineBatches`."""
+"""Size of the local pool of ``online``, the newest images; see `OnlineBatches`."""
 OFFICIAL_LEAST = 0.1
 """Weight of a splat in a pixel above which the pixel counts for its initial colour in the authors' program."""
 
 
 @dataclass(frozen=True)
 class RGBAvatarConfig(SurfaceSettings):
-    """RGBAvatar (CVPR 2025): splats on a mesh, changed by a few blendshapes whose weights a small network gives.
+    """RGBAvatar (CVPR 2025): splats on a mesh with a few blendshapes, whose weights are predicted by a small network.
 
     Attributes
     ----------
@@ -40,8 +40,7 @@ class RGBAvatarConfig(SurfaceSettings):
         batch draws its images independently, as 1 does.
     online : bool
         Train as if the images, sorted by timestep, arrived one after another, and draw mostly the newest
-        (local-global sampling); blendshapes are trained from the start, and every splat is kept. Not with another
-        ``together`` than 1.
+        (local-global sampling); blendshapes are trained from the start, and every splat is kept. Requires ``together`` = 1.
     trained_per_arrival : int
         Images trained on for each that arrives in ``online``: 25 at the published 630 images a second and 25
         frames a second. After 10 s of video 250 images have arrived in 625 steps of 10.

@@ -40,7 +40,7 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
     Attributes
     ----------
     colored : Tensor
-        (N,) bool, splats that images have given a colour.
+        (N,) bool, splats with a colour initialised from images.
     """
 
     stored_class = StoredShapes
@@ -97,7 +97,7 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         return total / len(images)
 
     def after_backward(self, iteration: int) -> None:
-        """Give colours to splats that are seen for the first time; set the learning rates."""
+        """Initialise colours of splats seen for the first time; set the learning rates."""
         config = self._config
         due = config.color_weight > 0 and (iteration - 1) % config.color_every == 0
         if not due or bool(self.colored.all()):
@@ -105,7 +105,7 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         self._unfinished = self._official
         if not self._official:
             self._still(self._take_colors())
-        # While images arrive, time is counted from the first one, whatever the length of the run. The first step has the initial rate.
+        # Online, time counts from the first image, regardless of the run's length. The first step has the initial rate.
         settles = config.position_settles if config.online else self._timeline.at(config.position_settles)
         rate = log_linear(config.position_lr, config.position_lr_final, (iteration - 1) / max(settles, 1))
         self.optimiser.set_learning_rate("means", rate)
@@ -123,7 +123,7 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         self.colored = state["colored"]
 
     def result(self) -> StoredShapes:
-        """The trained avatar, without splats that no image has shown: that never had a gradient, or never got a colour (official)."""
+        """The trained avatar without splats never seen: those that never had a gradient, or never got a colour ("official")."""
         self._finish_step()
         moments = self.optimiser.moments("colors")
         shown = self.colored
@@ -144,7 +144,7 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         return recomposited(pixels[:, :, :3], pixels[:, :, 3:], self._background, background), background
 
     def _finish_step(self) -> None:
-        """Set the colours that the last step found, if they are set after it; none without a step, as while steps are timed."""
+        """Set the colours found in the last step if the variant sets them after it; none without a step, as in timing."""
         if self._unfinished:
             self._unfinished = False
             self._take_colors()
@@ -152,7 +152,7 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
     def _take_colors(self) -> Tensor:
         """Set colours of splats whose weights over the batch's foreground add up to enough for the first time; return their rows.
 
-        The colour is the mean of the images' colours, weighted by what the splat contributes to each pixel.
+        The colour is the mean over pixels, weighted by the splat's blending weight.
         """
         seen, self._seen = self._seen, []
         sums = torch.zeros(len(self.colored), 4, device=self.colored.device)
@@ -171,7 +171,7 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         return rows
 
     def _still(self, rows: Tensor) -> None:
-        """Keep the step that follows from moving the colours of some splats."""
+        """Prevent the next optimiser step from changing the colours of some splats."""
         gradient = self.optimiser["colors"].grad
         if gradient is not None:
             gradient[rows] = 0
@@ -202,7 +202,7 @@ class RGBAvatarAvatar(SurfaceAvatar[StoredShapes]):
 
 
 class RGBAvatar(SurfaceMethod[RGBAvatarConfig, RGBAvatarAvatar]):
-    """The method: see the module."""
+    """See the module docstring."""
 
     name, version = SPEC.name, SPEC.version
     config_class, avatar_class, training_class = RGBAvatarConfig, RGBAvatarAvatar, RGBAvatarTraining

@@ -24,7 +24,7 @@ PER_SPLAT = {"means": (3,), "quats": (4,), "colors": (3,), "log_scales": (3,), "
 degree 0, scales logarithms of metres, opacities logits."""
 WEIGHTS, BIASES = layer_names(3)
 FRAMES = ";frame_variant="
-"""Between the inputs and the variant of the axes in an avatar's file."""
+"""Separator of the inputs and the variant of the axes in an avatar's file."""
 
 
 def blend_weights(network: Mapping[str, Tensor], inputs: Tensor) -> Tensor:
@@ -51,8 +51,8 @@ def seen_colors(values: Tensor) -> Tensor:
 class StoredShapes(SurfaceSplats[RGBAvatarConfig]):
     """Content of an avatar's file: neutral splats by the names of `PER_SPLAT`, blendshapes by those of `SHAPES`, and the network.
 
-    A splat takes 68 bytes, and 40 for each of its blendshapes. Of the settings, the file has the tracked parameters that the network
-    takes and the variant of the axes.
+    A splat takes 68 bytes, and 40 for each of its blendshapes. The file also contains the names of the network's inputs and
+    the variant of the axes.
     """
 
     KEY = "inputs"

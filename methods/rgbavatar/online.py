@@ -10,17 +10,17 @@ from ..shared.schedule import Batches, numpy_generator
 from .config import LOCAL
 
 GLOBAL = 1_000
-"""Number of kept frames of those older than the newest `LOCAL`."""
+"""Size of the global pool: frames kept of those older than the newest `LOCAL`."""
 MOST_GLOBAL, RAMP = 0.7, 599
-"""Maximum share of draws from the older frames, and the number of older frames from which on it holds."""
+"""Maximum share of draws from the global pool, and the number of older frames at which it is reached."""
 
 
 class OnlineBatches(Batches):
-    """Batches of the images that have arrived so far, mostly of the newest.
+    """Batches of the images that have arrived so far, mostly the newest.
 
-    Each draw is from the older images with a probability that rises with their number, else from the newest `LOCAL`, of which newer
-    ones are more probable. Of the older ones a uniform sample of `GLOBAL` is kept (reservoir sampling; Vitter, ACM TOMS 1985,
-    algorithm R).
+    Each draw is from the global pool with a probability that rises with the number of older images, else from the newest
+    `LOCAL`, where newer ones are more probable. The global pool is a uniform sample of `GLOBAL` older images
+    (reservoir sampling; Vitter, ACM TOMS 1985, algorithm R).
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class OnlineBatches(Batches):
         self._passed = 0
 
     def arrived(self, iteration: int) -> int:
-        """Number of images that a batch can have; the images of the first batch are there at the start."""
+        """Number of images available to a batch; those of the first batch are available from the start."""
         return min(len(self._images), self._size + (iteration - 1) * self._size // self._trained)
 
     def batch(self, iteration: int) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""Spec of RGBAvatar. Light: the implementation is not imported."""
+"""Spec of RGBAvatar; the implementation is not imported."""
 
 from __future__ import annotations
 

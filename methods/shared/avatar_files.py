@@ -25,7 +25,7 @@ Content = TypeVar("Content")
 AVATAR_FILE = "avatar.safetensors"
 """The tensors of an avatar as its training leaves them."""
 COMPACT_FILE = "compact.safetensors"
-"""The coded file of an avatar (`avatars.compact`), which stands in place of the files of its training."""
+"""The coded file of an avatar (`avatars.compact`), which replaces the files written by training."""
 RECORDED_LOSSES = 200  # maximum number of losses in an avatar's record
 _SIZES = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
 TRACKED = ("expression", "rotation", "neck", "jaw", "eyes", "translation")
@@ -72,7 +72,7 @@ def read_shared_head(folder: Path) -> HeadArrays:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write an uncompressed npz, whole or not at all; equal arrays give equal bytes."""
+    """Write an uncompressed npz atomically; equal arrays give equal bytes."""
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, allow_pickle=False, **{name: np.asarray(value) for name, value in arrays.items()})
 
@@ -100,7 +100,7 @@ def read_subject(path: Path, head: HeadAsset) -> Subject:
 
 
 class ReadAvatar(NamedTuple, Generic[Content]):
-    """An avatar's folder, read: its files, head model, subject, and the content of its file."""
+    """Contents of an avatar's folder: file paths, head model, subject, and content of the avatar's file."""
 
     files: list[Path]
     head: HeadArrays
@@ -114,9 +114,9 @@ def read_stored(
     read_exact: Callable[[Path, HeadArrays], Content],
     read_coded: Callable[[Path, HeadArrays], tuple[Subject, Content]],
 ) -> ReadAvatar[Content]:
-    """Read the coded file of a folder, or the file ``name`` that a training left and its subject.
+    """Read the coded file of a folder if there is one, else the file ``name`` and the subject written by training.
 
-    Raises `InputError` for damaged or foreign files.
+    Raises `InputError` for damaged or incompatible files.
     """
     head, coded = read_shared_head(folder), folder / COMPACT_FILE
     if coded.exists():
@@ -134,7 +134,7 @@ def settings_text(config: Any, names: Sequence[str], optional: Sequence[str] = (
 def settings_of_text(
     kind: type[Content], names: Sequence[str], text: str, path: Path, key: str, optional: Sequence[str] = ()
 ) -> Content:
-    """A configuration of a class with the settings of a `settings_text`, found in ``path`` under ``key``.
+    """Parse a `settings_text` into a configuration of class ``kind``; ``path`` and ``key`` locate it in errors.
 
     Raises `InputError` for other text.
     """
@@ -207,9 +207,9 @@ def run_digest(method: str, version: str, config: Any, clip: Clip, budget: Budge
 
 
 def is_finished(folder: Path, run: str) -> bool:
-    """Whether this folder has the finished avatar of this run.
+    """Whether this folder contains the finished avatar of this run.
 
-    Raises `InputError` if it has that of another run.
+    Raises `InputError` if it contains the avatar of another run.
     """
     path = folder / TRAINING_FILE
     if not path.exists():
@@ -235,7 +235,7 @@ def write_record(fit: Fit, summary: TrainingSummary, **more: Any) -> None:
 
 
 def thinned(losses: Sequence[tuple[int, float]]) -> list[tuple[int, float]]:
-    """At most `RECORDED_LOSSES` pairs of a last iteration and the mean loss up to it, over equal numbers of pairs."""
+    """Losses averaged over equal blocks: at most `RECORDED_LOSSES` pairs of a block's last iteration and its mean loss."""
     size = -(-len(losses) // RECORDED_LOSSES)
     groups = [losses[start : start + size] for start in range(0, len(losses), size)]
     return [(group[-1][0], sum(value for _, value in group) / len(group)) for group in groups]

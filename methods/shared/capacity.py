@@ -56,7 +56,7 @@ class CapacityPlan:
     decisions: tuple[Decision, ...]
 
     def apply(self, config: Config) -> Config:
-        """The configuration with the planned sizes in it."""
+        """The configuration with the planned sizes."""
         return with_sizes(
             config, {"capacity.mode": "fixed"} | {each.name: each.chosen for each in self.decisions}
         )
@@ -119,10 +119,10 @@ class CapacityPlanner:
         return chosen
 
     def confirmed(self, columns: slice, numbers: dict[str, float]) -> tuple[bool, str]:
-        """Whether pictures confirm tracked motion, and in words; its agreement is added to ``numbers``.
+        """Whether images confirm tracked motion, and a sentence that says so; the agreement is added to ``numbers``.
 
-        Too few timesteps confirm everything. Directions of expression are confirmed together: pictures show single trailing
-        ones too weakly, and leaving out those that they do not confirm loses quality.
+        With too few timesteps all motion counts as confirmed. Directions of expression are confirmed together: single
+        trailing ones are too weak in images, and leaving out unconfirmed ones loses quality.
         """
         if self.motion is None:
             return True, ""
@@ -133,7 +133,7 @@ class CapacityPlanner:
 
     @cached_property
     def motion(self) -> PictureMotion | None:
-        """The face's motion in training pictures, read once it is needed; None for too few timesteps."""
+        """Motion of the face in training images, computed on first access; None for too few timesteps."""
         return picture_motion(self._clip, self._mesh, self.pixel)
 
     def splats(self, name: str, configured: int | None, least: int) -> None:

@@ -1,4 +1,4 @@
-"""Checkpoints: tensors and plain containers, written whole or not at all, read as data only.
+"""Checkpoints: tensors and plain containers, written atomically and read without executing code.
 
 A checkpoint is a safetensors file. Its metadata has one key, ``checkpoint``: JSON with ``layout``, ``run``, ``state``
 and ``digest``. In the state, tensors are referenced by number, and containers have their type.

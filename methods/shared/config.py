@@ -1,4 +1,4 @@
-"""Settings and presets shared by methods trained with splats. Light: neither torch nor numpy is imported here.
+"""Settings and presets shared by methods trained with splats; imports neither torch nor numpy.
 
 The defaults are the published values (600,000 iterations). If the authors' program differs from the paper, a setting
 ``<name>_variant`` selects "paper" or "official".
@@ -226,7 +226,7 @@ class Capacity:
 
 PAPER_ITERATIONS = 600_000
 GPU_ITERATIONS = 60_000
-"""Preset "gpu": "paper" with these changes; an estimated hour per subject on one card."""
+"""Preset "gpu": "paper" with these changes; an estimated hour per subject on one GPU."""
 
 SHORT_SPLATS: Mapping[str, Any] = {
     "initial_opacity": 0.5,

@@ -1,7 +1,7 @@
 """Motion of the face that training pictures confirm.
 
 Tracked coefficients contain the tracker's noise. A tracker of single frames has an error that changes with every timestep,
-one of videos an error that lasts for a sequence, so the course of the coefficients does not tell noise from motion; pictures do.
+one of videos an error that lasts for a sequence, so coefficients alone do not distinguish noise from motion; images do.
 
 The mesh is posed with the mean expression and jaw of the training timesteps and the tracked motion of the head. Where the face
 deforms, a picture differs there from the mean of the other timesteps' pictures. One step of photometric alignment (Lucas and
@@ -34,7 +34,7 @@ BLUR = 5e-3
 RIDGE = 0.1
 """Weight of the coefficients' squares relative to the mean weight that the pictures give them."""
 FLOOR = 0.2
-"""Tracked coefficients that move the face by less than this fraction of the most moving one count less, since they are less exact."""
+"""Tracked coefficients that move the face by less than this fraction of the largest motion get less weight."""
 CONFIRMED = 2.0
 """Standard deviations above chance from which motion is confirmed (docs/explanation/methods/ours.md has the measured values)."""
 JAW = slice(-3, None)
@@ -44,7 +44,7 @@ _STEP = 0.02  # radians, of the finite differences by jaw rotation
 
 @dataclass(frozen=True)
 class PictureMotion:
-    """Deviations of expression and jaw from their means at T training timesteps, tracked and as the pictures have them.
+    """Deviations of expression and jaw from their means at T training timesteps, from tracking and from images.
 
     Attributes
     ----------
@@ -57,10 +57,10 @@ class PictureMotion:
     pictured: FloatArray
 
     def agreement(self, columns: slice) -> float:
-        """How many standard deviations tracked and pictured coefficients agree above chance.
+        """Agreement of tracked and image-based coefficients, in standard deviations above chance.
 
-        Chance is their agreement if one of both is moved by some timesteps, cyclically, which keeps what both have in common
-        with their neighbours in time. 0 for coefficients that do not move, and for pictures without any contrast.
+        Chance is their agreement after a cyclic shift of one of them in time, which preserves temporal correlation. 0 for
+        constant coefficients and for images without contrast.
         """
         tracked, pictured = self.tracked[:, columns], self.pictured[:, columns]
         spread, other = tracked.std(axis=0), pictured.std(axis=0)

@@ -16,7 +16,7 @@ from .rendering import view_of
 from .schedule import Sampler, Timeline
 
 Initial = Mapping[str, tuple[Tensor, float]]
-"""Initial tensors with their learning rates, by name."""
+"""Initial tensors and learning rates by name."""
 
 
 class ImageTrainer(OptimiserState):
@@ -34,7 +34,7 @@ class ImageTrainer(OptimiserState):
     """
 
     cost_growth: float = 1.0
-    """Cost of a late step relative to an early one with the same parts, to turn a time into iterations."""
+    """Cost of a late step relative to an early one, to convert a time budget into iterations."""
 
     def __init__(
         self, clip: Clip, settings: SplatSettings, sampler: Sampler, device: str, *, masks: bool = False

@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 TIMED_STEPS = 5  # steps timed to turn seconds into iterations
 COST_GROWTH = 1.6  # estimated cost of a late step relative to an early one, because there are more splats
 ESTIMATED_AGAIN = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4)
-"""Parts of a budget in seconds after which the iterations are estimated again: the first steps also read images and fill caches."""
+"""Fractions of a time budget at which iterations are re-estimated: the first steps also read images and fill caches."""
 REPORT_EVERY = 10  # iterations between reads of the loss, each of which waits for the device
 
 
@@ -51,7 +51,7 @@ class Trainable(Protocol):
         """Hook between gradients and step: densification, resets, learning rates."""
 
     def state(self) -> dict[str, Any]:
-        """Everything that training changes, as tensors and plain containers."""
+        """All state that training changes, as tensors and plain containers."""
 
     def load_state(self, state: dict[str, Any]) -> None: ...
 
@@ -138,7 +138,7 @@ def train(
     path, compiled = fit.out / CHECKPOINT, bool(instruction_sets())
     wait = synchroniser(fit.device)
     saved = load_checkpoint(path, fit.run, fit.device)
-    # The preparation of a resumed training has counted before.
+    # For a resumed training, preparation was counted before.
     started = clock() if fit.began is None or saved is not None else fit.began
     losses: list[tuple[int, float]] = []
     if saved is None:
@@ -177,7 +177,7 @@ def train(
                     moments = [moment for moment in moments if moment > now]
                     pace = (now - timed_from[1]) / (iteration - timed_from[0])
                     left = max(budget.seconds - now, 0.0)
-                    # What is left of the growth, and so less than that over a whole run.
+                    # The remaining growth, which is less than that over a whole run.
                     more = _in_seconds(left, pace * cost_growth ** (left / budget.seconds))
                     total, timed_from = iteration + more, (iteration, now)
                     trainable.begin(Timeline(total, published_length))
@@ -232,7 +232,7 @@ def _estimate(
     clock: Callable[[], float],
     wait: Callable[[], None],
 ) -> int:
-    """Number of iterations in a number of seconds, at least one, estimated from a few steps without effect."""
+    """Number of iterations in a number of seconds, at least one, estimated from a few steps whose effect is discarded."""
     trainable.begin(Timeline(published_length, published_length))
     # With a constant number of splats, steps late in the run have all parts of the model.
     step_number = 1 if cost_growth > 1 else published_length

@@ -21,7 +21,7 @@ Avatar = TypeVar("Avatar")
 
 
 class TrainedMethod(Generic[Config, Avatar]):
-    """A `Method` except for its training, `_train`, which writes the avatar under ``fit.out``.
+    """Base class of trained methods; subclasses implement `_train`, which writes the avatar under ``fit.out``.
 
     A derived class defines the classes of its settings and its avatar (with ``read(folder, device)``), name and
     version of its spec, and whether it draws splats.
@@ -69,7 +69,7 @@ class TrainedMethod(Generic[Config, Avatar]):
         load_optimisers()
 
     def _use(self, device: str) -> None:
-        """Prepare drawing on ``device``. Raises `InputError` where the method cannot."""
+        """Prepare rendering on ``device``. Raises `InputError` if the method does not support it."""
         if self.draws_splats:
             cuda.prepare(device)
         else:
@@ -84,8 +84,8 @@ class TrainedMethod(Generic[Config, Avatar]):
     def _resolved(self, clip: Clip, device: str) -> tuple[Any, Any]:
         """The configuration to train with, and the part of it that identifies the run.
 
-        With planned sizes the latter has the sizes and not the measurements for them, whose last digits depend on the number
-        of threads.
+        With planned sizes the latter contains the sizes, but not the measurements behind them, whose last digits depend on the
+        number of threads.
         """
         config: Any = self.config
         if getattr(config, "capacity", None) is None or config.capacity.mode == "fixed":
@@ -108,5 +108,5 @@ class TrainedMethod(Generic[Config, Avatar]):
 
 
 def load_optimisers() -> None:
-    """Import what PyTorch imports with the first optimiser of a process: 1.5 s that belong to no training."""
+    """Trigger PyTorch's lazy imports for optimisers (1.5 s), so that they do not count as training time."""
     importlib.import_module("torch._dynamo")

@@ -13,11 +13,11 @@ from ...datasets.head.rotations import axis_angle_to_matrix
 from .schedule import torch_generator
 
 ROTATIONS = ("neck", "jaw", "eyes")
-"""Inputs that are rotations."""
+"""Names of the inputs that are rotations."""
 
 
 def tracked_inputs(arguments: Mapping[str, Tensor], names: Sequence[str]) -> Tensor:
-    """(T, I) inputs of a network: coefficients as they are, each rotation as the first two rows of its matrix.
+    """(T, I) inputs of a network: unchanged coefficients, and rotations as the first two rows of their matrices.
 
     Eyelids are left out for a head model without them.
     """
@@ -46,7 +46,7 @@ def layer_names(layers: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def layer_shapes(sizes: Sequence[int | str]) -> dict[str, tuple[int | str, ...]]:
-    """Shapes of weights and biases by name; ``sizes`` as for `initial_network`, or names of those that are not known."""
+    """Shapes of weights and biases by name; ``sizes`` as for `initial_network`; unknown ones may be names."""
     shapes: dict[str, tuple[int | str, ...]] = {}
     for weight, bias, fan_in, fan_out in zip(*layer_names(len(sizes) - 1), sizes, sizes[1:]):
         shapes |= {weight: (fan_out, fan_in), bias: (fan_out,)}
@@ -54,7 +54,7 @@ def layer_shapes(sizes: Sequence[int | str]) -> dict[str, tuple[int | str, ...]]
 
 
 def outputs_of(network: Mapping[str, Tensor], sums: Tensor, layers: int) -> Tensor:
-    """Outputs of a network of some ``layers`` with ReLU between them, from the (N, H) sums of its first layer."""
+    """Outputs of an MLP with ReLU, given the (N, H) pre-activations of its first layer."""
     weights, biases = layer_names(layers)
     for weight, bias in zip(weights[1:], biases[1:]):
         sums = linear(sums.relu(), network[weight], network[bias])

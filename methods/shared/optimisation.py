@@ -18,7 +18,7 @@ EPS = 1e-15
 
 
 class OptimiserState:
-    """State of a `Trainable` that changes nothing but the tensors of its optimiser."""
+    """State of a `Trainable` whose only state is its optimiser."""
 
     optimiser: Optimiser
 
@@ -123,7 +123,7 @@ class Optimiser:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state` returned, with any number of rows."""
+        """Restore what `state` returned; tensors may have any number of rows."""
         for name, group in self._groups.items():
             entry = state[name]
             old = group["params"][0]
@@ -225,7 +225,7 @@ class Densifier:
         self._optimiser.set_values("opacities", logits.clamp_max(ceiling))
 
     def state(self) -> dict[str, Any]:
-        """Binding and gathered statistics."""
+        """Binding and accumulated statistics."""
         return {"binding": self.binding, "gradient_sum": self._gradient_sum, "views": self._views}
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -243,13 +243,13 @@ class Densifier:
         return largest * face_sizes.index_select(0, self.binding)
 
     def _within_bound(self, asks: Tensor, gradient: Tensor) -> Tensor:
-        """If the maximum number allows only some splats, select those with the largest gradients."""
+        """If the maximum number of splats limits densification, select the candidates with the largest gradients."""
         if self._settings.max_splats is None:
             return asks
         room = max(self._settings.max_splats - len(self.binding), 0)
         if int(asks.sum()) <= room:
             return asks
-        # A stable sort takes equal gradients in order, so that a resumed run selects the same splats.
+        # A stable sort keeps the order of equal gradients, so that a resumed run selects the same splats.
         order = torch.argsort(
             torch.where(asks, gradient, gradient.new_full((), -1.0)), descending=True, stable=True
         )

@@ -21,7 +21,7 @@ SCALARS = {
     **dict.fromkeys(("float", "float32"), "<f4"),
     **dict.fromkeys(("double", "float64"), "<f8"),
 }
-"""Types of a property, by both their names."""
+"""Types of properties; each has two names."""
 BEGIN, END = re.compile(rb"ply\r?\n"), re.compile(rb"\nend_header\r?\n")
 OPACITY, LARGEST_LOGIT = "opacity", 20.0  # its sigmoid is 1 in float32
 _COUNT = re.compile(r"[0-9]{1,18}")
@@ -30,7 +30,7 @@ HEADER_LIMIT = 65536  # bytes; files with a longer header are refused
 
 
 def write_ply(path: Path, names: tuple[str, ...], table: FloatArray, comment: str = "") -> None:
-    """Write an (N, len(names)) table as binary little-endian float32 vertices, whole or not at all.
+    """Write an (N, len(names)) table as binary little-endian float32 vertices atomically.
 
     Comments are at the end of the header because some viewers count the lines before the properties.
     """
@@ -48,7 +48,7 @@ def write_ply(path: Path, names: tuple[str, ...], table: FloatArray, comment: st
 def read_ply(path: Path, names: tuple[str, ...]) -> FloatArray:
     """Read columns of a binary little-endian vertex table by name, as (N, len(names)) float32.
 
-    Other columns of any scalar type are ignored. Raises `InputError` if the file is no such PLY, lacks a column, is
+    Other columns of any scalar type are ignored. Raises `InputError` if the file is not such a PLY, lacks a column, is
     truncated, or has numbers that are not finite in float32. Infinite opacity logits are clamped to `LARGEST_LOGIT`.
     """
     content = read_bytes(path, EXPECTED, MAX_BYTES)

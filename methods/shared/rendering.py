@@ -111,8 +111,8 @@ def pixel_sums(
 ) -> Tensor:
     """(N, C) sums over pixels of (H, W, C) targets times the weight of each splat, its alpha times the transmittance before it.
 
-    They are the derivatives of the sum of a rendering times the targets by the splats' colours. With ``least`` above 0 only weights
-    above it count, which takes several times as long.
+    They are the derivatives of the sum of a rendering times the targets by the splats' colours. If ``least`` > 0, only
+    larger weights count, which takes several times as long.
     """
     if least:
         sums = targets.new_zeros(len(opacities), targets.shape[2])
@@ -132,7 +132,7 @@ def pixel_sums(
 def splat_depth(
     world: WorldSplats, opacities: Tensor, camera: Camera, device: str, cutoffs: Cutoffs = USUAL
 ) -> FloatArray:
-    """(H, W) mean depth of the centres of the splats that a pixel shows, weighted as their colours; NaN below an alpha of 0.5."""
+    """(H, W) mean depth of splat centres with the blending weights of the colours; NaN where alpha is below 0.5."""
     view = view_of(camera, device, (0.0, 0.0, 0.0))
     axis = view.world_to_camera[2]
     along = (world.means @ axis[:3] + axis[3]).clamp(min=0)[:, None].expand(-1, 3).contiguous()
@@ -198,8 +198,7 @@ def view_of(camera: Camera, device: str, background: Sequence[float] = ()) -> Vi
 def scene_center(poses: Iterable[HeadPose]) -> FloatArray:
     """(3,) reference point near the head in these poses, metres, for worlds with a distant origin.
 
-    Rounded to whole metres: captures around the origin, as all published ones, are not changed, and differences are
-    exact.
+    Rounded to whole metres: captures around the origin, like all published ones, are unaffected, and differences are exact.
     """
     places = np.array([pose.translation for pose in poses], np.float64)
     return np.asarray(places.mean(axis=0).round())
@@ -208,8 +207,8 @@ def scene_center(poses: Iterable[HeadPose]) -> FloatArray:
 def scene_extent(cameras: Mapping[str, Camera], center: FloatArray | None = None) -> float:
     """1.1 times the largest distance of a training camera from their mean centre, metres.
 
-    A single camera has no such radius; half its distance to ``center``, the place of the head (`scene_center`; None: the
-    world's origin), stands in, so that learning rates and size thresholds keep their scale.
+    For a single camera, half its distance to ``center`` (the head's position, see `scene_center`; None: the world's origin)
+    is used instead, so that learning rates and size thresholds keep their scale.
     """
     centers = np.stack([camera.center for camera in cameras.values()])
     radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
@@ -241,12 +240,12 @@ class LastPose(Generic[Value]):
 
 
 class StoredSplatAvatar:
-    """Base class of avatars of splats; a derived class gives the splats of a pose.
+    """Base class of splat avatars.
 
     Parameters
     ----------
     stored : Sequence[Path]
-        Files in the avatar's folder that count as storage.
+        Files in the avatar's folder that count towards its size.
     place : Callable
         Returns the splats of a pose; calls its second argument with "drive" when the mesh is posed.
     """

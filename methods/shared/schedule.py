@@ -58,7 +58,7 @@ def log_linear(start: float, end: float, fraction: float) -> float:
 
 
 RECOVERY = 1_000
-"""Iterations that a shorter run than the published one has at least after a reset: opacities take several hundred to recover."""
+"""Minimum iterations after a reset in runs shorter than published: opacities take several hundred to recover."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ BLOCK = 1024  # draws with replacement are made in blocks of this many
 
 
 class Sampler(Protocol):
-    """Gives the index of the image for an iteration. Holds no state that training changes."""
+    """Returns the image index for an iteration. Has no state that training changes."""
 
     def __call__(self, iteration: int) -> int: ...
 
@@ -177,7 +177,7 @@ class Batches:
         raise NotImplementedError
 
     def positions(self, iteration: int) -> list[tuple[int, int]]:
-        """Number, as for the sampler, and index of each image of a batch."""
+        """Position (as numbered by the sampler) and index of each image of a batch."""
         batch, end = self.batch(iteration), iteration * self._size
         numbers = [*range(end - self._size + 1, end - self._size + len(batch)), end]
         return list(zip(numbers, batch))
@@ -198,7 +198,7 @@ class GroupedBatches(Batches):
     size : int
         Images of a batch; the last one of an epoch may have fewer.
     together : int
-        Number of images of a group that follow each other, if it has that many.
+        Number of consecutive images from one group, if it has that many.
     """
 
     def __init__(self, groups: Sequence[int], size: int, together: int, seed: int):
@@ -220,7 +220,7 @@ class GroupedBatches(Batches):
             images = order[self._groups[order] == group]
             chunks += [images[at : at + self._together] for at in range(0, len(images), self._together)]
         chunks = [chunks[at] for at in random.permutation(len(chunks))]
-        # Incomplete ones come last, so that they do not displace those after them.
+        # Incomplete groups come last, so that they do not shift those after them.
         images = np.concatenate(sorted(chunks, key=len, reverse=True))
         return [tuple(map(int, images[at : at + self._size])) for at in range(0, len(images), self._size)]
 

@@ -1,4 +1,4 @@
-"""Training of splats on the images of a clip, independent of their placement and colour model."""
+"""Training of splats on the images of a clip, for any placement and colour model."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class SplatTrainer(ImageTrainer):
         return f"{len(self.binding)} splats"
 
     def _position_progress(self, iteration: int) -> float:
-        """Progress of the positions' learning rate towards the final one, which it keeps above 1."""
+        """Progress of the learning-rate schedule of positions; above 1 the final rate is kept."""
         return self._timeline.fraction(iteration)
 
     def _render(
@@ -138,7 +138,7 @@ class ShadedSplats(NamedTuple):
 
 
 class Appearance(Protocol):
-    """The specific part of a mesh-bound method: tracking, colour and opacity.
+    """Method-specific part of a mesh-bound method: tracking, colour and opacity.
 
     All tensors are in the optimiser: per-splat tensors (`splat_parameters`) and others (`parameters`).
     """
@@ -195,7 +195,7 @@ def one_per_triangle(face_count: int, opacity: float, device: str) -> Start:
 class BoundTraining(SplatTrainer):
     """A `Trainable`: splats on the triangles of a mesh, trained on the images of a clip.
 
-    ``start`` has each of the ``face_count`` triangles at least once; None uses `one_per_triangle`.
+    ``start`` contains each of the ``face_count`` triangles at least once; None uses `one_per_triangle`.
     """
 
     _settings: SplatTraining

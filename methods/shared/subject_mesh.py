@@ -40,7 +40,7 @@ class SubjectMesh:
         self.model = HeadModel(head, device=device)
         self.faces = self.model.faces
         like = self.model.template
-        # Copies: what a clip gives is read-only and shared by all methods.
+        # Copies: a clip's arrays are read-only and shared by all methods.
         identity, offset = (torch.tensor(np.asarray(each)).to(like) for each in (shape, static_offset))
         self._canonical = self.model.canonical(identity, offset)
         check_size(
@@ -58,7 +58,7 @@ class SubjectMesh:
         return self._canonical[0]
 
     def arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
-        """Driving signal as tensors with a batch axis. Raises `InputError` for another head model's pose."""
+        """Driving signal as tensors with a batch axis. Raises `InputError` for a pose of another head model."""
         return self.model.pose_arguments(poses)
 
     def posed(self, arguments: Mapping[str, Tensor]) -> Tensor:
@@ -108,7 +108,7 @@ def centroid_displacements(one: Tensor, other: Tensor, faces: Tensor) -> Tensor:
 
 
 class BoundedCache(Generic[Value]):
-    """Values by key, computed on request; the least recently used ones are dropped beyond a number of entries."""
+    """LRU cache: values by key, computed on request, with a maximum number of entries."""
 
     def __init__(self, compute: Callable[[int], Value], entries: int):
         self._compute, self._entries = compute, max(entries, 1)
@@ -130,7 +130,7 @@ DRIVING = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyel
 
 
 class Sized(Protocol):
-    """A value with a known memory size."""
+    """A value that knows its memory size."""
 
     @property
     def bytes(self) -> int: ...
@@ -140,7 +140,7 @@ SizedValue = TypeVar("SizedValue", bound=Sized)
 
 
 class KnownPoses(Generic[SizedValue]):
-    """Values by pose. The key of a pose is all its values, so equal timesteps of other poses do not match."""
+    """Values by pose. The key contains all values of a pose, not its timestep."""
 
     def __init__(self, compute: Callable[[HeadPose], SizedValue], limit: int):
         self._compute, self._limit = compute, limit

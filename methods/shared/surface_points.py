@@ -66,7 +66,7 @@ class MeshPoints:
 
     def __init__(self, points: SurfacePoints, faces: Tensor, like: Tensor):
         self.triangles = torch.from_numpy(points.triangles).to(like.device)
-        # All first corners first: separate corners are added faster than rows of three.
+        # Corner by corner: adding separate corners is faster than rows of three.
         self._corners = faces[self.triangles].t().reshape(-1)
         self._weights = torch.from_numpy(points.barycentric).to(like).t()[:, :, None]
 
@@ -138,16 +138,16 @@ def spread_points(
 
 
 def chart_resolution(uv: FloatArray, count: int) -> int:
-    """Texels R of a side, so that about ``count`` of R x R lie in triangles with (F, 3, 2) texture coordinates; 0 if that is too many."""
+    """Side R of a chart with about ``count`` texels in triangles with (F, 3, 2) texture coordinates; 0 if R is too large."""
     a, b, c = np.moveaxis(uv, 1, 0)
     area = 0.5 * float(np.abs(_cross(b - a, c - a)).sum())
     return round(np.sqrt(count / area)) if area * _MOST_ACROSS**2 > count else 0
 
 
 def texel_points(uv: FloatArray, triangles: IntArray, count: int) -> SurfacePoints:
-    """The centres of the texels of a chart, by triangle: a square of R x R texels, with R so that there are about ``count``.
+    """The centres of the texels of a chart, by triangle: R x R texels, with R chosen to give about ``count``.
 
-    A triangle without area in the chart has no texel. Charts that lie on each other have texels of their own.
+    A triangle without area in the chart has no texel. Triangles that overlap in the chart have separate texels.
 
     Parameters
     ----------

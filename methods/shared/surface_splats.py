@@ -1,4 +1,4 @@
-"""A fixed number of splats on the surface of a head, changed by a network of the tracked parameters: file, avatar, training."""
+"""A fixed number of splats on the surface of a head, driven by a network of the tracked parameters: file, avatar, training."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Avatar = TypeVar("Avatar")
 
 
 class PointSurface:
-    """Points on the mesh of a subject with axes at each: those of its triangle, or what a derived class has.
+    """Points on the mesh of a subject with local axes: those of the triangle, unless a subclass overrides them.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class HeadSurface(PointSurface):
     def axes(self, arguments: Mapping[str, Tensor], vertices: Tensor) -> tuple[Tensor, Tensor]:
         """See `PointSurface.axes`."""
         root, neck = (axis_angle_to_quaternion(arguments[name]) for name in ("rotation", "neck"))
-        # The shorter way from root to head: the real part of their quotient, the neck's, is not negative.
+        # Interpolate along the shorter arc: the neck's relative quaternion has a non-negative real part.
         neck = torch.where(neck[:, :1] < 0, -neck, neck)
         head = apply_matrices(left_products(root).flatten(1), neck)
         turns = normalize(head + self._of_root * (root - head), dim=1)
@@ -130,7 +130,7 @@ class SurfaceSplats(Generic[Settings]):
     points : SurfacePoints
         Surface point of each of the N splats.
     settings : Settings
-        What rendering needs besides.
+        Further values that rendering needs.
     """
 
     tensors: dict[str, Tensor]
@@ -168,7 +168,7 @@ class SurfaceSplats(Generic[Settings]):
         return replace(self, tensors={name: self.tensors[name].to(device) for name in members})
 
     def write(self, path: Path) -> None:
-        """Write the file, exact: 12 bytes for the point of each splat, 4 for each number of a tensor."""
+        """Write the file without loss: 12 bytes for the point of each splat, 4 for each number of a tensor."""
         write_tensors(path, self.tensors | point_tensors(self.points), {self.KEY: self.text()})
 
     @classmethod
@@ -184,7 +184,7 @@ Stored = TypeVar("Stored", bound=SurfaceSplats[Any])
 
 
 class SurfaceAvatar(StoredSplatAvatar, Generic[Stored]):
-    """Base class of the trained heads: a derived class has the classes of its file and its surface, and places splats.
+    """Base class of the trained heads: subclasses define the classes of file and surface, and place splats.
 
     Files: ``avatar.safetensors`` and ``subject.npz``, or the coded file in place of both, count as storage. The folder also has
     the shared head model.
@@ -202,7 +202,7 @@ class SurfaceAvatar(StoredSplatAvatar, Generic[Stored]):
 
     @classmethod
     def read(cls, folder: Path, device: str) -> Self:
-        """Read an avatar from its folder. Raises `InputError` for damaged or foreign files."""
+        """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
         readers = partial(cls.stored_class.read, device=device), partial(cls.read_coded, device=device)
         return cls(*read_stored(folder, AVATAR_FILE, *readers), device)
 
@@ -275,7 +275,7 @@ class SurfaceTrainer(ImageTrainer, Generic[Config]):
 
 
 class SurfaceMethod(TrainedMethod[Config, Avatar]):
-    """A `Method`: a derived class has the class of its training beside those of a `TrainedMethod`."""
+    """Base class of methods; subclasses define the training class besides those of a `TrainedMethod`."""
 
     training_class: ClassVar[Any]
 

@@ -1,4 +1,4 @@
-"""Tensors in safetensors files, checked when read by the same descriptions as the arrays of an npz."""
+"""Tensors in safetensors files, validated on reading like the arrays of an npz."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ...bench.io.arrays import Member, check_arrays
 from ...bench.io.files import open_regular, reading, write_bytes
 
 MAX_HEADER = 2**24
-"""Maximum bytes of names, shapes and metadata; those of checkpoints, the largest, have about ten thousand."""
+"""Maximum bytes of names, shapes and metadata; checkpoints, the largest, need about ten thousand."""
 MAX_MAGNITUDE = 1e6
 """Maximum magnitude of values of an avatar: network weights, features, positions in units of the triangle."""
 MAX_LOGARITHM = 30.0
@@ -25,7 +25,7 @@ MAX_LOGARITHM = 30.0
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write tensors, real numbers in float32, whole or not at all; equal tensors give equal bytes."""
+    """Write tensors atomically, real numbers in float32; equal tensors give equal bytes."""
     stored = {}
     for name, value in tensors.items():
         dtype = torch.float32 if value.is_floating_point() else value.dtype
@@ -65,7 +65,7 @@ def check_tensors(
     for name in members.keys() & tensors.keys():
         try:
             arrays[name] = tensors[name].numpy()
-        except TypeError as error:  # a type that numpy does not have
+        except TypeError as error:  # a dtype that numpy lacks
             expected = members[name].dtype or "numbers"
             raise InputError(path, name, expected, str(tensors[name].dtype)) from error
     return check_arrays(path, arrays, members, sizes)

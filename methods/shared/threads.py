@@ -12,7 +12,7 @@ _kernels: ContextVar[int | None] = ContextVar("threads of kernels", default=None
 
 
 def threads() -> int:
-    """Number of threads of kernels: as many as torch has, or had outside of `torch_on_one_thread`."""
+    """Number of kernel threads: that of torch, as set outside of `torch_on_one_thread`."""
     return _kernels.get() or torch.get_num_threads()
 
 

@@ -76,7 +76,7 @@ def _warn_once(reason: str, remedy: str) -> None:
 def prepare(device: str) -> None:
     """Load gsplat if ``device`` is a CUDA device and it is installed; see `use_device`. Call it before timing.
 
-    Raises `UnavailableError` if gsplat's extension can neither be loaded nor compiled.
+    Raises `UnavailableError` if gsplat's extension can be neither loaded nor compiled.
     """
     use_device(device)
     if is_cuda(device) and installed():
@@ -102,7 +102,7 @@ def load() -> ModuleType:
         with _one_process():
             gsplat = importlib.import_module("gsplat")
             extension = importlib.import_module("gsplat.cuda._backend")._C
-    except Exception as error:  # the compiler's errors are of many kinds
+    except Exception as error:  # compilation can raise many types of errors
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise UnavailableError(
             f"gsplat's CUDA extension cannot be loaded: {reason}.", toolkit_remedy()
@@ -116,7 +116,7 @@ def load() -> ModuleType:
 
 @contextmanager
 def _one_process() -> Iterator[None]:
-    """Prevent other headbench processes from loading gsplat meanwhile, which would delete files being compiled."""
+    """Lock against other headbench processes, since loading gsplat there would delete files being compiled."""
     from torch.utils.cpp_extension import get_default_build_root
 
     root = Path(os.environ.get("TORCH_EXTENSIONS_DIR", get_default_build_root()))
@@ -172,7 +172,7 @@ def rasterize_cuda(request: Request) -> Rendering:
 
 
 def draw(gsplat: Any, request: Request) -> Rendering:
-    """Render ``request`` with a module with gsplat's functions."""
+    """Render ``request`` with gsplat's functions, given as a module."""
     views, count = len(request.viewmats), len(request.means)
     columns, rows = -(-request.width // TILE), -(-request.height // TILE)
     radii, means2d, depths, conics, compensations = gsplat.fully_fused_projection(

@@ -188,7 +188,7 @@ def project(request: Request, view: CameraInputs, subset: Tensor | slice) -> Foo
 def _find_drawn(request: Request, view: CameraInputs) -> tuple[Tensor, Tensor, Tensor]:
     """Indices (M,) of the splats to draw, half sizes (M, 2) of their bounding boxes, and radii (N,) of all splats.
 
-    Conditions are positive, so that a NaN culls the splat.
+    Conditions are written so that NaN culls the splat.
     """
     subset = _in_depth(request, view).nonzero().squeeze(-1)
     footprints = project(request, view, subset)
@@ -221,7 +221,7 @@ def published_radii(request: Request) -> Tensor:
 
 
 def _in_depth(request: Request, view: CameraInputs) -> Tensor:
-    """(N,) which splats are between the near and the far plane."""
+    """(N,) mask of splats between the near and the far plane."""
     depths = request.means @ view.viewmat[2, :3] + view.viewmat[2, 3]
     return (depths > request.near) & (depths < request.far)
 

@@ -29,7 +29,7 @@ class Rendering:
     alpha: Tensor
     """(H, W) in [0, 1]: one minus the transmittance."""
     find_radii: Callable[[], Tensor]
-    """Gives `radii`."""
+    """Computes `radii` on first access."""
     masked: int = 0
     """Number of splats skipped because a value is not finite; counted only with ``mask_non_finite``."""
 
@@ -74,7 +74,7 @@ class Request:
     eps2d: float = 0.3
     antialiased: bool = False
     batched: bool = False
-    masked: Tensor | None = None  # (N,) bool, splats to skip; None for none
+    masked: Tensor | None = None  # (N,) bool, splats to skip; None skips none
     alpha_min: float = ALPHA_MIN
     transmittance_min: float = TRANSMITTANCE_MIN
 
@@ -203,7 +203,7 @@ def make_request(
 
 
 def _count_views(cameras: dict[str, Tensor]) -> tuple[bool, int]:
-    """Whether there is a leading dimension of cameras, and their number."""
+    """Whether inputs have a leading camera dimension, and the number of cameras."""
     counts = {name: len(value) for name, value in cameras.items() if value.ndim == 3}
     if len(set(counts.values())) > 1:
         raise _error("viewmat, K", "as many cameras in both", f"{counts['viewmat']} and {counts['K']}")
@@ -214,7 +214,7 @@ def _count_views(cameras: dict[str, Tensor]) -> tuple[bool, int]:
 
 
 def _mask(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor | None]:
-    """Make splats with non-finite values invisible by zeros, without opacity and gradient."""
+    """Replace splats with non-finite values by zeros, so that they have neither opacity nor gradient."""
     count = len(tensors["means"])
     bad = torch.zeros(count, dtype=torch.bool, device=tensors["means"].device)
     for value in tensors.values():

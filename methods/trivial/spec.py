@@ -1,4 +1,4 @@
-"""The trivial baselines: specs and settings. Light: no implementation is imported."""
+"""The trivial baselines: specs and settings; no implementation is imported."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def _gaussian(points: FloatArray, center: Vector | FloatArray, sigma: Vector | f
 
 @dataclass(frozen=True, eq=False)
 class Strokes:
-    """The surface with the strokes that form shapes. All act only on the skin."""
+    """The surface with the strokes that form shapes. They act only on the skin."""
 
     surface: SculptedHead
 

@@ -95,7 +95,7 @@ def packed_sizes(arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
 
 
 def write_content(path: Path, content: Content) -> None:
-    """Write a file whole or not at all; equal content gives equal bytes."""
+    """Write a file atomically; equal content gives equal bytes."""
     coded_arrays = packed(content.arrays)
     streams = {name: np.frombuffer(stream, np.uint8) for name, stream in coded_arrays.streams.items()}
     arrays = {name: [values.dtype.str[1:], list(values.shape)] for name, values in content.arrays.items()}

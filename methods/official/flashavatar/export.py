@@ -108,7 +108,7 @@ def write_program(identity: Subject, head: HeadAsset, work: Workplace, *, own_ch
         content = read_bytes(path, "a file of the program", MOST_TEMPLATE)
         write_bytes(folder / path.relative_to(checkout.folder), content)
     write_bytes(folder / MODEL_FILE, pickled(subject.model()))
-    # Splats of a chart of their own are those of the native method, of which none is left out.
+    # Splats of a separate chart are those of the native method; none is left out.
     border = np.zeros(0, np.int64) if own_chart else subject.official.region(BOUNDARY)
     write_bytes(folder / MASKS_FILE, pickled({BOUNDARY: border}))
     subject.official.write_eyelids(*(folder / name for name in EYELID_FILES))
@@ -141,7 +141,7 @@ def native_network(head: HeadAsset, seed: int) -> dict[str, Tensor]:
 
 
 def grid_of(samples: int) -> int:
-    """Texels of a side of a chart for about ``samples`` points, with room for a quarter more."""
+    """Side of a chart, texels, for about ``samples`` points, with a margin of a quarter."""
     return int(np.ceil(np.sqrt(1.25 * samples)))
 
 

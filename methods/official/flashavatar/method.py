@@ -56,7 +56,7 @@ CHANGES: tuple[Patch, ...] = (
     PICTURES,
     ("train.py", "if iteration % 5000 == 0:", "if iteration == opt.iterations:"),
 )
-"""Images of any size, no frames that are held out, and a checkpoint at the end of a run of any length."""
+"""Source patches: images of any size, no held-out frames, and a checkpoint at the end of a run of any length."""
 RENDERING_CHANGES: tuple[Patch, ...] = (
     *CHANGES[:2],
     ("test.py", *PICTURES[1:]),
@@ -72,7 +72,8 @@ ORDER: Patch = (
     "viewpoint_stack.pop(random.randint(0, len(viewpoint_stack)-1))",
     "scene.getCameras()[int(images_in_order[iteration - 1])]",
 )
-"""They draw a frame at random; it is replaced by the next of the given order. As in the native method, no step follows the last one."""
+"""The authors' code draws a frame at random; this takes the next of the given order. As in the native method, the last one
+has no step."""
 NETWORK_FILE = "network.pth"
 START: tuple[Patch, ...] = (
     (
@@ -91,7 +92,7 @@ NUMBERS = {
     "range": (r"range\((\d+)\)", "range({})"),
     "uv_size": (r"self\.uv_size = (\d+)", "self.uv_size = {}"),
 }
-"""Texts with the numbers of vertices and of texels of a side, which the CPU shim replaces for another topology."""
+"""Source texts with the numbers of vertices and texels per side, which the CPU shim replaces for another topology."""
 SHRINK = """
 import sys, torch
 path = sys.argv[1]
@@ -101,8 +102,8 @@ def lean(part):
 torch.save((tuple(map(lean, network)), tuple(map(lean, splats)), iteration), path)
 print("headbench:", len(splats[1]), "splats")
 """
-"""Removes the state of both optimisers, two thirds of the file, from a checkpoint, since rendering takes no step, and tells the
-number of splats."""
+"""Removes the state of both optimisers, two thirds of the file, from a checkpoint, since rendering does not need it, and
+prints the number of splats."""
 SPLATS = re.compile(r"^headbench: (\d+) splats$", re.MULTILINE)
 _DRAWN = r"drawn (\d+)"
 _white = partial(is_white, other=(0.0, 1.0, 0.0), known="white, or green (0, 1, 0)")
@@ -126,7 +127,7 @@ FLASHAVATAR_REPOSITORY = Repository(
 
 
 class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
-    """The method: see the module."""
+    """See the module docstring."""
 
     name, version = FLASHAVATAR_OFFICIAL.name, FLASHAVATAR_OFFICIAL.version
     config_class, repository = FlashAvatarOfficialConfig, FLASHAVATAR_REPOSITORY
@@ -253,7 +254,7 @@ class FlashAvatarOfficial(PartsMethod[FlashAvatarOfficialConfig]):
         return self.command_of(calls, _DRAWN, work)
 
     def read_back(self, frame: Listed, path: Path, background: Sequence[float], work: Workplace) -> Frame:
-        """A render, after its frame is verified by the image on its left."""
+        """A render; the image on its left is used to verify the frame."""
         window = around(frame.camera)
         width = window.camera.width
         image = read_sized(path, frame, 2 * width, window.camera.height)

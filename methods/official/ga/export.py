@@ -20,7 +20,7 @@ from .windows import Window, around, cameras_of, inside
 
 TRAIN, VALIDATION, TEST = layout.SPLIT_FILES.values()
 MARK_LEVELS, MARK_STEP = 16, 16
-"""A mark is a colour of one of 16 levels per channel, 16 apart, so that no rounding turns one into another."""
+"""A mark is a colour with 16 levels per channel, 16 apart, so that rounding cannot confuse them."""
 
 
 def write_training(
@@ -84,7 +84,7 @@ def mark(number: int) -> ByteArray:
 
 
 def check_mark(image: ByteArray, path: Path, number: int) -> None:
-    """Raise `InputError` if pixels of a file are not the mark of a frame, so that another frame was rendered."""
+    """Raise `InputError` if pixels of a file are not the frame's mark, which means that another frame was rendered."""
     pixels = image.reshape(-1, 3).astype(int)
     off = int(np.abs(pixels - mark(number).astype(int)).max())
     if off >= MARK_STEP // 2:

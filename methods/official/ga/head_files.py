@@ -44,7 +44,7 @@ MOST_TEMPLATE = 2**26
 
 
 def padding_remarks(head: HeadAsset) -> list[str]:
-    """A sentence for the record of an avatar if the expression basis of its head is padded."""
+    """Record entry of an avatar if the expression basis of its head is padded."""
     size = head.expression_basis.shape[2]
     return [f"an expression basis of {size} directions is padded with zeros"] * (size < EXPRESSION_SIZE)
 
@@ -210,7 +210,7 @@ def write_landmarks(path: Path, sizes: Mapping[str, tuple[int, ...]]) -> None:
 
 
 def write_npy(path: Path, array: np.ndarray) -> None:
-    """Write an array as npy, whole or not at all."""
+    """Write an array as npy atomically."""
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         np.save(stream, array, allow_pickle=False)
 
@@ -238,7 +238,7 @@ class SparseMatrix:
 
 
 class _ModuleReference:
-    """A module that is imported where the pickle is read."""
+    """A reference to a module, imported when the pickle is read."""
 
     def __init__(self, name: str):
         self.name = name

@@ -72,7 +72,7 @@ THEIR_NAMES = {
     "eyes": "eyes_pose",
     "translation": "translation",
 }
-"""Their name of each tracked value."""
+"""Name of each tracked value in the authors' code."""
 
 
 class GALayoutMethod(OfficialMethod[Config]):
@@ -157,7 +157,7 @@ class GALayoutMethod(OfficialMethod[Config]):
         return [*work.checkout.python, script, *option_words(options), "--skip_train", "--skip_val"]
 
     def read_back(self, frame: Listed, path: Path, background: Sequence[float], work: Workplace) -> Frame:
-        """A render, after its frame is verified by the ground truth written beside it."""
+        """A render; the ground truth written beside it is used to verify the frame."""
         truth = path.parent.parent / "gt" / path.name
         check_mark(read_png(truth), truth, frame.number)
         return opaque(read_window(frame, path))
@@ -189,7 +189,7 @@ class GALayoutMethod(OfficialMethod[Config]):
 
 
 class GAOfficial(GALayoutMethod[GAOfficialConfig]):
-    """The method: see the module."""
+    """See the module docstring."""
 
     name, version = GA_OFFICIAL.name, GA_OFFICIAL.version
     config_class, repository = GAOfficialConfig, GA_REPOSITORY
@@ -244,8 +244,8 @@ def _first_round(schedule: DensifySchedule) -> int:
     """Iteration after which their densification begins; on white, their code resets opacities there in runs of any
     length.
 
-    The native methods have no such reset in a short run. If their first round is later in any case, the start is set
-    to 0, which is no iteration.
+    The native methods have no such reset in a short run. If the first round is later anyway, the start is set to 0, so that
+    no iteration matches.
     """
     if schedule.first_reset is None and schedule.start < schedule.every:
         return 0

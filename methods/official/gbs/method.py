@@ -32,7 +32,7 @@ CHECKPOINTS = ("fix_chkpnt", "mouth0_chkpnt", "mouth1_chkpnt")
 FILES = {**{name: f"{name}.pth" for name in CHECKPOINTS}, "acc": "acc.npy"}
 """Prefixes of the files that their renderer opens, which end in the iteration, and their stored names."""
 MODEL_SOURCE, GRID_NODES = "FLAME/face_gs_model.py", 256
-"""Places in their code that fill grids of nearest triangles and skinning weights, and number of nodes per side."""
+"""Places in the authors' code that fill grids of nearest triangles and skinning weights, and nodes per side."""
 SHRINK = """
 import sys, torch
 for path in sys.argv[1:]:
@@ -47,7 +47,7 @@ WITHOUT_FIX = "2952da7d246e5790140dbb477d1468214564f092"
 
 
 class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
-    """The method: see the module."""
+    """See the module docstring."""
 
     name, version = GBS_OFFICIAL.name, GBS_OFFICIAL.version
     config_class = GBSOfficialConfig
@@ -68,8 +68,8 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
     avatar_files = (*FILES.values(), SUBJECT_FILE)
     render_folder, render_name = "seq/split_1", "pred_{:05d}.png"
     render_files = "pred_[!m]*"
-    """Besides, their script writes ground truth, meshes, masks and mouths into the folder."""
-    # They draw the index of a frame at random; it is replaced by the next of the given order.
+    """The script also writes ground truth, meshes, masks and mouths into the folder."""
+    # The authors' code draws a frame index at random; this takes the next of the given order.
     order_changes = (
         (
             "train.py",
@@ -141,7 +141,7 @@ class GBSOfficial(OfficialMethod[GBSOfficialConfig]):
         head.write_program(work.program)
         write_list(frames, head, work)
         for name, ours in FILES.items():
-            # Gigabytes, which are only read.
+            # Linked, since these files have gigabytes and are only read.
             (work.model / f"{name}1{Path(ours).suffix}").symlink_to((folder / ours).absolute())
         options: dict[str, Any] = {
             "--source_path": work.input,

@@ -147,7 +147,7 @@ def write_list(
 
 
 def overshot(wanted: Mapping[str, FloatArray], shown: dict[str, FloatArray]) -> dict[str, FloatArray]:
-    """Parameters from which a renderer that averages with the previous ones gets those wanted.
+    """Parameters that give the wanted ones in a renderer that averages with the previous ones.
 
     ``shown`` has the previous parameters, initially none, and is updated with rounding.
     """
@@ -224,7 +224,7 @@ def _resized(image: Any, side: int) -> Any:
 
 
 def read_render(path: Path, frame: Listed, side: int, rendered: int) -> tuple[ByteArray, FloatArray]:
-    """The image beside a render, and the (H, W, 3) render in [0, 1] at its camera's size.
+    """Input image and render of a file: the render (H, W, 3) in [0, 1] at its camera's size.
 
     Raises `InputError` for a file that is not two squares of ``rendered`` pixels.
     """

@@ -62,7 +62,7 @@ GHA_REPOSITORY = Repository(
 
 
 class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
-    """The method: see the module."""
+    """See the module docstring."""
 
     name, version = GHA_OFFICIAL.name, GHA_OFFICIAL.version
     config_class, repository = GHAOfficialConfig, GHA_REPOSITORY
@@ -186,7 +186,7 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
         return self._staged(work, parts, 0)
 
     def read_back(self, frame: Listed, path: Path, background: Sequence[float], work: Workplace) -> Frame:
-        """A render, after its frame is verified by the image beside it."""
+        """A render; the image beside it is used to verify the frame."""
         beside, render = read_render(path, frame, _side(work.root), RENDERED)
         check_mark(beside, path, frame.number)
         return opaque_colours(render)

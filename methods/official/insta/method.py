@@ -54,7 +54,7 @@ INSTA_REPOSITORY = Repository(
 
 
 class INSTAOfficial(PartsMethod[INSTAOfficialConfig]):
-    """The method: see the module."""
+    """See the module docstring."""
 
     name, version = INSTA_OFFICIAL.name, INSTA_OFFICIAL.version
     config_class, repository = INSTAOfficialConfig, INSTA_REPOSITORY

@@ -183,7 +183,7 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
 
 
 def _with_options(error: InputError, official: str) -> InputError:
-    """The error with the options of this command in place of the settings that a run has for them."""
+    """The error, naming options of this command instead of settings of a run."""
     place = f"settings.{official}"
     names = re.compile(rf"(?:--set )?{re.escape(place)}\.({'|'.join(OPTIONS)})\b")
     file, key, *texts = (
@@ -240,8 +240,8 @@ def as_theirs(native: str, iterations: int, samples: int) -> dict[str, Any]:
     """Settings that make a native run of any length equivalent to the run of the authors' program.
 
     ``samples`` is the initial number of splats of gbs, and that of flashavatar and rgbavatar. The authors' program raises the harmonics' degree
-    every 1,000 iterations regardless of the length (flashavatar: 500), removes large splats from the first regular reset of opacities, has lines in
-    the whole head (those of ours), and here uses all images equally often.
+    every 1,000 iterations regardless of the length (flashavatar: 500), removes large splats from the first regular reset of opacities,
+    has lines in the whole head (method "ours"), and here uses all images equally often.
     """
     if native == "rgbavatar":
         variants = {"frame_variant": "official", "color_init_variant": "official"}
@@ -335,7 +335,7 @@ def _cells(run_folder: RunFolder, rows: Rows, method: str, orders: Sequence[int]
 
 
 def _splats(folder: Path) -> int | None:
-    """Number of splats in an avatar's PLY file, or as FlashAvatar's log tells it; None without both."""
+    """Number of splats in an avatar's PLY file, or from FlashAvatar's log; None without both."""
     plys, log = [folder / name for name in ("point_cloud.ply", PLY_FILE)], folder / TRAINING_LOG
     path = next((ply for ply in plys if ply.is_file()), None)
     if path is None:

@@ -109,7 +109,7 @@ def write_config(path: Path, checkout: Checkout, changes: Mapping[str, Any]) -> 
 def write_list(frames: Sequence[Listed], subject: FlameSubject, folder: Path) -> None:
     """Write frames of one camera's intrinsics as a video.
 
-    Images have one pixel: their renderer loads them and uses none, and takes the size from the first frame's file.
+    Images have one pixel: the renderer loads but does not use them, and takes the size from the first frame's file.
     """
     with grouped_writes():
         for index, frame in enumerate(at_rest(subject.posed, frames)):

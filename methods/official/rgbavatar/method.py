@@ -50,7 +50,7 @@ PART = 500
 BATCH = RGBAvatarConfig().batch
 """Images of a step. Their numbers of iterations count images; here an iteration is a step, as in the native method."""
 CLIPPED: Patch = ("render.py", "* 255.0).to(dtype=torch.uint8", "* 255.0).clamp(0, 255).to(dtype=torch.uint8")
-"""Their renderer converts colours to 8 bits without limits, so that values above 1 are not defined."""
+"""The authors' renderer converts colours to 8 bits without clipping, so values above 1 are undefined."""
 ORDER: tuple[Patch, ...] = (
     (
         "dataset/dataloader.py",
@@ -64,7 +64,8 @@ ORDER: tuple[Patch, ...] = (
         "range((iteration - 1) // batch_size)",
     ),
 )
-"""They draw the frames of a step at random; they are replaced by the next of the given order. As in the native method, steps of
+"""The authors' code draws the frames of a step at random; this takes the next of the given order. As in the native method,
+steps of
 fewer frames count as whole ones in their schedule, and no step follows the last batch."""
 IN_TORCH: tuple[Patch, ...] = (
     (
@@ -127,7 +128,7 @@ RGBAVATAR_REPOSITORY = Repository(
 
 
 class RGBAvatarOfficial(PartsMethod[RGBAvatarOfficialConfig]):
-    """The method: see the module."""
+    """See the module docstring."""
 
     name, version = RGBAVATAR_OFFICIAL.name, RGBAVATAR_OFFICIAL.version
     config_class, repository = RGBAvatarOfficialConfig, RGBAVATAR_REPOSITORY
@@ -176,7 +177,7 @@ class RGBAvatarOfficial(PartsMethod[RGBAvatarOfficialConfig]):
         }
         if self.config.motion == "root":
             changes["dataset"] = (
-                "\n  retarget_neck: False"  # an argument of their loader that the published file leaves out
+                "\n  retarget_neck: False"  # an argument of the authors' loader missing in the published file
             )
         if self._has_own_chart(fit.clip.head, work.checkout):
             changes |= _as_native(fit.clip.head, self.config.samples)
@@ -208,7 +209,7 @@ class RGBAvatarOfficial(PartsMethod[RGBAvatarOfficialConfig]):
         return (drawn.batch(step) for step in range(1, (fit.budget.iterations or 0) + 1))
 
     def done(self, line: str) -> tuple[int, str] | None:
-        """Their training counts images."""
+        """The authors' training counts images."""
         found = super().done(line)
         return None if found is None else (found[0] // BATCH, found[1])
 

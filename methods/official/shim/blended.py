@@ -151,4 +151,4 @@ ALWAYS: dict[str, dict[str, Any]] = {
         "rasterize": rasterize_chart,
     },
 }
-"""Those of packages that are replaced also where they are installed: nvdiffrast needs CUDA or OpenGL."""
+"""Stand-ins used even if the package is installed: nvdiffrast needs CUDA or OpenGL."""

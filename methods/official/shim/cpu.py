@@ -72,7 +72,7 @@ def mean_square_distances(points: Tensor) -> Tensor:
 
 
 def _is_installed(name: str) -> bool:
-    """Whether a module is that of an installed package, or already replaced by a stand-in."""
+    """Whether a module is installed or already replaced by a stand-in."""
     package = name.partition(".")[0]
     if package == "torch":  # replaced by a module that imports another package
         package = name.rpartition(".")[2]

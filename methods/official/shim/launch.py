@@ -36,7 +36,9 @@ def patch_sources(patches: Any, root: str) -> None:
 
     ``patches`` are [file, old text, new text]; each old text must occur in its file.
     """
-    sys.pycache_prefix = os.path.join(root, "no-such-folder")  # code compiled before has no replacements
+    sys.pycache_prefix = os.path.join(
+        root, "no-such-folder"
+    )  # cached bytecode was compiled without the patches
     by_path: dict = {}
     for file, old, new in patches:
         by_path.setdefault(os.path.realpath(os.path.join(root, file)), []).append((old, new))
@@ -56,7 +58,7 @@ def patch_sources(patches: Any, root: str) -> None:
 
 
 def feed_order(order: Any) -> None:
-    """Make random loaders return the images of these names, in this order.
+    """Make random loaders return the images with these names in this order.
 
     Patched code without such a loader reads the names from ``images_in_order``.
     """

@@ -1,4 +1,4 @@
-"""Stand-ins for what official code imports without using it."""
+"""Stand-ins for modules that official code imports but does not use."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from torch import Tensor, nn
 
 
 class PerceptualLoss(nn.Module):
-    """Takes the place of the perceptual loss, whose weights are not here; calling it is an error."""
+    """Replaces the perceptual loss, whose weights are unavailable; calling it is an error."""
 
     def __init__(self, **options: Any):
         super().__init__()
 
     def forward(self, *images: Tensor) -> Tensor:
-        """Raises `NotImplementedError`: runs in which the loss is used are refused before."""
+        """Raises `NotImplementedError`: runs that would use the loss are refused earlier."""
         raise NotImplementedError("the shim has no perceptual loss")
 
 
@@ -30,7 +30,7 @@ class Node:
 
 
 class Silent:
-    """Ignores all calls, like a log that is not written."""
+    """Ignores all calls, like a null logger."""
 
     def __init__(self, *arguments: Any, **options: Any):
         pass
@@ -48,4 +48,4 @@ OF_FLASHAVATAR: dict[str, dict[str, Any]] = {
 }
 """Stand-in modules for packages that are not installed, by name."""
 REPLACED: dict[str, dict[str, Any]] = {"lpips": {"LPIPS": PerceptualLoss}}
-"""Those of packages that are replaced also where they are installed: LPIPS fetches weights when it is made."""
+"""Stand-ins used even if the package is installed: LPIPS downloads weights on construction."""

@@ -42,7 +42,7 @@ _MODEL_SOURCE, _TRAIN_SOURCE = "scene/flame_gaussian_model.py", "train.py"
 
 
 class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
-    """The method: see the module.
+    """See the module docstring.
 
     Their preprocessing draws the jaw bases from validation and test poses. It is not run: bases and expression
     clusters are those of `datasets.steps`, from training frames only, in the files that their training opens.
