@@ -44,7 +44,7 @@ class CaptureOptions:
         return open_clips(path, self.reader, progress=progress, **self._settings(settings))
 
     def _settings(self, others: dict[str, Any]) -> dict[str, Any]:
-        from ..bench.configuration import merge, parse_assignments  # which takes long to import
+        from ..bench.configuration import merge, parse_assignments  # slow to import
 
         options = {"head": self.head, "cy": None if self.cy == "auto" else self.cy, **others}
         given = {key: value for key, value in options.items() if value is not None}

@@ -1,4 +1,4 @@
-"""Pictures of the tracked mesh over images, for people to see whether tracking fits."""
+"""Overlays of the tracked mesh on images, for visual inspection of the tracking."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ ANGLE_BITS = 30
 
 
 def share_left(seconds: FloatArray | float, constant: float) -> FloatArray:
-    """Share of a difference that is left after ``seconds``, 1/e after ``constant``, on the grid of coefficients."""
+    """Fraction of a difference that remains after ``seconds``, 1/e after ``constant``; rounded to the grid of coefficients."""
     return on_grid(np.exp(-np.asarray(seconds) / constant), COEFFICIENT_BITS)
 
 

@@ -1,4 +1,4 @@
-"""The clips of a run with tracking from their images: a registered change of clips."""
+"""Replaces the tracking of a run's clips by one estimated from their images; a registered clip transform."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ class RegionError(NamedTuple):
     affine: float
     """Distance after the best affine map of the region at each timestep."""
     motion: float
-    """Change of the distance over time, in the frame of the head: what is left without each vertex's mean error."""
+    """Change of the distance over time, in the frame of the head: the error after subtracting each vertex's mean error."""
 
 
 def error_regions(head: HeadAsset) -> dict[str, IntArray]:
@@ -78,7 +78,7 @@ def tracking_errors(tracked: Clip, exact: Clip) -> Mapping[str, RegionError]:
 
 
 def mesh_errors(found: FloatArray, wanted: FloatArray, turns: FloatArray) -> RegionError:
-    """Errors of points (T, n, 3) against others, metres, for a head that is turned by (T, 3, 3)."""
+    """Errors of points (T, n, 3) relative to others, metres, for a head with rotations (T, 3, 3)."""
 
     def spread(gaps: FloatArray) -> float:
         return 1e3 * float(np.sqrt((gaps**2).sum(axis=-1).mean()))

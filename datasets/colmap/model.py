@@ -161,7 +161,7 @@ class _BinaryReader:
             raise InputError(self.file, key, "a name in UTF-8", repr(text[:60])) from error
 
     def skip(self, size: int, key: str) -> None:
-        """Pass over bytes."""
+        """Skip bytes."""
         self._need(size, key)
         self._stream.seek(size, os.SEEK_CUR)
 

@@ -1,7 +1,7 @@
-"""The 52 blendshapes of ARKit and MediaPipe, and what they do to a head model with a jaw and eyes that turn.
+"""The 52 blendshapes of ARKit and MediaPipe, and their effect on a head model with jaw and eye joints.
 
-FLAME has no such shapes. They are performed by a head that has them, the embedded one or one with expressions of ARKit's
-names such as ICT-FaceKit's, whose vertices are then transferred to the avatar's head.
+FLAME has no such shapes. They are applied to a head that has them, the embedded one or one with ARKit's expression
+names such as ICT-FaceKit's, and its vertices are transferred to the avatar's head.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def is_embedded(head: HeadArrays) -> bool:
 
 
 def blendshape_parts(head: HeadArrays) -> dict[str, dict[str, FloatArray]]:
-    """What each blendshape adds to the parts of a pose at 1, by its name: expression (E,), jaw (3,), eyes (6,), eyelids (2,).
+    """Effect of each blendshape at 1 on the parts of a pose, by name: expression (E,), jaw (3,), eyes (6,), eyelids (2,).
 
     Raises `InputError` for a head without shapes of ARKit's names other than the embedded one.
     """
@@ -181,7 +181,7 @@ def blendshape_parts(head: HeadArrays) -> dict[str, dict[str, FloatArray]]:
         expected = "the embedded head, or one with expressions of ARKit's names such as ICT-FaceKit's"
         raise InputError("command line", "--signal-head", expected, head.version)
     for name, direction in columns.items():
-        if name == "jawOpen":  # the joint's place is taken by the shape
+        if name == "jawOpen":  # the shape replaces the joint
             found.pop(name)
         found.setdefault(name, {})["expression"] = direction
     if "jawLeft" in columns:
@@ -223,7 +223,7 @@ def _named_columns(head: HeadArrays) -> dict[str, FloatArray]:
     for name, column in zip(head.expression_names, np.eye(len(head.expression_names))):
         stem = re.sub("_([LR])$", "", name)
         side = {"_L": "Left", "_R": "Right"}.get(name[len(stem) :], "")
-        for arkit in (stem + side, stem):  # browInnerUp is one shape with ARKit, a pair with others
+        for arkit in (stem + side, stem):  # browInnerUp is one shape in ARKit and a pair in others
             if arkit_name(arkit):
                 found[arkit_name(arkit)] = found.get(arkit_name(arkit), 0.0) + column
                 break

@@ -1,6 +1,6 @@
 """FLAME coefficients as trackers of single images give them: DECA, EMOCA, SMIRK and SHeaP.
 
-None of them has a file format of its own for videos: their outputs are saved by array, under the names in `NAMES`.
+They have no file format for videos; arrays of their outputs are read under the names in `NAMES`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def is_coefficients(table: SignalTable) -> bool:
 
 
 def read_coefficients(request: SignalRequest) -> DrivingSignal:
-    """Coefficients of each frame. Identity stays behind."""
+    """Coefficients of each frame. Identity is ignored."""
     table = request.columns
     head = request.head(DEFAULT_HEAD)
     found = {part: next((n for n in names if n in table.columns), "") for part, names in NAMES.items()}

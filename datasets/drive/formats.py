@@ -23,7 +23,7 @@ class SignalFormat:
     Attributes
     ----------
     name, summary : str
-        Name for ``--form``, and what it is.
+        Name for ``--form``, and a description.
     fits : Callable[[SignalTable], bool]
         Whether a table without a map is of this format.
     read : Callable[[SignalRequest], DrivingSignal]

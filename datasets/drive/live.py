@@ -15,7 +15,7 @@ from .transfer import FrameTransfer
 
 
 class LiveDriver:
-    """Takes lines with a frame each to poses of an avatar's head model: coefficients or blendshapes, as `read_signal` has them.
+    """Converts lines of one frame each (coefficients or blendshapes, as for `read_signal`) to poses of a head model.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class LiveDriver:
     def __call__(self, line: str) -> HeadPose:
         """The pose of a line; the head moves around the origin, relative to the first line.
 
-        Raises `InputError` for a line that is no frame of a known format.
+        Raises `InputError` for a line that is not a frame of a known format.
         """
         path = Path("live signal")
         frame = parse_line(line, path, "line")

@@ -1,4 +1,4 @@
-"""Tables of one's own, whose columns a map file takes to coefficients of a head model or to blendshapes."""
+"""Custom tables, whose columns a map file converts to coefficients of a head model or to blendshapes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is measured of driven poses: jitter, identity spill, lip closure."""
+"""Measures of driven poses: jitter, identity spill, lip closure."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def canonical(head: HeadArrays) -> HeadPose:
 
 
 class Renderer:
-    """Renders the frames of a clip as the avatar's method takes it, and keeps the time of each.
+    """Renders the frames of a clip in the form required by the avatar's method, and records their times.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The scene of a driven avatar: its head and identity, a camera, and where the head rests."""
+"""The scene of a driven avatar: head model, identity, camera, and rest position of the head."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class AvatarScene:
         return self.clip.head
 
     def placed(self, poses: Sequence[HeadPose]) -> list[HeadPose]:
-        """Poses that move around the origin, moved to where the head rests."""
+        """Poses around the origin, moved to the head's rest position."""
         return [retarget(pose, AT_ORIGIN, self.rest, self.clip.subject) for pose in poses]
 
     def driven(self, poses: Mapping[int, HeadPose], sequences: Mapping[int, str]) -> CaptureClip:

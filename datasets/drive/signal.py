@@ -72,7 +72,7 @@ class SignalRequest:
 
     @property
     def columns(self) -> SignalTable:
-        """The table. Raises `InputError` if the signal is none."""
+        """The table. Raises `InputError` if the signal is not a table."""
         if self.table is None:
             raise InputError(self.path, "", "a table of numbers, or files of each frame", "a capture")
         return self.table
@@ -98,7 +98,7 @@ def _loaded(name: str) -> HeadArrays:
 
 
 def make_poses(path: Path, head: HeadArrays, parts: Mapping[str, FloatArray]) -> list[HeadPose]:
-    """Poses of (T, n) arrays by name: expression, eyelids and those of `POSE_PARTS`; what is missing is 0.
+    """Poses of (T, n) arrays by name: expression, eyelids and those of `POSE_PARTS`; missing ones are 0.
 
     Fewer expression coefficients than the head model has are padded with zeros; eyelids are left out if it has no basis.
 

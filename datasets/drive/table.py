@@ -1,4 +1,4 @@
-"""Tables of values over time from outside: CSV, JSON, JSON lines, npz, and folders with a file for each frame."""
+"""Tables of values over time: CSV, JSON, JSON lines, npz, and folders with one file per frame."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class SignalTable:
     columns : Mapping[str, Sequence[Any] | np.ndarray]
         T values by name: numbers, text, lists of numbers, or an array (T, ...).
     places : Sequence[str]
-        Where each of the T frames stands, such as "line 7".
+        Location of each of the T frames in the file, such as "line 7".
     """
 
     path: Path

@@ -23,7 +23,7 @@ def is_flame_parameters(table: SignalTable) -> bool:
 
 
 def read_flame_parameters(request: SignalRequest) -> DrivingSignal:
-    """Poses of a folder with a parameter file for each frame, or of one file. Identity stays behind.
+    """Poses of a folder with a parameter file for each frame, or of one file. Identity is ignored.
 
     The head model is the one given, else that which a declaration of headbench beside the folder names, else the avatar's if
     it is VHAP's.

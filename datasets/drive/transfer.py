@@ -38,7 +38,7 @@ class Transferred(NamedTuple):
     residual_mm: float | None
     """Mean distance of the facial vertices after a refit between head models, millimetres; None if none was needed."""
     unused: dict[str, str]
-    """Channels lost on the way."""
+    """Channels lost in the transfer."""
 
 
 def transfer(
@@ -81,7 +81,7 @@ def transfer(
 
 
 class FrameTransfer:
-    """`transfer` of one frame at a time, for signals whose end is not known.
+    """`transfer` frame by frame, for live signals.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def same_basis(one: HeadArrays, other: HeadArrays) -> bool:
 
 
 def relative_to_neutral(poses: Sequence[HeadPose], neutral: HeadPose | None) -> list[HeadPose]:
-    """Poses as seen from a neutral face: differences of coefficients, turns of jaw and eyes from the neutral ones."""
+    """Poses relative to a neutral face: differences of coefficients, relative rotations of jaw and eyes."""
     if neutral is None:
         return list(poses)
     return [

@@ -162,7 +162,7 @@ def measure_cameras(
     trusted = [camera for camera in live if camera not in doubted]
     if len(trusted) < FEWEST_CAMERAS - 1:
         trusted = live
-    elif doubted:  # what is wrong with one is no measure for the others
+    elif doubted:  # a faulty camera is no reference for the others
         compared = {camera: table.compared(camera, facts[camera], trusted) for camera in live}
     for camera in doubted:
         fits, match = table.fits(camera, trusted)

@@ -93,7 +93,7 @@ def is_insta(root: Path) -> bool:
 
 
 def read_insta(root: Path, head: HeadArrays, progress: Progress) -> Track:
-    """Read a folder. Raises `InputError` for what is missing or does not fit the head model."""
+    """Read a folder. Raises `InputError` for missing data and data that do not fit the head model."""
     held_out: frozenset[tuple[str, int]] | None = None
     documents = [root / file for file in (SPLIT_FILES["train"], SPLIT_FILES["self_reenactment"])]
     if not all(document.is_file() for document in documents):

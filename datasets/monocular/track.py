@@ -71,8 +71,8 @@ class Track:
     shape : FloatArray
         (S,) identity coefficients of the head model.
     solid : tuple[float, float] | None
-        Masks become 1 above the first and up to the second coverage in [0, 1] and else 0, as in the layout's own loader; None
-        leaves them.
+        Coverage range (low, high] in [0, 1] that becomes 1, all else 0, as in the layout's own loader; None keeps masks
+        unchanged.
     held_out : frozenset[tuple[str, int]] | None
         Names of the frames that the layout holds out; None if it does not define a split.
     files : frozenset[Path]

@@ -1,4 +1,4 @@
-"""A chart for head models without texture coordinates, for methods whose splats lie on one."""
+"""A chart for head models without texture coordinates, for methods that place splats on a chart."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SHEAR = np.tan(np.radians(18))
 """Shear of the triangles, so that the directions along the two coordinates are 18 degrees from orthogonal, the median in FLAME's
 chart."""
 MARGIN = 0.05
-"""Part of a cell that stays free around the largest triangle."""
+"""Fraction of a cell left free around the largest triangle."""
 
 
 def with_packed_chart(clip: Clip, config: RunConfig) -> CaptureClip:

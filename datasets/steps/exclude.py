@@ -84,7 +84,7 @@ def exclude_given(clip: Clip, exclude: Mapping[int, str] | str | Path | None) ->
         As for `exclude_timesteps` and `read_reasons`; or the clip's head model does not have FLAME's
         layout.
     """
-    from ..clip import as_capture  # which takes long to import
+    from ..clip import as_capture  # slow to import
 
     clip = as_capture(clip)
     if isinstance(exclude, (str, Path)):

@@ -16,7 +16,7 @@ from ..head.subject import PosedSubject
 def as_rigid_head(clip: Clip, config: RunConfig) -> CaptureClip:
     """A clip whose poses have no rotation of the neck: root and translation make up the motion of the head.
 
-    Everything that follows the neck fully stays where it was; what is below it follows the head. The images are the same.
+    Vertices that fully follow the neck do not move; those below it follow the head. Images are unchanged.
     """
     source = as_capture(clip)
     subject = PosedSubject.of(source)

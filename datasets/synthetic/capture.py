@@ -338,7 +338,7 @@ def _manifest(settings: SyntheticSettings, head: str) -> dict[str, Any]:
     return {
         "version": _VERSION,
         **settings.described(),
-        "head": Path(settings.head).name,  # the same file may have another path, so compare its content
+        "head": Path(settings.head).name,  # not the path, since only the content counts
         "size": list(settings.size),
         "head_fingerprint": head,
     }

@@ -209,7 +209,7 @@ def gaze(time: FloatArray, seconds: float, rng: np.random.Generator) -> FloatArr
 
 
 JAW_ROLL = 0.12
-"""Deviation of a roll of the jaw of its own, in units of the control."""
+"""Standard deviation of independent jaw roll, in units of the control."""
 IDLE_SECONDS = (1.5, 6.0)
 SWAY = {"neck_turn": 0.004, "neck_nod": 0.004, "sway_x": 0.002, "sway_y": 0.0015, "sway_z": 0.002}
 """Deviations of idle motion by control: radians, metres."""

@@ -34,8 +34,8 @@ class SyntheticTruth:
 
     Shape, skin, hair, lights, samples a pixel, tone curve and errors of masks are the capture's, the
     background is the clip's. Blood flow and wrinkles are in the steady state of the expression, and the tongue is inside.
-    Effects that depend on time
-    (`--hair-lag`, `--motion-blur`) and the response of single cameras (`--camera-colour`) are left out.
+    Effects that depend on time (`--hair-lag`, `--motion-blur`) and the response of single cameras (`--camera-colour`) are
+    left out.
 
     The pose is taken as it is. If the capture's tracking has errors, an avatar that was trained with them is compared with
     the true person in the pose that it is given, not with the pictures that were tracked as that pose.

@@ -1,4 +1,4 @@
-"""The table of trackers whose files are read: a new one is a new entry."""
+"""Supported trackers; add a new tracker as an entry of this table."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class TrackerFormat:
     convert : Convert
         Makes a timestep of them.
     layout : Layout
-        Where the images and masks are.
+        Locations of images and masks.
     """
 
     name: str

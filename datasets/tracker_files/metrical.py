@@ -40,7 +40,7 @@ MEMBERS = {
 
 
 def metrical_frame(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> TrackedFrame:
-    """A timestep of the arrays in `MEMBERS`. Raises `InputError` for rotations that are none."""
+    """A timestep of the arrays in `MEMBERS`. Raises `InputError` for invalid rotations."""
     motion = np.eye(4)
     motion[:3] = np.column_stack([arrays["opencv.R"][0], arrays["opencv.t"][0]])
     width, height = image_size(path, arrays)

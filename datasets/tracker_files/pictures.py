@@ -18,7 +18,7 @@ INSIDE, INSIDE_SUFFIX = "parsing", "_neckhead"
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a tracker's images and masks are.
+    """Locations of a tracker's images and masks.
 
     Attributes
     ----------

@@ -22,7 +22,7 @@ MOST_SPREAD = 0.004
 """Maximum median sliding of a landmark on the mesh, metres; others are left out."""
 FEWEST_LANDMARKS = 10
 FACING = 0.5
-"""Least cosine between the normal of a landmark and the direction to the camera."""
+"""Minimum cosine between the normal of a landmark and the direction to the camera."""
 _FEWEST = 0.15  # fraction of images in which a landmark must hit the mesh
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def track_with_program(settings: TrackSettings, progress: Progress) -> CommandResult:
-    """Run another tracker on the file of a video and make a capture of what it wrote.
+    """Run another tracker on the file of a video and convert its output to a capture.
 
     Its files are in a folder of its name in ``settings.out``, the capture beside it. A repeated call resumes after the last
     finished step. Raises `InputError` before anything runs, and `ProgramError` for a program that fails.

@@ -55,7 +55,7 @@ LEVELS = (
 )
 """From coarse to fine. A narrow tolerance at coarse levels would reject the points that move most."""
 SHARPEST = 0.7
-"""Least blur, pixels."""
+"""Minimum blur, pixels."""
 WIDE_MM = 6.0
 """Blur that is subtracted from the images."""
 LANDMARK_WEIGHT, COLOUR_WEIGHT = 0.005, 0.1

@@ -18,7 +18,7 @@ FRAMES = 16
 WEIGHT = 1.0
 """Weight of a landmark relative to the prior. With that of tracking, residuals due to the prior would hide perspective."""
 CLEAR = 1.02
-"""Ratio of the residuals at both ends of `TRIED` to the least one from which the focal length counts as determined."""
+"""Minimum ratio of the residuals at both ends of `TRIED` to the smallest one for a determined focal length."""
 
 
 class FocalLength(NamedTuple):

@@ -51,7 +51,7 @@ class Step:
     name : str
         For messages.
     arguments : Callable
-        Arguments of the interpreter, in the checkout's folder: a script, and what it is given.
+        Arguments of the interpreter, in the checkout's folder: a script and its arguments.
     output : str
         Pattern of files in the working folder of which one exists afterwards; programs may fail with exit code 0. It contains
         ``{name}`` for the name of the video.
@@ -247,7 +247,7 @@ def run_steps(
 
     Finished steps are kept in ``steps.json`` of the working folder, all output in ``program.log``.
 
-    Raises `ProgramError` with the last lines of a step that fails or does not write what it should.
+    Raises `ProgramError` with the last lines of a step that fails or does not write its output.
     """
     record = work.folder / STEPS
     finished: dict[str, str] = read_json(record) if record.exists() else {}

@@ -110,7 +110,7 @@ def track(
     Raises
     ------
     InputError
-        A camera is unknown, there is none or no timestep, a frame of a camera is missing, or there are no landmarks.
+        A camera is unknown, there are no cameras, timesteps or landmarks, or a frame of a camera is missing.
     """
     where = f"clip of {clip.subject}"
     check_cameras(clip, cameras)

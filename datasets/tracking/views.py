@@ -15,7 +15,7 @@ CELL = 4
 MARGIN = 0.002
 """Depth tolerance, metres, in addition to the slope within a cell: a point is hidden if another surface is nearer by more."""
 FACING = 0.25
-"""Least cosine between the normal of a point and the direction to the camera."""
+"""Minimum cosine between the normal of a point and the direction to the camera."""
 _SPACING = 0.003  # between the samples of a surface that fill the buffer, metres
 _NEAR = 0.05
 

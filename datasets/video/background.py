@@ -1,4 +1,4 @@
-"""Masks of a person by the difference from the empty room, for a camera that stands still."""
+"""Masks of a person by background subtraction of the empty room, for a static camera."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from ...bench.landmark_network import face_size
 from .faces import BELOW
 
 SAMPLES, LEAST_EMPTY = 60, 10
-"""Most and fewest frames of the empty room from which the background is learnt."""
+"""Maximum and minimum number of frames of the empty room from which the background is learnt."""
 LEAST_LEVELS, NOISES = 12.0, 6.0
-"""Difference from the background that shows a person: levels of 255, and multiples of the noise of the pixel."""
+"""Minimum difference from the background of foreground: levels of 255, and multiples of the pixel's noise."""
 MOST_NOISE, MOST_NOISY = 12.0, 0.25
-"""Noise of a pixel whose background moves, levels, and the part of such pixels from which the camera counts as moved."""
+"""Noise above which a pixel's background moves, levels, and fraction of such pixels above which the camera counts as moved."""
 MOST_UNSURE = 0.5
-"""Most `HeadMask.unsure`, median of `CHECKED` frames."""
+"""Maximum of `HeadMask.unsure`, median of `CHECKED` frames."""
 CHECKED = 12
 BLUR = 1.0  # pixels
 _USE = "for --masks background"
@@ -37,8 +37,8 @@ class HeadMask(NamedTuple):
     mask: ByteArray
     """(H, W) 255 for the person."""
     unsure: float
-    """Pixels of which the difference says little, relative to those of the person: near the outline those whose difference is near the
-    threshold, and inside of the face those that look like the background."""
+    """Ambiguous pixels relative to those of the person: near the outline, those with a difference near the threshold; inside
+    the face, those that look like the background."""
 
 
 class Background(NamedTuple):
@@ -47,7 +47,7 @@ class Background(NamedTuple):
     colours: FloatArray
     """(H, W, 3) levels."""
     threshold: FloatArray
-    """(H, W) levels of difference that show a person."""
+    """(H, W) minimum difference of foreground, levels."""
 
     def mask(self, image: ByteArray, face: FloatArray) -> HeadMask:
         """The mask of an (H, W, 3) image of the same view with the landmarks ``face``, (L, 2) pixels.
@@ -59,7 +59,7 @@ class Background(NamedTuple):
         inside, bottom = hull.astype(bool), float(face[:, 1].max())
         above = np.arange(len(hull))[:, None] < bottom + BELOW * (bottom - face[:, 1].min())
         levels = cv2.GaussianBlur(image, (0, 0), BLUR).astype(np.float32)
-        # Phones change the exposure; the part beside the face shows by how much.
+        # Phones change the exposure; it is estimated from pixels beside the face.
         outside = cv2.distanceTransform(1 - hull, cv2.DIST_L2, 5) > face_size(face) / 2
         outside &= np.arange(len(hull))[:, None] < bottom
         colours = self.colours
@@ -94,14 +94,14 @@ def learn_background(path: Path, images: Sequence[ByteArray]) -> Background:
     Raises
     ------
     InputError
-        There are too few, or the room moves in them.
+        There are too few images, or the room moves.
     """
     if len(images) < LEAST_EMPTY:
         expected = f"at least {LEAST_EMPTY} frames that show nobody's face, {_USE}"
         raise InputError(path, "", expected, f"{len(images)}", _REMEDY)
     blurred = np.stack([cv2.GaussianBlur(image, (0, 0), BLUR) for image in images])
     colours, noise = np.empty(blurred.shape[1:], np.float32), np.empty(blurred.shape[1:3], np.float32)
-    for row in range(len(colours)):  # one at a time, for the memory
+    for row in range(len(colours)):  # one at a time, to limit memory
         values = blurred[:, row].astype(np.float32)
         colours[row] = np.median(values, axis=0)
         noise[row] = 1.4826 * np.median(np.abs(values - colours[row]).max(axis=2), axis=0)
@@ -115,7 +115,7 @@ def learn_background(path: Path, images: Sequence[ByteArray]) -> Background:
 def check_background(
     path: Path, background: Background, images: Sequence[ByteArray], faces: FloatArray
 ) -> None:
-    """Raise `InputError` if masks of images with landmarks (N, L, 2) are too unsure, as where the person is in the background."""
+    """Raise `InputError` if masks of images with landmarks (N, L, 2) are too uncertain: the person may be in the background."""
     unsure = float(np.median([background.mask(image, face).unsure for image, face in zip(images, faces)]))
     if unsure > MOST_UNSURE:
         expected = f"masks in which at most {MOST_UNSURE:.0%} of the person's pixels are unsure, {_USE}"

@@ -28,7 +28,7 @@ from .settings import VideoOptions
 
 FACES, IMAGES, MASKS = "faces.npz", "images", "masks"
 USUAL_FOCAL = 1.0
-"""Focal length relative to the longer side of a frame where it is not known: about that of phones' main cameras and of webcams."""
+"""Default focal length relative to the longer side of a frame: about that of phones' main cameras and webcams."""
 DISTANCE = 1.0  # of the head before it is tracked, metres
 
 
@@ -73,10 +73,10 @@ def open_video(
 ) -> VideoClip:
     """Read a video, write its frames and masks under ``out``, and return them as a clip in a neutral pose.
 
-    What an earlier call with the same video and options wrote there is not made again.
+    Files that an earlier call with the same video and options wrote there are reused.
 
-    Raises `InputError` for a file that is no video, masks that do not fit, too few frames with a face, and where it is not said
-    how to mask, before images are written.
+    Raises `InputError` before images are written for a file that is not a video, masks that do not fit, too few frames with a
+    face, and an unspecified source of masks.
     """
     subject = options.subject or subject_of(path)
     check_subject(subject, "--subject")
@@ -131,7 +131,7 @@ def _write_frames(
     }
     left = {number for number, paths in files.items() if not all(file.exists() for file in paths)}
     if masks.by_background:
-        left = set(seen)  # all, for the shares of unsure pixels
+        left = set(seen)  # all frames, for the fractions of ambiguous pixels
     if not left:
         return
     masks.learn(path, _frames(path, options), faces, view)
@@ -153,7 +153,7 @@ def _frames(path: Path, options: VideoOptions) -> Iterator[TimedFrame]:
 
 
 def _neutral(head: HeadArrays) -> HeadPose:
-    """At rest in front of the camera, upright and facing it."""
+    """Neutral pose in front of the camera, upright and facing it."""
     return replace(
         resting(head), rotation=np.array([np.pi, 0.0, 0.0]), translation=np.array([0.0, 0.0, DISTANCE])
     )

@@ -1,4 +1,4 @@
-"""The part of ``headbench track`` that is for video files."""
+"""Video files in ``headbench track``."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _FOCAL = {"pixels": Member("f", ()), "residuals": Member("f", ("N",)), "tried": 
 
 
 class OpenedVideo(NamedTuple):
-    """A video to be tracked: its clip, its landmarks, and what is said of it, as data and in lines."""
+    """A video to be tracked: its clip, its landmarks, and information about it as data and as lines of text."""
 
     clip: CaptureClip
     landmarks: NetworkLandmarks
@@ -43,7 +43,7 @@ class OpenedVideo(NamedTuple):
 def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) -> OpenedVideo:
     """The clip of a video with its focal length.
 
-    Its frames, and what is learnt of them, are stored in ``folder``, from which a later call continues. Raises `InputError` for options
+    Its frames and results are stored in ``folder``, from which a later call resumes. Raises `InputError` for options
     that are missing, and as `open_video`.
     """
     path = Path(settings.capture)
@@ -53,7 +53,9 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
     named = settings.head or ""
     head = target_head(named, "--head")
     network, weights = LandmarkNetwork(Path(settings.landmarks)), digest_file(Path(settings.landmarks))
-    own = replace(settings, head=named if Path(named).exists() else None)  # a name of a head is for no reader
+    own = replace(
+        settings, head=named if Path(named).exists() else None
+    )  # the name of a head is not passed to a reader
     teacher = own.open(settings.embedding, progress) if settings.embedding else None
     make_work_folder(folder)
     mark = digest(tracking_code(), weights, head.fingerprint(), teacher.fingerprint if teacher else "")
@@ -114,7 +116,7 @@ def _data(video: VideoClip, given: float | None, focal: FocalLength | None) -> d
 
 
 def _focal(video: VideoClip, given: float | None, focal: FocalLength | None) -> tuple[float, str]:
-    """Focal length in pixels of the video, and where it is from."""
+    """Focal length in pixels of the video, and its source."""
     if focal is None:
         return given or 0.0, "given"
     if focal.clear:

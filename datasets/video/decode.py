@@ -14,7 +14,7 @@ from ...bench.contracts import ByteArray
 from ...bench.errors import InputError
 
 LEAST_SHARE = 0.9
-"""Part of the stated number of frames that has to be decoded."""
+"""Minimum fraction of the stated number of frames that must be decoded."""
 MOST_SIDE = 8192
 """Longest side of a frame, pixels."""
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
@@ -99,7 +99,7 @@ def _decoded(path: Path) -> Iterator[tuple[float, ByteArray]]:
             yield max(0.0, now - first), frame
         if first is None:
             raise _undecoded(path)
-        stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))  # of some formats an estimate
+        stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))  # an estimate in some formats
         if count < LEAST_SHARE * stated:
             remedy = "The file is damaged. Convert it again, for example with ffmpeg."
             raise InputError(path, "", f"{stated} frames, as the file states", f"{count}", remedy)

@@ -1,4 +1,4 @@
-"""Where the head of one person is in the frames of a video."""
+"""Localisation of one person's head in the frames of a video."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from ...bench.landmark_network import COUNT, SAME, LandmarkNetwork, face_distanc
 from .decode import TimedFrame
 
 LEAST_SEEN = 0.5
-"""Part of the frames in which a face has to be found."""
+"""Minimum fraction of frames with a detected face."""
 ABOVE, BELOW, BESIDE = 1.0, 0.6, 0.8
 """Room around the landmarks in a crop, relative to their height or width: hair, neck, and turns of the head."""
 SEARCHED = 10
-"""In every frame of this number the whole picture is searched for further faces."""
+"""Interval, in frames, of searches of the whole image for further faces."""
 REACH, SPEED = 1.0, 5.0
-"""A face is taken for the lost one again within this distance of its last place, and this distance a second more, relative to its size."""
+"""Maximum distance between a lost face and its rediscovery, relative to its size: constant, and increase per second."""
 STORED_S = 10.0
 """Seconds after which landmarks are stored again, for a run that is interrupted."""
 
@@ -39,7 +39,7 @@ class FoundAgain(NamedTuple):
 
     @property
     def elsewhere(self) -> bool:
-        """Whether it is so far away that the places alone do not say that it is the same face."""
+        """Whether it is too far away to be identified as the same face by position alone."""
         return self.jump >= SAME
 
 
@@ -87,7 +87,7 @@ class Crop(NamedTuple):
 
 @dataclass
 class FaceFollower:
-    """Follows the face of one person, and all others in order not to take one of them for it.
+    """Tracks the face of one person, and all other faces to avoid confusing them.
 
     The person is the one with the largest face in the first frame that shows a face. From then on a face is the person's because
     it is where that was in the frame before. Where the face is lost, the whole picture is searched at once. The person is then the
@@ -103,7 +103,7 @@ class FaceFollower:
     last_time : float
         Time of that frame, seconds.
     lost : bool
-        Whether the latest frame does not show them.
+        Whether the person is missing in the latest frame.
     others : list[FloatArray]
         (COUNT, 2) landmarks of every other face of the latest frame.
     """
@@ -122,7 +122,7 @@ class FaceFollower:
         time : float
             Of the frame, seconds.
         search : bool
-            Whether to look for further faces though the person's is there.
+            Whether to search for further faces even if the person's is found.
         """
         own = None if self.lost or self.last is None else self._near(image, self.last)
         others: list[FloatArray] = []
@@ -132,7 +132,7 @@ class FaceFollower:
                 continue
             if own is not None and self.last is not None and same_face(own, now):
                 if face_distance(own, self.last) <= face_distance(now, before):
-                    continue  # the other one is hidden or has left
+                    continue  # the other face is hidden or has left
                 own = None
             others.append(now)
         if own is None or search:
@@ -165,7 +165,7 @@ class FaceFollower:
 
 
 class _Searched(NamedTuple):
-    """What was found in a frame."""
+    """Detections in a frame."""
 
     number: int
     time: float
@@ -203,7 +203,7 @@ def find_faces(
     frames : Iterable[TimedFrame]
         Its frames; not iterated if an earlier call has finished.
     store : Path
-        File of the landmarks, written meanwhile, whose frames a later call does not search again.
+        File of the landmarks, written during the search; a later call skips its frames.
     mark : str
         Digest of everything that the landmarks depend on.
 

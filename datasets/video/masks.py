@@ -1,4 +1,4 @@
-"""Where the masks of a video's frames are from."""
+"""Sources of the masks of a video's frames."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ class FrameView(NamedTuple):
 
 
 class MaskSource:
-    """Masks as the options ask for them.
+    """Masks according to the options.
 
     Raises
     ------
     InputError
-        None or several are asked for, or the file is not the network.
+        None or several sources are requested, or the file is not the network.
     UnavailableError
         The package of the network is missing.
     """
@@ -86,11 +86,11 @@ class MaskSource:
 
     @property
     def by_background(self) -> bool:
-        """Whether masks are made from what is behind the head."""
+        """Whether masks are computed by background subtraction."""
         return self.options.masks == BACKGROUND
 
     def prepare(self, numbers: Sequence[int], info: VideoInfo) -> str:
-        """Check what masks of frames of some numbers are made from; a digest of it.
+        """Check the inputs of the masks of frames with these numbers; returns a digest of the inputs.
 
         Raises `InputError` unless a folder of masks has one of the video's size for every frame.
         """

@@ -1,6 +1,6 @@
 """``headbench doctor stress splats``: the renderer at numerical extremes, forward and backward, each with a verdict.
 
-Cases are small: their truth is the float64 reference. Bounds are on float32 arithmetic, whatever the instruction set:
+Cases are small: their truth is the float64 reference. Bounds hold for float32 arithmetic with any instruction set:
 the mean absolute error of the image (colours of order 1), and the relative L2 error of the worst gradient.
 """
 
@@ -30,20 +30,20 @@ from .scenes import (
 
 TIGHT = 1e-4  # of gradients where float32 loses nothing; 2e-4 for quaternions is within
 FLIPPED = 1e-4
-"""A pixel with an error above this, in units of the largest colour, took another side of a threshold than float64 did. Such
-pixels count in the image's error but are left out of the gradients compared."""
+"""A pixel with a larger error, in units of the largest colour, was on the other side of a threshold in float64. Such pixels
+count in the image's error but are excluded from the comparison of gradients."""
 FLIPPED_MAX = 0.01
-"""The largest part of the pixels that may."""
+"""Maximum fraction of such pixels."""
 
 
 def no_complaint(outcome: DrawnScene) -> str:
-    """Nothing is asked of the outcome beyond its errors."""
+    """No check of the result beyond its errors."""
     return ""
 
 
 @dataclass(frozen=True)
 class Extreme:
-    """One extreme."""
+    """A test case with extreme inputs."""
 
     name: str
     make: Callable[[], SplatScene]
@@ -55,7 +55,7 @@ class Extreme:
     """The gradients that have a bound; all must be finite."""
     options: Mapping[str, Any] = field(default_factory=dict)
     complaint: Callable[[DrawnScene], str] = no_complaint
-    """Says what is wrong with the outcome beyond its errors, or nothing."""
+    """Further check of the result; returns a fault, or an empty text."""
 
 
 def uneven(count: int, scale: float) -> Tensor:
@@ -82,7 +82,7 @@ def facing(count: int, size: int = 32, *, seed: int = 0, spread: float = 0.25, *
 
 
 def culled(*indices: int) -> Callable[[DrawnScene], str]:
-    """Ask that just these splats are out of view and get no gradient."""
+    """Check that exactly these splats are out of view and get no gradient."""
 
     def complaint(outcome: DrawnScene) -> str:
         found = (outcome.rendering.radii == 0).nonzero().flatten().tolist()
@@ -94,7 +94,7 @@ def culled(*indices: int) -> Callable[[DrawnScene], str]:
 
 
 def too_faint(*indices: int) -> Callable[[DrawnScene], str]:
-    """Ask that these splats get no gradient, although they are in view as all others are."""
+    """Check that these splats get no gradient, although all splats are in view."""
 
     def complaint(outcome: DrawnScene) -> str:
         hidden = (outcome.rendering.radii == 0).nonzero().flatten().tolist()
@@ -424,7 +424,7 @@ def special_cases(backend: str) -> dict[str, str]:
 
 
 def poisoned(bad: float) -> SplatScene:
-    """Thirty splats, the first five with a value in one of their inputs each."""
+    """Thirty splats; in each of the first five, one input has the given value."""
     scene = facing(30, seed=9)
     for index, name in enumerate(("means", "quats", "scales", "opacities", "colors")):
         value = getattr(scene, name).clone()

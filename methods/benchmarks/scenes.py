@@ -1,4 +1,4 @@
-"""Synthetic splats that load the renderer as a trained head avatar does."""
+"""Synthetic splats with the rendering load of a trained head avatar."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def cloud(
     quats = torch.randn(count, 4, generator=rng)
     opacities = torch.sigmoid(opacity + 2 * torch.randn(count, generator=rng))
     colors = torch.randn(count, channels, generator=rng)
-    # A camera a little turned and moved; its rotation is exact to float64, whatever the dtype asked for.
+    # A slightly rotated and moved camera; its rotation is exact to float64 for any requested dtype.
     skew = 0.2 * torch.randn(3, 3, generator=rng, dtype=torch.float64)
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3] = torch.linalg.matrix_exp(skew - skew.T)

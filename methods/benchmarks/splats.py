@@ -1,4 +1,4 @@
-"""``headbench doctor bench splats``: what the renderer's two passes take, and what settings that give up accuracy buy."""
+"""``headbench doctor bench splats``: time of the renderer's two passes, and speedup by settings that reduce accuracy."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ TRADEOFF_SIZE, QUICK_TRADEOFF_SIZE = (60_000, 550, 802), (5_000, 128, 184)
 
 
 def tradeoffs(quick: bool, progress: Progress) -> CommandResult:
-    """Errors and times of settings that draw less, on a head's load, against the exact one."""
+    """Errors and times of settings that draw less, relative to exact rendering of a head."""
     scene = head_shell(*(QUICK_TRADEOFF_SIZE if quick else TRADEOFF_SIZE))
     backend = available_backends()[0]
     with torch_threads(1):
@@ -148,7 +148,7 @@ def tradeoffs(quick: bool, progress: Progress) -> CommandResult:
 def settings(
     scene: SplatScene, weight: Tensor
 ) -> Iterator[tuple[tuple[str, str], SplatScene, dict[str, Any]]]:
-    """Knob and setting, the splats to draw and options of `rasterize`: the exact ones first."""
+    """Name and value of each setting, splats to draw, and options of `rasterize`; the exact ones first."""
     yield EXACT, scene, {}
     for alpha in (2, 4, 8):
         yield ("least alpha", f"{alpha}/255"), scene, {"alpha_min": alpha / 255}

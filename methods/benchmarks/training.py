@@ -1,7 +1,7 @@
 """``headbench doctor bench training``: an iteration of each method that trains splats, against the rasteriser's two passes.
 
-Splats lie at random on the procedural head, as training leaves them, and the images are drawn from an untrained avatar: what an
-iteration costs does not depend on what it learns.
+Splats lie at random on the procedural head, as training leaves them, and the images are rendered from an untrained avatar,
+since the cost of an iteration does not depend on the content.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ SHOWN = 12
 
 
 def speed(quick: bool, progress: Progress) -> CommandResult:
-    """Time an iteration of each method at the demo's size and preset, and where in it the time goes."""
+    """Time an iteration of each method at the demo's size and preset, by operation."""
     count, rounds = (QUICK_SPLATS, QUICK_ROUNDS) if quick else (SPLATS, ROUNDS)
     clip = with_images(*untrained(count, *SIZE))
     iterations: list[Row] = []
@@ -71,7 +71,7 @@ def speed(quick: bool, progress: Progress) -> CommandResult:
 
 
 def measure(training: SplatTrainer, rounds: int) -> Row:
-    """Least processor ms of an iteration and of its rasteriser alone, in turns, and their ratio."""
+    """Minimum processor time, ms, of an iteration and of its rasteriser alone, measured alternately, and their ratio."""
     seconds = take_turns(
         {"iteration": lambda: iterate(training), "rasteriser": _rasteriser(training)},
         rounds,

@@ -21,7 +21,7 @@ from ..shared.schedule import numpy_generator, torch_generator
 from ..shared.subject_mesh import SubjectMesh
 
 DISTANCE = 1.0  # metres, from the camera to the middle of the head
-FILL = 0.8  # part of the image height that the head's mesh takes
+FILL = 0.8  # fraction of the image height covered by the head's mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ def with_images(clip: MemoryClip, avatar: OursAvatar) -> MemoryClip:
 
 
 def untrained_avatar(head: HeadAsset, count: int) -> OursAvatar:
-    """Splats spread over the triangles as training leaves them: flat, smaller the more there are."""
+    """Splats spread over the triangles like trained ones: flat, and smaller if there are more."""
     config = OursConfig()
     subject = Subject(
         "untrained",

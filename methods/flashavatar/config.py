@@ -28,7 +28,7 @@ class FlashAvatarConfig(SurfaceSettings, HarmonicsTraining):
     hyper_gaussians : int
         Number of latents that the network emits instead of the outputs, which are then conditional means of Gaussians
         that every splat has over outputs and latents (HyperGaussians, arXiv 2507.02803: 8 in the paper, 32 in the
-        program). They start at zero, whatever ``zero_output``, and have the rate ``network_lr``. 0 disables them.
+        program). They start at zero regardless of ``zero_output``, and have the rate ``network_lr``. 0 disables them.
     offset_m : float
         Maximum offset of a splat from its point on the surface along each axis of the head, metres.
     scale_variant : Literal['official', 'product']

@@ -39,7 +39,7 @@ from .spec import GA as SPEC
 from .storage import PLY_FILE, read_ga_splats, write_ga_splats
 
 DRIVING_FILE = "driving.npz"
-STORED_DEGREE = 3  # the PLY layout has degree 3, whatever degree was trained
+STORED_DEGREE = 3  # the PLY layout has degree 3, regardless of the trained degree
 POSES = ("rotation", "neck", "jaw", "eyes")
 
 

@@ -54,7 +54,7 @@ class Entries(NamedTuple):
 
     @classmethod
     def of(cls, counts: Tensor, expressions: Tensor, weights: Tensor) -> Entries:
-        """From the (N,) numbers of rows."""
+        """Construct from the (N,) row counts of the splats."""
         starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
         owners = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
         return cls(starts, owners, expressions, weights, torch.arange(len(owners), device=counts.device))
@@ -73,7 +73,7 @@ class Entries(NamedTuple):
 
 
 class _SumEntries(torch.autograd.Function):
-    """Sums of weighted rows of a table, run by run. The adjoint is one gather: torch's own scatters."""
+    """Segment sums of weighted table rows. The backward pass is a single gather, whereas torch's own is a scatter."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, shares: Tensor, entries: Entries) -> Tensor:
@@ -222,7 +222,7 @@ class Rig:
         self.turns = turns.flatten(0, 1)
 
     def arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
-        """Driving signal as tensors. Raises `InputError` for another head model's pose."""
+        """Driving signal as tensors. Raises `InputError` for a pose of another head model."""
         return self.mesh.arguments(poses)
 
     def coefficients(self, arguments: Mapping[str, Tensor]) -> Tensor:

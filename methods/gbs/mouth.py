@@ -23,7 +23,7 @@ MARGIN = 1.1
 
 
 class MouthCylinder(NamedTuple):
-    """An upright cylinder: (3,) centre, radius and half height, metres."""
+    """Upright cylinder: (3,) centre, radius and half height, metres."""
 
     center: Tensor
     radius: float

@@ -1,4 +1,4 @@
-"""The exact file of an avatar of GaussianBlendshapes: neutral splats and differences, checked whole when read."""
+"""The exact file of an avatar of GaussianBlendshapes: neutral splats and differences, fully validated on reading."""
 
 from __future__ import annotations
 

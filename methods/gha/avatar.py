@@ -45,7 +45,7 @@ class GHAAvatar:
     Parameters
     ----------
     driver : Driver
-        On the CPU for any device of the tensors, because its work is small.
+        Always on the CPU, regardless of the tensors' device, because its work is small.
     """
 
     def __init__(
@@ -86,8 +86,8 @@ class GHAAvatar:
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """Render one frame. Raises `InputError` where the pose is of another head model.
 
-        Super-resolution knows only the training background; its difference to the requested one is added where the
-        splats leave it visible.
+        Super-resolution only produces the training background; the difference to the requested one is added where it is visible
+        behind the splats.
         """
         trained = self._tensors["background"]
         with torch_on_one_thread(bool(instruction_sets())):
@@ -106,7 +106,7 @@ class GHAAvatar:
 
     @torch.no_grad()
     def depth(self, camera: Camera, pose: HeadPose) -> FloatArray:
-        """See `splat_depth`: super-resolution does not move what is shown."""
+        """See `splat_depth`; super-resolution does not move image content."""
         splats = self._posed(pose)
         world = splats.world._replace(quats=F.normalize(splats.world.quats, dim=1))
         return splat_depth(world, splats.opacities, camera, str(world.means.device))
@@ -223,7 +223,7 @@ def _shapes(head: GaussianHead, expression_size: int) -> dict[str, tuple[int | N
 def _checked(
     path: Path, tensors: dict[str, Tensor], head: GaussianHead, expression_size: int, device: str
 ) -> dict[str, Tensor]:
-    """The stored tensors as the avatar uses them. Raises `InputError` for the first that does not fit."""
+    """The stored tensors in the form that the avatar uses. Raises `InputError` for the first inconsistent one."""
     shapes = _shapes(head, expression_size)
     members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in shapes.items()}
     # Without bounds of the code, these are float32's largest numbers.

@@ -53,8 +53,8 @@ class GHAConfig:
         Whether super-resolution adds to the splatted colours instead of replacing them, as published.
         A short run then starts from the result of splatting, with the colours of the mesh phase.
     neutral_jaw : float
-        Opening of the jaw in the neutral head, radians about the first axis. Displacements depend on
-        position, so lips that touch could not part; published landmarks start at an arbitrary first
+        Opening of the jaw in the neutral head, radians about the first axis. Displacements depend on position, so lips that
+        touch could not separate; published landmarks start at an arbitrary first
         timestep.
     motion_steps : int
         Steps that fit the deformation by expression to the head model's own (`TrackedMotion`) before
@@ -67,8 +67,7 @@ class GHAConfig:
         training otherwise tint a face.
     zero_initialised : bool
         Whether expression and pose initially have no effect, with zero deformation and attribute
-        outputs, instead of small random ones: what a short capture does not show then keeps no
-        effect.
+        outputs, instead of small random ones: inputs that do not occur in a short capture then have no effect.
     angle_unit : float
         Radians of jaw and eye angles that correspond to 1 in the expression code. Expression
         coefficients are of the order of 1, and a short run hardly responds to much smaller angles.

@@ -109,7 +109,7 @@ class Driver:
         self.expression_scale = expression_scale
 
     def arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
-        """Driving signal as tensors with a batch axis. Raises `InputError` for another head model's pose."""
+        """Driving signal as tensors with a batch axis. Raises `InputError` for a pose of another head model."""
         return self.model.pose_arguments(poses)
 
     @torch.no_grad()

@@ -339,7 +339,7 @@ def normalised_convolution(values: Tensor, weight: Tensor) -> Tensor:
 
 
 Reader = Callable[[int, int], Tensor]
-"""(1, C, rows, W) rows of an image, from the first number to before the second."""
+"""Returns rows ``first`` to ``last`` - 1 of an image, (1, C, rows, W)."""
 
 
 def _convolved(read: Reader, height: int, weight: Tensor, rows: int) -> Tensor:

@@ -100,7 +100,7 @@ class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
 
 
 def _phase_progress(progress: Progress, before: int, after: int) -> Progress:
-    """Progress of one phase within that of the whole."""
+    """Progress of one phase as part of the total progress."""
 
     def report(done: int, total: int, note: str = "") -> None:
         progress(before + done, before + total + after, note)
@@ -121,7 +121,7 @@ def parted(budget: Budget, fraction: float) -> tuple[Budget, Budget]:
 
 
 def within(part: Budget, whole: Budget, spent: float) -> Budget:
-    """The budget of a phase, limited to the seconds of the whole that are not ``spent``; at least a millisecond."""
+    """The budget of a phase, limited to the remaining seconds of the total after ``spent``; at least a millisecond."""
     if part.seconds is None or whole.seconds is None:
         return part
     return replace(part, seconds=min(part.seconds, max(whole.seconds - spent, 1e-3)))

@@ -174,7 +174,7 @@ class Controllers:
 
     @property
     def of_gaussians(self) -> tuple[Mlp, ...]:
-        """All of them."""
+        """All networks."""
         return *self.of_mesh, self.expression_attribute, self.pose_attribute
 
     def colors(

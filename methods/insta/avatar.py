@@ -45,7 +45,7 @@ MIDDLE = 0.5  # fraction of a step: position of samples without random jitter
 
 
 class InstaAvatar:
-    """A trained head: a canonical field, the space with density, and the mesh that maps rays to it."""
+    """A trained head: a canonical radiance field, the region with density, and the mesh that maps rays to canonical space."""
 
     def __init__(
         self,

@@ -111,7 +111,7 @@ class RadianceField:
 
 
 class _BoundedExp(torch.autograd.Function):
-    """exp with a bounded argument; the gradient is not cut at the bound, so values can leave it."""
+    """exp with a clamped argument; the gradient does not vanish at the bound, so values can return."""
 
     @staticmethod
     def forward(ctx, values: Tensor) -> Tensor:  # type: ignore[no-untyped-def]

@@ -141,7 +141,7 @@ class InstaTraining:
         for name in self._names:
             self._optimiser.set_learning_rate(name, decay * config.learning_rate)
         wanted = self._rays * config.samples_per_iteration / max(self._seen, 1)
-        # By at most half at once, since an iteration may have few samples by chance.
+        # Changes are limited to half, since an iteration may have few samples by chance.
         self._rays = int(np.clip(wanted, max(self._rays / 2, RAYS_MIN), min(self._rays * 1.5, RAYS_MAX)))
         if iteration % config.occupancy_every == 0:
             self._refresh(iteration)

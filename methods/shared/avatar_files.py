@@ -62,7 +62,7 @@ def head_arrays(head: HeadAsset) -> HeadArrays:
 
 
 def save_shared_head(folder: Path, head: HeadAsset) -> None:
-    """Write the head model beside the avatar, so that the folder can be rendered by itself. It is a shared asset."""
+    """Write the head model beside the avatar, so that the folder is self-contained. It is a shared asset."""
     save_head(folder / HEAD_FILE, head_arrays(head))
 
 

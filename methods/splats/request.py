@@ -15,7 +15,7 @@ from torch import Tensor
 from .constants import ALPHA_MAX, ALPHA_MIN, CHANNELS_MAX, TRANSMITTANCE_MIN
 
 _SMALLEST = torch.finfo(torch.float32).tiny
-"""Least focal length, pixels."""
+"""Minimum focal length, pixels."""
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 

@@ -61,7 +61,7 @@ def tongue(settings: TongueSettings, progress: Progress) -> CommandResult:
     for clip in clips:
         earlier = decided.get(clip.subject)
         decided[clip.subject] = _look(clip, settings, earlier, out / f"tongue_{clip.subject}.png", progress)
-        # After every subject, so that a killed run keeps what it has found.
+        # After every subject, so that a killed run keeps its results.
         write_exclusions(path, decided)
         text.append(_summary(clip.subject, decided[clip.subject]))
         data[clip.subject] = _data(decided[clip.subject])
@@ -114,7 +114,7 @@ def _summary(subject: str, decided: Exclusions) -> str:
     )
     sequences: dict[str, list[int]] = {}
     for timestep in reasons:
-        frame = decided.frames.get(timestep)  # None where people left out what none of the cameras recorded
+        frame = decided.frames.get(timestep)  # None for timesteps excluded manually that no camera recorded
         sequences.setdefault(frame.sequence if frame else "in no camera", []).append(timestep)
     lines += [f"  {name}: {spans(timesteps, len(timesteps))}" for name, timesteps in sequences.items()]
     if near := _near(decided):

@@ -1,7 +1,7 @@
 """A map of lips and chin to which every frame is resampled.
 
-The map looks at the subject's neutral mesh from straight ahead. Each of its pixels is a point on the surface (a
-triangle and barycentric weights), so that a pixel is one point of the skin for any pose and camera.
+The map looks at the subject's neutral mesh from straight ahead. Each pixel is a point on the surface (a triangle and
+barycentric weights), the same point of the skin for any pose and camera.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def _in_regions(head: HeadAsset, names: Iterable[str]) -> np.ndarray:
 
 
 def _lip_line(lips: np.ndarray, lower: np.ndarray, camera: Camera) -> FloatArray:
-    """(W,) row of the line between the lips in each column; beyond the corners it goes on level."""
+    """(W,) row of the line between the lips in each column; beyond the corners it continues horizontally."""
     rows = np.arange(camera.height) + 0.5
     line = np.full(camera.width, np.nan)
     for column in range(camera.width):

@@ -34,7 +34,7 @@ from .transform import decode_vectors, encode_vectors, read_classes, store_class
 FLOOR = 5e-5
 """Splats smaller than this, metres, are placed as finely as one of this size."""
 DIFFERENCE_STEP = 0.5
-"""Step of differences, in the steps of what they change: in a pose several of them add up."""
+"""Step of differences relative to that of the attribute: in a pose, several differences add up."""
 
 
 def encode_blended(
@@ -172,7 +172,7 @@ def _rest(points: SurfacePoints, subject: Subject, head: HeadAsset) -> FloatArra
 def _units(
     precision: Precision, size: FloatArray, owners: IntArray, scales: FloatArray, columns: int
 ) -> FloatArray:
-    """(M, C) steps of what the differences change, per unit of their coefficient."""
+    """(M, C) steps of the attributes that the differences change, per unit of their coefficient."""
     widths = difference_widths(0)
     by_name = {
         "means": precision.positions * size[owners],

@@ -1,7 +1,7 @@
-"""One codec for the avatars of every native method: what each stores, and how visible it is in training views.
+"""Codec for avatars of all native methods: stored tensors of each, and their visibility in training views.
 
-All methods share the container, the entropy coder, the transform and the steps (`Precision`); they differ in the parts that they
-have.
+All methods share the container, the entropy coder, the transform and the steps (`Precision`); they differ only in their
+parts.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from .reduced import encode_reduced
 from .simplify import simplify
 
 CODEC_VERSION = 3
-"""Raised when the same avatar and steps give other files."""
+"""Codec version, increased when the same avatar and steps give different files."""
 DRIVING_FILE = "driving.npz"
 """Driving signal beside the avatars of some methods, which is not part of their size."""
 MAX_SETTINGS = 2**20
@@ -54,7 +54,8 @@ MAX_SETTINGS = 2**20
 def encode_avatar(avatar: Avatar, head: HeadAsset, precision: Precision, clip: Clip | None = None) -> Content:
     """Content of the coded file of an avatar of any method of `ENCODERS`.
 
-    With a clip, steps follow the visibility of each splat in its training views, and what no training pose shows is left out.
+    With a clip, steps follow the visibility of each splat in its training views, and parts invisible in all training poses
+    are left out.
     Raises `InputError` for an avatar of another method, and for one that was read from a coded file.
     """
     encoder = ENCODERS.get(type(avatar))
@@ -68,7 +69,7 @@ def encode_avatar(avatar: Avatar, head: HeadAsset, precision: Precision, clip: C
 
 
 def codec_name(precision: Precision) -> str:
-    """Name of the codec with its steps: "2, steps x1", and a digest of the single steps where they are not the defaults."""
+    """Name of the codec with its steps: "2, steps x1", and a digest of the individual steps if they are not the defaults."""
     name = f"{CODEC_VERSION}, steps x{precision.step:g}"
     own = replace(precision, step=1.0)
     return name if own == Precision() else f"{name} ({digest(asdict(own))[:8]})"
@@ -101,7 +102,7 @@ def _encode_ours(avatar: OursAvatar, head: HeadAsset, precision: Precision, clip
 def _encode_ga(avatar: GAAvatar, head: HeadAsset, precision: Precision, clip: Clip | None) -> Content:
     directions = None
     if clip is not None:
-        # The harmonics stay in the world, where the cameras are at rest.
+        # The harmonics are in world space, where the cameras are static.
         views = training_views(clip)
         middle = np.mean(avatar.splats(views[0][1]).means, axis=0)
         places = {camera.id: camera.center for camera, _ in views}

@@ -306,7 +306,7 @@ class Arrays:
         return dequantise(self.integers(name, *shape), step)
 
     def drop(self, name: str) -> None:
-        """Leave an array out, if it is there."""
+        """Remove an array if it exists."""
         self._left.pop(name, None)
 
     def rest(self) -> Mapping[str, FloatArray]:
@@ -337,7 +337,7 @@ def dequantise(folded: np.ndarray, step: FloatArray | float) -> FloatArray:
 
 
 def narrow(values: np.ndarray) -> np.ndarray:
-    """Non-negative integers in the smallest unsigned type of 1, 2 or 4 bytes."""
+    """Non-negative integers in the smallest sufficient unsigned type of 1, 2 or 4 bytes."""
     top = int(values.max(initial=0))
     return values.astype(np.uint8 if top < 2**8 else np.uint16 if top < 2**16 else np.uint32)
 

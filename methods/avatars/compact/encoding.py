@@ -189,7 +189,7 @@ def negligible_lines(tensors: Mapping[str, Tensor], step: float) -> np.ndarray:
 def _plane_shares(
     tensors: Mapping[str, Tensor], positions: Tensor, weights: FloatArray | None
 ) -> list[np.ndarray]:
-    """(S,) for each plane: the weights of the splats that read a sample, times their shares of it; 0 if none reads it."""
+    """(S,) for each plane: sum over splats of weight times interpolation weight of the sample; 0 if no splat reads it."""
     ones = {name: torch.ones(len(tensors[name]), 1, requires_grad=True) for name in PLANES}
     box = Bounds(*tensors["plane_box"].cpu())
     # Weights are above 0, since every sample that is read is stored.

@@ -1,4 +1,4 @@
-"""Lossless coder of tables of integers: adaptive frequencies, contexts chosen by the encoder, and range coding.
+"""Lossless coder of tables of integers: adaptive frequencies, contexts chosen by the encoder, and range ANS.
 
 A table has rows of equal length, one row for each attribute and one column for each splat (or sample). Rows are coded one
 after the other, and a row can be conditioned on rows before it:
@@ -8,7 +8,7 @@ after the other, and a row can be conditioned on rows before it:
 * Numbers have folded signs (0, -1, 1, -2, ... are 0, 1, 2, 3, ...). A row may be predicted, by the previous column or by an
   earlier row; then differences are coded.
 * A token's frequencies are those seen so far in its context, which is the class of the same column in up to two earlier rows.
-  Contexts with few values lean on the frequencies of the whole row.
+  Contexts with few values are blended with the frequencies of the whole row.
 * Tokens are coded by interleaved range asymmetric numeral systems (J. Duda, arXiv 1311.2540; interleaving after F. Giesen,
   arXiv 1402.3392), one for each lane, so that numpy works on all lanes at once.
 
@@ -69,7 +69,7 @@ def encode(rows: Sequence[IntArray]) -> tuple[bytes, FloatArray]:
     Returns
     -------
     bytes
-        The stream; `decode` needs the numbers of rows and columns besides.
+        The stream; `decode` also needs the numbers of rows and columns.
     FloatArray
         (R,) bits that each row takes.
     """
@@ -265,7 +265,7 @@ class _Classes:
             values = np.abs(values) if given % 2 else values
             ordered = np.sort(values)
             limits = ordered[np.arange(1, CLASSES) * len(ordered) // CLASSES] if len(ordered) else ordered
-            # Limits are first values of a class. A value that fills several classes has one for itself.
+            # Limits are first values of a class. A value that would fill several classes gets a separate class.
             limits = np.unique(np.concatenate([limits, limits + 1]))
             found = np.searchsorted(limits, values, side="right")
             names, found = np.unique(found, return_inverse=True)

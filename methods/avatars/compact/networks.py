@@ -29,7 +29,7 @@ from .transform import (
 FLOOR = 1e-4
 """Splats smaller than this, in canonical units, are placed as finely as one of this size."""
 FINER = 0.5
-"""Factor of the steps of weights: here the whole appearance passes through the networks, and they are few of the bytes."""
+"""Factor of the steps of weights: the whole appearance depends on the networks, which take only a small part of the file."""
 GEOMETRY = {"points": 3, "log_scales": 3, "quats": 4, "opacities": 1}
 """Columns of a table of splats with features, as `gha.avatar.write_avatar` stores it; features follow."""
 

@@ -1,4 +1,4 @@
-"""Content of the coded file of splats that a network moves, turns and scales: avatars of FlashAvatar."""
+"""Content of the coded file of splats that a network translates, rotates and scales: avatars of FlashAvatar."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .transform import read_classes, store_classes, visibility_classes
 FLOOR = 5e-5
 """Splats smaller than this, metres, are placed as finely as one of this size."""
 BARYCENTRIC_STEP = 1 / 64
-"""Finer than where splats have positions of their own, which make up for the rounding."""
+"""Finer than for splats with separate positions, which compensate the rounding."""
 
 
 def encode_offsets(
@@ -60,7 +60,7 @@ def encode_offsets(
         arrays |= encode_matrix(weight, tensors[weight], FINER * precision.networks)
         arrays[bias] = tensors[bias].astype(np.float32)
     for name in gaussian_shapes(trained.settings.hyper_gaussians):
-        # By columns, as the splats' numbers of one kind are of a size.
+        # By columns, since values of one kind have similar magnitudes.
         arrays |= encode_matrix(name, tensors[name][order].T, FINER * precision.networks)
     person = encode_subject(subject, precision)
     text = {**person.text, trained.KEY: trained.text()}

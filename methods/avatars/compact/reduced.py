@@ -54,8 +54,8 @@ def encode_reduced(
     weights : FloatArray | None
         (N,) `importance` of the splats; None: all are equally visible.
     moments : FloatArray | None
-        (K, K) second moments of the blendshapes' weights in training; None: the identity. Errors of blendshapes are
-        measured in the poses that these stand for.
+        (K, K) second moments of the blendshapes' weights in training; None: the identity. Errors of blendshapes are weighted
+        by these moments.
     """
     precision = precision.scaled
     order = np.argsort(stored.points.triangles, kind="stable")

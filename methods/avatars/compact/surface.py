@@ -18,7 +18,7 @@ BARYCENTRIC_STEP = 1 / 16
 def encode_points(
     points: SurfacePoints, precision: Precision, step: float = BARYCENTRIC_STEP
 ) -> dict[str, np.ndarray]:
-    """Arrays of points sorted by triangle. They are rounded: positions have to be stored relative to the points as read."""
+    """Arrays of points sorted by triangle. They are rounded, so positions must be stored relative to the decoded points."""
     inside = points.barycentric[:, 1:].T
     return {
         "triangles": narrow(np.diff(points.triangles, prepend=0)),
@@ -36,5 +36,5 @@ def decode_points(arrays: Arrays, head: HeadAsset, step: float = BARYCENTRIC_STE
 
 
 def points_as_read(encoded: dict[str, np.ndarray], head: HeadAsset) -> SurfacePoints:
-    """The points that a reader of these arrays will have."""
+    """The points as decoded from these arrays."""
     return decode_points(Arrays(Path(), Content(encoded)), head)

@@ -15,7 +15,7 @@ from ....bench.errors import InputError
 from .container import Arrays, dequantise, fold, narrow
 
 RATE_WEIGHT = 2 * np.log(2) / 12
-"""Squared error, in squared steps, that a bit is worth: the slope of a fine uniform quantiser, 2 ln 2 / 12."""
+"""Lagrangian weight of a bit, in squared steps: the slope of a fine uniform quantiser, 2 ln 2 / 12."""
 BASIS_BITS = 16
 MOST_NUMBERS = 2**25
 """Maximum of all numbers of decoded vectors, which may take no bytes: 83,000 splats with 20 blendshapes of 10 numbers are half."""
@@ -51,7 +51,7 @@ def scale_of(classes: IntArray, coarsest: int = COARSEST) -> FloatArray:
 
 
 def levels(values: FloatArray, rounds: int = 3) -> IntArray:
-    """Choose whole numbers for values in steps, trading squared error for bits of an entropy code (`RATE_WEIGHT`).
+    """Rate-distortion optimised quantisation of values in units of steps (`RATE_WEIGHT`).
 
     For each value the nearest level, the next one towards 0, and 0 are compared, with the bits that the levels of all values
     take; these are estimated from the choice before, ``rounds`` times.

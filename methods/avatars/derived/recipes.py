@@ -25,8 +25,8 @@ STORAGE_SUMMARIES: Mapping[Storage, str] = {
     "half": "16-bit floats",
     "8bit": "8 bits between each column's extremes",
 }
-# Both avatars of a capture at 144x208 (20,000 splats, 2,000 iterations) lost 0.3 and 0.8 dB, and twice their LPIPS, by
-# the earlier ones, for no measurable processor time; hence no other variant has them.
+# Both avatars of a capture at 144x208 (20,000 splats, 2,000 iterations) lost 0.3 and 0.8 dB, and twice their LPIPS, with
+# the earlier cutoffs, without measurably less processor time; hence no other variant has them.
 EARLY = Cutoffs(2 / 255, 1e-3)
 EARLIER = Cutoffs(4 / 255, 1e-2)
 
@@ -119,7 +119,7 @@ def most_contributing(weights: Tensor, fraction: float) -> Tensor:
 
 
 def kept_rows(weights: Callable[[], Tensor], fraction: float, count: int) -> Tensor:
-    """The same for ``count`` splats, whose weights are computed only if some are left out."""
+    """Like `most_contributing`, for ``count`` splats; weights are computed only if some splats are left out."""
     return torch.arange(count) if fraction >= 1 else most_contributing(weights(), fraction)
 
 

@@ -1,4 +1,4 @@
-"""What moves the avatar of a page: its sliders, and the recorded sequences as values of them."""
+"""Controls of an avatar in a page: sliders, and recorded sequences as slider values."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from .model import JOINTS, Slider
 JAW, JAW_SIDE, NECK, EYES = 0.4, 0.12, 0.4, 0.4
 """Radians."""
 MOST_HIDDEN = 6
-"""Directions of expression that recorded sequences need besides the sliders; each takes bytes."""
+"""Maximum number of additional expression directions for recorded sequences, which increase the page's size."""
 STILL_M = 2e-4
-"""Motion of a vertex, root mean square, that needs no further direction."""
+"""Root mean square error of vertices below which no further direction is added."""
 SEQUENCES = {"train": "", "novel_view": "", "self_reenactment": "held out"}
-"""Splits with frames to replay, and what a page says of their sequences."""
+"""Splits with frames to replay, and their description in a page."""
 MOST_TIMESTEPS = 500
-"""Of a sequence; longer ones are cut, since they are to look at and take bytes."""
+"""Maximum length of a sequence; longer ones are cut to limit the page's size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,14 +111,14 @@ def _fitted(root: FloatArray, directions: FloatArray, wanted: FloatArray) -> Flo
 
 
 def _hidden(head: HeadArrays, chosen: Sequence[Slider], poses: Sequence[HeadPose]) -> list[Slider]:
-    """Principal directions of what the chosen sliders leave of the expressions of poses."""
+    """Principal directions of the residual of the poses' expressions after the fit by the chosen sliders."""
     if not poses:
         return []
     root, wanted = _root(head), np.array([pose.expression for pose in poses], np.float64)
     directions = np.array([slider.direction for slider in chosen]).reshape(-1, wanted.shape[1])
     left = wanted - _fitted(root, directions, wanted) @ directions
     _, sizes, axes = np.linalg.svd(left @ root.T, full_matrices=False)
-    rms = np.sqrt(np.cumsum(sizes[::-1] ** 2)[::-1] / len(poses))  # what is left before each direction
+    rms = np.sqrt(np.cumsum(sizes[::-1] ** 2)[::-1] / len(poses))  # residual before each direction
     found = []
     for axis in axes[: min(MOST_HIDDEN, int((rms > STILL_M).sum()))]:
         direction = np.linalg.lstsq(root, axis, rcond=1e-6)[0]

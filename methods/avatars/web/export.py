@@ -133,7 +133,7 @@ def pictures(source: Source, sliders: Sequence[Slider], view: Mapping[str, Any])
 
 
 def fill_page(content: bytes, title: str) -> str:
-    """The page with the bytes of an avatar, script and style in it; it may load nothing else."""
+    """The self-contained page with an avatar's data, script and style; it loads nothing else."""
     from jinja2 import Environment, FileSystemLoader
 
     here = Path(__file__).parent
@@ -166,7 +166,7 @@ def measure_losses(
             values = np.zeros(len(page.sliders))
             values[number] = value
             trials.append((group, values))
-    # Several at once, since avatars need not be additive as morphs are.
+    # Several at once, since avatars are not necessarily additive, unlike morphs.
     names = [slider.name for slider in page.sliders if slider.name and not slider.joints][:2] + ["jaw open"]
     trials.append(("together", np.array([slider.high * (slider.name in names) for slider in page.sliders])))
     losses: dict[str, float] = {}

@@ -239,9 +239,9 @@ def run_config(settings: ParitySettings, out: Path) -> RunConfig:
 def as_theirs(native: str, iterations: int, samples: int) -> dict[str, Any]:
     """Settings that make a native run of any length equivalent to the run of the authors' program.
 
-    ``samples`` is the initial number of splats of gbs, and that of flashavatar and rgbavatar. The authors' program raises the harmonics' degree
-    every 1,000 iterations regardless of the length (flashavatar: 500), removes large splats from the first regular reset of opacities,
-    has lines in the whole head (method "ours"), and here uses all images equally often.
+    ``samples`` is the initial number of splats of gbs, and that of flashavatar and rgbavatar. The authors' program raises
+    the harmonics' degree every 1,000 iterations regardless of the length (flashavatar: 500), removes large splats from the
+    first regular reset of opacities, has lines in the whole head (method "ours"), and here uses all images equally often.
     """
     if native == "rgbavatar":
         variants = {"frame_variant": "official", "color_init_variant": "official"}

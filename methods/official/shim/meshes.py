@@ -101,7 +101,7 @@ def rasterize_meshes(
     """The first triangle in the centre of each pixel of a square image, in PyTorch3D's conventions.
 
     Normalised device coordinates run from 1 to -1 to the right and downwards. A triangle has the pixels whose centres are strictly
-    inside it, whatever its orientation; of several that with the smallest z, then that with the smallest index. Triangles behind
+    inside it, in either orientation; of several that with the smallest z, then that with the smallest index. Triangles behind
     z = 0 and triangles without area have none. Barycentric coordinates are exact; those of PyTorch3D divide by an area that
     is larger by `SMALLEST_AREA`.
 

@@ -70,8 +70,8 @@ class GaussianRasterizer(nn.Module):
         Returns
         -------
         tuple[Tensor, ...]
-            Image (3, H, W); coverage (H, W) if requested; radii (N,), positive for every splat in
-            view, whatever its opacity.
+            Image (3, H, W); coverage (H, W) if requested; radii (N,), positive for every splat in view, regardless of its
+            opacity.
 
         Raises
         ------
