@@ -57,10 +57,17 @@ NO_FUNCTION = spec(function="toy_command:not_there")
 '''
 
 
+@pytest.fixture(scope="module")
+def toys(tmp_path_factory):
+    """Folder of the module of commands, whose source is read as long as it is imported."""
+    folder = tmp_path_factory.mktemp("toys")
+    (folder / "toy_command.py").write_text(TOY)
+    return folder
+
+
 @pytest.fixture
-def offer(monkeypatch, tmp_path):
-    (tmp_path / "toy_command.py").write_text(TOY)
-    monkeypatch.syspath_prepend(tmp_path)
+def offer(monkeypatch, toys):
+    monkeypatch.syspath_prepend(toys)
 
     def offer(*names, spec="toy_command:LOOK"):
         own = [EntryPoint("list", "headbench.bench.builtin:LIST", "headbench.commands")]

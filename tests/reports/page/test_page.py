@@ -373,5 +373,5 @@ def test_a_missing_metric_makes_no_difference_testable(page, write_run):
     rows.loc[rows["metric"] == "lpips", ["status", "reason"]] = ["missing", "no weights"]
     rows.to_parquet(run / "rows.parquet", index=False)
     text = " ".join(page([run]).texts.values())
-    assert "So few subjects cannot show" in text
-    assert "may be said of the subjects of captures like these" not in text
+    assert "These subjects are too few to show" in text
+    assert "applies to subjects of captures like these" not in text
