@@ -33,7 +33,7 @@ TASK_TITLES: Mapping[str, str] = {
 
 TaskWithoutTruth = Literal["cross_reenactment", "extremes"]
 """Tasks without recorded ground truth, which measure the stability of an avatar and the preservation of its appearance. For
-extremes of synthetic captures, the truth is rendered."""
+extremes of synthetic captures, the ground truth is rendered."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Protocol:
     resolution : str
         Image sizes of the truth at which metrics are computed, WIDTHxHEIGHT.
     background : tuple[float, float, float]
-        Colour on which renders and truth are composited.
+        Colour on which renders and ground truth are composited.
     quantisation : str
         Conversion of float renders to 8-bit frames.
     metric_profile : str

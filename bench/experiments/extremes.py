@@ -217,8 +217,8 @@ def drive(
 ) -> tuple[Rows, dict[str, Any], list[Path]]:
     """Render and evaluate every frame of the plan; the registered change "extremes".
 
-    The details are the record of the avatar: views, frames, truth and results. The files are the frames of the contact
-    sheet and their truth.
+    The details are the record of the avatar: views, frames, ground truth and results. The files are the frames of the contact
+    sheet and their ground truth.
     """
     plan = ExtremesPlan.of(job.form.clip, **parameters)
     files: list[Path] = []
@@ -240,7 +240,7 @@ def _shown(job: Job, plan: ExtremesPlan) -> ShownFrames:
 
 
 def _truth(job: Job) -> tuple[TruthPictures | None, str]:
-    """The truth of a cell's subject, or None and the reason."""
+    """The ground truth of a cell's subject, or None and the reason."""
     try:
         return TruthPictures.of(job), ""
     except UnavailableError as error:

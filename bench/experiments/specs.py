@@ -106,7 +106,7 @@ AGAINST_TRUTH = (
     MetricSpec("response", "Response", "ratio", True, 2, "", kind="avatar"),
     MetricSpec("flicker", "Flicker", "levels", False, 3, "", kind="avatar"),
 )
-"""Metrics of `truth.TruthJudge` and `surface.surface`, with limits derived from the truth."""
+"""Metrics of `truth.TruthJudge` and `surface.surface`, with limits derived from the ground truth."""
 
 EXTREMES = ConditionSpec(
     name="extremes",

@@ -26,7 +26,7 @@ def surface(depth: FloatArray | None, truth: TrueFrame, camera: Camera) -> list[
     depth : FloatArray | None
         (H, W) metres along the camera's axis, NaN where nothing is shown; None for an avatar that gives none.
     truth : TrueFrame
-        Truth with depth.
+        Ground truth with depth.
     camera : Camera
         Camera of the (H, W) images.
     """

@@ -1,6 +1,6 @@
 """Comparison of an avatar in new poses and views with the ground truth of a synthetic capture.
 
-Limits are not fixed numbers of decibels, which would fit only one capture. They are derived from each frame's truth: the
+Limits are not fixed numbers of decibels, which would fit only one capture. They are derived from each frame's ground truth: the
 score of a blurred copy, and its difference from the subject's typical pose or from the previous frame.
 """
 
@@ -30,27 +30,27 @@ from .surface import FACE, NO_FACE, absent_surface
 FOLDER = "truth"
 POSE_FIELDS = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids")
 LEAST_CHANGE = 2.0
-"""Minimum change of the truth, root mean square in 8-bit levels, for evaluating the change of an avatar."""
+"""Minimum change of the ground truth, root mean square in 8-bit levels, for evaluating the change of an avatar."""
 NOT_FINITE = "the frame is not finite"
 
 
 @dataclass(frozen=True)
 class TruthLimits:
-    """Limits on the difference of a frame from the truth.
+    """Limits on the difference of a frame from the ground truth.
 
     Attributes
     ----------
     blur, blur_beyond : float
-        PSNR and LPIPS must be at least as good as for the truth after a Gaussian blur relative to the image's height; the
-        second is for views beyond the training cameras, where no training frame shows the hair.
+        PSNR and LPIPS must be at least as good as for the ground truth after a Gaussian blur relative to the image's height;
+        the second is for views beyond the training cameras, where no training frame shows the hair.
     iou : float
         Minimum overlap of alpha and the true mask.
     colour : float
         Maximum CIEDE2000 difference of the face's mean colours.
     response : float
-        Minimum fraction of the truth's change from the typical pose that the avatar shows.
+        Minimum fraction of the ground truth's change from the typical pose that the avatar shows.
     flicker : float
-        Maximum flicker relative to the truth's change, which is the flicker of a static avatar.
+        Maximum flicker relative to the ground truth's change, which is the flicker of a static avatar.
     """
 
     blur: float = 0.015
@@ -76,7 +76,7 @@ class TruthPictures:
 
     @classmethod
     def of(cls, job: Job) -> TruthPictures:
-        """The truth of a cell's subject in the head model of its method. Raises `UnavailableError` if there is none."""
+        """The ground truth of a cell's subject in the head model of its method. Raises `UnavailableError` if there is none."""
         clip = job.form.clip
         place = f"truth of {clip.fingerprint}"
         if place not in job.kept:
@@ -94,7 +94,7 @@ class TruthPictures:
         return sum(not (picture.exists() and mask.exists()) for picture, mask in files)
 
     def at(self, camera: Camera, pose: HeadPose) -> tuple[TrueFrame, tuple[Path, Path]]:
-        """The truth of a frame, rendered if it is not in the folder, and its files: image, mask and face."""
+        """The ground truth of a frame, rendered if it is not in the folder, and its files: image, mask and face."""
         view = self.view(camera)
         files = picture, masks = self._files(view, pose)
         try:
@@ -141,7 +141,7 @@ class TruthPair(NamedTuple):
 
 
 class TruthJudge:
-    """Compares frames with the truth and its limits. Unavailable metrics are missing, with the reason."""
+    """Compares frames with the ground truth and its limits. Unavailable metrics are missing, with the reason."""
 
     def __init__(self, device: str = "cpu") -> None:
         self._psnr, self._lpips, self._flicker = (
@@ -167,10 +167,11 @@ class TruthJudge:
         return [*checks, self._overlap(frame), self._colour(frame)]
 
     def response(self, frame: TruthPair | None, reference: TruthPair | None) -> LimitCheck:
-        """Fraction of the truth's change between two poses in one view that the avatar shows.
+        """Fraction of the ground truth's change between two poses in one view that the avatar shows.
 
-        The slope of the least-squares line through 0 of the avatar's differences over the truth's, over the pixels of the face
-        in either frame: 0 for a static avatar, 1 for one that moves as the truth, regardless of errors common to both frames.
+        The slope of the least-squares line through 0 of the avatar's differences over those of the ground truth, over the
+        pixels of the face in either frame: 0 for a static avatar, 1 for one that moves as the ground truth, regardless of
+        errors common to both frames.
         """
         if frame is None or reference is None:
             return _absent("response", FULL, NOT_FINITE)
@@ -237,7 +238,7 @@ def _absent(name: str, region: str, reason: str) -> LimitCheck:
 
 
 def without_truth(reason: str) -> tuple[list[LimitCheck], LimitCheck, LimitCheck]:
-    """Missing appearance, response and flicker of a frame without truth."""
+    """Missing appearance, response and flicker of a frame without ground truth."""
     appearance = [_absent(name, region, reason) for name, region in APPEARANCE]
     appearance += absent_surface(reason)
     return appearance, _absent("response", FULL, reason), _absent("flicker", FULL, reason)

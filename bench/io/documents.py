@@ -36,7 +36,7 @@ text."""
 MAX_RECORD_BYTES = 8 * 2**20
 """Maximum size of a run's records, which may be untrusted; the record of the largest known run has 78 KB."""
 MAX_YAML_BYTES = 4 * 2**20
-"""YAML files are written by hand, or list excluded frames; the parser is slower than JSON's."""
+"""YAML files are written by users, or list excluded frames; the parser is slower than JSON's."""
 MAX_DEPTH = 64
 
 _TAG = "tag:yaml.org,2002:"

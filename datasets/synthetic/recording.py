@@ -31,7 +31,7 @@ _SOFT = _BETWEEN = (
     0.002  # metres of a matte's soft edge, and over which an outline of hair turns into one of skin
 )
 ROOM = 0.5
-"""Colour (sRGB) of the room behind the head, visible where a matte is too wide."""
+"""Colour (sRGB) of the room behind the head, visible where a mask is too wide."""
 
 
 @dataclass(frozen=True, eq=False)

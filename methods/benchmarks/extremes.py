@@ -1,6 +1,6 @@
 """``headbench doctor stress splats``: the renderer at numerical extremes, forward and backward, each with a verdict.
 
-Cases are small: their truth is the float64 reference. Bounds hold for float32 arithmetic with any instruction set:
+Cases are small: their true values are from the float64 reference. Bounds hold for float32 arithmetic with any instruction set:
 the mean absolute error of the image (colours of order 1), and the relative L2 error of the worst gradient.
 """
 

@@ -45,7 +45,7 @@ def write_extremes_sheet(
 ) -> None:
     """Draw the sheet of avatars that ``headbench run extremes`` rendered into a folder: a column per view, then the path.
 
-    The truth, if available, is above each render. Views beyond the training cameras have an orange border, frames that
+    The ground truth, if available, is above each render. Views beyond the training cameras have an orange border, frames that
     violate a limit a red one. The typical pose comes first, sampled poses below it.
     """
     write_sheet(
@@ -110,7 +110,7 @@ def _extremes_sections(folder: Path, avatar: Mapping[str, Any], width: int) -> l
         (path if sequence == "path" else columns[camera]).append(frame)
 
     def rows(frames: Sequence[Mapping[str, Any] | None], label: str) -> list[TileRow]:
-        """The truth of some frames, if available, with their renders below; None leaves a gap."""
+        """The ground truth of some frames, if available, with their renders below; None leaves a gap."""
         made = []
         for name, shown in (("truth", "truth"), ("render", "driven")):
             if all(frame is None or shown in frame for frame in frames):

@@ -108,11 +108,7 @@ def test_a_list_without_values_is_refused(offer, capsys, words):
 
 @pytest.mark.parametrize(
     ("words", "named"),
-    [
-        ("look", "What to look at"),
-        ("look here --limti 1", "--limti"),
-        ("look here --limit much", "--limit"),
-    ],
+    [("look", "What to look at"), ("look here --limti 1", "--limti"), ("look here --limit much", "--limit")],
 )
 def test_words_that_do_not_parse_end_in_one_line(offer, capsys, words, named):
     offer("look")
