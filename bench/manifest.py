@@ -145,8 +145,8 @@ class Manifest:
     Attributes
     ----------
     paths : dict[str, str] | None
-        Files and folders of the configuration by dotted key, relative to the run folder; None in a
-        bundle, which contains no paths of the machine that wrote it.
+        Files and folders of the configuration by dotted key, relative to the run folder; None in
+        stored results, which contain no paths of the machine that wrote them.
     metrics, methods, protocols : tuple[MetricSpec, ...], tuple[MethodRecord, ...], dict[str, ProtocolRecord]
         In the order of the configuration; protocols by task, in files of their own.
     machine : dict[str, Any]

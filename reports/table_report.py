@@ -22,7 +22,7 @@ from .papers import printed_tables
 from .printed import as_printed
 from .protocols import chosen
 from .runs import WHOLE, FrameSelection, RunSet
-from .tables import AVATAR_TITLE, TITLES, RowGroup, Table, build_table
+from .tables import AVATAR_TITLE, TITLES, Table, build_table
 from .writers import WRITERS, to_text
 
 
@@ -191,10 +191,8 @@ def table_of(
     runs: RunSet,
     layout: str = COMPARISON,
     columns: Columns = ALL_COLUMNS,
-    apart: Sequence[RowGroup] = (),
-    claimed: Collection[tuple[str, str]] = (),
 ) -> Table:
-    """Build a table of loaded runs; for ``apart`` and ``claimed`` see `build_table`.
+    """Build a table of loaded runs.
 
     Avatar metrics of other layouts are shown if ``columns`` names them.
     """
@@ -228,6 +226,4 @@ def table_of(
         averaged=runs.averaged,
         avatar_title=TITLES.get(layout, AVATAR_TITLE),
         name=layout,
-        apart=apart,
-        claimed=claimed,
     )

@@ -65,8 +65,6 @@ class StepState(TypedDict, total=False):
     landlock : int
         Version of Landlock that restricted the process of an isolated method, 0 if the kernel has none; absent for
         methods that were not isolated.
-    earlier : list[dict[str, Any]]
-        Values before a repeated measurement, each with its time, machine and load.
     derived_from : str
         Digest of the trained avatar from which this one was derived without training.
     codec : str
@@ -91,7 +89,6 @@ class StepState(TypedDict, total=False):
     method: dict[str, Any]
     finished_at: float
     load: dict[str, Any]
-    earlier: list[dict[str, Any]]
     derived_from: str
     codec: str
 

@@ -597,3 +597,14 @@ def test_a_run_folder_names_no_module_for_a_later_call(config, refuses, monkeypa
     runner.run(replace(config, methods=("toy_plugin:METHOD", "toy_plugin:MIRROR")))
     refuses(config, "methods: expected registered names, found 'toy_plugin:MIRROR'")
     refuses(replace(config, metrics=("psnr",), methods=("toy_plugin:METHOD", "toy_plugin:MIRROR")), "metrics")
+
+
+def test_planned_cells_have_their_state_and_nothing_is_trained(config, toy):
+    runner.run(config)
+    longer = replace(config, out=f"{config.out}-long", settings={"toy": {"budget": {"iterations": 200}}})
+    before = toy.FITS.copy()
+    for settings, state in ((config, "done"), (longer, "to train")):
+        names = [f"{subject} toy seed 0" for subject in ("subject1", "subject2")]
+        assert runner.planned_cells(settings) == dict.fromkeys(names, state)
+    assert toy.FITS == before
+    assert not Path(longer.out).exists()
