@@ -295,18 +295,6 @@ class Rows:
         }
         return Rows(table.assign(**columns))
 
-    def with_suspects(self, limits: Mapping[str, float], region: str) -> Rows:
-        """Return the rows; of values of whole images (``region``), exactly those above their metric's limit are suspect."""
-        table = self._table
-        above = table["value"] > table["metric"].map(dict(limits)).astype(float)
-        above &= (table["status"] == "ok") & (table["region"] == region) & (table["task"] != "")
-        marked = table["reason"].str.startswith(SUSPECT)
-        reasons = table["reason"].mask(marked, "").astype("str")
-        texts = (
-            SUSPECT + "above " + table["metric"].map({m: f"{v:g}" for m, v in limits.items()}).astype("str")
-        )
-        return Rows(table.assign(reason=reasons.mask(above, texts)))
-
     def in_single_precision(self) -> Rows:
         """Return the rows with values rounded to float32 (7 digits, more than tables show), which halves the file."""
         return Rows(self._table.assign(value=self._table["value"].astype(np.float32).astype(np.float64)))
@@ -343,29 +331,6 @@ class Rows:
         parts = [table[~whole].assign(task=names.astype("str"))]
         parts += [table[whole].assign(task=name) for name in (inside, outside)]
         return Rows(pd.concat(parts, ignore_index=True))
-
-    def updated(self, new: Rows) -> Rows:
-        """Return the rows in their order, replaced by rows of ``new`` with the same method, seed, frame, region
-        and metric.
-
-        Raises `InputError` for new rows that replace nothing.
-        """
-        identity = ["method", "condition", "seed", "task", *FRAME, "region", "metric"]
-        own, others = (pd.MultiIndex.from_frame(table[identity]) for table in (self._table, new._table))
-        places = own.get_indexer(others)
-        if (places < 0).any():
-            where = " ".join(map(str, others[int(np.argmin(places))]))
-            raise InputError("rows", where, "a row to replace", "none")
-        chosen = np.arange(len(own))
-        chosen[places] = len(own) + np.arange(len(others))
-        return Rows(pd.concat([self._table, new._table]).take(chosen).reset_index(drop=True))
-
-    def with_values(self, other: Rows) -> Rows:
-        """Return the rows with measured values replaced by those that ``other`` has as well."""
-        identity = ["method", "condition", "seed", "task", *FRAME, "region", "metric"]
-        theirs = other._table[other._table["status"] == "ok"].set_index(identity)["value"]
-        found = theirs.reindex(pd.MultiIndex.from_frame(self._table[identity])).to_numpy()
-        return Rows(self._table.assign(value=self._table["value"].where(np.isnan(found), found)))
 
     @property
     def regions(self) -> set[str]:

@@ -108,30 +108,6 @@ def test_single_precision_keeps_seven_digits(rows, tmp_path):
     assert sizes[2] - sizes[0] < 0.65 * (sizes[1] - sizes[0])
 
 
-def test_values_are_taken_from_other_rows_alone(rows):
-    table = rows.select(**NAMED)
-    other = table[[7 <= i < 9 for i in range(len(table))]][::-1].assign(value=-1.0, version="2")
-    missing = table[:1].assign(status="missing", value=float("nan"))
-    found = rows.with_values(Rows(pd.concat([other, missing]))).select(**NAMED)
-    expected = [-1.0 if 7 <= i < 9 else value for i, value in enumerate(table["value"])]
-    assert found["value"].tolist() == expected
-    assert found.drop(columns="value").equals(table.drop(columns="value"))
-
-
-def test_rows_are_updated_in_their_places(rows):
-    table = rows.select(**NAMED)
-    new = Rows(
-        table[[7 <= i < 9 for i in range(len(table))]][::-1].assign(value=-1.0, machine="m", threads=2)
-    )
-    found = rows.updated(new).select(**NAMED)
-    changed = found["value"] == -1.0
-    assert list(found.index[changed]) == [7, 8]
-    assert found[~changed].equals(table[~changed])
-    assert set(found["threads"][changed]) == {2}
-    with pytest.raises(InputError, match="another: expected a row to replace"):
-        rows.updated(Rows(table.assign(metric="another")))
-
-
 def written(path, frame, **how):
     frame.to_parquet(path, index=False, **how)
     return path
