@@ -73,8 +73,6 @@ def train_again(
 ) -> RunFolder:
     """Run the configuration of an unpacked bundle into ``out``, on regenerated captures; continue if it was interrupted.
 
-    Methods of other packages are isolated, see `RunConfig.isolation`.
-
     Raises
     ------
     InputError
@@ -94,7 +92,7 @@ def train_again(
             expected = "methods that run no program which the bundle names"
             remedy = "Give --trust to run it, if you trust who made the bundle."
             raise InputError(folder.manifest, "configuration.methods", expected, method.spec.name, remedy)
-    run(replace(config, isolation="plugins"), execution, clips=clips, reports=False)
+    run(config, execution, clips=clips, reports=False)
     return RunFolder(out / "run")
 
 

@@ -4,6 +4,7 @@ import importlib
 import json
 import math
 import re
+import shutil
 import sys
 import time
 import types
@@ -11,6 +12,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -26,7 +28,9 @@ from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked
 from headbench.bench.registry import Plugin
+from headbench.bench.rows import Rows
 from headbench.bench.specs import ReportSpec
+from headbench.reports.tables import METHODS_TITLE, SUSPECT_TITLE, build_table
 
 
 @pytest.fixture
@@ -353,13 +357,14 @@ def edit(toy, tmp_path, monkeypatch):
         "def error(image, truth):\n    return toy.mean_error(image, truth)\n"
         "ERROR = toy.replace(toy.ERROR, implementation='edited_metric:error')\n",
     }
-    folder = tmp_path / "plug-ins"
-    folder.mkdir()
-    monkeypatch.syspath_prepend(folder)
+    folders = {name: tmp_path / name.partition("_")[2].replace("level", "plugin") for name in texts}
+    for folder in {*folders.values()}:
+        folder.mkdir()
+        monkeypatch.syspath_prepend(folder)
 
     def edit(**changes):
         for name, text in texts.items():
-            (folder / f"{name}.py").write_text(text.replace(*changes.get(name, ("", ""))))
+            (folders[name] / f"{name}.py").write_text(text.replace(*changes.get(name, ("", ""))))
             sys.modules.pop(name, None)
         importlib.invalidate_caches()
 
@@ -382,11 +387,26 @@ def test_changed_code_of_a_plug_in_is_refused(config, edit, toy, refuses, monkey
         with pytest.raises(KeyboardInterrupt) if kill else nullcontext():
             runner.run(config)
     when = "in an earlier run" if kill else r"\d+ s ago"
-    edit(edited_level=("1", "2"))
-    refuses(config, f"method, code: .*edited_plugin:Method.*changed since its training {when}")
+    for file, change in (("edited_level", ("1", "2")), ("edited_plugin", ("pass", "..."))):
+        edit(**{file: change})
+        refuses(config, f"method, code: .*edited_plugin:Method.*changed since its training {when}")
     edit()
     runner.run(config)
     assert len(toy.FITS) == 2 * kill
+
+
+def test_an_edited_plug_in_trains_again_once_avatars_are_deleted(config, edit, toy, cell):
+    """As the tutorial of an own method says."""
+    config = replace(config, **EDITED)
+    runner.run(config)
+    before = cell.step("fit")
+    edit(edited_level=("1", "2"))
+    for folder in Path(config.out).glob("*/toy"):
+        shutil.rmtree(folder)
+    toy.FITS.clear()
+    runner.run(config)
+    assert toy.FITS == ["subject1", "subject2"]
+    assert cell.step("fit")["fingerprint"] != before["fingerprint"]
 
 
 def test_changed_code_of_a_metric_is_measured_again(config, edit, toy):
@@ -422,6 +442,25 @@ def test_a_failing_method_is_recorded_and_the_others_go_on(config):
     assert failed["reason"].str.contains("the training diverged").all()
     assert failed["value"].isna().all()
     assert (rows[rows["method"] == "toy"]["status"] == "ok").all()
+
+
+def test_frames_as_good_as_the_truth_are_suspect_and_not_ranked(config, toy, monkeypatch):
+    original = toy.MirrorAvatar.render
+
+    def truth(self, camera, pose, *others):
+        frame = original(self, camera, pose, *others)
+        return frame._replace(
+            rgb=np.full_like(frame.rgb, (40 + 10 * pose.timestep + (camera.id == "b")) / 255)
+        )
+
+    monkeypatch.setattr(toy.MirrorAvatar, "render", truth)
+    rows = rows_of(config, methods=("toy_plugin:METHOD", "toy_plugin:MIRROR"), metrics=("psnr",))
+    assert set(rows["reason"][rows["method"] == "mirror"]) == {"suspect: above 50 dB"}
+    assert set(rows["reason"][rows["method"] == "toy"]) == {""}
+    psnr = RunFolder(Path(config.out)).read_manifest().metrics
+    table = build_table(Rows(rows), psnr, ("mirror", "toy"), ("novel_view",), protocol_ids={})
+    groups = {title: [line.method for line in lines] for title, lines in table.groups}
+    assert groups == {METHODS_TITLE: ["toy"], SUSPECT_TITLE: ["mirror"]}
 
 
 def test_a_missing_metric_has_its_reason_and_is_warned_of_first(config, caplog):
@@ -591,9 +630,3 @@ def test_a_received_run_is_not_written_through_its_links(
     for target in outside.iterdir():
         assert target.read_text() == "victim" if target.is_file() else not list(target.iterdir())
     assert code == expected, error
-
-
-def test_a_run_folder_names_no_module_for_a_later_call(config, refuses, monkeypatch):
-    runner.run(replace(config, methods=("toy_plugin:METHOD", "toy_plugin:MIRROR")))
-    refuses(config, "methods: expected registered names, found 'toy_plugin:MIRROR'")
-    refuses(replace(config, metrics=("psnr",), methods=("toy_plugin:METHOD", "toy_plugin:MIRROR")), "metrics")
