@@ -1,5 +1,7 @@
 """A run on toy plug-ins, small enough to see through."""
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -7,6 +9,7 @@ import pytest
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.config import RunConfig
 from headbench.bench.engine.store import RunFolder
+from headbench.bench.rows import Rows
 
 
 @pytest.fixture
@@ -44,11 +47,35 @@ def config(toy, tmp_path, monkeypatch, subjects):
     )
 
 
+@pytest.fixture(scope="session")
+def runs_kept(tmp_path_factory):
+    """Folders of runs by their settings, each run once."""
+    return {}, tmp_path_factory.mktemp("runs")
+
+
 @pytest.fixture
-def run(config, toy):
+def finished(runs_kept, toy, tmp_path):
+    """Put a finished run of a configuration into its folder: a copy, of a run made once. Return its rows."""
+    kept, root = runs_kept
+
+    def finished(config):
+        captures = sorted(path.name for path in Path(config.data).iterdir())
+        key = repr((replace(config, data="", out=""), captures))
+        if key not in kept:
+            kept[key] = root / str(len(kept))
+            shutil.copytree(config.data, kept[key] / "data")
+            runner.run(replace(config, data=str(kept[key] / "data"), out=str(kept[key] / "run")))
+        shutil.copytree(kept[key] / "run", config.out)
+        toy.FITS.clear()
+        return Rows.read(RunFolder(Path(config.out)).rows)
+
+    return finished
+
+
+@pytest.fixture
+def run(config, finished):
     """The folder of a finished run."""
-    runner.run(config)
-    toy.FITS.clear()
+    finished(config)
     return Path(config.out)
 
 
