@@ -40,14 +40,6 @@ def own_cache(tmp_path_factory):
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def no_flush_to_disk():
-    """Tests survive no power cut, and waiting for the disk takes most of the time of small runs."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda file: None)
-        yield
-
-
 @pytest.fixture(autouse=True)
 def seeded():
     """Every test starts from the same random numbers, in whatever order the tests run."""

@@ -11,6 +11,8 @@ from headbench.bench.engine.config import RunConfig
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.rows import Rows
 
+from ..world import place
+
 
 @pytest.fixture
 def toy(monkeypatch):
@@ -47,25 +49,23 @@ def config(toy, tmp_path, monkeypatch, subjects):
     )
 
 
-@pytest.fixture(scope="session")
-def runs_kept(tmp_path_factory):
-    """Folders of runs by their settings, each run once."""
-    return {}, tmp_path_factory.mktemp("runs")
+FINISHED: dict[str, Path] = {}
+"""Runs that tests copy, by their settings."""
 
 
 @pytest.fixture
-def finished(runs_kept, toy, tmp_path):
+def finished(toy):
     """Put a finished run of a configuration into its folder: a copy, of a run made once. Return its rows."""
-    kept, root = runs_kept
 
     def finished(config):
         captures = sorted(path.name for path in Path(config.data).iterdir())
         key = repr((replace(config, data="", out=""), captures))
-        if key not in kept:
-            kept[key] = root / str(len(kept))
-            shutil.copytree(config.data, kept[key] / "data")
-            runner.run(replace(config, data=str(kept[key] / "data"), out=str(kept[key] / "run")))
-        shutil.copytree(kept[key] / "run", config.out)
+        if key not in FINISHED:
+            root = place(f"toy-{len(FINISHED)}")
+            shutil.copytree(config.data, root / "data")
+            runner.run(replace(config, data=str(root / "data"), out=str(root / "run")))
+            FINISHED[key] = root / "run"
+        shutil.copytree(FINISHED[key], config.out)
         toy.FITS.clear()
         return Rows.read(RunFolder(Path(config.out)).rows)
 
