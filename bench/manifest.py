@@ -19,7 +19,6 @@ from .io.documents import MAX_RECORD_BYTES, checked, read_json, shown
 from .io.files import check_name, digest, write_json, write_text
 from .protocol import Protocol
 from .specs import LABEL, MetricSpec, is_label
-from .upgrade import upgraded_manifest
 
 MAX_CELLS = 20_000
 """Maximum number of cells, since a small record can declare any number; the largest suite has some hundred."""
@@ -185,9 +184,8 @@ class Manifest:
         methods = record.get("methods")
         if isinstance(methods, list) and len(methods) > MAX_CELLS:  # before they are copied
             raise InputError(path, "methods", f"at most {MAX_CELLS} methods", str(len(methods)))
-        record = upgraded_manifest(record)
         if record.get("format") != 2:
-            raise InputError(path, "format", "1 or 2", shown(record.get("format")))
+            raise InputError(path, "format", "2", shown(record.get("format")))
         hashes = checked(record.get(PROTOCOLS), dict[str, str], path, PROTOCOLS)
         manifest = checked({**record, PROTOCOLS: {}}, cls, path)
         cells = len(manifest.methods) * len(manifest.clips) * len(manifest.configuration.seeds)

@@ -24,7 +24,6 @@ from .contracts import IntArray
 from .errors import InputError, is_damage, shortened
 from .io.files import atomic_path, open_regular, reading
 from .specs import LABEL, is_label
-from .upgrade import upgraded_rows
 
 log = logging.getLogger(__name__)
 FRAME = ["subject", "sequence", "timestep", "camera"]
@@ -145,7 +144,7 @@ class Rows:
             raise InputError(path, "", "the rows of a finished run", "no such file", "Start the run again.")
         with reading(path, ROWS):
             table = _read_table(path)
-        return cls(upgraded_rows(_checked(table, path)))
+        return cls(_checked(table, path))
 
     def write(self, path: Path) -> None:
         """Write the rows as Parquet, atomically."""

@@ -126,7 +126,6 @@ def pytest_sessionfinish(session):
 SLOW_FILES = (
     "test_end_to_end.py",
     "test_readme.py",
-    "test_forgeries.py",
     "test_flame_files.py",
     "test_benchmarks.py",
 )

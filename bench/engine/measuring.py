@@ -12,7 +12,6 @@ from ..contracts import Avatar, Camera, CodedAvatar, FrameKey, HeadPose, Measure
 from ..errors import HeadbenchError, UnavailableError
 from ..io.files import digest, digest_file
 from ..io.images import read_png
-from ..isolation.parent import IsolatedAvatar
 from ..machine import ProcessorLoad, machine_name
 from ..protocol import Protocol
 from ..registry import get
@@ -64,7 +63,6 @@ def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
                 found = outcome.details.items() if isinstance(outcome, Measurement) else ()
                 # JSON has only finite numbers; a metric with another value has its own row.
                 details[spec.name] = {k: v for k, v in found if not isinstance(v, float) or math.isfinite(v)}
-    job.check_unchanged()
     parts: list[Rows] = []
     for spec in metrics:
         if spec not in wanted:
@@ -96,7 +94,6 @@ def drive(job: Job, avatar: Avatar) -> Rows:
     change = job.condition.drive
     with job.progress(RENDERING) as report:
         rows, details, files = resolve_change(change, "drive")(job, avatar, report)
-    job.check_unchanged()
     rows.write(job.cell.rows)
     job.cell.finish(
         "measure",
@@ -260,10 +257,7 @@ def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement |
         if not spec.machine_bound:
             return metric(avatar, pairs)  # type: ignore[no-any-return]
         with ProcessorLoad(job.device, wait=True) as load:
-            if isinstance(avatar, IsolatedAvatar):
-                found = avatar.measured(metric, pairs)
-            else:
-                found = metric(avatar, pairs)
+            found = metric(avatar, pairs)
         return Measurement(found.value, {**found.details, **load.details})
     except UnavailableError as error:
         return error

@@ -48,7 +48,6 @@ def render(job: Job, avatar: Avatar) -> None:
                 cell.begin(DIGESTS, made_of, files=known)
                 recorded = time.monotonic()
             report(index + 1, len(missing), protocol.task)
-        job.check_unchanged()
         lacking = missing.keys() - known.keys()
         if lacking:
             first = missing[min(lacking)][1]

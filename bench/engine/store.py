@@ -62,9 +62,6 @@ class StepState(TypedDict, total=False):
     load : dict[str, Any]
         Machine, threads and cores of the training, and cores used by other processes; see
         `ProcessorLoad`.
-    landlock : int
-        Version of Landlock that restricted the process of an isolated method, 0 if the kernel has none; absent for
-        methods that were not isolated.
     derived_from : str
         Digest of the trained avatar from which this one was derived without training.
     codec : str
@@ -85,7 +82,6 @@ class StepState(TypedDict, total=False):
     peak_device_memory_bytes: int
     device_memory_before_bytes: int
     tf32: bool
-    landlock: int
     method: dict[str, Any]
     finished_at: float
     load: dict[str, Any]

@@ -20,7 +20,7 @@ from ..head.subject import resting
 from ..images import write_image
 from ..monocular.clip import check_subject, clip_of_track, subject_of
 from ..monocular.track import VIDEO, Track, VideoFrame
-from ..tracking.code import tracking_code
+from ..tracking.work import TRACKER_VERSION
 from .decode import TimedFrame, VideoInfo, probe_video, video_frames
 from .faces import FoundFaces, crop_around, find_faces
 from .masks import FrameView, MaskSource
@@ -82,7 +82,7 @@ def open_video(
     check_subject(subject, "--subject")
     info = probe_video(path)
     masks = MaskSource(options)
-    mark = digest(tracking_code(), digest_file(path), network_digest, options.rate, options.longest)
+    mark = digest(TRACKER_VERSION, digest_file(path), network_digest, options.rate, options.longest)
     faces = find_faces(path, _frames(path, options), network, out / FACES, mark, progress)
     shown = faces.numbers[faces.found].tolist()
     mark = digest(mark, options.size, masks.prepare(shown, info))

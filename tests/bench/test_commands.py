@@ -241,13 +241,6 @@ def test_a_word_calls_a_command_alone_and_before_a_second_word(offer, capsys):
         assert "`headbench make twice`" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("word", commands.MOVED)
-def test_a_word_of_earlier_versions_leads_to_the_new_line(capsys, word):
-    assert cli.main([*word.split(), "a b", "--out", "c"]) == 2
-    assert f"It is now `headbench {commands.MOVED[word]} 'a b' --out c`" in capsys.readouterr().err
-    assert commands.MOVED[word] in registry.discover("commands")
-
-
 @pytest.mark.parametrize(
     ("spec", "why", "listed"),
     [
