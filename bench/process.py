@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import IO
 
 from .errors import HeadbenchError, shortened
-from .io.files import flush_renames
 from .orphans import orphans_ended
 
 KEPT = (
@@ -107,7 +106,6 @@ def run_program(
     ProgramError
         The command cannot be started, or takes longer than ``hours``.
     """
-    flush_renames()
     until = math.inf if hours is None else time.monotonic() + 3600 * hours
     with log.open("ab") as stream, orphans_ended():
         stream.write(f"$ {' '.join(command)}\n".encode())

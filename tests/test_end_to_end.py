@@ -29,7 +29,7 @@ from headbench.metrics import speed
 from .datasets.flat_renderer import flat_pictures
 from .datasets.monocular.videos import Recording
 from .datasets.tracker_files.trackers import write_metrical
-from .fuzz.samples import SETTINGS
+from .small_run import SETTINGS
 
 SMALL = (f"--set=settings.{name}={json.dumps(SETTINGS[name])}" for name in ("gbs", "gha", "insta"))
 TINY = ("--preset", "smoke", "--set=frames_per_task=3", *SMALL)

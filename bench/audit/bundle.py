@@ -17,7 +17,7 @@ from ..engine.job import DIGESTS
 from ..engine.store import STAGES, RunFolder
 from ..errors import InputError
 from ..io.archives import open_archive
-from ..io.documents import MAX_JSON_BYTES, checked, parse_json
+from ..io.documents import checked, parse_json
 from ..io.files import atomic_path, check_writable, digest_file, write_json
 from ..io.provenance import RENDER, source_type
 from ..manifest import PROTOCOLS, Manifest, protocol_path
@@ -219,8 +219,8 @@ def _unpack(archive: zipfile.ZipFile, path: Path, into: Path) -> Bundle:
     sizes = {info.filename: info.file_size for info in archive.infolist()}
     if sum(sizes.values()) > MAX_BYTES:
         raise InputError(path, "", f"files of at most {MAX_BYTES} bytes", f"{sum(sizes.values())}")
-    if sizes.get(INDEX, MAX_JSON_BYTES + 1) > MAX_JSON_BYTES:
-        raise InputError(path, INDEX, f"a list of the files, at most {MAX_JSON_BYTES} bytes", "none")
+    if INDEX not in sizes:
+        raise InputError(path, INDEX, "a list of the files", "none")
     bundle = checked(parse_json(archive.read(INDEX), path, INDEX), Bundle, path)
     check_shown(bundle, f"{path}, {INDEX}")
     held = set(sizes) - {INDEX}

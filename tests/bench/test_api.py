@@ -8,8 +8,7 @@ import pytest
 
 import headbench as hb
 
-from ..fuzz.samples import SETTINGS
-from ..small_run import rows_of, small_run
+from ..small_run import SETTINGS, rows_of, small_run
 
 KEY = ["task", "timestep", "camera", "region", "metric"]
 

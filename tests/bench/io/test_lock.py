@@ -89,10 +89,14 @@ def test_lock_and_log_are_never_links(tmp_path, name):
     assert victim.read_text() == "victim"
 
 
-def test_what_dead_processes_left_is_removed_under_the_lock(tmp_path):
+def test_what_killed_processes_left_is_removed_except_where_another_works(tmp_path):
     (tmp_path / "below").mkdir()
     left = tmp_path / "below" / f"{TEMPORARY}x.png"
     left.touch()
+    with locked(left.parent):
+        left.touch()
+        with locked(tmp_path):
+            assert left.exists()
     with locked(tmp_path):
         assert not left.exists()
 
