@@ -21,9 +21,6 @@ from .protocol import Protocol
 from .specs import LABEL, MetricSpec, is_label
 from .upgrade import upgraded_manifest
 
-MAX_CELLS = 20_000
-"""Maximum number of cells, since a small record can declare any number; the largest suite has some hundred."""
-
 
 @dataclass(frozen=True)
 class MethodRecord:
@@ -182,18 +179,11 @@ class Manifest:
         Names used in paths are checked as by `check_name`.
         """
         record = read_json(path)
-        methods = record.get("methods")
-        if isinstance(methods, list) and len(methods) > MAX_CELLS:  # before they are copied
-            raise InputError(path, "methods", f"at most {MAX_CELLS} methods", str(len(methods)))
         record = upgraded_manifest(record)
         if record.get("format") != 2:
             raise InputError(path, "format", "1 or 2", shown(record.get("format")))
         hashes = checked(record.get(PROTOCOLS), dict[str, str], path, PROTOCOLS)
         manifest = checked({**record, PROTOCOLS: {}}, cls, path)
-        cells = len(manifest.methods) * len(manifest.clips) * len(manifest.configuration.seeds)
-        if cells > MAX_CELLS:
-            expected = f"at most {MAX_CELLS} cells (methods, captures and seeds)"
-            raise InputError(path, "configuration.seeds", expected, str(cells))
         named: dict[str, set[str]] = {
             "methods": {method.label for method in manifest.methods},
             "metrics, tables": {table for metric in manifest.metrics for table in metric.tables},

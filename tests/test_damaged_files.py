@@ -125,7 +125,9 @@ def samples(tmp_path_factory):
         cv2.imwrite(str(folder / name), picture)
     (folder / "a.json").write_text('{"x": [1, 2.5, "text"]}')
     (folder / "a.yaml").write_text("x: [1, 2.5, text]\ny: {z: true}\n")
-    (folder / "config.yaml").write_text("data: nowhere\nout: run\nmethods: [ga]\nseeds: [0, 1]\nframes_per_task: 3\n")
+    (folder / "config.yaml").write_text(
+        "data: nowhere\nout: run\nmethods: [ga]\nseeds: [0, 1]\nframes_per_task: 3\n"
+    )
     (folder / "excluded.yaml").write_text(
         "format: headbench-exclusions-1\nsubjects:\n  '901': {threshold: 0.5, frames: {}, overrides: {1: keep}}\n"
     )
