@@ -1,9 +1,10 @@
-"""Runs small enough for tests: on toy plug-ins, and of methods trained for a few iterations on a tiny capture."""
+"""The small world that tests share: a capture, a clip and runs, built once in a process and copied where a test writes."""
 
+import tempfile
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
 
@@ -12,14 +13,15 @@ from headbench.bench.engine.config import RunConfig
 from headbench.bench.engine.store import RunFolder
 
 from .datasets.head.toy import toy_head
-from .datasets.tiny_capture import make_plan, rig, write_tiny_capture
+from .datasets.tiny_capture import TinyCapture, make_plan, write_tiny_capture
 from .methods.flashavatar.small import SMALL as SMALL_FLASHAVATAR
 from .methods.gha.small import SMALL as SMALL_GHA
 from .methods.insta.small import SMALL as SMALL_INSTA
 from .methods.rgbavatar.small import SMALL as SMALL_RGBAVATAR
+from .methods.toy_clip import ToyClip, toy_clip
 
 ITERATIONS = {"budget": {"iterations": 2}}
-SETTINGS: dict[str, dict[str, Any]] = {
+SETTINGS = {
     "flashavatar": {**ITERATIONS, **SMALL_FLASHAVATAR},
     "ga": ITERATIONS,
     "gbs": {**ITERATIONS, "samples": 200, "teeth_samples": 20},
@@ -34,6 +36,35 @@ SETTINGS: dict[str, dict[str, Any]] = {
     },
 }
 """Two iterations of the smallest form of each method."""
+
+
+@cache
+def _folder() -> tempfile.TemporaryDirectory[str]:
+    """What is built once; removed when the process ends."""
+    return tempfile.TemporaryDirectory(prefix="headbench-tests-")
+
+
+def place(name: str) -> Path:
+    """A path for what is built once."""
+    return Path(_folder().name, name)
+
+
+@cache
+def capture() -> TinyCapture:
+    """A capture that tests only read: two training sequences and FREE, three cameras, a toy head with teeth."""
+    return write_tiny_capture(place("capture"))
+
+
+@cache
+def procedural_capture() -> TinyCapture:
+    """As `capture`, with a head whose version names the procedural one, as methods and readers of videos want it."""
+    return write_tiny_capture(place("procedural"), make_plan(head=toy_head(16, version="procedural2020")))
+
+
+@cache
+def clip() -> ToyClip:
+    """A clip in memory that tests only read."""
+    return toy_clip(toy_head(16), timesteps=3, cameras=3, width=28, height=36)
 
 
 def run_on(data: Path, out: Path, *methods: str, subjects: tuple[str, ...] = (), **changes: Any) -> RunFolder:
@@ -56,20 +87,15 @@ def rows_of(run: RunFolder) -> pd.DataFrame:
     return pd.read_parquet(run.rows)
 
 
+METHODS = ("mean-image", "ga", "gbs", "gha", "insta", "ours")
+
+
+@cache
+def finished() -> RunFolder:
+    """A run of `METHODS` that tests only read, its capture ``data`` beside it; the trained ones have two iterations."""
+    return small_run(place("finished"), *METHODS)
+
+
 def small_run(folder: Path, *methods: str) -> RunFolder:
     """A run of methods, each trained for two iterations, beside its capture ``data``."""
-    capture = write_tiny_capture(folder / "data", make_plan(head=toy_head(16, version="procedural2020")))
-    return run_on(capture.union, folder / "out", *methods)
-
-
-def small_capture(folder: Path) -> None:
-    """Write a capture of five timesteps and two cameras, of the head model that every method takes as it is."""
-    lengths = {"FREE": 2, "EMO-1-shout+laugh": 2, "SEN-01-cramp_small_danger": 1}
-    head = toy_head(16, version="procedural2020")
-    plan = make_plan(
-        lengths=lengths,
-        cameras=rig(24, 32, 12.3, 15.1)[:2],
-        head=head,
-        static_offset=np.zeros_like(head.template),
-    )
-    write_tiny_capture(folder, plan)
+    return run_on(procedural_capture().copied(folder / "data").union, folder / "out", *methods)
