@@ -16,9 +16,8 @@ from ..contracts import Progress, no_progress
 from ..engine.job import DIGESTS
 from ..engine.store import STAGES, RunFolder
 from ..errors import InputError
-from ..io.archives import open_archive
 from ..io.documents import checked, parse_json
-from ..io.files import atomic_path, check_writable, digest_file, write_json
+from ..io.files import atomic_path, check_writable, digest_file, reading, write_json
 from ..io.provenance import RENDER, source_type
 from ..manifest import PROTOCOLS, Manifest, protocol_path
 from ..rows import ALL, Rows
@@ -28,7 +27,6 @@ from .settings import BundleSettings, check_shown
 INDEX = "bundle.json"
 MAX_FILES = 200_000
 MAX_BYTES = 8 * 2**30
-MAX_RATIO = 200
 """Maximum ratio of unpacked to packed size; JSON is compressed by a factor of 30."""
 
 _CELL = r"[^/\\]+/[^/\\]+/seed-\d+"
@@ -210,8 +208,7 @@ def read_bundle(path: Path, into: Path) -> Bundle:
         The file is not a bundle, its files differ from their list or are of an unexpected kind, or the
         content exceeds the size or number of files allowed in a bundle.
     """
-    bounds = {"members": MAX_FILES, "spare_bytes": 0, "per_byte": MAX_RATIO}
-    with open_archive(path, "a bundle of `headbench bundle`", **bounds) as archive:
+    with reading(path, "a bundle of `headbench bundle`"), zipfile.ZipFile(path) as archive:
         return _unpack(archive, path, into)
 
 
