@@ -530,12 +530,13 @@ def earlier_rows(path: Path) -> Rows | None:
 def _read_table(path: Path) -> pa.Table:
     """Read the columns of `Row`; text as dictionaries, so that repeated text takes no memory."""
     with open_regular(path, ROWS) as stream:
-        file = pq.ParquetFile(stream, read_dictionary=list(TEXTS), pre_buffer=False)
-        names = Counter(file.schema_arrow.names)
+        names = Counter(pq.read_schema(stream).names)
         columns = [name for name in COLUMNS if name != "condition" or names[name]]  # version 1 has none
         wrong = [f"{names[name] or 'no'} {name}" for name in columns if names[name] != 1]
         if wrong:
             raise InputError(path, "columns", f"once each {', '.join(COLUMNS)}", ", ".join(wrong))
+        texts = [name for name in TEXTS if name in columns]
+        file = pq.ParquetFile(stream, read_dictionary=texts, pre_buffer=False)
         table = file.read(columns=columns, use_threads=False, use_pandas_metadata=False)
         table.validate(full=True)
         return table

@@ -4,6 +4,7 @@ results."""
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 import platform
@@ -15,7 +16,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from ..errors import InputError
-from .files import TEMPORARY, check_inside, output_inside, removed_if_empty
+from .files import TEMPORARY, check_inside, no_link, output_inside, removed_if_empty
 
 LOCK_FILE = "run.lock"
 
@@ -53,16 +54,14 @@ def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
 
 
 def is_locked(folder: Path) -> bool:
-    """Whether a process holds the lock of ``folder``."""
-    path = folder / LOCK_FILE
-    if not path.is_file():
-        return False
+    """Whether a process holds the lock of ``folder``, which may be read-only here."""
     try:
-        _acquire(path).release()
-    except InputError:
+        with open(folder / LOCK_FILE, opener=no_link) as stream:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
         return True
-    except OSError:
-        pass
+    except (OSError, InputError):
+        return False
     return False
 
 

@@ -155,7 +155,7 @@ def twice(path, frame):
         (lambda p, f: written(p, f.assign(other_cores=-0.5)), "other_cores: expected a number from 0"),
         (twice, "2 task"),
         (lambda p, f: written(p, f.assign(value="1")), "value: expected numbers"),
-        (lambda p, f: written(p, f.assign(value=[[1.0]] * len(f))), "no value"),
+        (lambda p, f: written(p, f.assign(value=[[1.0]] * len(f))), "value: expected numbers"),
         (lambda p, f: written(p, f.assign(seed=0.5)), "seed: expected whole numbers"),
         (lambda p, f: written(p, f.assign(method=1)), "method: expected text"),
         (lambda p, f: written(p, f.assign(method=None)), "method: expected text"),

@@ -147,19 +147,15 @@ def test_two_writers_of_a_file_leave_one_whole_content(tmp_path):
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a", "one")]
 
 
-def test_a_link_to_itself_is_replaced(tmp_path):
-    (tmp_path / "a").symlink_to(tmp_path / "a")
-    write_text(tmp_path / "a", "new")
-    assert not (tmp_path / "a").is_symlink()
-    assert (tmp_path / "a").read_text() == "new"
-
-
-def test_a_link_is_replaced_and_its_target_left_alone(tmp_path):
+@pytest.mark.parametrize("target", ["a", "victim", "nothing"])
+def test_a_link_is_replaced_and_its_target_left_alone(tmp_path, target):
     (tmp_path / "victim").write_text("victim")
-    (tmp_path / "a").symlink_to(tmp_path / "victim")
+    (tmp_path / "a").symlink_to(tmp_path / target)
     write_text(tmp_path / "a", "ours")
     assert (tmp_path / "victim").read_text() == "victim"
     assert not (tmp_path / "a").is_symlink()
+    assert (tmp_path / "a").read_text() == "ours"
+    assert not (tmp_path / "nothing").exists()
 
 
 def test_a_file_that_lies_elsewhere_too_keeps_its_mode(tmp_path):
