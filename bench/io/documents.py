@@ -138,7 +138,8 @@ def checked(value: Any, kind: type[T], source: Source, prefix: str = "", *, fore
         # JSON has no tuples and only text keys, so only this mode accepts lists as tuples without accepting text
         # as numbers.
         text = json.dumps(value, allow_nan=False)
-        return _validator(kind).validate_json(text, strict=True, extra="ignore" if foreign else "forbid")
+        extra = "ignore" if foreign else "forbid"
+        return _validator(kind).validate_json(text, strict=True, extra=extra)  # type: ignore[arg-type]
     except ValidationError as error:
         _refuse(error.errors(include_url=False)[0], kind, source, prefix)
     except (TypeError, ValueError) as error:

@@ -25,72 +25,6 @@ from headbench.bench.io.images import (
 from headbench.bench.io.video import write_video
 from headbench.datasets.images import read_image, read_mask, write_image
 
-MODES = {"L": 1, "RGB": 3, "RGBA": 4, "LA": 2, "P": 3}
-
-
-def encode(mode: str, size: tuple[int, int], format: str, **options) -> bytes:
-    noise = np.random.default_rng(0).integers(0, 255, size=(size[1], size[0], 3), dtype=np.uint8)
-    stream = io.BytesIO()
-    Image.fromarray(noise).convert("RGB").convert("L" if mode == "LA" else mode).convert(mode).save(
-        stream, format, **options
-    )
-    return stream.getvalue()
-
-
-JPEG_OPTIONS = ({}, {"progressive": True}, {"exif": b"Exif\0\0" + bytes(200)})
-
-
-@pytest.mark.parametrize(
-    ("mode", "format", "options"),
-    [(mode, "PNG", {}) for mode in MODES]
-    + [(mode, "JPEG", options) for mode in ("L", "RGB") for options in JPEG_OPTIONS],
-)
-def test_a_header_is_read(tmp_path, mode, format, options):
-    path = tmp_path / "image"
-    path.write_bytes(encode(mode, (17, 31), format, **options))
-    assert probe_image(path, decode=True) == ImageInfo(17, 31, MODES[mode])
-
-
-@settings(max_examples=60, deadline=None)
-@given(data=st.data(), format=st.sampled_from(["PNG", "JPEG"]))
-def test_every_truncation_is_found(tmp_path_factory, data, format):
-    whole = encode("RGB", (24, 16), format)
-    length = data.draw(st.integers(0, len(whole) - 1))
-    path = tmp_path_factory.mktemp("truncated") / "image"
-    path.write_bytes(whole[:length])
-    with pytest.raises(InputError):
-        probe_image(path)
-
-
-def test_another_size_than_the_required_one_is_refused(tmp_path):
-    path = tmp_path / "image.png"
-    path.write_bytes(encode("RGB", (17, 31), "PNG"))
-    assert read_pixels(path, size=(17, 31)).shape == (31, 17, 3)
-    with pytest.raises(InputError, match="18x31 pixels, found 17x31"):
-        read_pixels(path, size=(18, 31))
-
-
-def test_every_level_survives_the_round_trip(tmp_path):
-    image = np.arange(256, dtype=np.uint8).reshape(16, 16, 1) * np.array([1, 3, 7], np.uint8)
-    write_png(tmp_path / "a.png", image)
-    assert np.array_equal(read_png(tmp_path / "a.png"), image)
-    assert np.array_equal(quantise(image.astype(np.float32) / 255), image)
-
-
-def test_rounding_goes_to_the_nearest_level_and_clamps():
-    rgb = np.array([[[-0.5, 0.49 / 255, 0.51 / 255], [254.4 / 255, 254.6 / 255, 2.0]]])
-    assert quantise(rgb).tolist() == [[[0, 0, 1], [254, 255, 255]]]
-
-
-@pytest.mark.parametrize(
-    ("rgb", "match"),
-    [([[[np.nan, np.inf, 0.0]]], "2 of 3"), (np.zeros((1, 1, 3), np.uint8), "floating-point")],
-)
-def test_what_is_no_colour_is_refused(rgb, match):
-    with pytest.raises(InputError, match=match):
-        quantise(np.asarray(rgb))
-
-
 NOISE = np.random.default_rng(3).integers(0, 256, (23, 37, 4), np.uint8)
 STEPS = NOISE[..., 0] // 64 * 64
 RED_TABLE, DARK_TABLE, GREY_TABLE = ([0, 0, 0, *entry] for entry in ((128, 0, 0), (0, 64, 0), (90, 90, 90)))
@@ -116,6 +50,57 @@ def saved(image: Image.Image, format: str = "PNG", **options) -> bytes:
     stream = io.BytesIO()
     image.save(stream, format, **options)
     return stream.getvalue()
+
+
+HEADERS = [
+    (mode, "PNG", count, {}) for mode, count in {"L": 1, "RGB": 3, "RGBA": 4, "LA": 2, "P16": 3}.items()
+]
+HEADERS += [
+    (mode, "JPEG", count, options)
+    for mode, count in {"L": 1, "RGB": 3}.items()
+    for options in ({}, {"progressive": True}, {"exif": b"Exif\0\0" + bytes(200)})
+]
+
+
+@pytest.mark.parametrize(("mode", "format", "channels", "options"), HEADERS)
+def test_a_header_is_read(tmp_path, mode, format, channels, options):
+    path = tmp_path / "image"
+    path.write_bytes(saved(picture(mode), format, **options))
+    assert probe_image(path, decode=True) == ImageInfo(37, 23, channels)
+    assert read_pixels(path, size=(37, 23)).shape[:2] == (23, 37)
+    with pytest.raises(InputError, match="38x23 pixels, found 37x23"):
+        read_pixels(path, size=(38, 23))
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data(), format=st.sampled_from(["PNG", "JPEG"]))
+def test_every_truncation_is_found(tmp_path_factory, data, format):
+    whole = saved(picture("RGB"), format)
+    path = tmp_path_factory.mktemp("truncated") / "image"
+    path.write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1))])
+    with pytest.raises(InputError):
+        probe_image(path)
+
+
+def test_every_level_survives_the_round_trip(tmp_path):
+    image = np.arange(256, dtype=np.uint8).reshape(16, 16, 1) * np.array([1, 3, 7], np.uint8)
+    write_png(tmp_path / "a.png", image)
+    assert np.array_equal(read_png(tmp_path / "a.png"), image)
+    assert np.array_equal(quantise(image.astype(np.float32) / 255), image)
+
+
+def test_rounding_goes_to_the_nearest_level_and_clamps():
+    rgb = np.array([[[-0.5, 0.49 / 255, 0.51 / 255], [254.4 / 255, 254.6 / 255, 2.0]]])
+    assert quantise(rgb).tolist() == [[[0, 0, 1], [254, 255, 255]]]
+
+
+@pytest.mark.parametrize(
+    ("rgb", "match"),
+    [([[[np.nan, np.inf, 0.0]]], "2 of 3"), (np.zeros((1, 1, 3), np.uint8), "floating-point")],
+)
+def test_what_is_no_colour_is_refused(rgb, match):
+    with pytest.raises(InputError, match=match):
+        quantise(np.asarray(rgb))
 
 
 STORED = {
@@ -188,7 +173,7 @@ def test_a_mask_covers_what_a_viewer_shows_as_not_black(tmp_path, name):
     assert np.array_equal(read_mask(tmp_path / "mask.png"), expected)
 
 
-@pytest.mark.parametrize("orientation", range(2, 9))
+@pytest.mark.parametrize("orientation", [3, 6, 7])
 @pytest.mark.parametrize(("mode", "format"), [("RGB", "PNG"), ("L", "PNG"), ("RGB", "JPEG"), ("L", "JPEG")])
 def test_pixels_stay_where_they_are_stored(tmp_path, mode, format, orientation):
     exif = Image.Exif()
@@ -244,8 +229,6 @@ OTHERS = {
     ),
     "WebP": (saved(picture("RGBA"), "WEBP"), "WEBP data"),
     "TIFF": (saved(picture("RGB"), "TIFF"), "TIFF data"),
-    "TIFF of floats": (saved(Image.fromarray(NOISE[..., 0].astype(np.float32)), "TIFF"), "TIFF data"),
-    "Lab": (saved(picture("RGB").convert("LAB"), "TIFF"), "TIFF data"),
     "GIF": (saved(picture("P16"), "GIF"), "GIF data"),
     "BMP": (saved(picture("RGB"), "BMP"), "BMP data"),
     "HEIC": (b"\0\0\0\x18ftypheic" + bytes(40), "HEIF, AVIF or video data"),
