@@ -12,7 +12,7 @@ from typing import cast
 import pandas as pd
 
 from ..bench.errors import InputError
-from ..bench.io.files import grouped_writes, write_text
+from ..bench.io.files import write_text
 from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from ..bench.registry import unknown
 from ..bench.specs import MetricSpec
@@ -125,11 +125,10 @@ def write_tables(run_folder: Path) -> list[Path]:
     files = []
     for layout in layouts(runs):
         table = table_of(runs, layout)
-        with grouped_writes():
-            for suffix, write in WRITERS.values():
-                path = runs.runs[0].folder.tables / f"{layout}.{suffix}"
-                write_text(path, write(table))
-                files.append(path)
+        for suffix, write in WRITERS.values():
+            path = runs.runs[0].folder.tables / f"{layout}.{suffix}"
+            write_text(path, write(table))
+            files.append(path)
     return files
 
 

@@ -27,7 +27,6 @@ from ..io.files import (
     check_output_folder,
     digest,
     digest_file,
-    grouped_writes,
 )
 from ..io.images import probe_image, read_pixels, write_png
 from ..io.lock import locked
@@ -176,16 +175,15 @@ def _open(settings: EvaluateSettings, label: str, heads: Mapping[str, str]) -> t
 
 def _copy(images: Mapping[tuple[str, FrameKey], Render], job: Job) -> None:
     """Copy the images of a subject to the run's folders of renders."""
-    with grouped_writes():
-        for (task, key), source in images.items():
-            target = job.cell.render(task, key)
-            if key.subject != job.clip.subject or (target.exists() and target.samefile(source.image)):
-                continue
-            if source.alpha is not None:
-                write_png(target, composited(source, job.clip.background.tolist()))
-                continue
-            with atomic_path(target) as temporary:
-                shutil.copyfile(source.image, temporary)
+    for (task, key), source in images.items():
+        target = job.cell.render(task, key)
+        if key.subject != job.clip.subject or (target.exists() and target.samefile(source.image)):
+            continue
+        if source.alpha is not None:
+            write_png(target, composited(source, job.clip.background.tolist()))
+            continue
+        with atomic_path(target) as temporary:
+            shutil.copyfile(source.image, temporary)
 
 
 SHOWN = 3
