@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import IO
 
 from .errors import HeadbenchError, shortened
-from .io.files import flush_renames
 
 KEPT = (
     *("PATH", "HOME", "USER", "LANG", "LC_ALL", "TMPDIR", "XDG_CACHE_HOME", "XDG_RUNTIME_DIR"),
@@ -105,7 +104,6 @@ def run_program(
     ProgramError
         The command cannot be started, or takes longer than ``hours``.
     """
-    flush_renames()
     until = math.inf if hours is None else time.monotonic() + 3600 * hours
     with log.open("ab") as stream:
         stream.write(f"$ {' '.join(command)}\n".encode())

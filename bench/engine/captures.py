@@ -183,7 +183,6 @@ def open_run_clips(
     out: Path | None = None,
     altered: bool = False,
     use_cache: bool = True,
-    only: int | None = None,
     used: tuple[Plugins, ...] = ("methods", "metrics"),
 ) -> tuple[RunConfig, list[Clip]]:
     """Open the captures that a run was made from; return its settings as well, see `run_configuration`.
@@ -195,7 +194,7 @@ def open_run_clips(
         folder, which the caller must have locked.
     altered : bool
         Return captures even if they differ from those of the run.
-    use_cache, only : bool, int or None
+    use_cache : bool
         See `open_clips`.
     used : tuple[Plugins, ...]
         Plug-ins that the caller resolves from the returned settings. Names that would import a module
@@ -214,7 +213,7 @@ def open_run_clips(
     for config in _configurations(run, options, used):
         config = config if out is None else replace(config, out=str(out))
         try:
-            clips = open_clips(config, use_cache=use_cache, only=only)
+            clips = open_clips(config, use_cache=use_cache)
         except InputError as error:
             refused.append(error)
             continue

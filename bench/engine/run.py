@@ -205,15 +205,25 @@ def _planned(
     return planned, protocols, jobs
 
 
-def planned_jobs(config: RunConfig) -> list[Job]:
-    """The cells that `run` would execute, with the same checks; nothing is written into ``config.out``."""
+def planned_cells(config: RunConfig) -> dict[str, str]:
+    """State of each cell that `run` would execute, with the same checks: done, trained, to train or to derive.
+
+    Nothing is written into ``config.out``.
+    """
     folder = RunFolder(Path(config.out))
     config = grown(config, folder)
     with TemporaryDirectory() as scratch:
         clips = open_clips(replace(config, out=scratch))
         metrics = resolve_metrics(config)
         forms = replace(config, out=scratch)
-        return _planned(forms, resolve_cells(config), metrics, folder, clips, Path(scratch))[2]
+        jobs = _planned(forms, resolve_cells(config), metrics, folder, clips, Path(scratch))[2]
+    return {job.name: _state(job) for job in jobs}
+
+
+def _state(job: Job) -> str:
+    if not job.cell.is_done("fit", job.fit_fingerprint):
+        return "to train" if job.source is None else "to derive"
+    return "done" if job.cell.ended("measure") else "trained"
 
 
 def grown(config: RunConfig, folder: RunFolder, *, trust: bool = False) -> RunConfig:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...bench.contracts import Camera, FloatArray, HeadPose, Progress, no_progress
-from ...bench.io.files import digest, digest_file, grouped_writes
+from ...bench.io.files import digest, digest_file
 from ...bench.landmark_network import LandmarkNetwork
 from ..clip import CaptureClip
 from ..head.arrays import HeadArrays
@@ -135,17 +135,16 @@ def _write_frames(
     if not left:
         return
     masks.learn(path, _frames(path, options), faces, view)
-    with grouped_writes():
-        for done, frame in enumerate(_frames(path, options)):
-            progress(done, len(faces.numbers), "frames")
-            if frame.number not in left:
-                continue
-            pictures = [view.image(frame.image)]
-            if masks:
-                pictures.append(masks.mask(frame, view, seen[frame.number]))
-            for file, picture in zip(files[frame.number], pictures):
-                if not file.exists():
-                    write_image(file, picture)
+    for done, frame in enumerate(_frames(path, options)):
+        progress(done, len(faces.numbers), "frames")
+        if frame.number not in left:
+            continue
+        pictures = [view.image(frame.image)]
+        if masks:
+            pictures.append(masks.mask(frame, view, seen[frame.number]))
+        for file, picture in zip(files[frame.number], pictures):
+            if not file.exists():
+                write_image(file, picture)
 
 
 def _frames(path: Path, options: VideoOptions) -> Iterator[TimedFrame]:

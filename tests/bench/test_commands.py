@@ -190,7 +190,7 @@ def test_help_lists_commands_in_groups(capsys):
         text.index("\n  demo ")
         < text.index("\n  run ")
         < text.index("\n  table ")
-        < text.index("\n  bundle ")
+        < text.index("\n  export ply ")
     )
     headings = [group.capitalize() for group in specs.COMMAND_GROUPS]
     assert re.findall(r"(?m)^([A-Z]\w+)$", text) == headings
@@ -284,7 +284,6 @@ def test_every_command_with_a_folder_to_write_locks_it():
     own |= {f"run {what}" for what in ("curve", "extremes", "reenact", "sweep")}
     files = {
         "doctor bench",
-        "bundle",
         "export glb",
         "export html",
         "export ply",

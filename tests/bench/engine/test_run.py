@@ -641,3 +641,14 @@ def test_a_received_run_is_not_written_through_its_links(
     for target in outside.iterdir():
         assert target.read_text() == "victim" if target.is_file() else not list(target.iterdir())
     assert code == expected, error
+
+
+def test_planned_cells_have_their_state_and_nothing_is_trained(config, toy, finished):
+    finished(config)
+    longer = replace(config, out=f"{config.out}-long", settings={"toy": {"budget": {"iterations": 200}}})
+    before = toy.FITS.copy()
+    for settings, state in ((config, "done"), (longer, "to train")):
+        names = [f"{subject} toy seed 0" for subject in ("subject1", "subject2")]
+        assert runner.planned_cells(settings) == dict.fromkeys(names, state)
+    assert toy.FITS == before
+    assert not Path(longer.out).exists()
