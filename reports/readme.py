@@ -97,13 +97,13 @@ PAGES = {
     "demo": "docs/explanation/results.md",
     SUITE: "README.md",
     PROTOCOLS: "docs/explanation/protocols.md",
-    DROPS: "docs/explanation/suite.md",
+    DROPS: "docs/explanation/results.md",
     ABLATIONS: "docs/explanation/methods/ours.md",
     PROFILES: "docs/explanation/protocols.md",
     FACES: "docs/explanation/metrics.md",
     RATES: "docs/explanation/fairness.md",
     FURTHER: "docs/explanation/methods/rgbavatar.md",
-    **{f"{CURVES}-{over}": "docs/explanation/budgets.md" for over in CURVE_UNITS},
+    **{f"{CURVES}-{over}": "docs/explanation/results.md" for over in CURVE_UNITS},
 }
 """The page of each block, in the repository."""
 COMPARED = (OURS, "ga")
