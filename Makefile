@@ -18,7 +18,7 @@ help:
 	@echo "make lock    write the lock again, requirements*.txt, with the newest versions that pyproject.toml admits"
 	@echo "make demo    compare avatar methods on a capture made on the spot (OUT=$(OUT))"
 	@echo "make pictures  pictures of a demo (OUT=$(OUT)), in docs/pictures; of the page REPORT=FILE for the README"
-	@echo "make docs    build the documentation, in build/docs (NOTEBOOKS=no leaves them unexecuted)"
+	@echo "make docs    build the documentation, in build/docs"
 	@echo "make test    run the tests (in JOBS=$(JOBS) processes)"
 	@echo "make test-latest  run the tests with the newest versions instead of the lock, in $(VENV)-latest"
 	@echo "make test-slow    run the tests marked slow"
@@ -63,9 +63,9 @@ lock:
 demo: setup
 	$(BIN)/headbench demo --out $(OUT)
 
-# Warnings, broken links among them, are errors. Notebooks are executed and their output is shown on their pages.
+# Warnings, broken links among them, are errors.
 docs: setup
-	HEADBENCH_DOCS_NOTEBOOKS=$(NOTEBOOKS) $(BIN)/python -m sphinx -W --keep-going --quiet -j $(JOBS) -d build/docs-cache docs build/docs
+	$(BIN)/python -m sphinx -W --keep-going --quiet -j $(JOBS) -d build/docs-cache docs build/docs
 	@echo "The documentation is in build/docs/index.html."
 
 # The page of a demo's avatar and faults of footage on its capture, in docs/pictures, and the picture of the README, of any run's
