@@ -38,14 +38,6 @@ def test_every_command_is_listed(capsys):
     assert {name for name in offered if f'"{name}"' not in listed} == set()
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_commands_that_pages_call_exist(page):
-    offered = set(discover("commands"))
-    blocks = re.findall(r"```bash\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    called = re.findall(r"^(?:\w+=\S+ )*headbench ([a-z]+(?: [a-z]+)?)", "\n".join(blocks), re.MULTILINE)
-    assert [name for name in called if not {name, name.split()[0]} & offered] == []
-
-
 def test_the_readme_counts_what_is_stored():
     from headbench.bench.named_protocol import named_protocols
     from headbench.reports.papers import papers
