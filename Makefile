@@ -21,7 +21,7 @@ help:
 	@echo "make docs    build the documentation, in build/docs"
 	@echo "make test    run the tests (in JOBS=$(JOBS) processes)"
 	@echo "make test-latest  run the tests with the newest versions instead of the lock, in $(VENV)-latest"
-	@echo "make test-commands  run all commands end to end, browsers, notebooks, the README's tables"
+	@echo "make test-commands  run all commands end to end, browsers, the README's tables"
 	@echo "make test-slow    run the tests marked slow"
 	@echo "make nightly      run what takes too long for every change: the list in .ci/run"
 	@echo "make check   style, types, architecture"

@@ -4,7 +4,6 @@ python -m headbench.reports.readme demo demo-output .
 python -m headbench.reports.readme suite suite-output .
 python -m headbench.reports.readme profiles run-of-one-subject .
 python -m headbench.reports.readme faces run-of-one-subject .
-python -m headbench.reports.readme rates folder-of-sweeps .
 python -m headbench.reports.readme further folder-of-runs .
 python -m headbench.reports.readme curves folder-of-seconds-and-pictures .
 python -m headbench.reports.readme subjects suite-output .
@@ -55,11 +54,8 @@ from .curve.blocks import UNITS as CURVE_UNITS
 from .curve.blocks import curve_block
 from .curve.curve import read_curve, write_curve
 from .papers import paper_named
-from .pareto.plot import write_rates
-from .pareto.rates import read_rates
-from .pareto.table import rate_tables
 from .protocols import USUAL, ProtocolsSettings, protocols_command
-from .runs import FrameSelection, RunData, RunSet, joined_subjects, synthetic_settings
+from .runs import FrameSelection, RunData, RunSet, synthetic_settings
 from .statistics.comparisons import compare
 from .statistics.primary import primary_table
 from .suite.extremes import FOLDER as EXTREMES
@@ -78,8 +74,6 @@ DROPS, ABLATIONS = "drops", "ablations"
 """Blocks of the suite's drops from novel views to self-reenactment, and of its ablations."""
 PROFILES, FACES = "profiles", "faces"
 """Stored results of one of its subjects: by the definitions of all protocols, and by metrics of faces."""
-RATES = "rates"
-"""Stored sweeps over codec steps, one each for some of its subjects."""
 OURS = "ours"
 FURTHER = "further"
 """Stored runs of methods outside of the suite's plan, on some of its subjects; each named as that subject's run."""
@@ -101,7 +95,6 @@ PAGES = {
     ABLATIONS: "docs/explanation/methods/ours.md",
     PROFILES: "docs/explanation/protocols.md",
     FACES: "docs/explanation/metrics.md",
-    RATES: "docs/explanation/fairness.md",
     FURTHER: "docs/explanation/methods/rgbavatar.md",
     **{f"{CURVES}-{over}": "docs/explanation/results.md" for over in CURVE_UNITS},
 }
@@ -123,8 +116,6 @@ BESIDE = (
 """Pairs of the README's exploratory differences."""
 PAPER = "tensorial-2025"
 """The paper of `OURS`."""
-RATES_PICTURE = "docs/pictures/rate-distortion.png"
-RATES_TASKS = ("novel_view", "self_reenactment")
 SHOWN = ("psnr", "lpips")
 """Metrics of frames in the README, whose table would not fit a page with all; those of the suite's tables are in `RESULTS`."""
 
@@ -203,15 +194,6 @@ def stored_curves(gallery: Path, over: str) -> list[Path]:
 def _copy_all(out: Path, target: Path) -> None:
     for run in sorted(path.parent for path in out.glob("*/rows.parquet")):
         _copy(RunFolder(run), RunFolder(target / run.name))
-
-
-def publish_rates(out: Path, root: Path) -> None:
-    """Copy manifests and rows of the sweeps in a folder to the repository ``root``, and write their block and its plot."""
-    target = root / GALLERY / RATES
-    _copy_all(out, target)
-    runs = rate_runs(target)
-    write_rates(root / RATES_PICTURE, {task: read_rates(runs, task) for task in RATES_TASKS})
-    _write(root / PAGES[RATES], RATES, rates_block(runs))
 
 
 def _copy(source: RunFolder, target: RunFolder) -> None:
@@ -369,17 +351,6 @@ def _worth_of_choices(runs: Sequence[Path]) -> str:
     return f"`{'` and `'.join(COMPARED)}`, {subjects} of the suite:\n\n{found.text}"
 
 
-def rate_runs(folder: Path) -> list[RunData]:
-    """The stored sweeps over steps of the codec, of all subjects."""
-    return joined_subjects([RunData.read(path.parent) for path in sorted(folder.glob("*/rows.parquet"))])
-
-
-def rates_block(runs: Sequence[RunData]) -> str:
-    """Bytes and losses by step of the codec, and BD-rates: Markdown."""
-    subjects = counted(len({subject for run in runs for subject in run.rows.subjects}), "subject")
-    return f"Means of {subjects} of the suite:\n\n{rate_tables(runs, RATES_TASKS, COMPARED[1])}"
-
-
 SUBJECT_BLOCKS: dict[str, Callable[[Path], str]] = {
     PROFILES: lambda folder: _worth_of_choices([folder]),
     FACES: lambda folder: table_text([folder], "md").strip(),
@@ -514,7 +485,6 @@ def _cost_text(runs: RunSet, folders: Sequence[Path], seeds: Sequence[Path]) -> 
 PUBLISH: dict[str, Callable[[Path, Path], None]] = {
     "demo": publish_demo,
     SUITE: publish_suite,
-    RATES: publish_rates,
     FURTHER: publish_further,
     CURVES: publish_curves,
     "subjects": publish_picture,

@@ -187,7 +187,6 @@ def test_tables_are_generated_from_the_stored_rows_never_typed():
         readme.ABLATIONS: readme.ablations_block(ROOT / readme.GALLERY / readme.SUITE),
         readme.DROPS: readme.drops_block(ROOT / readme.GALLERY / readme.SUITE),
         readme.PROTOCOLS: readme.protocols_block(ROOT / readme.GALLERY / readme.SUITE),
-        readme.RATES: readme.rates_block(readme.rate_runs(ROOT / readme.GALLERY / readme.RATES)),
         **{
             f"{readme.CURVES}-{over}": curve_block(readme.stored_curves(ROOT / readme.GALLERY, over), over)
             for over in readme.CURVE_UNITS

@@ -79,7 +79,9 @@ def test_commands_on_pages_exist_with_their_options(entries):
             name = next((name for name in (" ".join(words[:2]), words[0]) if name in known), None)
             group = any(other.startswith(f"{words[0]} ") for other in known)
             options = {word.partition("=")[0] for word in words if re.match(r"--[a-z]", word)}
-            listed = {(f"commands/{(name or '').replace(' ', '-')}", option) for option in options - {"--help"}}
+            listed = {
+                (f"commands/{(name or '').replace(' ', '-')}", option) for option in options - {"--help"}
+            }
             if (name is None and not group) or not listed <= entries["option"]:
                 wrong.append((page.name, line))
     assert wrong == []
@@ -132,7 +134,8 @@ def test_every_registered_name_has_an_entry(entries):
         "exitcode": {str(code.value) for code in ExitCode},
     }
     assert all(expected.values())
-    assert {kind: names - entries[kind] for kind, names in expected.items()} == dict.fromkeys(expected, set())
+    missing = {kind: sorted(names - entries[kind]) for kind, names in expected.items()}
+    assert not any(missing.values()), missing
 
 
 def test_every_public_name_has_an_entry(reference):
