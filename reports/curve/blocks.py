@@ -1,4 +1,4 @@
-"""Stored curves as Markdown for a page: quality by training cost, the best methods, and recommendations."""
+"""Stored curves as Markdown for a page: quality by training cost, and the best methods."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ...bench.progress import counted
-from ..recommend import RecommendSettings, recommend
 from ..runs import RunData
 from ..writers import pipe_table
 from .curve import CurveData, leaders_text, read_curve
@@ -14,18 +13,12 @@ from .points import HELD_OUT, column
 
 UNITS = {"seconds": " s", "pictures": ""}
 """Varied quantities of stored curves, and the unit of their columns."""
-TASK = "self_reenactment"
-"""Held-out frames that recommendations are for."""
 
 
 def curve_block(runs: Sequence[Path], over: str) -> str:
-    """Quality of all methods, the best ones and, for seconds, the recommended ones: Markdown."""
+    """Quality of all methods, and the best ones: Markdown."""
     curve = read_curve([RunData.read(run) for run in runs], over)
-    parts = [_table(curve), leaders_text(curve)]
-    if over == "seconds":
-        limits = sorted({point.budget.seconds or 0.0 for point in curve.points})
-        parts += _recommended(runs, limits)
-    return "\n\n".join(parts)
+    return f"{_table(curve)}\n\n{leaders_text(curve)}"
 
 
 def _table(curve: CurveData) -> str:
@@ -53,17 +46,3 @@ def _table(curve: CurveData) -> str:
 def _amount(over: str, place: Sequence[float]) -> float:
     """Seconds or number of images, from the place of a point; see `CurvePoint`."""
     return place[1 if over == "seconds" else 2]
-
-
-def _recommended(runs: Sequence[Path], limits: Sequence[float]) -> list[str]:
-    """Text of `headbench recommend` for limits of seconds, without tables and repeated sentences."""
-    found = [
-        recommend(RecommendSettings(tuple(map(str, runs)), seconds=limit, task=TASK)).data for limit in limits
-    ]
-    common = [text for text in found[0]["conclusions"] if all(text in each["conclusions"] for each in found)]
-    lines = []
-    for limit, each in zip(limits, found):
-        named = str(each["recommended"]).removesuffix(f"+seconds-{limit:g}").replace("+", "` with `")
-        own = " ".join(text for text in each["conclusions"] if text not in common)
-        lines.append(f"- Up to {limit:g} s: `{named}`. {own}".strip())
-    return ["Recommended by `headbench recommend` for held-out timesteps:", "\n".join(lines), *common]

@@ -32,7 +32,7 @@ def opened(new_tab):
                 else new_tab.faults.append(request.url)
             ),
         )
-        tab.goto(f"http://{address}")
+        tab.goto(server.address)
         tab.get_by_text("Drawn by trained models").wait_for()
         tab.get_by_text(re.compile(r"\d+x\d+: .*sent in")).wait_for()  # a whole frame, not a draft
         return tab
