@@ -121,7 +121,7 @@ def page_text(
     worst = worst_frames(values, runs, metrics[0]) if metrics else []
     parts = _parts(runs)
     comparisons = _comparisons(runs)
-    words = verdict(runs, parts[0].table, metrics, comparisons["all"], values)
+    words = verdict(runs, metrics, comparisons["all"])
     cards = cards_of(runs)
     content = {
         "title": words.title,

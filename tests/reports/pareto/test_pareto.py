@@ -84,13 +84,6 @@ def test_points_of_several_runs_and_which_are_on_the_front(make_run, tmp_path):
     assert found.passed
 
 
-def test_the_published_result_has_its_points(tmp_path):
-    gallery = Path(__file__).parents[3] / "reports" / "gallery"
-    points = pareto_runs(ParetoSettings((str(gallery),), str(tmp_path / "out"))).data["points"]
-    assert len(points) == 12  # six methods and their coded avatars; its rows are of two regions
-    assert all(point["megabytes"] and point["milliseconds"] for point in points)
-
-
 def test_a_metric_where_less_is_better_turns_the_front_round(make_run, tmp_path):
     folder = make_run(
         "r", ours=(28.0, 0.10, 1.0, 200.0), ga=(27.0, 0.05, 2.0, 400.0), gbs=(30.0, 0.2, 3.0, 9.0)

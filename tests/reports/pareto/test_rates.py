@@ -20,10 +20,7 @@ from headbench.bench.specs import MetricSpec
 from headbench.reports.pareto.command import pareto_runs
 from headbench.reports.pareto.rates import rate_difference
 from headbench.reports.pareto.settings import ParetoSettings
-from headbench.reports.pareto.table import rate_tables
-from headbench.reports.runs import RunData
 
-GALLERY = Path(__file__).parents[3] / "reports" / "gallery"
 STEPS = ("coded-x0.25", "coded-x0.5", "coded", "coded-x2")
 METRICS = [
     MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr"),
@@ -154,29 +151,6 @@ def test_other_seeds_of_a_training_have_no_curves(coded_run, tmp_path):
     result = pareto_runs(ParetoSettings(runs, str(tmp_path / "out")))
     assert result.data["rates"] == []
     assert "expected the values of wide in another run" in result.text
-
-
-def test_stored_sweeps_of_single_subjects_are_joined(tmp_path):
-    """Their protocols differ by the subject."""
-    runs = sorted(str(path.parent) for path in (GALLERY / "rates").glob("*/rows.parquet"))
-    result = pareto_runs(ParetoSettings(tuple(runs), str(tmp_path / "out"), reference="ga"))
-    assert {rate["subjects"] for rate in result.data["rates"]} <= {0, len(runs)}
-    assert all(
-        rate["low"] <= rate["percent"] <= rate["high"] for rate in result.data["rates"] if rate["subjects"]
-    )
-    assert len(result.data["points"]) == 4 * 5
-
-
-def test_a_table_has_bytes_and_losses_of_every_step(coded_run):
-    run = RunData.read(Path(coded_run()))
-    text = rate_tables([run], ["novel_view"], "slim")
-    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line]
-    assert cells[0][2:] == ["MB", "bytes per primitive", "PSNR, novel view", "LPIPS, novel view"]
-    assert cells[7:9] == [
-        ["wide", "none", "80.00", "–", "36.00", "0.640"],
-        ["wide", "coded-x0.25", "1.00", "–", "-0.50", "+0.005"],
-    ]
-    assert cells[-2] == ["wide", "novel view", "PSNR", "+100 %", "+100 to +100 %"]
 
 
 def test_too_few_steps_have_no_difference(coded_run, tmp_path):

@@ -11,6 +11,7 @@ from headbench.reports.view.server import serving
 from headbench.reports.view.settings import ViewSettings
 
 pytest.importorskip("viser", reason="viser is not installed")
+pytestmark = pytest.mark.commands
 CANVAS = {"x": 40, "y": 200, "width": 200, "height": 190}
 """Part of the page beside the panel and below viser's note on software WebGL."""
 ALIKE = 0.5
