@@ -12,6 +12,7 @@ from headbench.bench.engine.store import RunFolder
 from headbench.bench.manifest import Manifest, MethodRecord, ProtocolRecord
 from headbench.bench.rows import Rows
 from headbench.bench.specs import MetricSpec
+from headbench.reports.pareto import plot
 
 from ..small_run import run_on
 from .made_rows import TASKS, avatar_row, row
@@ -172,3 +173,10 @@ def write_run(tmp_path, write_manifest):
         return folder.root
 
     return write
+
+
+@pytest.fixture
+def no_plots(monkeypatch):
+    """Leave out the drawing of `report pareto`, which takes longer than all else it does."""
+    for name in ("write_plot", "write_rates"):
+        monkeypatch.setattr(plot, name, lambda *args, **options: None)
