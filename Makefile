@@ -126,7 +126,7 @@ bench: setup
 
 # The documentation's table and picture of the demo are those of the last one.
 readme: demo
-	$(BIN)/python -m headbench.reports.readme demo $(OUT) .
+	$(BIN)/python docs/_ext/stored_results.py demo $(OUT) .
 
 # The committed tree, ready to be built. An index page has no files beside it: with URL, the README's links become
 # absolute and the package names its repository.
