@@ -13,9 +13,6 @@ from headbench.methods.benchmarks import avatar, splats, training
 from headbench.methods.benchmarks.scenes import cloud
 from headbench.methods.splats import available_backends, rasterize
 from headbench.metrics import benchmark as metrics
-from headbench.reports.statistics import calibration
-from headbench.reports.statistics.calibration import Population
-from headbench.reports.view import benchmark as viewer
 
 from .metrics.conftest import bare_machine  # noqa: F401 - a fixture
 
@@ -28,22 +25,10 @@ SMALLEST = {
     head.speed: ({"FLAME_SIZES": (12, 8), "QUICK_ROUNDS": 2}, [head.ONCE, "identity blended at each call"]),
     metrics.speed: ({"QUICK_SIZE": (40, 31)}, ["scikit-image", "torchmetrics", "headbench", "weights"]),
     refit.speed: ({"QUICK_TIMESTEPS": 3, "FLAME_SIZES": (12, 8)}, [case[0] for case in refit.CASES]),
-    viewer.speed: (
-        {"QUICK_SPLATS": (700,), "QUICK_SECONDS": 0.1, "WINDOW": (640, 400)},
-        ["700", "images", "splats"],
-    ),
-    calibration.stress: ({"QUICK_TRIALS": 3}, [*calibration.CASES, "best by"]),
 }
 
 
-BROWSER = pytest.param(viewer.speed, marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize(
-    "measure",
-    [BROWSER if each is viewer.speed else each for each in SMALLEST],
-    ids=lambda f: f"{f.__module__}.{f.__name__}",
-)
+@pytest.mark.parametrize("measure", SMALLEST, ids=lambda f: f"{f.__module__}.{f.__name__}")
 @pytest.mark.usefixtures("bare_machine")
 def test_a_benchmark_has_every_row(measure, monkeypatch):
     sizes, rows = SMALLEST[measure]
@@ -112,28 +97,3 @@ def test_all_ways_to_a_metric_have_one_value():
         for ways in metrics.structural_ways(metrics.noisy_pairs(2, 40, 31), pool).values():
             values = [way() for way in ways.values()]
             assert values == pytest.approx([values[0]] * len(values), abs=1e-3)
-
-
-def test_a_few_simulations_keep_the_level_of_the_test():
-    found = calibration.calibrate(Population(7, sequences=2, timesteps=60, correlation=0.9), 80)
-    assert found["verdict"] == "ok"
-    assert found["test rejects %"] <= 12
-    assert found["frame t-test rejects %"] > 50
-    few = calibration.calibrate(Population(5, sequences=1, timesteps=10), 3)
-    assert few["test rejects %"] is None
-    assert calibration.best_set_errors(3, 5, 3) == (0, 1)
-    at_margin, far_within = (calibration.equivalence_share(9, 80, mean) for mean in (calibration.MARGIN, 0.0))
-    assert at_margin <= 0.12
-    assert far_within > 0.7
-    # The test assumes symmetry: it calls too many skewed differences equivalent.
-    assert calibration.equivalence_share(9, 400, calibration.MARGIN, skewed=True) > 0.08
-
-
-@pytest.mark.slow
-def test_every_simulated_case_keeps_its_level():
-    found = calibration.stress(False, no_progress)
-    assert found.passed
-    cases = {case["simulated"]: case for case in found.data["Tests and intervals"]}
-    for name in ("7 subjects", "9 subjects", "9 subjects, 3 seeds", "20 subjects"):
-        assert 3 <= cases[name]["test rejects %"] <= 7
-        assert 93 <= cases[name]["interval covers %"] <= 97

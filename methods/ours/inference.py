@@ -1,7 +1,6 @@
 """Per-frame computation of a stored avatar of "ours", with precomputed values that do not depend on the frame.
 
-`tests/methods/ours/test_formula.py` compares it with the definition in float64. docs/explanation/methods/ours.md lists optimisations that
-were measured and not adopted.
+`tests/methods/ours/test_formula.py` compares it with the definition in float64.
 """
 
 from __future__ import annotations
