@@ -26,7 +26,6 @@ from headbench.bench.io.images import (
     read_png,
     write_png,
 )
-from headbench.bench.io.video import write_video
 from headbench.datasets.images import read_image, read_mask, write_image
 
 from ...memory import memory_below
@@ -349,7 +348,6 @@ WRITERS = {
     "frame": ("a.png", lambda path: write_png(path, NOISE[..., :3])),
     "image": ("a.png", lambda path: write_image(path, NOISE)),
     "JPEG": ("a.jpg", lambda path: write_image(path, NOISE[..., :3])),
-    "video": ("a.mp4", lambda path: write_video(path, [np.tile(NOISE[:22, :36, :3], (9, 9, 1))] * 9, 25.0)),
 }
 
 
