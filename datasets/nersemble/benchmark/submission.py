@@ -53,12 +53,6 @@ def find_frames(
     data : Path | None
         The benchmark's folder, which gives the number of frames of a sequence if that is not
         published.
-
-    Raises
-    ------
-    InputError
-        Participants, sequences, cameras or frames are missing, timesteps have a gap, or a size is
-        wrong.
     """
     found: dict[Video, list[Path]] = {}
     by_participant = {name: _by_camera(folder, name, method) for name in track.sequences}
@@ -234,11 +228,6 @@ def check_submission(
         published totals.
     name : str
         Name of the track; "" takes the one with the most files in the zip.
-
-    Raises
-    ------
-    InputError
-        The file is not a zip, or its entries are too many or too large.
     """
     issues = Issues()
     bounds = {"members": MOST_ENTRIES, "spare_bytes": 0, "per_byte": MOST_PER_BYTE}
