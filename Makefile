@@ -4,13 +4,11 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 OUT    ?= demo-output
 JOBS   ?= 2
-SEED   ?= 0
-SECONDS ?= 600
 
 # Build of PyTorch: cpu, cuda, or what pip's indexes offer of the two, the smaller first.
 TORCH  ?=
 
-.PHONY: help setup lock demo pictures docs test test-slow test-latest check fuzz kills nightly gpu gpu-checks gate baseline bench readme \
+.PHONY: help setup lock demo pictures docs test test-commands test-slow test-latest check nightly gpu gpu-checks gate baseline bench readme \
   release-source dist wheels clean
 
 help:
@@ -21,11 +19,10 @@ help:
 	@echo "make docs    build the documentation, in build/docs (NOTEBOOKS=no leaves them unexecuted)"
 	@echo "make test    run the tests (in JOBS=$(JOBS) processes)"
 	@echo "make test-latest  run the tests with the newest versions instead of the lock, in $(VENV)-latest"
+	@echo "make test-commands  run all commands end to end, browsers, notebooks, the README's tables"
 	@echo "make test-slow    run the tests marked slow"
 	@echo "make nightly      run what takes too long for every change: the list in .ci/run"
 	@echo "make check   style, types, architecture"
-	@echo "make fuzz    give damaged files to every reader for ten minutes (SEED=0, SECONDS=600)"
-	@echo "make kills   kill every command that writes before each change of the disk, and start it again (the same)"
 	@echo "make gpu     does a GPU give the CPU's numbers, and how fast; WHEELS=DIR collects wheels to install without a network"
 	@echo "make gate    compare the numbers of a small demo with tests/demo_baseline.json"
 	@echo "make baseline  write that baseline again, after a change that is meant to move them"
@@ -78,6 +75,9 @@ pictures: setup
 test: setup
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
+test-commands: setup
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -m "commands and not slow" -n $(JOBS) --dist loadfile --no-loadscope-reorder
+
 test-slow: setup
 	$(BIN)/python -m pytest -m "slow and not slurm"
 
@@ -97,12 +97,6 @@ check: setup
 	$(BIN)/mypy bench datasets methods metrics reports
 	$(BIN)/python -m pytest -q tests/test_architecture.py
 	$(BIN)/python -m headbench.reports.papers
-
-fuzz: setup
-	$(BIN)/python -m headbench.tests.fuzz --seed $(SEED) --seconds $(SECONDS)
-
-kills: setup
-	$(BIN)/python -m headbench.tests.fuzz.kills --seed $(SEED) --seconds $(SECONDS)
 
 gpu:
 	$(MAKE) gpu-checks TORCH=cuda

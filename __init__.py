@@ -54,7 +54,7 @@ if _TYPE_CHECKING:
     from .bench.engine.adaptation import AdaptedClip, MethodNeeds
     from .bench.engine.config import resolve_method
     from .bench.engine.stored import load_avatar
-    from .bench.errors import ChangedInputError, HeadbenchError, InputError, LeftOutError, UnavailableError
+    from .bench.errors import HeadbenchError, InputError, LeftOutError, UnavailableError
     from .bench.options import DependentOptions
     from .bench.rows import ALL
     from .bench.specs import (
@@ -86,7 +86,6 @@ __all__ = [
     "BenchmarkSpec",
     "Budget",
     "Camera",
-    "ChangedInputError",
     "CheckedMethod",
     "Clip",
     "CodedAvatar",
@@ -159,7 +158,7 @@ _HOMES = {
     "bench.conformance.metrics": ("check_metric",),
     "bench.conformance.readers": ("check_clip", "check_reader"),
     "bench.options": ("DependentOptions",),
-    "bench.errors": ("ChangedInputError", "HeadbenchError", "InputError", "LeftOutError", "UnavailableError"),
+    "bench.errors": ("HeadbenchError", "InputError", "LeftOutError", "UnavailableError"),
     "bench.engine.config": ("resolve_method",),
     "bench.engine.stored": ("load_avatar",),
     "bench.rows": ("ALL",),

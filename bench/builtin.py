@@ -26,14 +26,6 @@ STATUS = CommandSpec(
     function="headbench.bench.executors.command:status",
 )
 
-SPEED = CommandSpec(
-    name="run speed",
-    group="compare",
-    summary="Measure the speed of a finished run's avatars again, without training.",
-    settings="headbench.bench.executors.command:SpeedSettings",
-    function="headbench.bench.executors.command:speed",
-)
-
 EVALUATE = CommandSpec(
     name="evaluate",
     group="compare",
@@ -54,18 +46,9 @@ FRAMES = CommandSpec(
 VERIFY = CommandSpec(
     name="verify",
     group="validate",
-    summary="Recompute a run's digests and metrics from its frames and report differences.",
+    summary="Score a run's stored frames again and report values that differ.",
     settings="headbench.bench.audit.settings:VerifySettings",
-    function="headbench.bench.audit.verify:verify_run",
-    writes="out",
-)
-
-BUNDLE = CommandSpec(
-    name="bundle",
-    group="export",
-    summary="Write the results of a finished run to one file, for a leaderboard.",
-    settings="headbench.bench.audit.settings:BundleSettings",
-    function="headbench.bench.audit.bundle:write_bundle",
+    function="headbench.bench.audit.verify:verify_runs",
 )
 
 CHECK_PLUGIN = CommandSpec(

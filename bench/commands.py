@@ -6,7 +6,6 @@ Light to import: the parser and the settings of a command are loaded on demand.
 from __future__ import annotations
 
 import difflib
-import shlex
 import shutil
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -31,28 +30,6 @@ _ALIASES = {
 }
 COMMAND_ALIASES = {word: name for name, words in _ALIASES.items() for word in words.split()}
 """Command names of other toolkits, and the equivalent command of headbench."""
-
-MOVED = {
-    "bench": "doctor bench",
-    "check-plugin": "doctor check",
-    "compact": "export compact",
-    "curve": "run curve",
-    "extremes": "run extremes",
-    "gate": "compare",
-    "leaderboard build": "report leaderboard",
-    "parity": "run parity",
-    "pareto": "report pareto",
-    "record nersemble": "export nersemble",
-    "reenact": "run reenact",
-    "refit": "prepare refit",
-    "speed": "run speed",
-    "steps": "inspect steps",
-    "stress": "doctor stress",
-    "suite": "run suite",
-    "sweep": "run sweep",
-    "tongue": "prepare tongue",
-}
-"""Commands of earlier versions, and their replacement, which `InputError` names."""
 
 ABOUT = (
     "Benchmark of animatable 3D head avatars. Start with `headbench demo`. `headbench COMMAND --help` explains a command, "
@@ -117,13 +94,7 @@ def _place(name: str) -> int:
 
 
 def _unknown(words: Sequence[str], plugins: Mapping[str, Plugin]) -> InputError:
-    """The error for an unknown command, with the new command line for `MOVED`, otherwise with the nearest command."""
-    for asked in (" ".join(words[:2]), words[0]):
-        if asked in MOVED:
-            line = f"headbench {MOVED[asked]} {shlex.join(words[len(asked.split()) :])}".rstrip()
-            return InputError(
-                "command line", "", "a command of headbench", repr(asked), f"It is now `{line}`."
-            )
+    """The error for an unknown command, with the nearest command."""
     firsts = {name.partition(" ")[0] for name in plugins}
     asked = " ".join(words[: 2 if words[0] in firsts else 1])
     name = COMMAND_ALIASES.get(asked.lower().replace("_", "-"), "")

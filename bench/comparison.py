@@ -39,7 +39,6 @@ from .io.lock import locked
 from .listing import presets_of_methods
 from .machine import check_device
 from .named_protocol import check_capture, needed
-from .options import DependentOptions
 from .progress import counted, log_to_file
 from .progress import progress as show_progress
 from .registry import get, resolve
@@ -132,14 +131,10 @@ class RunSettings:
     unchecked: bool = False
     """Train even if `headbench lint` finds an error that makes the results of a capture meaningless."""
     dry_run: bool = False
-    """Check everything and list the cells with estimates of their time, disk space and memory; train nothing."""
-    estimates: str | None = None
-    """With --dry-run: folder of an earlier run on a machine like this one, to estimate from; that of --out is always used."""
+    """Check everything and list the cells; train nothing."""
     set: Assignments = ()
     """Any setting, for example `frames_per_task=50`, `settings.ga.budget.iterations=5000`, `execution.slurm.hours=8`;
     repeatable."""
-
-    dependent = (DependentOptions(("estimates",), "dry_run"),)
 
     @staticmethod
     def notes() -> str:
@@ -177,12 +172,13 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
     config = build_run_config(values, source)
     check_kind(Path(config.out), "a run")  # before the log is written there
     if settings.dry_run:
-        from .engine.forecast import forecast
-        from .engine.run import planned_jobs
+        from .engine.run import planned_cells
 
-        own = [Path(config.out)] if (Path(config.out) / "run.json").is_file() else []
-        known = [*own, *([Path(settings.estimates)] if settings.estimates else [])]
-        return forecast(planned_jobs(config), known)
+        cells = planned_cells(config)
+        lines = [f"{name:<40} {state}" for name, state in cells.items()]
+        return CommandResult(
+            "\n".join(lines), {"cells": [{"cell": name, "state": state} for name, state in cells.items()]}
+        )
     if settings.protocol:
         from .engine.captures import open_clips
 

@@ -27,7 +27,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
         keys = path.strip().split(".")
         if not equals or not all(keys):
             raise InputError("--set", assignment, "KEY=VALUE with dots in KEY for nesting", "no such form")
-        value = _scalar(parse_setting(text, "--set", path))
+        value = parse_setting(text, "--set", path)
         level = nested
         for key in keys[:-1]:
             level = level.setdefault(key, {})
@@ -147,19 +147,6 @@ def build_arguments(
     return arguments
 
 
-def _scalar(value: Any) -> Any:
-    """Convert numbers that YAML 1.1 reads as text, such as 1e-3, which has no dot."""
-    if not isinstance(value, str):
-        return value
-    for kind in (int, float):
-        try:
-            number = kind(value)
-        except ValueError:
-            continue
-        return number if math.isfinite(number) else value
-    return value
-
-
 def _convert(hint: Any, value: Any, source: str, key: str) -> Any:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is typing.Literal:
@@ -182,7 +169,10 @@ def _convert(hint: Any, value: Any, source: str, key: str) -> Any:
         origin, arguments = tuple, (*arguments, Ellipsis)
     if origin is tuple:
         if isinstance(value, str):
-            value = [_scalar(part.strip()) for part in value.split(",") if part.strip()]
+            parts = [part.strip() for part in value.split(",") if part.strip()]
+            value = [
+                parse_setting(part, source, key) if part[0] in "+-.0123456789" else part for part in parts
+            ]
         if not isinstance(value, (list, tuple)):
             raise InputError(source, key, "a list", shown(value))
         repeated = len(arguments) == 2 and arguments[1] is Ellipsis

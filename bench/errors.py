@@ -45,10 +45,6 @@ class HeadbenchError(Exception):
     """Base of all errors the command line reports as one paragraph, without a traceback (exit code 2)."""
 
 
-class ChangedInputError(HeadbenchError):
-    """A method changed inputs of other methods, so that all further results of this process are invalid."""
-
-
 LONGEST_PLACE, LONGEST_WORDS, LONGEST_FOUND = 400, 1200, 300
 """Maximum characters of an error's parts; longer text is shortened in the middle."""
 

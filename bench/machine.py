@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Self
@@ -35,7 +36,7 @@ def processor_count() -> int:
 
 
 def machine_record(device: str = "cpu") -> dict[str, Any]:
-    """Processor, memory, system and the versions of packages that influence results.
+    """Processor, memory, system, the versions of packages that influence results, and headbench's git commit, if any.
 
     For a CUDA ``device`` the entry "device" has its name, memory, compute capability, the CUDA version of
     torch, and whether matrix products and convolutions may round to TF32.
@@ -49,9 +50,21 @@ def machine_record(device: str = "cpu") -> dict[str, Any]:
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in RECORDED_PACKAGES},
+        **_commit_record(Path(__file__).parents[1]),
         "accelerators": accelerators(),
         **_device_record(device),
     }
+
+
+@cache
+def _commit_record(folder: Path) -> dict[str, str]:
+    """The entry ``commit`` of a checkout, with "-dirty" if its files differ from it; empty for any other folder."""
+    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    with suppress(OSError, subprocess.SubprocessError):
+        if (folder / ".git").exists():
+            found = subprocess.run(command, capture_output=True, text=True, check=True, timeout=20)
+            return {"commit": found.stdout.strip()}
+    return {}
 
 
 def _device_record(device: str) -> dict[str, Any]:

@@ -15,14 +15,10 @@ from .condition import label_of
 from .contracts import FrameKey
 from .engine.config import RunConfig
 from .errors import InputError
-from .io.documents import MAX_RECORD_BYTES, checked, read_json, shown
+from .io.documents import checked, read_json, shown
 from .io.files import check_name, digest, write_json, write_text
 from .protocol import Protocol
 from .specs import LABEL, MetricSpec, is_label
-from .upgrade import upgraded_manifest
-
-MAX_CELLS = 20_000
-"""Maximum number of cells, since a small record can declare any number; the largest suite has some hundred."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +123,7 @@ def _read_protocol(run: Path, task: str, name: str) -> ProtocolRecord:
     if not path.exists():
         expected = f"the protocol of {task} that {run.name} names"
         raise InputError(path, "", expected, "no such file", "Copy it from where the run was made.")
-    record = checked(read_json(path, MAX_RECORD_BYTES), ProtocolRecord, path)
+    record = checked(read_json(path), ProtocolRecord, path)
     if (record.task, record.hash) != (task.partition("@")[0], name):
         raise InputError(path, "task, hash", f"{task}, {name}", f"{record.task}, {record.hash}")
     names = {part for key in record.keys for part in (key.subject, *key.sequence.split("/"), key.camera)}
@@ -145,8 +141,8 @@ class Manifest:
     Attributes
     ----------
     paths : dict[str, str] | None
-        Files and folders of the configuration by dotted key, relative to the run folder; None in a
-        bundle, which contains no paths of the machine that wrote it.
+        Files and folders of the configuration by dotted key, relative to the run folder; None in
+        stored results, which contain no paths of the machine that wrote them.
     metrics, methods, protocols : tuple[MetricSpec, ...], tuple[MethodRecord, ...], dict[str, ProtocolRecord]
         In the order of the configuration; protocols by task, in files of their own.
     machine : dict[str, Any]
@@ -181,19 +177,11 @@ class Manifest:
 
         Names used in paths are checked as by `check_name`.
         """
-        record = read_json(path, MAX_RECORD_BYTES)
-        methods = record.get("methods")
-        if isinstance(methods, list) and len(methods) > MAX_CELLS:  # before they are copied
-            raise InputError(path, "methods", f"at most {MAX_CELLS} methods", str(len(methods)))
-        record = upgraded_manifest(record)
+        record = read_json(path)
         if record.get("format") != 2:
-            raise InputError(path, "format", "1 or 2", shown(record.get("format")))
+            raise InputError(path, "format", "2", shown(record.get("format")))
         hashes = checked(record.get(PROTOCOLS), dict[str, str], path, PROTOCOLS)
         manifest = checked({**record, PROTOCOLS: {}}, cls, path)
-        cells = len(manifest.methods) * len(manifest.clips) * len(manifest.configuration.seeds)
-        if cells > MAX_CELLS:
-            expected = f"at most {MAX_CELLS} cells (methods, captures and seeds)"
-            raise InputError(path, "configuration.seeds", expected, str(cells))
         named: dict[str, set[str]] = {
             "methods": {method.label for method in manifest.methods},
             "metrics, tables": {table for metric in manifest.metrics for table in metric.tables},

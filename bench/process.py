@@ -17,8 +17,6 @@ from pathlib import Path
 from typing import IO
 
 from .errors import HeadbenchError, shortened
-from .io.files import flush_renames
-from .orphans import orphans_ended
 
 KEPT = (
     *("PATH", "HOME", "USER", "LANG", "LC_ALL", "TMPDIR", "XDG_CACHE_HOME", "XDG_RUNTIME_DIR"),
@@ -87,9 +85,8 @@ def run_program(
 ) -> ProgramEnd:
     """Run a command in ``folder`` until it ends; its output, both streams, is appended to ``log``.
 
-    All processes that it started are terminated when it ends or this call is interrupted: its process group, and those
-    that left the group (on Linux). A process that keeps the output open is not waited for. Files written for it are
-    flushed to disk before, even inside a group of writes.
+    Its process group is terminated when it ends or this call is interrupted. A process that keeps the output open is
+    not waited for. Files written for it are flushed to disk before, even inside a group of writes.
 
     Parameters
     ----------
@@ -107,9 +104,8 @@ def run_program(
     ProgramError
         The command cannot be started, or takes longer than ``hours``.
     """
-    flush_renames()
     until = math.inf if hours is None else time.monotonic() + 3600 * hours
-    with log.open("ab") as stream, orphans_ended():
+    with log.open("ab") as stream:
         stream.write(f"$ {' '.join(command)}\n".encode())
         try:
             process = subprocess.Popen(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -24,7 +23,6 @@ from .contracts import IntArray
 from .errors import InputError, is_damage, shortened
 from .io.files import atomic_path, open_regular, reading
 from .specs import LABEL, is_label
-from .upgrade import upgraded_rows
 
 log = logging.getLogger(__name__)
 FRAME = ["subject", "sequence", "timestep", "camera"]
@@ -80,15 +78,6 @@ TYPES = {
 }
 
 ROWS = "a Parquet file of rows"
-MAX_FILE_BYTES = 256 * 2**20
-MAX_TEXT_BYTES = 256 * 2**20
-MAX_UNPACKED_BYTES = 512 * 2**20
-"""Schema of all columns in the file."""
-READING: Any = {"thrift_string_size_limit": 2**20, "thrift_container_size_limit": 2**16, "pre_buffer": False}
-"""Limits on texts and lists in the file's metadata, since a list allocates its declared length. Without pre-buffering,
-in which threads of pyarrow may keep the file open longer than the reader."""
-SPARE_ROWS = 100_000
-"""Rows that a file may have in addition to one per byte: repeated rows, such as those of a missing metric, compress well."""
 JOINED_AT_ONCE = 64
 """Number of tables concatenated at a time: many small tables take many times the memory of their content."""
 MAX_VALUE = 1e15
@@ -145,7 +134,7 @@ class Rows:
             raise InputError(path, "", "the rows of a finished run", "no such file", "Start the run again.")
         with reading(path, ROWS):
             table = _read_table(path)
-        return cls(upgraded_rows(_checked(table, path)))
+        return cls(_checked(table, path))
 
     def write(self, path: Path) -> None:
         """Write the rows as Parquet, atomically."""
@@ -295,18 +284,6 @@ class Rows:
         }
         return Rows(table.assign(**columns))
 
-    def with_suspects(self, limits: Mapping[str, float], region: str) -> Rows:
-        """Return the rows; of values of whole images (``region``), exactly those above their metric's limit are suspect."""
-        table = self._table
-        above = table["value"] > table["metric"].map(dict(limits)).astype(float)
-        above &= (table["status"] == "ok") & (table["region"] == region) & (table["task"] != "")
-        marked = table["reason"].str.startswith(SUSPECT)
-        reasons = table["reason"].mask(marked, "").astype("str")
-        texts = (
-            SUSPECT + "above " + table["metric"].map({m: f"{v:g}" for m, v in limits.items()}).astype("str")
-        )
-        return Rows(table.assign(reason=reasons.mask(above, texts)))
-
     def in_single_precision(self) -> Rows:
         """Return the rows with values rounded to float32 (7 digits, more than tables show), which halves the file."""
         return Rows(self._table.assign(value=self._table["value"].astype(np.float32).astype(np.float64)))
@@ -343,29 +320,6 @@ class Rows:
         parts = [table[~whole].assign(task=names.astype("str"))]
         parts += [table[whole].assign(task=name) for name in (inside, outside)]
         return Rows(pd.concat(parts, ignore_index=True))
-
-    def updated(self, new: Rows) -> Rows:
-        """Return the rows in their order, replaced by rows of ``new`` with the same method, seed, frame, region
-        and metric.
-
-        Raises `InputError` for new rows that replace nothing.
-        """
-        identity = ["method", "condition", "seed", "task", *FRAME, "region", "metric"]
-        own, others = (pd.MultiIndex.from_frame(table[identity]) for table in (self._table, new._table))
-        places = own.get_indexer(others)
-        if (places < 0).any():
-            where = " ".join(map(str, others[int(np.argmin(places))]))
-            raise InputError("rows", where, "a row to replace", "none")
-        chosen = np.arange(len(own))
-        chosen[places] = len(own) + np.arange(len(others))
-        return Rows(pd.concat([self._table, new._table]).take(chosen).reset_index(drop=True))
-
-    def with_values(self, other: Rows) -> Rows:
-        """Return the rows with measured values replaced by those that ``other`` has as well."""
-        identity = ["method", "condition", "seed", "task", *FRAME, "region", "metric"]
-        theirs = other._table[other._table["status"] == "ok"].set_index(identity)["value"]
-        found = theirs.reindex(pd.MultiIndex.from_frame(self._table[identity])).to_numpy()
-        return Rows(self._table.assign(value=self._table["value"].where(np.isnan(found), found)))
 
     @property
     def regions(self) -> set[str]:
@@ -540,26 +494,13 @@ def earlier_rows(path: Path) -> Rows | None:
 def _read_table(path: Path) -> pa.Table:
     """Read the columns of `Row`; text as dictionaries, so that repeated text takes no memory."""
     with open_regular(path, ROWS) as stream:
-        size = os.fstat(stream.fileno()).st_size
-        if size > MAX_FILE_BYTES:
-            raise InputError(path, "", f"rows of at most {MAX_FILE_BYTES} bytes", f"{size}")
-        about = pq.ParquetFile(stream, **READING).metadata
-        names = Counter(about.schema.column(index).path for index in range(about.num_columns))
+        names = Counter(pq.read_schema(stream).names)
         columns = [name for name in COLUMNS if name != "condition" or names[name]]  # version 1 has none
         wrong = [f"{names[name] or 'no'} {name}" for name in columns if names[name] != 1]
         if wrong:
             raise InputError(path, "columns", f"once each {', '.join(COLUMNS)}", ", ".join(wrong))
-        groups = [about.row_group(index) for index in range(about.num_row_groups)]
-        rows = max(about.num_rows, sum(group.num_rows for group in groups))
-        if rows > size + SPARE_ROWS:
-            raise InputError(path, "", f"at most {size + SPARE_ROWS} rows in {size} bytes", f"{rows} rows")
-        # Sizes of groups, not of columns: pyarrow crashes when asked for a damaged column.
-        unpacked = sum(max(0, group.total_byte_size) for group in groups)
-        if unpacked > MAX_UNPACKED_BYTES:
-            raise InputError(path, "", f"columns of at most {MAX_UNPACKED_BYTES} bytes", f"{unpacked}")
-        file = pq.ParquetFile(
-            stream, metadata=about, read_dictionary=[name for name in TEXTS if name in columns], **READING
-        )
+        texts = [name for name in TEXTS if name in columns]
+        file = pq.ParquetFile(stream, read_dictionary=texts, pre_buffer=False)
         table = file.read(columns=columns, use_threads=False, use_pandas_metadata=False)
         table.validate(full=True)
         return table
@@ -616,8 +557,4 @@ def _texts(column: Any, path: Path, name: str) -> pd.Series[str]:
     for word in words:
         if name != "reason" and not is_label(word):
             raise InputError(path, name, LABEL, repr(word))
-    indices = column.indices.to_numpy()
-    total = int(np.bincount(indices) @ [len(word.encode()) for word in words[: indices.max() + 1]])
-    if total > MAX_TEXT_BYTES:
-        raise InputError(path, name, f"at most {MAX_TEXT_BYTES} bytes of text", f"{total}")
-    return pd.Series(np.array(words, dtype=object)[indices], dtype="str")
+    return pd.Series(np.array(words, dtype=object)[column.indices.to_numpy()], dtype="str")

@@ -22,8 +22,6 @@ PLACES = np.array(
 )
 """Positions of the eyes, the tip of the nose and the corners of the mouth in the crop, pixels."""
 LENGTH = 512
-MAX_BYTES = 2**30
-"""Maximum size of a file; that of ResNet-50 has 0.17 GB."""
 
 
 class ArcFace:
@@ -35,7 +33,7 @@ class ArcFace:
 
     def __init__(self, path: Path):
         expected = f"a network of ONNX that maps a picture of {SIDE}x{SIDE} pixels to {LENGTH} numbers"
-        content = read_bytes(path, expected, MAX_BYTES)
+        content = read_bytes(path, expected)
         with reading(path, expected):
             self._network = cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8))
             found = self._run(np.zeros((SIDE, SIDE, 3), np.uint8))

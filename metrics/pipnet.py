@@ -173,7 +173,7 @@ def face_box(landmarks: FloatArray, mean_face: FloatArray) -> IntArray:
 def read_mean_face(path: Path) -> FloatArray:
     """Read (98, 2) positions in the crop, from 0 to 1, from a text file of 196 numbers. Raises `InputError`."""
     expected = f"the {2 * COUNT} numbers of the project PIPNet's file data/WFLW/meanface.txt"
-    text = read_bytes(path, expected, 2**16)
+    text = read_bytes(path, expected)
     with reading(path, expected):
         numbers = np.array(text.split(), float)
     if numbers.size != 2 * COUNT:

@@ -3,8 +3,6 @@ code."""
 
 from __future__ import annotations
 
-import io
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,41 +12,25 @@ import torch
 from torch import Tensor
 
 from ..bench.errors import InputError
-from ..bench.io.archives import open_archive
 from ..bench.io.arrays import check_numbers
 from ..bench.io.files import open_regular, reading
 
 EXPECTED = "a PyTorch file of weights"
-MAX_BYTES = 2**30
-"""Maximum size of a file; that of VGG-16, the largest backbone of LPIPS, has 0.55 GB."""
-MAX_MEMBERS = 10_000
 
 
 def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
     """Read the tensors named in ``shapes`` as float32, on the CPU.
 
-    Both layouts are supported: the archive of PyTorch 1.6 and later, with uncompressed members, and the earlier one.
-    Raises `InputError` for a file that is missing, damaged, larger than `MAX_BYTES`, of another kind or with other objects
-    than tensors; and for a tensor that is missing, of another shape, not floating-point or not finite.
+    Raises `InputError` for a file that is missing, damaged, of another kind or with other objects than tensors; and for a
+    tensor that is missing, of another shape, not floating-point or not finite.
     """
-    with open_regular(path, EXPECTED) as stream:
-        size = os.fstat(stream.fileno()).st_size
-        if size > MAX_BYTES:
-            raise InputError(path, "", f"{EXPECTED} of at most {MAX_BYTES} bytes", f"{size}")
-        is_archive = stream.read(4) == b"PK\3\4"
-        if is_archive:
-            with open_archive(path, EXPECTED, members=MAX_MEMBERS, spare_bytes=0, per_byte=1):
-                pass
-        stream.seek(0)
-        # Reading from a file allocates as many bytes as a damaged pickle declares; reading from memory does not.
-        source = stream if is_archive else io.BytesIO(stream.read())
-        with reading(path, EXPECTED):
-            try:
-                content = torch.load(source, map_location="cpu", weights_only=True)
-            except UnpicklingError as error:  # its message advises to load without weights_only
-                name = re.search(r"GLOBAL (\S+)", str(error))
-                found = f"the name {name[1]}, which no weights need" if name else "another pickle"
-                raise InputError(path, "", EXPECTED, found) from error
+    with open_regular(path, EXPECTED) as stream, reading(path, EXPECTED):
+        try:
+            content = torch.load(stream, map_location="cpu", weights_only=True)
+        except UnpicklingError as error:  # its message advises to load without weights_only
+            name = re.search(r"GLOBAL (\S+)", str(error))
+            found = f"the name {name[1]}, which no weights need" if name else "another pickle"
+            raise InputError(path, "", EXPECTED, found) from error
     if not isinstance(content, dict):
         raise InputError(path, "", "a dictionary of tensors", type(content).__name__)
     return {name: _tensor(path, name, content.get(name), shape) for name, shape in shapes.items()}

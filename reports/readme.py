@@ -24,7 +24,6 @@ from typing import Any
 
 import cv2
 
-from ..bench.audit.bundle import without_paths
 from ..bench.contracts import no_progress
 from ..bench.engine.config import CODED
 from ..bench.engine.scoring import FULL
@@ -43,6 +42,7 @@ from ..bench.experiments.suite_settings import (
 )
 from ..bench.io.files import write_bytes, write_json, write_text
 from ..bench.io.images import encode_image, read_png
+from ..bench.manifest import Manifest
 from ..bench.progress import counted
 from ..bench.protocol import SEEN_CAMERAS, TASK_TITLES, evenly
 from ..bench.registry import discover
@@ -218,10 +218,26 @@ def _copy(source: RunFolder, target: RunFolder) -> None:
     """Manifest, without this machine's folders, protocols and rows of a run."""
     manifest = source.read_manifest()
     target.root.mkdir(parents=True, exist_ok=True)
-    without_paths(manifest, tuple(dict.fromkeys(method.name for method in manifest.methods))).write(
-        target.manifest
-    )
+    _without_folders(manifest).write(target.manifest)
     Rows.read(source.rows).in_single_precision().write(target.rows)
+
+
+def _without_folders(manifest: Manifest) -> Manifest:
+    """The record of a run with the names of files and folders instead of their paths."""
+    config = manifest.configuration
+    files = {key.rpartition(".")[2] for key in manifest.paths or {}}
+    settings = {
+        key: Path(value).name if key in files else value for key, value in config.reader_settings.items()
+    }
+    config = replace(
+        config,
+        data=Path(config.data).name,
+        out="",
+        source=Path(config.source).name,
+        reader_settings=settings,
+        heads={name: Path(path).name for name, path in config.heads.items()},
+    )
+    return replace(manifest, configuration=config, paths=None)
 
 
 def marks(name: str) -> tuple[str, str]:

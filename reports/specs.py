@@ -142,15 +142,6 @@ PARETO = CommandSpec(
     writes="out",
 )
 
-LEADERBOARD_BUILD = CommandSpec(
-    name="report leaderboard",
-    group="inspect",
-    summary="Build a leaderboard page from the result bundles in a folder.",
-    settings="headbench.reports.leaderboard.settings:LeaderboardSettings",
-    function="headbench.reports.leaderboard.page:build",
-    writes="out",
-)
-
 RENDER = CommandSpec(
     name="render",
     group="inspect",

@@ -12,7 +12,7 @@ from typing import cast
 import pandas as pd
 
 from ..bench.errors import InputError
-from ..bench.io.files import grouped_writes, write_text
+from ..bench.io.files import write_text
 from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from ..bench.registry import unknown
 from ..bench.specs import MetricSpec
@@ -22,7 +22,7 @@ from .papers import printed_tables
 from .printed import as_printed
 from .protocols import chosen
 from .runs import WHOLE, FrameSelection, RunSet
-from .tables import AVATAR_TITLE, TITLES, RowGroup, Table, build_table
+from .tables import AVATAR_TITLE, TITLES, Table, build_table
 from .writers import WRITERS, to_text
 
 
@@ -125,11 +125,10 @@ def write_tables(run_folder: Path) -> list[Path]:
     files = []
     for layout in layouts(runs):
         table = table_of(runs, layout)
-        with grouped_writes():
-            for suffix, write in WRITERS.values():
-                path = runs.runs[0].folder.tables / f"{layout}.{suffix}"
-                write_text(path, write(table))
-                files.append(path)
+        for suffix, write in WRITERS.values():
+            path = runs.runs[0].folder.tables / f"{layout}.{suffix}"
+            write_text(path, write(table))
+            files.append(path)
     return files
 
 
@@ -191,10 +190,8 @@ def table_of(
     runs: RunSet,
     layout: str = COMPARISON,
     columns: Columns = ALL_COLUMNS,
-    apart: Sequence[RowGroup] = (),
-    claimed: Collection[tuple[str, str]] = (),
 ) -> Table:
-    """Build a table of loaded runs; for ``apart`` and ``claimed`` see `build_table`.
+    """Build a table of loaded runs.
 
     Avatar metrics of other layouts are shown if ``columns`` names them.
     """
@@ -228,6 +225,4 @@ def table_of(
         averaged=runs.averaged,
         avatar_title=TITLES.get(layout, AVATAR_TITLE),
         name=layout,
-        apart=apart,
-        claimed=claimed,
     )

@@ -45,13 +45,13 @@ class Column:
 class TableCell:
     """A value, or the reason why it is missing.
 
-    ``status`` is "ok", "claimed" (an unverified value in a leaderboard), "missing" (could not be or was not measured),
+    ``status`` is "ok", "missing" (could not be or was not measured),
     "failed" (the method raised an error), "published" (printed in a paper, not measured) or "none" (not printed there).
     ``rank`` is 1 for all methods that may be the best, then 2, 3, ... for the next displayed values; None if unranked.
     """
 
-    status: Literal["ok", "claimed", "missing", "failed", "published", "none"]
-    value: float | None  # full precision; None unless ok, claimed or published
+    status: Literal["ok", "missing", "failed", "published", "none"]
+    value: float | None  # full precision; None unless ok or published
     text: str  # as displayed
     spread: str = ""  # standard deviation over seeds, as displayed; "" with one seed
     rank: int | None = None
@@ -195,16 +195,6 @@ METHODS_TITLE = "Methods"
 TRIVIAL_TITLE = "Trivial baselines (not ranked)"
 SUSPECT_TITLE = "Suspect: better than any method that has not seen the frames (not ranked)"
 CONDITIONS_TITLE = "Under other conditions (not ranked)"
-CLAIMED = "Claimed by its author, not verified (not ranked)."
-
-
-@dataclass(frozen=True)
-class RowGroup:
-    """A separate group of a table's rows; those that are not ``ranked`` come last."""
-
-    title: str
-    methods: frozenset[str]
-    ranked: bool = True
 
 
 def build_table(
@@ -225,8 +215,6 @@ def build_table(
     averaged: str = AVERAGED,
     avatar_title: str = AVATAR_TITLE,
     name: str = "",
-    apart: Sequence[RowGroup] = (),
-    claimed: Collection[tuple[str, str]] = (),
 ) -> Table:
     """Build the comparison table of whole images.
 
@@ -254,10 +242,6 @@ def build_table(
         Heading of the columns that belong to no task.
     name : str
         Name of the layout.
-    apart : Sequence[RowGroup]
-        Separate groups of methods, by the support for their values.
-    claimed : Collection[tuple[str, str]]
-        Methods and metrics with unverified values, which are marked and not ranked.
 
     Raises
     ------
@@ -275,21 +259,13 @@ def build_table(
         for m, task, title in places
     )
     found = conditions(rows, metrics, methods)
-    unsupported = {method for group in apart if not group.ranked for method in group.methods}
-    marked = marks(found, [*trivial, *unsupported])
+    marked = marks(found, trivial)
     suspect = suspects(rows, methods)
     too_good = {method for _, method, _ in suspect}
     titles = dict.fromkeys(methods, METHODS_TITLE)
-    for group in (
-        *(group for group in apart if group.ranked),
-        RowGroup(SUSPECT_TITLE, frozenset(too_good), ranked=False),
-        RowGroup(TRIVIAL_TITLE, frozenset(trivial), ranked=False),
-        RowGroup(CONDITIONS_TITLE, frozenset(changed), ranked=False),
-        *(group for group in apart if not group.ranked),
-    ):
-        titles |= {method: group.title for method in methods if method in group.methods}
-    ranked_titles = [*(group.title for group in apart if group.ranked), METHODS_TITLE]
-    unranked = {method for method, title in titles.items() if title not in ranked_titles}
+    for title, own in ((SUSPECT_TITLE, too_good), (TRIVIAL_TITLE, trivial), (CONDITIONS_TITLE, changed)):
+        titles |= {method: title for method in methods if method in own}
+    unranked = {method for method, title in titles.items() if title != METHODS_TITLE}
     notes: list[str] = []
     lines: list[TableRow] = []
     for method in methods:
@@ -297,11 +273,7 @@ def build_table(
         for c in columns:
             cell = summarise(rows, method, c.metric, c.task)
             mark = suspect.get((c.metric, method, c.task)) or marked.get((c.metric, method), "")
-            known = (method, c.metric) not in claimed
-            if not known and method not in unranked:
-                mark = f"{mark} {CLAIMED}".lstrip()
-            shown = _cell(cell, c.digits, notes, mark)
-            cells.append(shown if known or shown.status != "ok" else replace(shown, status="claimed"))
+            cells.append(_cell(cell, c.digits, notes, mark))
         lines.append(TableRow(method, ", ".join(rows.versions(method)), method in unranked, tuple(cells)))
     # Times measured under different conditions are not ranked.
     unequal = {metric for metric, method in marked if method not in unranked}
@@ -310,11 +282,9 @@ def build_table(
         for index, column in enumerate(columns)
     ]
     lines = _ranked(lines, columns, bests)
-    order = [*ranked_titles, SUSPECT_TITLE, CONDITIONS_TITLE, TRIVIAL_TITLE]
-    order += [group.title for group in apart if not group.ranked]
     groups = [
         (title, tuple(line for line in lines if titles[line.method] == title))
-        for title in dict.fromkeys(order)
+        for title in (METHODS_TITLE, SUSPECT_TITLE, CONDITIONS_TITLE, TRIVIAL_TITLE)
     ]
     return Table(
         columns=columns,
@@ -324,12 +294,10 @@ def build_table(
             _task_summary(rows, task, protocol_ids.get(task, ""), (keys or {}).get(task, ()))
             for task in tasks
         ),
-        seeds=max([1, *(len(rows.seeds(method)) for method in methods if method not in unsupported)])
-        if unsupported
-        else max(1, len(rows.seeds(ALL))),
+        seeds=max(1, len(rows.seeds(ALL))),
         marking=_marking(columns, lines, bests),
         image_size=image_size,
-        machine=measured_on(found.get("fps", {}), [*trivial, *unsupported], machine),
+        machine=measured_on(found.get("fps", {}), trivial, machine),
         part=part,
         missing=tuple(missing),
         cameras=cameras,

@@ -229,7 +229,7 @@ def _latex_cell(cell: TableCell) -> str:
 
 
 def to_html(table: Table) -> str:
-    """Write one page without scripts, fonts or network access, the best rows first. Tooltips have values in full precision."""
+    """Write one page that needs no network, the best rows first; columns can be sorted. Tooltips have values in full precision."""
     heading = " and ".join(task.title.lower() if i else task.title for i, task in enumerate(table.tasks))
     return render_page("table.html", table=table, heading=heading or TITLES.get(table.name, "Comparison"))
 
@@ -252,7 +252,7 @@ def _templates() -> Environment:
     """The templates, compiled on first use."""
     from jinja2 import Environment, FileSystemLoader
 
-    folders = [HERE, HERE / "leaderboard", HERE / "page"]
+    folders = [HERE, HERE / "page"]
     return Environment(autoescape=True, keep_trailing_newline=True, loader=FileSystemLoader(folders))
 
 

@@ -23,7 +23,7 @@ from headbench.methods.shared.threads import torch_threads
 from .axe import serious_findings
 
 # How long an example takes says something of the machine's load, nothing of the code. The examples are the same in every
-# run, so that a red run is the change's doing; `make fuzz` looks for new ones.
+# run, so that a red run is the change's doing; `make nightly` looks for new ones among damaged files.
 settings.register_profile(
     "repeatable", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
 )
@@ -126,7 +126,6 @@ def pytest_sessionfinish(session):
 SLOW_FILES = (
     "test_end_to_end.py",
     "test_readme.py",
-    "test_forgeries.py",
     "test_flame_files.py",
     "test_benchmarks.py",
 )

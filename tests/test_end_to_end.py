@@ -30,11 +30,13 @@ from .datasets.flat_renderer import flat_pictures
 from .datasets.monocular.videos import Recording
 from .datasets.nersemble.recordings import write_recording
 from .datasets.tracker_files.trackers import write_metrical
-from .fuzz.samples import SETTINGS
+from .world import SETTINGS
 
 SMALL = (f"--set=settings.{name}={json.dumps(SETTINGS[name])}" for name in ("gbs", "gha", "insta"))
 TINY = ("--preset", "smoke", "--set=frames_per_task=3", *SMALL)
 """Few frames; two iterations of the methods of which nothing but that they run is asked."""
+pytestmark = pytest.mark.commands
+
 METHODS = {"mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours", "ours-plus"}
 
 
@@ -195,7 +197,6 @@ CASES = {
     "demo": [],  # the run of this module
     "synth": [case(OTHERS, "others", "others/synthesis.json")],
     "run": [case(PLAIN, r"\| nearest-camera", "plain/rows.parquet", "plain/tables/comparison.md")],
-    "run speed": [case("run speed plain --methods mean-image", "speed measured again, avatars: 1")],
     "status": [case("status plain", "2 cells: 0 waiting, 0 running, 2 done, 0 failed")],
     "run suite": [
         case(
@@ -229,18 +230,7 @@ CASES = {
         case("report plain --split", "frames with pictures", "report/index.html"),
     ],
     "view": [case("view {demo} --port 0 --seconds 0", "the viewer of .*ours-plus has ended")],
-    "verify": [case("verify {demo}", "as recorded")],
-    "bundle": [
-        case("bundle plain --out board/plain.zip --by Somebody --renders", "plain.zip", "board/plain.zip"),
-        case("bundle {demo} --out board/all.zip --by Somebody --methods ga ours", "all.zip", "board/all.zip"),
-        case("verify board/plain.zip", "as recorded"),
-        case("verify board/all.zip", "No value was recomputed"),
-    ],
-    "report leaderboard": [
-        case(
-            "report leaderboard board --out page", "2 bundles", "page/leaderboard.md", "page/leaderboard.html"
-        )
-    ],
+    "verify": [case("verify plain --render", "as recorded")],
     "compare": [
         case("compare {demo} --metrics psnr", "ga +ours"),
         case("compare {demo} --metrics psnr --region face", "(?s)Region: face.*ga +ours"),
@@ -258,8 +248,8 @@ CASES = {
             "theirs/run.json",
         ),
         case(
-            f"evaluate {cell('ours')}/avatar --avatar --clip {{capture}} --out stored --frames-per-task 1",
-            r"(?s)images .*Storage|Storage.*images",
+            f"evaluate --avatar {cell('ours')}/avatar --data {{capture}} --out stored --frames-per-task 1",
+            r"(?s)Storage.*\| ours ",
             "stored/rows.parquet",
         ),
         case("verify stored", "as recorded"),

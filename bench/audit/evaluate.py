@@ -27,7 +27,6 @@ from ..io.files import (
     check_output_folder,
     digest,
     digest_file,
-    grouped_writes,
 )
 from ..io.images import probe_image, read_pixels, write_png
 from ..io.lock import locked
@@ -71,9 +70,10 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
         return run_as_task(f"{__name__}:evaluate_folder", settings, place, settings.device)
     source = Path(settings.folder)
     stored = open_avatar(source, settings.method) if settings.avatar else None
-    config, clips = _open(settings, {} if stored is None else stored.heads)
+    label = settings.label or ("images" if stored is None else stored.record["method"])
+    config, clips = _open(settings, label, {} if stored is None else stored.heads)
     metrics = [m for m in resolve_metrics(config) if m.per_frame or (settings.avatar and m.kind == "avatar")]
-    if not any(metric.per_frame for metric in metrics):
+    if not metrics:
         raise InputError("metrics", "", "at least one metric of frames", ", ".join(config.metrics))
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
     images: dict[tuple[str, FrameKey], Render] = {}
@@ -124,10 +124,10 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
     return CommandResult(f"{text}\n{folder.root}", data, not rows.failed)
 
 
-def _open(settings: EvaluateSettings, heads: Mapping[str, str]) -> tuple[RunConfig, list[Clip]]:
-    """The settings, with the head models of an avatar, and the captures for the evaluation."""
-    label = check_name(settings.label, "command line", "--label")
-    if label in discover("methods"):
+def _open(settings: EvaluateSettings, label: str, heads: Mapping[str, str]) -> tuple[RunConfig, list[Clip]]:
+    """The settings, with the name of the method and the head models of an avatar, and the captures to score against."""
+    check_name(label, "command line", "--label")
+    if settings.label in discover("methods"):
         expected = "a name that no registered method has"
         raise InputError("command line", "--label", expected, repr(label), f"For example {label}-official.")
     folder = RunFolder(Path(settings.out))
@@ -175,16 +175,15 @@ def _open(settings: EvaluateSettings, heads: Mapping[str, str]) -> tuple[RunConf
 
 def _copy(images: Mapping[tuple[str, FrameKey], Render], job: Job) -> None:
     """Copy the images of a subject to the run's folders of renders."""
-    with grouped_writes():
-        for (task, key), source in images.items():
-            target = job.cell.render(task, key)
-            if key.subject != job.clip.subject or (target.exists() and target.samefile(source.image)):
-                continue
-            if source.alpha is not None:
-                write_png(target, composited(source, job.clip.background.tolist()))
-                continue
-            with atomic_path(target) as temporary:
-                shutil.copyfile(source.image, temporary)
+    for (task, key), source in images.items():
+        target = job.cell.render(task, key)
+        if key.subject != job.clip.subject or (target.exists() and target.samefile(source.image)):
+            continue
+        if source.alpha is not None:
+            write_png(target, composited(source, job.clip.background.tolist()))
+            continue
+        with atomic_path(target) as temporary:
+            shutil.copyfile(source.image, temporary)
 
 
 SHOWN = 3

@@ -24,7 +24,6 @@ from ..specs import DatasetSpec
 MAP = "a list of names, MAP.csv"
 COLUMNS = ("file", "sequence", "timestep", "camera")
 MAP_COLUMNS = ("file", *FrameKey._fields)
-MAX_MAP_BYTES = 64 * 2**20
 MAP_REMEDY = "Name the images one by one with --names MAP.csv (columns file, sequence, timestep, camera)."
 
 
@@ -137,7 +136,7 @@ def every_frame(clip: Clip) -> set[FrameKey]:
 
 def _listed(path: Path, folder: Path, clips: Sequence[Clip]) -> Renders:
     """Images listed in a CSV file, relative to ``folder``; with several captures it needs a column ``subject``."""
-    text = read_text(path, "CSV", MAX_MAP_BYTES)
+    text = read_text(path, "CSV")
     needed = {*COLUMNS, *(["subject"] if len(clips) > 1 else [])}
     with reading(path, "a CSV file"):
         reader = csv.reader(io.StringIO(text, newline=""), strict=True)

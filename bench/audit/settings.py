@@ -1,10 +1,9 @@
-"""Settings of the commands verify, bundle, evaluate and frames."""
+"""Settings of the commands verify, evaluate and frames."""
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated
 
 import tyro
 
@@ -13,78 +12,27 @@ from ..engine.config import RunOptions
 from ..errors import InputError
 from ..executors.options import ExecutionOptions
 from ..options import DependentOptions
-from ..specs import LABEL, is_label
 
 
 @dataclass(frozen=True)
-class VerifySettings(RunOptions, ExecutionOptions):
-    """Recompute hashes and metrics of runs from their stored files, and state what was not verified.
+class VerifySettings(RunOptions):
+    """Score the stored frames of runs again and compare the values with those of the runs.
 
-    Of a bundle the listed digests are checked, and with renders in it all metrics of frames as well: against the capture
-    that --data names, or for a synthetic one against a capture made again from the recorded seed. Definitions of metrics and
-    methods are compared with those registered here. Of several runs or bundles, equal renders are listed.
-    Exit code 0: everything that was verified is as recorded; 1: something differs; 2: wrong usage; 3: a run or its capture is
-    missing or invalid.
+    Captures, protocols, frames and avatars are compared with the run's record, too. The last line of a run names what was not
+    verified. Exit code 0: everything that was verified is as recorded; 1: something differs; 2: wrong usage; 3: a run or its
+    capture is missing or invalid.
     """
 
     runs: tyro.conf.Positional[tuple[str, ...]]
-    """Folders of finished runs or of `headbench evaluate`, and files of `headbench bundle`."""
+    """Folders of finished runs, or of `headbench evaluate`."""
 
-    out: str | None = None
-    """Folder for verify.json and for temporary files; with --executor slurm one that all machines share. Default: temporary
-    files only, deleted at the end."""
+    render: bool = False
+    """Also render the stored avatars again and compare the frames, which may differ by one level of 8 bits."""
 
     def __post_init__(self) -> None:
-        """Refuse to verify nothing, and jobs of a cluster without a folder that they share."""
+        """Refuse to verify nothing."""
         if not self.runs:
-            raise InputError("command line", "RUNS", "a run or a bundle", "none")
-        if self.executor == "slurm" and self.out is None:
-            raise InputError("command line", "--out", "a folder that all machines share", "none")
-
-
-@dataclass(frozen=True)
-class BundleSettings:
-    """Write the results of a finished run to one file for a leaderboard and for `headbench verify`.
-
-    It holds the rows and records of a run with the digest of each file, and no folder names of this machine; no images unless
-    requested. It contains no licensed data. Add renders of real people only with their consent.
-    """
-
-    run: tyro.conf.Positional[str]
-    """Folder of a finished run, or of `headbench evaluate`."""
-
-    out: str
-    """File to write, for example NAME.zip."""
-
-    by: str
-    """Name of the submitter on a leaderboard."""
-
-    link: str = ""
-    """Web address, such as that of a paper or a repository."""
-
-    comment: str = ""
-    """Anything else, one line."""
-
-    methods: tuple[str, ...] = ()
-    """Only these methods; default: all of the run."""
-
-    renders: bool = False
-    """Add the scored frames, so that others can recompute the metrics."""
-
-    def __post_init__(self) -> None:
-        """Refuse values that a leaderboard cannot show."""
-        check_shown(self, "command line")
-
-
-def check_shown(submission: Any, source: str) -> None:
-    """Raise `InputError` unless a leaderboard can show ``by``, ``link`` and ``comment``; a link is of the web."""
-    for name in ("by", "link", "comment"):
-        text = getattr(submission, name)
-        if not is_label(text):
-            raise InputError(source, name, LABEL, repr(text[:60]))
-    link = submission.link
-    if link and not re.fullmatch(r"https?://[^\s\"'<>()\[\]]+", link):
-        raise InputError(source, "link", "an address that begins with https:// or http://", repr(link))
+            raise InputError("command line", "RUNS", "a run", "none")
 
 
 @dataclass(frozen=True)
@@ -103,11 +51,12 @@ class EvaluateSettings(ExecutionOptions):
     out: str
     """Folder to write: a run with one method, which `table`, `compare`, `verify` and every report can read."""
 
-    clip: str | None = None
+    clip: Annotated[str | None, tyro.conf.arg(aliases=["--data"])] = None
     """Capture to score against (or folder of several); default: that of the run named by --like."""
 
-    label: str = "images"
-    """Name of the method in tables; not the name of a registered method."""
+    label: str = ""
+    """Name of the method in tables; not the name of a registered method. Default: images, with --avatar the method that
+    avatar.json names."""
 
     avatar: bool = False
     """FOLDER holds an avatar: it is rendered, and its storage and speed are measured, too."""

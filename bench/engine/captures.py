@@ -21,6 +21,7 @@ from ..specs import LABEL, DatasetSpec, ResolutionRule, is_label
 from .adaptation import MethodNeeds, apply, plan
 from .config import RunConfig, RunOptions, resolve_change
 from .store import RunFolder
+from .trust import check_trusted, names_of
 
 log = logging.getLogger(__name__)
 Plugins = Literal["methods", "metrics"]
@@ -182,7 +183,6 @@ def open_run_clips(
     out: Path | None = None,
     altered: bool = False,
     use_cache: bool = True,
-    only: int | None = None,
     used: tuple[Plugins, ...] = ("methods", "metrics"),
 ) -> tuple[RunConfig, list[Clip]]:
     """Open the captures that a run was made from; return its settings as well, see `run_configuration`.
@@ -194,7 +194,7 @@ def open_run_clips(
         folder, which the caller must have locked.
     altered : bool
         Return captures even if they differ from those of the run.
-    use_cache, only : bool, int or None
+    use_cache : bool
         See `open_clips`.
     used : tuple[Plugins, ...]
         Plug-ins that the caller resolves from the returned settings. Names that would import a module
@@ -213,7 +213,7 @@ def open_run_clips(
     for config in _configurations(run, options, used):
         config = config if out is None else replace(config, out=str(out))
         try:
-            clips = open_clips(config, use_cache=use_cache, only=only)
+            clips = open_clips(config, use_cache=use_cache)
         except InputError as error:
             refused.append(error)
             continue
@@ -242,8 +242,9 @@ def _configurations(
     folder = RunFolder(run)
     manifest = folder.read_manifest()
     config = replace(manifest.configuration, out=str(run))
-    if not options.trust:
-        _check_registered(config, folder.manifest, used)
+    unused = [key for group, keys in _KEYS.items() if group not in used for key in keys]
+    named = {key: names for key, names in names_of(config).items() if key not in unused}
+    check_trusted(folder.manifest, named, trust=options.trust)
     if options.head is not None:
         config = replace(config, reader_settings={**config.reader_settings, "head": options.head})
     given = {"data": options.data, "reader_settings.head": options.head}
@@ -275,6 +276,7 @@ def _configurations(
         yield replace(config, data=place, reader_settings=settings, heads=heads, source=source)
 
 
+_KEYS: dict[Plugins, tuple[str, ...]] = {"methods": ("methods",), "metrics": ("metrics", "metric_profiles")}
 _REMEDIES = {
     "data": "Name the folder of the capture with --data.",
     "reader_settings.head": "Name the file of the head model with --head.",
@@ -292,24 +294,6 @@ def _named(config: RunConfig) -> dict[str, str]:
     source = {"source": config.source} if config.source else {}
     heads = {f"heads.{key}": path for key, path in config.heads.items()}
     return {"data": config.data, **files, **heads, **source}
-
-
-def _check_registered(config: RunConfig, manifest: Path, used: tuple[Plugins, ...]) -> None:
-    """Refuse to import modules that a run folder names, since it may be untrusted."""
-    named: dict[str, Sequence[str]] = {"reader": (config.reader,)}
-    changes = [(c.clip, c.derive, c.drive) for c in config.conditions]
-    named["conditions"] = [each.name for change in changes for each in change] + [config.clip.name]
-    if "methods" in used:
-        named["methods"] = config.methods
-    if "metrics" in used:
-        named |= {"metrics": config.metrics, "metric_profiles": config.metric_profiles}
-    for key, names in named.items():
-        for name in names:
-            if ":" in name:
-                remedy = (
-                    "Give --trust to import it, if you trust who made the run; or register it as a plug-in."
-                )
-                raise InputError(manifest, f"configuration.{key}", "registered names", repr(name), remedy)
 
 
 def changed(clip: Clip, change: Named, config: RunConfig) -> Clip:

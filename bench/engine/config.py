@@ -35,9 +35,6 @@ def default_names(group: Literal["methods", "metrics"]) -> tuple[str, ...]:
     return tuple(name for name, plugin in discover(group).items() if plugin.spec and plugin.spec.default)
 
 
-Isolation = Literal["none", "plugins", "all"]
-
-
 @dataclass(frozen=True)
 class RunConfig:
     """Settings of ``headbench run``, as in its YAML file.
@@ -84,9 +81,6 @@ class RunConfig:
         frames.
     source : str
         Folder of a finished run whose avatars are used instead of training; "" trains.
-    isolation : Isolation
-        Which methods train and render in processes of their own without access to test images: "none",
-        "plugins" (those of other packages) or "all", except adapters to official programs. Results are the same.
     """
 
     data: str
@@ -108,7 +102,6 @@ class RunConfig:
     conditions: tuple[Condition, ...] = (PLAIN,)
     clip: Named = field(default_factory=Named)
     source: str = ""
-    isolation: Isolation = "none"
 
     def __post_init__(self) -> None:
         """Refuse invalid settings early."""
@@ -183,13 +176,6 @@ class ResolvedMethod:
     spec: MethodSpec
     config: Any
     budget: Budget
-
-    def is_isolated(self, isolation: Isolation) -> bool:
-        """Whether it runs in separate processes, see `RunConfig.isolation`."""
-        able = bool(self.spec.implementation) and self.spec.native
-        return able and (
-            isolation == "all" or (isolation == "plugins" and is_outside(self.spec.implementation))
-        )
 
     def create(self) -> Any:
         """Import the implementation and create the `Method`."""

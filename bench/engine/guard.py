@@ -1,11 +1,10 @@
 """Prevents a method from reading test images and from changing the inputs of other methods.
 
-Within one process this prevents accidents, not malicious code: `bench.isolation` runs a method in separate processes.
+This prevents mistakes, not malicious code: a method runs in the same process.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from types import MappingProxyType
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..contracts import ByteArray, Clip, Frame, FrameKey, HeadAsset
-from ..errors import ChangedInputError, HeadbenchError, InputError
+from ..errors import HeadbenchError, InputError
 
 HEAD = tuple(name for name in vars(HeadAsset) if not name.startswith("_"))
 SHARED = ("shape", "static_offset", "background", "cameras", "poses")
@@ -64,25 +63,6 @@ def freeze(clip: Clip) -> None:
     """Make the arrays of a clip read-only, in place: those of its head model, cameras, poses, shape and background."""
     for array in _arrays(clip):
         array.flags.writeable = False
-
-
-def state_digest(clip: Clip) -> str:
-    """Digest of the inputs that all methods share: cameras, poses, splits, head model, shape, background."""
-    state = hashlib.blake2b(digest_size=16)
-    state.update(repr([sorted(clip.cameras), list(clip.poses), sorted(clip.splits.items())]).encode())
-    state.update(repr([(c.id, c.width, c.height) for c in clip.cameras.values()]).encode())
-    for array in _arrays(clip):
-        state.update(np.ascontiguousarray(array).data)
-    return state.hexdigest()
-
-
-def check_unchanged(clip: Clip, before: str, name: str) -> None:
-    """Raise `ChangedInputError` unless `state_digest` of the clip is still ``before``."""
-    if state_digest(clip) != before:
-        raise ChangedInputError(
-            f"{name} changed cameras, poses or the head model of {clip.subject} in memory, which every method is given. "
-            "Its results are not recorded. Leave the method out, or run it with --set isolation=all."
-        )
 
 
 def check_frame(frame: Frame, size: tuple[int, int], name: str, key: FrameKey) -> None:

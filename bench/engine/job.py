@@ -18,14 +18,13 @@ from ..contracts import CheckedMethod, Clip, FrameKey, Progress
 from ..errors import InputError
 from ..io.documents import read_json
 from ..io.files import digest, refuse_links, to_jsonable
-from ..isolation.parent import IsolatedMethod
 from ..progress import RunProgress, duration, progress
 from ..protocol import Protocol
 from ..rows import ALL, Rows
 from ..source import is_outside
 from .adaptation import AdaptedClip
 from .config import ResolvedMethod, RunConfig
-from .guard import TrainingView, check_unchanged, state_digest
+from .guard import TrainingView
 from .store import Cell, StepState
 from .stored import AVATAR_FILE
 
@@ -42,8 +41,7 @@ class Job:
     ``clip`` is the ground truth of every metric. ``adapted`` is the clip adapted to this method and
     condition, None if that is the clip itself. ``regions`` are evaluated besides the whole frame. ``source``
     is the cell whose avatar is used instead of training. ``config`` is that of the run. ``kept`` is a cache
-    shared by the cells of a run. ``line`` shows the progress of the run. ``hidden`` are folders that the separate
-    processes of an isolated method cannot read; None to run the method in this process.
+    shared by the cells of a run. ``line`` shows the progress of the run.
     """
 
     clip: Clip
@@ -58,16 +56,13 @@ class Job:
     source: Cell | None = None
     config: RunConfig | None = None
     line: RunProgress | None = None
-    hidden: tuple[Path, ...] | None = None
     created: list[Any] = field(default_factory=list, repr=False, compare=False)
     kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     def create(self) -> Any:
         """The `Method` of this cell, created on first use."""
         if not self.created:
-            own = self.hidden is not None
-            made = IsolatedMethod(self.method, self.cell.avatar, self.hidden or ()) if own else None
-            self.created.append(made or self.method.create())
+            self.created.append(self.method.create())
         return self.created[0]
 
     def rows_of(self, rows: Rows) -> pd.DataFrame:
@@ -81,12 +76,6 @@ class Job:
             seeds=(self.seed,),
             subject=self.clip.subject,
         )
-
-    def check_unchanged(self) -> None:
-        """Raise `ChangedInputError` if the clip in memory has changed since it was first passed to a method."""
-        clip = self.form.clip
-        place = f"state of {id(clip)}"
-        check_unchanged(clip, self.kept.setdefault(place, state_digest(clip)), self.label)
 
     def progress(self, step: str) -> AbstractContextManager[Progress]:
         """Progress of a step: part of the run's if the cell belongs to one, otherwise separate."""
@@ -149,11 +138,7 @@ class Job:
         code, earlier = (record.get("code") for record in (self.method.record(), state.get("method", {})))
         if is_outside(self.method.spec.implementation) and "method" in state and code != earlier:
             expected = f"{code}, the digest of the code of {self.method.spec.implementation}"
-            found = "none: it was trained before the code of plug-ins was recorded"
-            if earlier:
-                found = (
-                    f"{earlier}: the code of the plug-in has changed since its training {trained_ago(state)}"
-                )
+            found = f"{earlier}: the code of the plug-in has changed since its training {trained_ago(state)}"
             raise InputError(file, "method, code", expected, found, remedy)
         decides = json.loads(json.dumps(self.method.identity(), default=to_jsonable))
         both = ((path, value, _at(state.get("method"), path)) for path, value in _leaves(decides))

@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..io.files import atomic_path, digest, output_inside
 from ..protocol import Protocol, protocol_name
 from ..rows import Rows
-from ..specs import MethodSpec, MetricSpec
+from ..specs import MetricSpec
 from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
 from .captures import changed, open_run_clips, run_configuration
@@ -25,6 +25,7 @@ from .rendering import render
 from .scoring import check_regions
 from .store import Cell, RunFolder
 from .training import derive, fit
+from .trust import PROGRAMS, check_trusted
 
 
 def make_jobs(
@@ -62,7 +63,6 @@ def make_jobs(
         origin = source or (folder if condition.derive else None)
         return None if origin is None else origin.cell(clip.subject, method.spec.name, seed)
 
-    hidden = tuple(Path(text) for text in (config.data, config.source, str(folder.root)) if text)
     kept: dict[str, Any] = {}
     jobs = [
         Job(
@@ -81,7 +81,6 @@ def make_jobs(
             condition,
             source_of(clip, method, condition, seed),
             config,
-            hidden=hidden if method.is_isolated(config.isolation) else None,
             kept=kept,
         )
         for clip in clips
@@ -177,15 +176,6 @@ def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
     return measure(job, avatar, metrics)
 
 
-def check_programs(folder: RunFolder, methods: Sequence[MethodSpec], *, trust: bool) -> None:
-    """Refuse methods that run a program named in the run folder, unless the caller trusts its author."""
-    programs = [method.name for method in methods if not method.native]
-    if programs and not trust:
-        expected = "methods that run no program which the run folder names"
-        remedy = "Give --trust to run it, if you trust who made the run; or name other methods."
-        raise InputError(folder.manifest, "configuration.settings", expected, ", ".join(programs), remedy)
-
-
 def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -> tuple[RunConfig, list[Job]]:
     """Return the settings of a run and its cells with a trained avatar, which `load` reads.
 
@@ -215,7 +205,8 @@ def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -
     wanted = [(m, c) for m, c in resolved if (m.spec.name in methods if methods else not m.spec.trivial)]
     if not wanted:
         raise InputError(folder.manifest, "methods", "a method that is no trivial baseline", ", ".join(names))
-    check_programs(folder, [method.spec for method, _ in wanted], trust=options.trust)
+    programs = [method.spec.name for method, _ in wanted if not method.spec.native]
+    check_trusted(folder.manifest, {PROGRAMS: programs}, trust=options.trust)
     config, clips = open_run_clips(run, options, out=out)
     jobs = make_jobs(config, wanted, clips, {}, folder, out)
     for job in jobs:

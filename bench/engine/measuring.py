@@ -6,14 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, replace
-from datetime import UTC, datetime
 from typing import Any
 
 from ..contracts import Avatar, Camera, CodedAvatar, FrameKey, HeadPose, Measurement
 from ..errors import HeadbenchError, UnavailableError
 from ..io.files import digest, digest_file
 from ..io.images import read_png
-from ..isolation.parent import IsolatedAvatar
 from ..machine import ProcessorLoad, machine_name
 from ..protocol import Protocol
 from ..registry import get
@@ -37,29 +35,14 @@ from .scoring import FULL, Score, ScoredFrames, make_metric, score_frames
 from .store import Cell
 
 
-def measure(
-    job: Job, avatar: Avatar, metrics: Sequence[MetricSpec], again: Sequence[MetricSpec] = ()
-) -> Rows:
+def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
     """Evaluate the stored frames and the avatar as a whole; existing results are read back.
 
     Metrics with the same implementation are one measurement, which is read back or repeated as a whole. A measurement
     with any value is read back; a failed one is repeated. Damaged rows are measured again, with a warning.
     Rows of metrics that are not requested stay in the cell's file, with the record of their inputs.
-
-    Parameters
-    ----------
-    again : Sequence[MetricSpec]
-        Metrics to measure again, a subset of ``metrics`` that concern the avatar as a whole; others that
-        were already measured or tried are not. Former values stay in the record of the measurements,
-        under ``earlier``.
-
-    Raises
-    ------
-    UnavailableError
-        A metric in ``again`` has a value but can no longer be measured; nothing is changed then.
     """
     known, details, old = _measured_before(job)
-    repeated = {spec.implementation for spec in again}
     rendered = recorded_frames(job)
     earlier = {
         spec.name: old.select(method=ALL, condition=ALL, metric=spec.name, task=ALL, region=ALL, seeds=ALL)
@@ -68,8 +51,7 @@ def measure(
     fingerprints = {spec.name: _measure_fingerprint(job, spec, rendered) for spec in metrics}
     had = {spec.implementation for spec in metrics if "ok" in set(earlier[spec.name]["status"])}
     new = {spec.implementation for spec in metrics if known.get(spec.name) != fingerprints[spec.name]}
-    settled = ({spec.implementation for spec in metrics} if again else had) - new - repeated
-    wanted = [spec for spec in metrics if spec.implementation not in settled]
+    wanted = [spec for spec in metrics if spec.implementation not in had - new]
     per_frame = [spec for spec in wanted if spec.per_frame]
     scored = [_score(job, per_frame, protocol) for protocol in job.protocols.values() if per_frame]
     measured: dict[str, Measurement | UnavailableError] = {}
@@ -78,18 +60,9 @@ def measure(
         for spec in of_avatar:
             if spec.implementation not in measured:
                 measured[spec.implementation] = outcome = _measure_avatar(job, spec, avatar)
-                if isinstance(outcome, UnavailableError) and spec.implementation in repeated & had:
-                    raise outcome
                 found = outcome.details.items() if isinstance(outcome, Measurement) else ()
                 # JSON has only finite numbers; a metric with another value has its own row.
                 details[spec.name] = {k: v for k, v in found if not isinstance(v, float) or math.isfinite(v)}
-    job.check_unchanged()
-    replaced = [spec.name for spec in metrics if spec.implementation in repeated & had]
-    step = job.cell.step("measure")
-    history = [] if step is None else [*step.get("earlier", [])]
-    if replaced:
-        history.append(_replaced(old.of_metrics(replaced)))
-    record: dict[str, Any] = {"earlier": history} if history else {}
     parts: list[Rows] = []
     for spec in metrics:
         if spec not in wanted:
@@ -99,12 +72,8 @@ def measure(
         else:
             parts.append(Rows.of([_avatar_row(job, spec, measured[spec.implementation])]))
     result = Rows.joined(parts)
-    if lost := result.values_lacking(old.of_metrics(replaced)):
-        raise UnavailableError(
-            f"The new measurement has no value of {lost[0]}, and the former has one.", "The former is kept."
-        )
     others = sorted(old.metrics - fingerprints.keys())
-    job.cell.begin("measure", job.fit_fingerprint, **record)  # in case of an interruption before the record
+    job.cell.begin("measure", job.fit_fingerprint)  # in case of an interruption before the record
     Rows.joined([result, old.of_metrics(others)] if others else [result]).write(job.cell.rows)
     job.cell.finish(
         "measure",
@@ -113,23 +82,8 @@ def measure(
         details=details,
         rows=digest_file(job.cell.rows),
         codec=avatar.codec if isinstance(avatar, CodedAvatar) else "",
-        **record,
     )
     return result
-
-
-def _replaced(rows: Rows) -> dict[str, Any]:
-    """Record the former values of a cell with the conditions of their measurement."""
-    table = rows.select(method=ALL, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
-    table = table[table["status"] == "ok"]
-    first = table.iloc[0]
-    conditions = {name: first[name].item() for name in ("threads", "other_cores")}
-    return {
-        "replaced": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": str(first["machine"]),
-        **{name: value for name, value in conditions.items() if math.isfinite(value)},
-        "values": dict(zip(map(str, table["metric"]), map(float, table["value"]))),
-    }
 
 
 def drive(job: Job, avatar: Avatar) -> Rows:
@@ -140,7 +94,6 @@ def drive(job: Job, avatar: Avatar) -> Rows:
     change = job.condition.drive
     with job.progress(RENDERING) as report:
         rows, details, files = resolve_change(change, "drive")(job, avatar, report)
-    job.check_unchanged()
     rows.write(job.cell.rows)
     job.cell.finish(
         "measure",
@@ -304,10 +257,7 @@ def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement |
         if not spec.machine_bound:
             return metric(avatar, pairs)  # type: ignore[no-any-return]
         with ProcessorLoad(job.device, wait=True) as load:
-            if isinstance(avatar, IsolatedAvatar):
-                found = avatar.measured(metric, pairs)
-            else:
-                found = metric(avatar, pairs)
+            found = metric(avatar, pairs)
         return Measurement(found.value, {**found.details, **load.details})
     except UnavailableError as error:
         return error

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from ..contracts import Avatar, Camera, Frame, FrameKey, HeadPose, ListedFrames, Progress
 from ..errors import InputError
-from ..io.files import digest, grouped_writes
+from ..io.files import digest
 from ..io.images import quantise, write_png
 from ..protocol import Protocol
 from .guard import check_frame
@@ -37,7 +37,7 @@ def render(job: Job, avatar: Avatar) -> None:
     if not missing and cell.is_done(DIGESTS, made_of):
         return
     recorded = time.monotonic()
-    with job.progress(RENDERING) as report, grouped_writes():
+    with job.progress(RENDERING) as report:
         for index, (name, frame) in enumerate(_drawn(job, avatar, missing, report)):
             protocol, key = missing[name]
             camera = form.clip.cameras[form.key(key).camera]
@@ -48,7 +48,6 @@ def render(job: Job, avatar: Avatar) -> None:
                 cell.begin(DIGESTS, made_of, files=known)
                 recorded = time.monotonic()
             report(index + 1, len(missing), protocol.task)
-        job.check_unchanged()
         lacking = missing.keys() - known.keys()
         if lacking:
             first = missing[min(lacking)][1]

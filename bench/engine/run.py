@@ -16,7 +16,6 @@ import numpy as np
 from ..condition import Condition, label_of
 from ..contracts import CheckedMethod, Clip
 from ..errors import (
-    ChangedInputError,
     HeadbenchError,
     InputError,
     LeftOutError,
@@ -44,6 +43,7 @@ from .measuring import failed_rows
 from .scoring import compared_over_time, make_metric
 from .store import RunFolder
 from .tasks import execute, machine_of
+from .trust import PROGRAMS, check_trusted, names_of, programs
 
 log = logging.getLogger(__name__)
 RunCell = Callable[[Job, Sequence[MetricSpec]], Rows]
@@ -188,10 +188,7 @@ def _planned(
     for method, condition in cells:
         places = product([clip.subject for clip in clips], config.seeds)
         label = label_of(method.spec.name, condition.name)
-        isolated = method.is_isolated(
-            config.isolation
-        )  # the settings are checked with the clip, in its process
-        if not isolated and not all(folder.cell(s, label, seed).ended("measure") for s, seed in places):
+        if not all(folder.cell(s, label, seed).ended("measure") for s, seed in places):
             check_settings([(method, condition)])
     if config.drive:
         driven = make_jobs(config, cells, clips, {}, folder, out)
@@ -208,15 +205,25 @@ def _planned(
     return planned, protocols, jobs
 
 
-def planned_jobs(config: RunConfig) -> list[Job]:
-    """The cells that `run` would execute, with the same checks; nothing is written into ``config.out``."""
+def planned_cells(config: RunConfig) -> dict[str, str]:
+    """State of each cell that `run` would execute, with the same checks: done, trained, to train or to derive.
+
+    Nothing is written into ``config.out``.
+    """
     folder = RunFolder(Path(config.out))
     config = grown(config, folder)
     with TemporaryDirectory() as scratch:
         clips = open_clips(replace(config, out=scratch))
         metrics = resolve_metrics(config)
         forms = replace(config, out=scratch)
-        return _planned(forms, resolve_cells(config), metrics, folder, clips, Path(scratch))[2]
+        jobs = _planned(forms, resolve_cells(config), metrics, folder, clips, Path(scratch))[2]
+    return {job.name: _state(job) for job in jobs}
+
+
+def _state(job: Job) -> str:
+    if not job.cell.is_done("fit", job.fit_fingerprint):
+        return "to train" if job.source is None else "to derive"
+    return "done" if job.cell.ended("measure") else "trained"
 
 
 def grown(config: RunConfig, folder: RunFolder, *, trust: bool = False) -> RunConfig:
@@ -233,8 +240,7 @@ def grown(config: RunConfig, folder: RunFolder, *, trust: bool = False) -> RunCo
             raise
         log.warning("%s It is written again.", error)
         return config  # rows that would be lost are an error when they are written
-    if not trust:
-        _check_not_foreign(earlier, config, folder.manifest)
+    _check_additions(earlier, config, folder.manifest, trust=trust)
     before = product(earlier.methods, earlier.seeds)
     asked = product(config.methods, config.seeds)
     every = product({*earlier.methods, *config.methods}, {*earlier.seeds, *config.seeds})
@@ -272,23 +278,17 @@ def grown(config: RunConfig, folder: RunFolder, *, trust: bool = False) -> RunCo
     )
 
 
-def _check_not_foreign(earlier: RunConfig, config: RunConfig, manifest: Path) -> None:
-    """Refuse to import modules or run programs that only the run folder names, since it may be untrusted."""
-    remedy = "Name it in this call, if you trust who made the run; or choose another --out."
-    for key in ("methods", "metrics", "metric_profiles"):
-        for name in sorted({*getattr(earlier, key)} - {*getattr(config, key)}):
-            if ":" in name:
-                raise InputError(manifest, f"configuration.{key}", "registered names", repr(name), remedy)
-            if key == "methods" and not get("methods", name).native:
-                expected = "methods that run no program which the run folder names"
-                raise InputError(manifest, f"configuration.{key}", expected, name, remedy)
-    programs = {name for name in config.methods if not get("methods", name).native}
-    known = {condition.name: condition for condition in config.conditions}
-    for condition in earlier.conditions:
-        own = known.get(condition.name)
-        changes = {condition.clip.name, condition.derive.name, condition.drive.name}
-        if own is None and (any(":" in name for name in changes) or (condition.settings and programs)):
-            raise InputError(manifest, f"configuration.conditions, {condition.name}", "none", "one", remedy)
+def _check_additions(earlier: RunConfig, config: RunConfig, manifest: Path, *, trust: bool) -> None:
+    """Apply `check_trusted` to what only the run in the folder names."""
+    known = {condition.name for condition in config.conditions}
+    others = [condition for condition in earlier.conditions if condition.name not in known]
+    named, given = names_of(earlier, others), names_of(config)
+    del named["reader"]  # that of this call is used
+    check_trusted(manifest, named, given, trust=trust)
+    # Settings of a condition may name another program of a method in this call.
+    more = config.methods if any(condition.settings for condition in others) else ()
+    added = [name for name in earlier.methods if name not in config.methods]
+    check_trusted(manifest, {PROGRAMS: programs([*added, *more])}, trust=trust)
 
 
 def _same_place(first: str, second: str) -> bool:
@@ -335,8 +335,6 @@ def _run_inline(job: Job, metrics: Sequence[MetricSpec], each: RunCell) -> Rows:
     outcome_path(job.cell.folder).unlink(missing_ok=True)  # left by an earlier process or job
     try:
         return each(job, metrics)
-    except ChangedInputError:
-        raise  # the next cells would have other inputs than the previous ones
     except HeadbenchError as error:
         log.error("%s failed: %s", job.name, error)
         return failed_rows(job, metrics, reason_of(error))

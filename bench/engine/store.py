@@ -32,7 +32,7 @@ from typing_extensions import TypedDict
 
 from ..contracts import FrameKey
 from ..errors import InputError, is_damage
-from ..io.documents import MAX_RECORD_BYTES, checked, read_json
+from ..io.documents import checked, read_json
 from ..io.files import digest_file, is_system_file, write_json
 from ..manifest import Manifest
 from ..rows import DISCARD, Rows, earlier_rows, replace_rows
@@ -62,11 +62,6 @@ class StepState(TypedDict, total=False):
     load : dict[str, Any]
         Machine, threads and cores of the training, and cores used by other processes; see
         `ProcessorLoad`.
-    landlock : int
-        Version of Landlock that restricted the process of an isolated method, 0 if the kernel has none; absent for
-        methods that were not isolated.
-    earlier : list[dict[str, Any]]
-        Values before a repeated measurement, each with its time, machine and load.
     derived_from : str
         Digest of the trained avatar from which this one was derived without training.
     codec : str
@@ -87,11 +82,9 @@ class StepState(TypedDict, total=False):
     peak_device_memory_bytes: int
     device_memory_before_bytes: int
     tf32: bool
-    landlock: int
     method: dict[str, Any]
     finished_at: float
     load: dict[str, Any]
-    earlier: list[dict[str, Any]]
     derived_from: str
     codec: str
 
@@ -122,7 +115,7 @@ class Cell:
         path = self.folder / f"{name}.json"
         if not path.exists():
             return None
-        step: StepState = checked(read_json(path, MAX_RECORD_BYTES), StepState, path)
+        step: StepState = checked(read_json(path), StepState, path)
         for file in map(PurePosixPath, step.get("files", {})):
             if file.is_absolute() or ".." in file.parts:
                 raise InputError(path, "files", f"files inside {self.folder}", str(file))

@@ -15,7 +15,7 @@ from typing import Any
 
 from ..condition import Condition, label_of
 from ..contracts import Clip
-from ..errors import ChangedInputError, InputError, shortened
+from ..errors import InputError, shortened
 from ..executors.outcome import read_outcome
 from ..executors.schedule import DAMAGED, Failures, Schedule
 from ..executors.settings import Execution, is_speed
@@ -143,11 +143,7 @@ def execute_cell(task: Task, report: Callable[[str], None]) -> None:
             log.info("%s", words)
 
     job = replace(job, line=RunProgress({job.name: steps_ahead(job, metrics)}, show))
-    try:
-        run_cell(job, metrics if task.speed else [metric for metric in metrics if not is_speed(metric)])
-    except ChangedInputError:
-        _opened.forget()  # the next cell of this process opens the capture again
-        raise
+    run_cell(job, metrics if task.speed else [metric for metric in metrics if not is_speed(metric)])
 
 
 class _Opened:
@@ -156,10 +152,6 @@ class _Opened:
     def __init__(self) -> None:
         self._run: _Run | None = None
         self._clips: list[Clip] = []
-
-    def forget(self) -> None:
-        """Drop the cached capture."""
-        self._clips = []
 
     def job(
         self, run: Path, subject: str, label: str, seed: int, capture: int

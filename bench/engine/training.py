@@ -42,7 +42,6 @@ def fit(job: Job) -> Avatar:
     if earlier is None or earlier["status"] != "done":
         interruptions = 0 if earlier is None else earlier.get("interruptions", 0) + 1
         record = job.method.record()
-        job.check_unchanged()
         use_device(job.device)  # before the training is recorded as begun
         job.cell.begin("fit", job.fit_fingerprint, interruptions=interruptions, method=record)
         if isinstance(method, PreparedMethod):
@@ -64,7 +63,6 @@ def fit(job: Job) -> Avatar:
                 job.cell.set_aside(job.cell.avatar)
                 _train(job, method, report)
         seconds = time.perf_counter() - start
-        job.check_unchanged()
         clip, budget = job.form.clip, asdict(job.method.budget)
         origin = {"seed": job.seed, "budget": budget, "capture": clip.fingerprint}
         write_avatar_record(job.cell.avatar, job.method, *shown_by(clip), "training", origin)
@@ -74,7 +72,6 @@ def fit(job: Job) -> Avatar:
             seconds=round(seconds, 3),
             processor_seconds=round(processor_seconds() - processor, 3),
             interruptions=interruptions,
-            **({} if job.hidden is None else {"landlock": method.landlock}),
             peak_memory_bytes=memory.peak,
             memory_before_bytes=memory.before,
             **memory.device_record,

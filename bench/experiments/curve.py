@@ -13,9 +13,9 @@ from ..condition import Condition, Named
 from ..contracts import Budget, Clip, Progress, no_progress
 from ..engine.captures import open_run_clips, run_configuration
 from ..engine.config import ResolvedMethod, resolve_methods, with_methods
-from ..engine.jobs import check_programs
 from ..engine.run import run_locked
 from ..engine.store import Cell, RunFolder
+from ..engine.trust import PROGRAMS, check_trusted
 from ..errors import InputError
 from ..io.files import check_kind, output_inside, refuse_links
 from ..io.lock import locked
@@ -156,7 +156,8 @@ def _wanted(settings: CurveSettings, source: RunFolder) -> list[ResolvedMethod]:
             key, expected = f"budget of {method.spec.name}", "iterations or seconds, to train with a part of"
             remedy = "Name other methods with --methods."
             raise InputError(source.manifest, key, expected, "none", remedy)
-    check_programs(source, [m.spec for m in wanted], trust=settings.trust)
+    programs = [method.spec.name for method in wanted if not method.spec.native]
+    check_trusted(source.manifest, {PROGRAMS: programs}, trust=settings.trust)
     return wanted
 
 

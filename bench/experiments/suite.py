@@ -68,14 +68,13 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
         preset=settings.preset,
         seeds=settings.seeds,
         regions=REGIONS,
-        isolation=settings.isolation,
     )
     coded = (PLAIN, *coded_conditions(methods))
     config = replace(plain, conditions=(*coded, *_conditions(settings, plain)))
     cells = resolve_cells(config)
     resolve_metrics(config)
     check_executor(execution, config.device)
-    check_settings(cell for cell in cells if not cell[0].is_isolated(config.isolation))
+    check_settings(cells)
     width, height = parse_size(settings.size)
     large = replace(plain, data=str(out / "capture-large"), out=str(out / LARGE_RUN), conditions=coded)
     seeds = tuple(max(settings.seeds) + further for further in (1, 2))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from ..engine.config import Isolation, parse_size
+from ..engine.config import parse_size
 from ..errors import InputError
 from ..executors.options import ExecutionOptions
 from ..listing import presets_of_methods
@@ -106,9 +106,6 @@ class SuiteSettings(ExecutionOptions):
 
     tracker: Literal["per-frame", "video"] = "video"
     """As for `headbench synth`."""
-
-    isolation: Isolation = "plugins"
-    """Methods that train and render in separate processes, without access to test images (see SECURITY.md)."""
 
     def __post_init__(self) -> None:
         """Refuse invalid sizes and names."""

@@ -1,38 +1,24 @@
-"""Reads arrays of untrusted npz and npy files: sizes are checked before allocation, values before use."""
+"""Reads arrays of npz and npy files, and checks their types, shapes and values before use."""
 
 from __future__ import annotations
 
 import logging
-import math
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
 from ..errors import InputError
-from .archives import open_archive
 from .files import atomic_path, open_regular, reading
 
-MOST_BYTES, MOST_PER_BYTE = 2**28, 20
-"""Maximum bytes of all arrays of a file: 256 MiB plus 20 per byte of the file. This is ten times any head model, which
-compresses well, and admits tracked parameters of any length, which do not."""
-
-MAX_MEMBERS = 1000
 MAX_MAGNITUDE = 1e4
 """Largest magnitude of a number in a head model or its tracking: metres, radians, coefficients."""
 
-MAX_HEADER = 10_000
-"""Maximum characters of an array header, which numpy parses as Python literals."""
-
 _MARK = "mark"
 _log = logging.getLogger(__name__)
-_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _KINDS = "biufU"
-_LARGEST_ITEM = 8
 
 
 @dataclass(frozen=True)
@@ -187,44 +173,23 @@ def _check(
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """Read every member of an npz: numbers, truth values and text in the machine's byte order.
 
-    Sizes are read from the headers and checked against each other, the file's size and `MOST_BYTES` before
-    anything is unpacked; nothing is unpickled. Raises `InputError` for a file that is missing, damaged, too
-    large, or not an npz of such arrays.
+    Nothing is unpickled. Raises `InputError` for a file that is missing, damaged, or not an npz of such arrays.
     """
-    bounds = {"members": MAX_MEMBERS, "spare_bytes": MOST_BYTES, "per_byte": MOST_PER_BYTE}
-    content: dict[str, np.ndarray] = {}
-    with open_archive(path, "an npz file of plain arrays", **bounds) as archive:
-        for entry in archive.infolist():
-            name = entry.filename.removesuffix(".npy")
-            if name == entry.filename:
-                raise InputError(path, name, "members .npy", "another")
-            with archive.open(entry) as stream:
-                content[name] = _array(path, name, stream, entry.file_size)
-    return content
+    expected = "an npz file of plain arrays"
+    with open_regular(path, expected) as stream, reading(path, expected):
+        archive = np.lib.npyio.NpzFile(stream, allow_pickle=False)
+        return {name: _plain(path, name, archive[name]) for name in archive.files}
 
 
 def read_npy(path: Path) -> np.ndarray:
     """Read the array of an npy file, as `read_npz` reads its members; raises `InputError` as it does."""
-    with open_regular(path, "an npy file of a plain array") as stream:
-        return _array(path, "", stream, os.fstat(stream.fileno()).st_size)
+    expected = "an npy file of a plain array"
+    with open_regular(path, expected) as stream, reading(path, expected):
+        return _plain(path, "", np.load(stream, allow_pickle=False))
 
 
-def _array(path: Path, name: str, stream: IO[bytes], size: int) -> np.ndarray:
-    """One array in npy format, ``size`` bytes with its header."""
-    with reading(path, "an array in npy format", name):
-        version = np.lib.format.read_magic(stream)
-        shape, _, dtype = _HEADERS[version](stream, max_header_size=MAX_HEADER)
-    plain = dtype.kind in _KINDS and dtype.subdtype is None and dtype.names is None
-    if not plain or (dtype.kind != "U" and dtype.itemsize > _LARGEST_ITEM):
-        raise InputError(path, name, "numbers of at most 8 bytes, or text", f"dtype {dtype}"[:100])
-    left = size - stream.tell()
-    if math.prod(shape) * dtype.itemsize != left:
-        raise InputError(path, name, f"the bytes of {dtype} of shape {shape}"[:200], f"{left} bytes")
-    stream.seek(0)
-    with reading(path, "an array in npy format", name):
-        values = np.lib.format.read_array(stream, allow_pickle=False, max_header_size=MAX_HEADER)
-        if dtype.kind == "U":  # invalid code points would raise wherever the text is used
-            "".join(values.ravel().tolist()).encode()
-        if dtype.kind == "b":  # bytes other than 0 and 1 would have several values
-            values = values.view(np.uint8) != 0
-        return values.astype(dtype.newbyteorder("="), copy=False)
+def _plain(path: Path, name: str, values: object) -> np.ndarray:
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in _KINDS:
+        found = f"dtype {values.dtype}" if isinstance(values, np.ndarray) else "another kind of file"
+        raise InputError(path, name, "an array of numbers or text", found)
+    return values.astype(values.dtype.newbyteorder("="), copy=False)

@@ -1,4 +1,4 @@
-"""Reads untrusted text, JSON and YAML: limited in size and nesting, without duplicate keys, checked against dataclasses.
+"""Reads text, JSON and YAML from outside: without duplicate keys, checked against dataclasses.
 
 A document that breaks a rule raises an `InputError` with the file, the dotted key, the expected and the found
 value. Non-finite numbers are refused everywhere: JSON has none, and a missing value is written as null.
@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -24,46 +24,34 @@ from ..errors import InputError
 from ..registry import unknown
 from .files import read_bytes, reading
 
-if TYPE_CHECKING:
-    from pydantic_core import SchemaValidator
-
 T = TypeVar("T")
 Source = str | PathLike[str]
 
-MAX_JSON_BYTES = 64 * 2**20
-"""The JSON of the largest known capture, with 50,000 frames, has 35 MB. Objects take up to 25 times their
-text."""
-MAX_RECORD_BYTES = 8 * 2**20
-"""Maximum size of a run's records, which may be untrusted; the record of the largest known run has 78 KB."""
-MAX_YAML_BYTES = 4 * 2**20
-"""YAML files are written by users, or list excluded frames; the parser is slower than JSON's."""
-MAX_DEPTH = 64
-
 _TAG = "tag:yaml.org,2002:"
-_DECIMAL = re.compile(r"-?(0|[1-9][0-9]*)")
-_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_NUMBERS = {
+    "int": r"[-+]?(0|[1-9][0-9]*)$",
+    "float": r"([-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN))$",
+}
+"""Decimal numbers of YAML 1.2. YAML 1.1 takes 074 for 60, 1:30 for 90, and 1e-3 for text."""
+_DAMAGE = (yaml.YAMLError, ValueError, KeyError, IndexError, RecursionError)
+"""What the parser of YAML raises for a value that is none of its tag."""
 
 
-def read_json(path: Path, limit: int | None = None) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file whose top level is an object.
 
-    Raises `InputError` for a file that is missing, cannot be read, is larger than ``limit`` bytes (default: `MAX_JSON_BYTES`),
-    is invalid, nests deeper than `MAX_DEPTH`, has duplicate keys or non-finite numbers, or is not an object.
+    Raises `InputError` for a file that is missing, cannot be read, is invalid, has duplicate keys or non-finite
+    numbers, or is not an object.
     """
-    return parse_json(read_text(path, "JSON", MAX_JSON_BYTES if limit is None else limit), path)
+    return parse_json(read_text(path, "JSON"), path)
 
 
 def parse_json(text: str | bytes, source: Source, key: str = "") -> dict[str, Any]:
     """Parse JSON from ``key`` of some file; errors as for `read_json`."""
     try:
         value = json.loads(text, object_pairs_hook=_object, parse_constant=float)
-        if isinstance(value, (dict, list)):
-            _check_tree(value)
-    except _Refused as error:
-        raise InputError(source, _joined(key, error.key), error.expected, error.found) from None
-    except RecursionError as error:
-        raise InputError(source, key, f"JSON of at most {MAX_DEPTH} levels", "deeper nesting") from error
-    except ValueError as error:
+        _check_finite(value, source, key)
+    except (ValueError, RecursionError) as error:
         raise InputError(source, key, "valid JSON", f"content that does not parse ({error})") from error
     if not isinstance(value, dict):
         raise InputError(source, key, "a JSON object", f"a {type(value).__name__}")
@@ -74,10 +62,10 @@ def read_yaml(path: Path) -> dict[Any, Any]:
     """Read a YAML mapping; an empty file is an empty mapping. It is read as data, never as code.
 
     Supported types are text, numbers, true and false, null, lists and mappings. Raises `InputError` as
-    `read_json` does, and for anchors that are used, tags, dates, and whole numbers that YAML 1.1 reads in an
-    unexpected way (057 is 47, 1:30 is 90).
+    `read_json` does, and for other tags.
     """
-    value = _parse_yaml(read_text(path, "YAML", MAX_YAML_BYTES), path, "", literal=False)
+    value = parse_setting(read_text(path, "YAML"), path, "")
+    _check_finite(value, path, "")
     if value is None:
         return {}
     if not isinstance(value, dict):
@@ -86,8 +74,43 @@ def read_yaml(path: Path) -> dict[Any, Any]:
 
 
 def parse_setting(text: str, source: Source, key: str) -> Any:
-    """Read the YAML value of a setting on the command line; dates and numbers like 057 are text there."""
-    return _parse_yaml(text, source, key, literal=True)
+    """Read a YAML value, such as that of a setting on the command line. Dates and numbers like 057 are text."""
+    try:
+        return yaml.load(text, _Loader)
+    except _DAMAGE as error:
+        raise InputError(source, key, "valid YAML", " ".join(str(error).split())) from error
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """Text, numbers, true and false, null, lists, and mappings whose keys differ."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for name_node, _ in node.value:
+            name, found = self.construct_object(name_node, deep=True), ""
+            if not isinstance(name, (str, int)) or isinstance(name, bool):
+                found = (
+                    f"{shown(name)} as a key, which has to be text, in quotes where YAML takes it otherwise,"
+                )
+            elif str(name) in seen:  # 5 and "5" are the same key in JSON
+                found = f"the key {_REPR.repr(name)} again"
+            if found:
+                raise yaml.constructor.ConstructorError(None, None, found, name_node.start_mark)
+            seen.add(str(name))
+        return dict(super().construct_mapping(node, deep=deep))
+
+
+_Loader.yaml_constructors = {
+    tag: construct
+    for tag, construct in yaml.SafeLoader.yaml_constructors.items()
+    if tag is None or tag[len(_TAG) :] in ("null", "bool", "int", "float", "str", "seq", "map")
+}
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag[len(_TAG) :] in ("null", "bool")]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+for _kind, _pattern in _NUMBERS.items():
+    _Loader.add_implicit_resolver(_TAG + _kind, re.compile(_pattern), list("-+.0123456789"))
 
 
 def checked(value: Any, kind: type[T], source: Source, prefix: str = "", *, foreign: bool = False) -> T:
@@ -134,41 +157,20 @@ _REPR.maxlevel = 2
 
 
 @functools.cache
-def _validator(kind: Any) -> SchemaValidator:
-    """A validator that stops at the first bad item of a collection. Errors of all items of 1 MB of JSON take up to 3 GB."""
+def _validator(kind: Any) -> Any:
     from pydantic import TypeAdapter  # takes a third of the start-up time of the command line
-    from pydantic_core import SchemaValidator
 
-    return SchemaValidator(_fail_fast(TypeAdapter(kind).core_schema))
-
-
-def _fail_fast(schema: Any) -> Any:
-    if isinstance(schema, list | tuple):
-        return type(schema)(map(_fail_fast, schema))
-    if not isinstance(schema, dict):
-        return schema
-    changed = {name: _fail_fast(part) for name, part in schema.items()}
-    if schema.get("type") in ("list", "tuple", "set", "frozenset", "dict"):
-        changed["fail_fast"] = True
-    return changed
+    return TypeAdapter(kind)
 
 
-class _Refused(ValueError):
-    """A document violates a rule of this module."""
-
-    def __init__(self, expected: str, found: str, key: str = ""):
-        self.expected, self.found, self.key = expected, found, key
-        super().__init__(f"expected {expected}, found {found}")
-
-
-def read_text(path: Path, what: str, limit: int) -> str:
+def read_text(path: Path, what: str) -> str:
     """Read a UTF-8 text file, with or without a byte order mark; line ends are not changed.
 
-    ``what`` names the format in errors. Raises `InputError` for a file that is missing, cannot be read, is larger than
-    ``limit`` bytes, or has another encoding.
+    ``what`` names the format in errors. Raises `InputError` for a file that is missing, cannot be read, or has another
+    encoding.
     """
     article = f"a {what} file"
-    content = read_bytes(path, article, limit)
+    content = read_bytes(path, article)
     refuse_utf16(content, path, f"{article} in UTF-8")
     with reading(path, f"{article} in UTF-8"):
         return content.decode("utf-8-sig")
@@ -183,102 +185,29 @@ def refuse_utf16(content: bytes, source: Source, expected: str) -> None:
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) != len(pairs):
-        seen: set[str] = set()
-        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
-        raise _Refused("each key once", f"{_REPR.repr(twice)} again")
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the key {_REPR.repr(twice)} again")
     return result
 
 
-def _check_tree(value: Any) -> None:
-    """Limit the nesting and refuse non-finite numbers."""
-    level = [value]
-    for _ in range(MAX_DEPTH + 1):
-        below: list[Any] = []
-        for container in level:
-            for item in container.values() if isinstance(container, dict) else container:
-                kind = type(item)
-                if kind is dict or kind is list:
-                    below.append(item)
-                elif kind is float and not math.isfinite(item):
-                    raise _Refused("a finite number", str(item), _key_of(item, value) or "")
-        if not below:
-            return
-        level = below
-    raise _Refused(f"at most {MAX_DEPTH} levels", "deeper nesting")
+def _check_finite(value: Any, source: Source, key: str) -> None:
+    """Raise `InputError`, with its dotted key, for a number that is not finite."""
+    place = _non_finite(value)
+    if place is not None:
+        key = f"{key}{place}" if key or place.startswith("[") else place.removeprefix(".")
+        raise InputError(source, key, "a finite number", "infinity or NaN")
 
 
-def _key_of(item: Any, value: Any) -> str | None:
-    """Dotted key of an object in a tree; None if it is absent."""
-    if value is item:
-        return ""
+def _non_finite(value: Any) -> str | None:
+    """Place of the first non-finite number in a tree, such as ``.a[1]``; None without one."""
+    if isinstance(value, float):
+        return None if math.isfinite(value) else ""
     pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for name, part in pairs:
-        below = _key_of(item, part)
-        if below is not None:
-            return _joined(f"[{name}]" if isinstance(value, list) else str(name), below)
+        if isinstance(part, float | dict | list) and (place := _non_finite(part)) is not None:
+            return (f"[{name}]" if isinstance(value, list) else f".{name}") + place
     return None
-
-
-def _joined(key: str, below: str) -> str:
-    return f"{key}.{below}" if key and below and not below.startswith("[") else key + below
-
-
-def _parse_yaml(text: str, source: Source, key: str, *, literal: bool) -> Any:
-    try:
-        depth = 0
-        for event in yaml.parse(text, Loader=_LOADER):
-            if isinstance(event, yaml.AliasEvent):
-                raise InputError(source, key, "values written out", f"the alias *{event.anchor}")
-            depth += isinstance(event, yaml.CollectionStartEvent)
-            depth -= isinstance(event, yaml.CollectionEndEvent)
-            if depth > MAX_DEPTH:
-                raise InputError(source, key, f"YAML of at most {MAX_DEPTH} levels", "deeper nesting")
-        node = yaml.compose(text, Loader=_LOADER)
-    except yaml.YAMLError as error:
-        raise InputError(source, key, "valid YAML", " ".join(str(error).split())) from error
-    return None if node is None else _value(node, source, key, literal)
-
-
-def _value(node: yaml.Node, source: Source, key: str, literal: bool) -> Any:
-    """The value of a node at a dotted key."""
-    tag = node.tag.removeprefix(_TAG)
-    if isinstance(node, yaml.SequenceNode) and tag == "seq":
-        return [_value(item, source, f"{key}[{i}]", literal) for i, item in enumerate(node.value)]
-    if isinstance(node, yaml.MappingNode) and tag == "map":
-        result: dict[Any, Any] = {}
-        seen: set[str] = set()
-        for name_node, value_node in node.value:
-            name = _value(name_node, source, key, literal)
-            if not isinstance(name, (str, int)) or isinstance(name, bool):
-                raise InputError(source, key, "names, in quotes where YAML takes them otherwise", shown(name))
-            if str(name) in seen:  # 5 and "5" are the same key in JSON
-                raise InputError(source, key, "each key once", f"{_REPR.repr(name)} again{_line(name_node)}")
-            seen.add(str(name))
-            result[name] = _value(value_node, source, f"{key}.{name}" if key else str(name), literal)
-        return result
-    if isinstance(node, yaml.ScalarNode):
-        return _scalar(node, tag, source, key, literal)
-    raise InputError(source, key, "plain values, without tags", f"{_REPR.repr(node.tag)}{_line(node)}")
-
-
-def _scalar(node: yaml.ScalarNode, tag: str, source: Source, key: str, literal: bool) -> Any:
-    text = str(node.value)
-    number = tag in ("int", "float") and (":" in text or (tag == "int" and not _DECIMAL.fullmatch(text)))
-    if tag == "str" or (literal and (number or tag in ("timestamp", "merge", "value"))):
-        return text
-    found = f"{_REPR.repr(text)}{_line(node)}"
-    if number:
-        raise InputError(source, key, "numbers without leading zeros, other words in quotes", found)
-    if tag not in ("null", "bool", "int", "float"):
-        what = {"timestamp": "a date: "}.get(tag, f"{_REPR.repr(node.tag)}: ")
-        raise InputError(source, key, "text in quotes, or a number", what + found)
-    try:
-        value = getattr(yaml.constructor.SafeConstructor(), f"construct_yaml_{tag}")(node)
-    except (ValueError, KeyError, IndexError) as error:
-        raise InputError(source, key, f"a value of the type {tag}", found) from error
-    if isinstance(value, float) and not math.isfinite(value) and not literal:
-        raise InputError(source, key, "a finite number", found)
-    return value
 
 
 def _entries(kind: Any, place: Sequence[str | int]) -> list[str]:
@@ -293,10 +222,6 @@ def _entries(kind: Any, place: Sequence[str | int]) -> list[str]:
         elif get_args(kind):
             kind = get_args(kind)[0 if isinstance(part, int) else -1]
     return list(getattr(kind, "__annotations__", {}))
-
-
-def _line(node: yaml.Node) -> str:
-    return f" in line {node.start_mark.line + 1}"
 
 
 def _refuse(error: Any, kind: Any, source: Source, prefix: str) -> NoReturn:

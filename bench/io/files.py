@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import json
 import os
 import re
 import stat
 import tempfile
-import threading
-import time
-from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, is_dataclass
-from functools import partial
-from io import FileIO
+from dataclasses import asdict, is_dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -29,14 +23,11 @@ from ..errors import HeadbenchError, InputError, UnavailableError
 MAX_NAME_BYTES = 120
 """Maximum length of a subject, sequence or camera name; file names combine several and are limited to 255 bytes."""
 
-GROUP_FILES, GROUP_SECONDS, FLUSHES = 64, 2.0, 16
-"""Maximum number of files in a group, maximum delay of the first one, and files flushed at once."""
-
 ROOM_BYTES = 64 * 2**10
 """Less free space than this counts as a full disk."""
 
 TEMPORARY = ".tmp-headbench-"
-"""Prefix of temporary files, by which those of dead processes are found and removed."""
+"""Prefix of temporary files, by which those of killed processes are found and removed."""
 
 _UMASK = os.umask(0o077)
 os.umask(_UMASK)
@@ -46,9 +37,9 @@ os.umask(_UMASK)
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary name beside ``path``; rename it to ``path`` if the block ends without an error.
 
-    The content and all earlier renames are flushed to disk before the rename: after a power failure there are no
-    partial files, and no file without those written before it. The temporary name keeps the suffix, since many writers
-    choose their format by it. A link at ``path`` is replaced, not followed.
+    The content is on disk before the rename, so that there are no partial files after a kill or a power failure, and a
+    disk that is full raises. The temporary name keeps the suffix, since many writers choose their format by it. A link at
+    ``path`` is replaced, not followed.
 
     Raises
     ------
@@ -59,202 +50,37 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """
     _check_target(path)
     check_inside(path.parent)
-    _make_folder(path.parent)
-    write = _start(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with _naming(write):
-            yield write.temporary
-    except BaseException:
-        write.drop()
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
+    except OSError as error:
+        error.filename = str(path)
         raise
-    _writes.add(write)
-
-
-@contextmanager
-def grouped_writes() -> Iterator[None]:
-    """Flush and rename files written by `atomic_path` in the block in groups, in about half the time.
-
-    For loops over many small files; the block must not read the files that it wrote.
-    """
-    _writes.groups += 1
+    os.close(handle)
+    temporary = Path(name)
     try:
-        yield
+        yield temporary
+        _flush(temporary)
+        # mkstemp and some writers create private files; results should be readable by anyone who can read the folder.
+        if os.stat(temporary).st_nlink == 1:  # not a hard link to another file
+            os.chmod(temporary, 0o666 & ~_UMASK)
+        os.replace(temporary, path)
+    except OSError as error:
+        # The system reports a full disk without a name or with the temporary one.
+        if error.errno is not None and error.filename in (None, name):
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
     finally:
-        _writes.groups -= 1
-        flush_renames()
-
-
-def flush_renames() -> None:
-    """Wait until all files written so far are on disk under their names."""
-    _writes.commit()
-    _writes.flush()
-
-
-@dataclass(frozen=True, eq=False)
-class _Write:
-    """A file written under a temporary name. A lock on the open ``stream`` shows that its process is
-    alive."""
-
-    stream: FileIO
-    temporary: Path
-    path: Path
-
-    def rename(self) -> None:
-        with _naming(self), self.stream:
-            # mkstemp and some writers create private files; results should be readable by anyone who can read the folder.
-            if os.stat(self.temporary).st_nlink == 1:  # not a hard link to another file
-                os.chmod(self.temporary, 0o666 & ~_UMASK)
-            os.replace(self.temporary, self.path)
-
-    def drop(self) -> None:
-        with self.stream:
-            self.temporary.unlink(missing_ok=True)
-
-
-@contextmanager
-def _naming(write: _Write) -> Iterator[None]:
-    """Set the file name of an error; the system reports a full disk without a name or with the temporary
-    one."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno is not None and error.filename in (None, str(write.temporary)):
-            raise OSError(error.errno, error.strerror, str(write.path)) from error
-        raise
-
-
-class _Writes:
-    """Files that wait for their rename, and folders whose renames may not be on disk yet."""
-
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-        self.groups = 0
-        self.waiting: list[_Write] = []
-        self.since = 0.0
-        self.folders: set[Path] = set()
-
-    def add(self, write: _Write) -> None:
-        with self.lock:
-            if not self.waiting:
-                self.since = time.monotonic()
-            self.waiting.append(write)
-            late = time.monotonic() - self.since > GROUP_SECONDS
-            if not self.groups or late or len(self.waiting) >= GROUP_FILES:
-                self.commit()
-
-    def commit(self) -> None:
-        """Flush the waiting files and the earlier renames together, which the disk handles at once."""
-        with self.lock:
-            writes, self.waiting = self.waiting, []
-            try:
-                if writes:
-                    self.flush(*writes)
-                while writes:
-                    writes[0].rename()
-                    self.folders.add(writes.pop(0).path.parent)
-            finally:
-                for write in writes:
-                    write.drop()
-
-    def flush(self, *writes: _Write) -> None:
-        with self.lock:
-            folders, self.folders = self.folders, set()  # a failed one is not retried by later writes
-            tasks = [partial(_flush_file, write) for write in writes]
-            tasks += [partial(_flush_folder, folder) for folder in folders]
-            if len(tasks) > 1:
-                with ThreadPoolExecutor(min(len(tasks), FLUSHES)) as pool:
-                    for done in [pool.submit(task) for task in tasks]:
-                        done.result()
-            else:
-                for task in tasks:
-                    task()
-
-
-_writes = _Writes()
-
-
-def _flush_file(write: _Write) -> None:
-    with _naming(write):
-        _flush(write.temporary)  # by name, since some writers replace the file
-
-
-def _flush_folder(folder: Path) -> None:
-    try:
-        _flush(folder)
-    except OSError as error:
-        # The file system cannot flush folders, or the folder is not readable or was removed.
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.ENOENT):
-            error.filename = str(folder)
-            raise
+        temporary.unlink(missing_ok=True)
 
 
 def _flush(path: Path) -> None:
-    """Wait until a file or a folder is on disk."""
+    """Wait until a file is on disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _make_folder(folder: Path) -> None:
-    """Create a folder and its parents, which are flushed with the first file in it."""
-    missing = list(takewhile(lambda path: not path.exists(), (folder, *folder.parents)))
-    folder.mkdir(parents=True, exist_ok=True)
-    with _writes.lock:
-        _writes.folders.update(path.parent for path in missing)
-
-
-def _start(path: Path) -> _Write:
-    """Create a file beside ``path``, open and locked; the lock shows other processes that its process is alive."""
-    if path.parent not in _searched:
-        _searched.add(path.parent)
-        with os.scandir(path.parent) as entries:
-            _remove_dead(entry.path for entry in entries)
-    while True:
-        try:
-            handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
-        except OSError as error:
-            error.filename = str(path)
-            raise
-        stream = FileIO(handle, "r+")
-        if _lock(stream) is not False and os.fstat(handle).st_nlink:
-            return _Write(stream, Path(name), path)
-        stream.close()  # removed as a dead process's file before it was locked
-
-
-def remove_dead_temporaries(folder: Path) -> None:
-    """Remove unfinished files of killed processes in a folder and its subfolders."""
-    for root, _, names in os.walk(folder):
-        _remove_dead(os.path.join(root, name) for name in names)
-
-
-_searched: set[Path] = set()
-"""Folders already searched for temporary files of dead processes."""
-
-
-def _remove_dead(paths: Iterable[str]) -> None:
-    for path in paths:
-        if not os.path.basename(path).startswith(TEMPORARY):
-            continue
-        try:
-            stream = FileIO(path, "r+", opener=no_link)
-        except (OSError, InputError):
-            continue  # already finished, or not a temporary file of headbench
-        with stream:
-            if _lock(stream):
-                Path(path).unlink(missing_ok=True)
-
-
-def _lock(stream: FileIO) -> bool | None:
-    """Lock an open file; False if another process holds the lock, None if the file system has no locks."""
-    try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return None
-    return True
 
 
 _roots: list[Path] = []
@@ -498,14 +324,10 @@ def open_regular(path: Path, expected: str) -> Iterator[BinaryIO]:
         yield stream
 
 
-def read_bytes(path: Path, expected: str, limit: int) -> bytes:
-    """A file's content. Raises `InputError` as `open_regular` does, and for more than ``limit`` bytes."""
-    with open_regular(path, expected) as stream:
-        size = os.fstat(stream.fileno()).st_size
-        if size > limit:
-            raise InputError(path, "", f"{expected} of at most {limit} bytes", f"{size}")
-        with reading(path, expected):
-            return stream.read(size)
+def read_bytes(path: Path, expected: str) -> bytes:
+    """A file's content. Raises `InputError` as `open_regular` does."""
+    with open_regular(path, expected) as stream, reading(path, expected):
+        return stream.read()
 
 
 def check_name(name: str, file: str | os.PathLike[str], key: str) -> str:

@@ -1,31 +1,28 @@
 """Read cameras and images of a COLMAP sparse model, binary or text.
 
-The files are untrusted, and pycolmap's own reader (4.2) does not validate them: of 220 truncations of an
-``images.bin`` of three images, 72 gave wrong values without an error and 9 did not terminate; it also requires a file
-of points, which many projects lack. Here every count and length is compared with the remaining bytes before it is
-used.
+pycolmap's own reader (4.2) does not check files: of 220 truncations of an ``images.bin``, 72 gave wrong values without an
+error and 9 did not terminate. It also needs a file of points, which many projects lack, and ends names at a space.
 """
 
 from __future__ import annotations
 
 import importlib
 import math
-import os
 import signal
 import struct
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from os import PathLike
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ...bench.errors import InputError
-from ...bench.io.documents import refuse_utf16
-from ...bench.io.files import check_name, with_slashes
+from ...bench.io.documents import read_text
+from ...bench.io.files import check_name, read_bytes, reading, with_slashes
 
 
 @cache
@@ -38,10 +35,10 @@ def pycolmap() -> Any:
     return package
 
 
-T = TypeVar("T")
-
-_MAX_PIXELS = 1 << 20  # maximum pixels along one side, far above any sensor
+T = TypeVar("T", "ColmapCamera", "ColmapImage")
 _UNIT_TOLERANCE = 1e-3  # of a quaternion's length; COLMAP normalises quaternions when reading
+_POINT = struct.calcsize("<ddQ")  # x, y and the number of a point of the model
+_IMAGE_WORDS = 10  # number, quaternion, translation, camera, name
 
 
 @dataclass(frozen=True)
@@ -53,6 +50,13 @@ class ColmapCamera:
     height: int
     params: tuple[float, ...]
 
+    def check(self, file: Path, key: str) -> None:
+        """Raise `InputError` for a size or a parameter that no camera has."""
+        if self.width < 1 or self.height < 1:
+            raise InputError(file, key, "an image size in pixels", f"{self.width}x{self.height}")
+        if not np.isfinite(self.params).all():
+            raise InputError(file, key, "finite parameters", str(self.params))
+
 
 @dataclass(frozen=True)
 class ColmapImage:
@@ -62,6 +66,15 @@ class ColmapImage:
     camera: int
     quaternion: tuple[float, ...]
     translation: tuple[float, ...]
+
+    def check(self, file: Path, key: str) -> None:
+        """Raise `InputError` for a name that leaves the folder of images, or a pose that is none."""
+        for part in self.name.split("/"):
+            check_name(part, file, f"{key}, name")
+        length = math.hypot(*self.quaternion)
+        if not np.isfinite(self.translation).all() or not abs(length - 1) < _UNIT_TOLERANCE:
+            found = f"{self.translation} and a quaternion of length {length:.4g}"
+            raise InputError(file, key, "a finite position and a unit quaternion", found)
 
 
 @dataclass(frozen=True)
@@ -89,141 +102,71 @@ def camera_models() -> dict[int, tuple[str, int]]:
     return models
 
 
-def _check_camera(file: Path, key: str, camera: ColmapCamera) -> None:
-    if not (0 < camera.width <= _MAX_PIXELS and 0 < camera.height <= _MAX_PIXELS):
-        raise InputError(file, key, "an image size in pixels", f"{camera.width}x{camera.height}")
-    if not np.isfinite(camera.params).all():
-        raise InputError(file, key, "finite parameters", str(camera.params))
+class _Bytes:
+    """Little-endian numbers of a file, in order; raises `InputError` if it ends too early."""
 
-
-def _check_image(file: Path, key: str, image: ColmapImage) -> None:
-    for part in image.name.split("/"):
-        check_name(part, file, f"{key}, name")
-    if not np.isfinite([*image.quaternion, *image.translation]).all():
-        raise InputError(file, key, "a finite pose", f"{image.quaternion}, {image.translation}")
-    length = math.hypot(*image.quaternion)
-    if abs(length - 1) > _UNIT_TOLERANCE:
-        raise InputError(file, key, "a unit quaternion", f"one of length {length:.4g}")
-
-
-def _by_number(
-    file: Path, kind: str, entries: Iterable[tuple[int, T]], check: Callable[[Path, str, T], None]
-) -> dict[int, T]:
-    """Cameras or images by id, validated and unique."""
-    found: dict[int, T] = {}
-    for number, entry in entries:
-        key = f"{kind} {number}"
-        if number in found:
-            raise InputError(file, key, f"each {kind} once", "a second one")
-        check(file, key, entry)
-        found[number] = entry
-    return found
-
-
-_LONGEST_NAME = 1024
-_POINT = struct.calcsize("<ddQ")  # x, y and the number of a point of the model
-
-
-class _BinaryReader:
-    """Reads numbers from a file; raises `InputError` if it ends too early."""
-
-    def __init__(self, file: Path, stream: BinaryIO) -> None:
-        self.file, self._stream = file, stream
-        self._size = os.fstat(stream.fileno()).st_size
-
-    @property
-    def left(self) -> int:
-        """Bytes that remain."""
-        return self._size - self._stream.tell()
+    def __init__(self, file: Path) -> None:
+        self.file, self._content, self._place = file, read_bytes(file, "a file of a COLMAP model"), 0
 
     def take(self, layout: str, key: str) -> tuple[Any, ...]:
-        """Read numbers in a little-endian `struct` layout."""
-        size = struct.calcsize("<" + layout)
-        self._need(size, key)
-        return struct.unpack("<" + layout, self._stream.read(size))
-
-    def count(self, least: int, key: str) -> int:
-        """Read the number of following entries, each of at least ``least`` bytes."""
-        (number,) = self.take("Q", key)
-        self._need(number * least, f"{number} of {key}")
-        return int(number)
+        """Read numbers in a `struct` layout."""
+        with reading(self.file, "a count that the file can hold", key):
+            size = struct.calcsize("<" + layout)
+        start, self._place = self._place, self._place + size
+        if self._place > len(self._content):
+            expected, found = f"{size} more bytes at byte {start}", f"{len(self._content) - start}"
+            raise InputError(self.file, key, expected, found, "The file is truncated or damaged.")
+        return struct.unpack_from("<" + layout, self._content, start)
 
     def name(self, key: str) -> str:
         """Read a text that ends with a zero byte."""
-        start = self._stream.tell()
-        text, end, _ = self._stream.read(_LONGEST_NAME + 1).partition(b"\0")
-        if not end:
-            raise InputError(self.file, key, f"a name of at most {_LONGEST_NAME} bytes", "no end of it")
-        self._stream.seek(start + len(text) + 1)
-        try:
-            return text.decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise InputError(self.file, key, "a name in UTF-8", repr(text[:60])) from error
-
-    def skip(self, size: int, key: str) -> None:
-        """Skip bytes."""
-        self._need(size, key)
-        self._stream.seek(size, os.SEEK_CUR)
-
-    def _need(self, size: int, key: str) -> None:
-        if size > self.left:
-            expected = f"{size} more bytes at byte {self._stream.tell()}"
-            found = f"{self.left}"
-            raise InputError(self.file, key, expected, found, "The file is truncated or damaged.")
+        end = self._content.find(b"\0", self._place)
+        (text,) = self.take(f"{end + 1 - self._place if end >= 0 else len(self._content) + 1}s", key)
+        with reading(self.file, "a name in UTF-8", key):
+            return str(text[:-1], "utf-8")
 
     def finish(self) -> None:
         """Check that the file has no further bytes."""
-        if self.left:
-            expected = "the end of the file after the last entry"
-            raise InputError(self.file, "", expected, f"{self.left} more bytes")
+        left = len(self._content) - self._place
+        if left:
+            raise InputError(self.file, "", "the end of the file after the last entry", f"{left} more bytes")
 
 
 def _cameras_binary(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
-    models = camera_models()
-    with file.open("rb") as stream:
-        reader = _BinaryReader(file, stream)
-        for _ in range(reader.count(struct.calcsize("<IiQQ"), "cameras")):
-            number, model, width, height = reader.take("IiQQ", "camera")
-            key = f"camera {number}"
-            if model not in models:
-                raise InputError(file, key, "a camera model pycolmap knows", f"number {model}")
-            name, length = models[model]
-            yield number, ColmapCamera(name, width, height, reader.take(f"{length}d", key))
-        reader.finish()
+    stream, models = _Bytes(file), camera_models()
+    for _ in range(*stream.take("Q", "cameras")):
+        number, model, width, height = stream.take("IiQQ", "camera")
+        key = f"camera {number}"
+        if model not in models:
+            raise InputError(file, key, "a camera model pycolmap knows", f"number {model}")
+        name, length = models[model]
+        yield number, ColmapCamera(name, width, height, stream.take(f"{length}d", key))
+    stream.finish()
 
 
 def _images_binary(file: Path) -> Iterator[tuple[int, ColmapImage]]:
-    with file.open("rb") as stream:
-        reader = _BinaryReader(file, stream)
-        for _ in range(reader.count(struct.calcsize("<I7dIQ") + 1, "images")):
-            number, *pose, camera = reader.take("I7dI", "image")
-            key = f"image {number}"
-            name = with_slashes(reader.name(key))
-            points = reader.count(_POINT, f"{key}, points")
-            reader.skip(points * _POINT, key)
-            yield number, ColmapImage(name, camera, tuple(pose[:4]), tuple(pose[4:]))
-        reader.finish()
-
-
-_LONGEST_LINE = 2**23  # 300,000 points of an image; words take ten times the memory of their line
-_IMAGE_WORDS = 10  # number, quaternion, translation, camera, name
+    stream = _Bytes(file)
+    for _ in range(*stream.take("Q", "images")):
+        number, *pose, camera = stream.take("I7dI", "image")
+        key = f"image {number}"
+        name = stream.name(key)
+        (points,) = stream.take("Q", key)
+        stream.take(f"{points * _POINT}x", f"{key}, points")
+        yield number, ColmapImage(with_slashes(name), camera, tuple(pose[:4]), tuple(pose[4:]))
+    stream.finish()
 
 
 def _cameras_text(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
     lengths = dict(camera_models().values())
     for line, text in _lines(file):
-        words = text.split()
-        if not words:
-            continue
-        key = f"line {line}"
-        if len(words) < 4 or words[1] not in lengths:
-            expected = "a number, a camera model pycolmap knows and a size"
-            raise InputError(file, key, expected, " ".join(words)[:80])
-        if len(words) != 4 + lengths[words[1]]:
-            expected = f"{lengths[words[1]]} parameters of {words[1]}"
-            raise InputError(file, key, expected, f"{len(words) - 4}")
-        number, width, height = _whole(file, key, [words[0], words[2], words[3]])
-        yield number, ColmapCamera(words[1], width, height, _real(file, key, words[4:]))
+        if words := text.split():
+            if len(words) < 4 or len(words) - 4 != lengths.get(words[1]):
+                expected = "a number, a camera model pycolmap knows, a size and the model's parameters"
+                raise InputError(file, f"line {line}", expected, " ".join(words)[:80])
+            with reading(file, "numbers", f"line {line}"):
+                number, width, height = (int(words[place]) for place in (0, 2, 3))
+                params = tuple(map(float, words[4:]))
+            yield number, ColmapCamera(words[1], width, height, params)
 
 
 def _images_text(file: Path) -> Iterator[tuple[int, ColmapImage]]:
@@ -232,11 +175,11 @@ def _images_text(file: Path) -> Iterator[tuple[int, ColmapImage]]:
         words = text.strip().split(maxsplit=_IMAGE_WORDS - 1)  # the name, which comes last, may have spaces
         if not words:
             continue
-        key = f"line {line}"
         if len(words) != _IMAGE_WORDS:
-            raise InputError(file, key, f"{_IMAGE_WORDS} words of an image", f"{len(words)}")
-        number, camera = _whole(file, key, [words[0], words[8]])
-        pose = _real(file, key, words[1:8])
+            raise InputError(file, f"line {line}", f"{_IMAGE_WORDS} words of an image", f"{len(words)}")
+        with reading(file, "numbers", f"line {line}"):
+            number, camera = int(words[0]), int(words[8])
+            pose = tuple(map(float, words[1:8]))
         yield number, ColmapImage(with_slashes(words[9]), camera, pose[:4], pose[4:])
         _, points = next(lines, (0, "missing"))
         if len(points.split()) % 3:
@@ -246,31 +189,8 @@ def _images_text(file: Path) -> Iterator[tuple[int, ColmapImage]]:
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
     """Number and text of each line except comments. An empty line may be an image without points."""
-    try:
-        with file.open("rb") as start:
-            refuse_utf16(start.read(4), file, "text in UTF-8")
-        with file.open(encoding="utf-8-sig") as stream:
-            for number, line in enumerate(iter(partial(stream.readline, _LONGEST_LINE + 1), ""), start=1):
-                if len(line) > _LONGEST_LINE:
-                    expected = f"at most {_LONGEST_LINE} characters in a line"
-                    raise InputError(file, f"line {number}", expected, "more")
-                if not line.startswith("#"):
-                    yield number, line
-    except UnicodeDecodeError as error:
-        raise InputError(file, "", "text in UTF-8", str(error)) from error
-
-
-def _whole(file: Path, key: str, words: list[str]) -> list[int]:
-    if not all(word.isascii() and word.isdigit() and len(word) < 20 for word in words):
-        raise InputError(file, key, "whole numbers", ", ".join(words)[:80])
-    return [int(word) for word in words]
-
-
-def _real(file: Path, key: str, words: list[str]) -> tuple[float, ...]:
-    try:
-        return tuple(float(word) for word in words)
-    except ValueError as error:
-        raise InputError(file, key, "numbers", " ".join(words)[:80]) from error
+    lines = enumerate(read_text(file, "COLMAP text").split("\n"), start=1)
+    return ((number, line) for number, line in lines if not line.startswith("#"))
 
 
 _PLACES = (".", "sparse/0", "sparse")
@@ -299,14 +219,23 @@ def read_model(path: str | PathLike[str]) -> ColmapModel:
         expected = "a COLMAP model: cameras.bin and images.bin, or cameras.txt and images.txt"
         raise InputError(path, "", expected, "none in it, in sparse/0 or in sparse")
     binary = files[0].suffix == ".bin"
-    cameras = _by_number(
-        files[0], "camera", (_cameras_binary if binary else _cameras_text)(files[0]), _check_camera
-    )
-    images = _by_number(
-        files[1], "image", (_images_binary if binary else _images_text)(files[1]), _check_image
-    )
+    read_cameras, read_images = (_cameras_binary, _images_binary) if binary else (_cameras_text, _images_text)
+    cameras = _by_number(files[0], "camera", read_cameras(files[0]))
+    images = _by_number(files[1], "image", read_images(files[1]))
     for number, image in images.items():
         if image.camera not in cameras:
             expected = "one of the model's cameras"
             raise InputError(files[1], f"image {number}, camera", expected, str(image.camera))
     return ColmapModel(files, cameras, images)
+
+
+def _by_number(file: Path, kind: str, entries: Iterable[tuple[int, T]]) -> dict[int, T]:
+    """Cameras or images by id, validated and unique."""
+    found: dict[int, T] = {}
+    for number, entry in entries:
+        key = f"{kind} {number}"
+        if number in found:
+            raise InputError(file, key, f"each {kind} once", "a second one")
+        entry.check(file, key)
+        found[number] = entry
+    return found

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.io.files import atomic_path, grouped_writes
+from ...bench.io.files import atomic_path
 from ..clip import CaptureClip
 from ..ga import layout
 from ..ga.writer import identity_parameters, pose_to_parameters, save_npz
@@ -105,22 +105,21 @@ def export_model(
             )
         )
     views: dict[int, _Observation] = {}
-    with grouped_writes():
-        for number, key in enumerate(sorted(keys), start=1):
-            camera, picture = clip.cameras[key.camera], clip.image(key)
-            if key.timestep == first:
-                views[number] = _observe(vertices, np.asarray(clip.head.faces), camera, picture)
-            pixels = views[number].pixels if number in views else np.zeros((0, 2))
-            image = pycolmap().Image(names[key], pixels, ids.index(key.camera) + 1, number)
-            model.add_image_with_trivial_frame(image, pycolmap().Rigid3d(camera.world_to_camera[:3]))
-            write_image(out / "images" / names[key], picture)
-            mask = clip.mask(key)
-            if mask is not None:
-                # COLMAP's convention: the full name of the image with an additional suffix, 0 for masked pixels.
-                write_image(out / "masks" / f"{names[key]}.png", mask)
-                if naming == "flat":
-                    write_image(out / "masks" / names[key], mask)  # as nerfbaselines expects it
-            progress(number, len(keys), str(key))
+    for number, key in enumerate(sorted(keys), start=1):
+        camera, picture = clip.cameras[key.camera], clip.image(key)
+        if key.timestep == first:
+            views[number] = _observe(vertices, np.asarray(clip.head.faces), camera, picture)
+        pixels = views[number].pixels if number in views else np.zeros((0, 2))
+        image = pycolmap().Image(names[key], pixels, ids.index(key.camera) + 1, number)
+        model.add_image_with_trivial_frame(image, pycolmap().Rigid3d(camera.world_to_camera[:3]))
+        write_image(out / "images" / names[key], picture)
+        mask = clip.mask(key)
+        if mask is not None:
+            # COLMAP's convention: the full name of the image with an additional suffix, 0 for masked pixels.
+            write_image(out / "masks" / f"{names[key]}.png", mask)
+            if naming == "flat":
+                write_image(out / "masks" / names[key], mask)  # as nerfbaselines expects it
+        progress(number, len(keys), str(key))
     _add_points(model, vertices, views)
     _write_model(model, out / "sparse" / "0", model_format)
     return Exported(
@@ -131,10 +130,9 @@ def export_model(
 def export_tracking(clip: CaptureClip, timesteps: Collection[int], out: Path) -> None:
     """Write the additional files of the reader ``colmap``: parameters by timestep, head model, conventions."""
     identity = identity_parameters(clip.shape, clip.static_offset)
-    with grouped_writes():
-        for timestep in sorted(timesteps):
-            path = out / TRACKING_FOLDER / layout.parameter_name(timestep)
-            save_npz(path, pose_to_parameters(clip.poses[timestep]) | identity)
+    for timestep in sorted(timesteps):
+        path = out / TRACKING_FOLDER / layout.parameter_name(timestep)
+        save_npz(path, pose_to_parameters(clip.poses[timestep]) | identity)
     save_head(out / layout.HEAD_FILE, clip.head)
     red, green, blue = clip.background.tolist()
     excluded = {key.timestep: reason for key, reason in clip.excluded.items() if key.timestep in timesteps}

@@ -11,7 +11,6 @@ import numpy as np
 
 from ...bench.contracts import Avatar, ByteArray, FloatArray, FrameKey, HeadPose, Progress
 from ...bench.engine.adaptation import AdaptedClip
-from ...bench.io.files import grouped_writes
 from ...bench.io.images import quantise, write_png
 from ...bench.io.provenance import RENDER
 from ...bench.io.video import write_browser_video
@@ -89,7 +88,6 @@ def write_driven_capture(out: Path, renderer: Renderer, clip: CaptureClip) -> Pa
         background=(red, green, blue),
     )
     writer = CaptureWriter(out, plan)
-    with grouped_writes():
-        for place, frame in zip(places, renderer.frames(keys)):
-            write_png(writer.image_path(*place), frame, RENDER)
+    for place, frame in zip(places, renderer.frames(keys)):
+        write_png(writer.image_path(*place), frame, RENDER)
     return writer.write_metadata()

@@ -16,7 +16,7 @@ import numpy as np
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy, read_npz
-from ...bench.io.documents import MAX_JSON_BYTES, parse_json, read_json, read_text, shown
+from ...bench.io.documents import parse_json, read_json, read_text, shown
 from ...bench.io.files import reading, user_files
 from .names import IDENTITY, NAMES
 
@@ -145,7 +145,7 @@ def _categories(value: Any) -> dict[str, Any] | None:
 
 
 def _csv(path: Path) -> SignalTable:
-    text = read_text(path, "CSV", MAX_JSON_BYTES)
+    text = read_text(path, "CSV")
     with reading(path, "a CSV file"):
         reader = csv.reader(io.StringIO(text, newline=""), strict=True)
         rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
@@ -164,7 +164,7 @@ def _csv(path: Path) -> SignalTable:
 
 
 def _json_lines(path: Path) -> SignalTable:
-    lines = read_text(path, "JSON lines", MAX_JSON_BYTES).splitlines()
+    lines = read_text(path, "JSON lines").splitlines()
     places = [f"line {number}" for number, line in enumerate(lines, 1) if line.strip()]
     return _joined(
         path, places, [parse_line(line, path, f"line {n}") for n, line in enumerate(lines, 1) if line.strip()]

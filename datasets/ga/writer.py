@@ -18,7 +18,7 @@ import numpy as np
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
-from ...bench.io.files import atomic_path, grouped_writes, write_bytes, write_json, write_text
+from ...bench.io.files import atomic_path, write_bytes, write_json, write_text
 from ...bench.io.images import probe_image
 from ..head.arrays import HeadArrays, save_head
 from ..images import write_image
@@ -308,10 +308,9 @@ class CaptureWriter:
     def _write_sequence(self, sequence: SequencePlan) -> None:
         plan, folder = self.plan, self.sequence_folder(sequence.name)
         identity = identity_parameters(plan.shape, plan.static_offset)
-        with grouped_writes():
-            for timestep, pose in enumerate(sequence.poses):
-                path = folder / "flame_param" / layout.parameter_name(timestep)
-                save_npz(path, pose_to_parameters(pose) | identity)
+        for timestep, pose in enumerate(sequence.poses):
+            path = folder / "flame_param" / layout.parameter_name(timestep)
+            save_npz(path, pose_to_parameters(pose) | identity)
         zeros = {k: np.zeros_like(v) for k, v in pose_to_parameters(plan.sequences[0].poses[0]).items()}
         zeros["jaw_pose"] = np.array([CANONICAL_JAW], dtype=np.float64)
         save_npz(folder / layout.CANONICAL_FILE, zeros | identity)

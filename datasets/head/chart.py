@@ -14,8 +14,6 @@ from ...bench.io.files import reading
 
 CHART_FILES = ("head_template_mesh.obj", "head_template.obj")
 """FLAME's mesh with texture coordinates, as VHAP and GaussianAvatars, and DECA, name it."""
-_MOST_BYTES = 2**24
-"""Maximum file size; FLAME's has 1 MB. Parsing takes up to 60 times the size of the text."""
 
 
 def read_chart(path: Path, faces: IntArray) -> FloatArray:
@@ -34,7 +32,7 @@ def read_chart(path: Path, faces: IntArray) -> FloatArray:
         The file is missing or damaged, lacks texture coordinates or a triangle of the head model, or has non-finite
         coordinates or faces other than triangles.
     """
-    text = read_text(path, "mesh", _MOST_BYTES)
+    text = read_text(path, "mesh")
     with reading(path, "an OBJ mesh of triangles with texture coordinates"):
         rows = [row for row in map(str.split, text.splitlines()) if row[:1] in (["vt"], ["f"])]
         coordinates = np.array([row[1:3] for row in rows if row[0] == "vt"], np.float64)

@@ -46,7 +46,6 @@ CHECKED_MESHES = 50
 """Number of meshes of a video that are compared with complete parameters, enough to include a blink."""
 WORST_VERTEX = 1e-3
 """Maximum distance of a vertex from a mesh without a warning about lost eyelids, which move by up to 9 mm, metres."""
-MAX_TEXT = 2**16
 
 
 @dataclass(frozen=True)
@@ -270,7 +269,7 @@ class _Meshes:
         return rotations_of_6d(path, "", values.reshape(count, 6)).ravel()
 
     def _numbers(self, path: Path) -> FloatArray:
-        text = read_text(path, "text", MAX_TEXT)
+        text = read_text(path, "text")
         with reading(path, "numbers, one a line"):
             values = np.array([float(word) for word in text.split()])  # no array of the longest word
         check_numbers(path, "", values, MAX_MAGNITUDE)

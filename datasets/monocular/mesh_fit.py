@@ -21,8 +21,6 @@ from ...bench.protocol import evenly_with_ends
 from ..head.arrays import JOINT_NAMES, HeadArrays
 from ..head.model import HeadModel
 
-MAX_BYTES = 2**26
-"""Maximum bytes of a mesh file; FLAME's takes 0.6 MB."""
 WORST_DISTANCE = 1e-4
 """Maximum median distance of vertices from the mesh, metres: rounding gives 1e-8, another head model of the same
 topology 1e-3, and lids without a basis in the head model move fewer than half of the vertices."""
@@ -41,7 +39,7 @@ def read_vertices(path: Path, count: int) -> FloatArray:
 
     Raises `InputError` for a file that is missing, or has another number of vertices than ``count``.
     """
-    content = read_bytes(path, "a Wavefront OBJ", MAX_BYTES)
+    content = read_bytes(path, "a Wavefront OBJ")
     found = _VERTEX.findall(content)
     if len(found) != count:
         remedy = "Give the head model the video was tracked with."

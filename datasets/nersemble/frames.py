@@ -19,7 +19,6 @@ import cv2
 
 from ...bench.contracts import ByteArray, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.io.files import grouped_writes
 from ...bench.io.images import read_bgr
 from ...bench.machine import processor_count
 from ..images import is_whole, read_mask, write_image
@@ -106,7 +105,7 @@ def write_images(
     reports: queue.SimpleQueue[Future[None] | str] = queue.SimpleQueue()
     stop = threading.Event()
     done = kept
-    with grouped_writes(), ThreadPoolExecutor(workers or processor_count()) as pool:
+    with ThreadPoolExecutor(workers or processor_count()) as pool:
         for stream in streams:
             pool.submit(_run, stream, reports, stop).add_done_callback(reports.put)
         try:

@@ -19,8 +19,8 @@ import numpy as np
 from ...bench.contracts import Camera, FloatArray, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.documents import checked, read_json
-from ...bench.io.files import digest, grouped_writes, remove_dead_temporaries, write_json
-from ...bench.io.lock import locked
+from ...bench.io.files import digest, write_json
+from ...bench.io.lock import locked, remove_temporaries
 from ..ga import layout
 from ..ga.writer import camera_record, file_record, save_npz, transforms_document, write_sequence, write_union
 from ..head.arrays import save_head
@@ -81,7 +81,7 @@ def prepare(
         for plan in plans:  # one by one: other subjects of the same folder may be prepared elsewhere
             stack.enter_context(locked(plan.union, beside=True))
             for job in plan.jobs:
-                remove_dead_temporaries(job.folder)
+                remove_temporaries(job.folder)
         return _prepare(plans, workers, progress)
 
 
@@ -226,10 +226,9 @@ def _moved(camera: Camera, shift: FloatArray) -> Camera:
 
 def _write_tracked(job: SequenceJob, tracked: TrackedSequence, declaration: layout.Declaration) -> None:
     """Write parameters and JSONs in the world whose mean translation is zero."""
-    with grouped_writes():
-        for timestep in range(tracked.count):
-            path = job.folder / "flame_param" / layout.parameter_name(timestep)
-            save_npz(path, tracked.parameters(timestep))
+    for timestep in range(tracked.count):
+        path = job.folder / "flame_param" / layout.parameter_name(timestep)
+        save_npz(path, tracked.parameters(timestep))
     save_npz(job.folder / layout.CANONICAL_FILE, tracked.canonical())
     frames = _frames(job, tracked.shift)
     write_sequence(job.folder, frames, _intrinsics(job.cameras[-1]), (NOVEL_VIEW_CAMERA,), declaration)

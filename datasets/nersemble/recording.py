@@ -28,7 +28,7 @@ import numpy as np
 
 from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
-from ...bench.io.documents import MAX_YAML_BYTES, read_json, read_text
+from ...bench.io.documents import read_json, read_text
 from ...bench.io.files import check_name, entries, reading
 from ..ga.transforms import found_entry, read_matrix, read_rigid
 from .names import BACKGROUND, FULL_SIZE, is_subject, match_sequence, serial_of
@@ -154,7 +154,7 @@ def _listed_sequences(root: Path) -> dict[str, tuple[str, ...]]:
     if not path.exists():
         return {}
     with reading(path, "a CSV file"):
-        rows = [*csv.DictReader(io.StringIO(read_text(path, "CSV", MAX_YAML_BYTES), newline=""))]
+        rows = [*csv.DictReader(io.StringIO(read_text(path, "CSV"), newline=""))]
     if rows and "ID" not in rows[0]:
         expected = "a column of participants"
         raise InputError(path, "ID", expected, f"columns {', '.join(map(str, rows[0]))[:80]}")

@@ -27,7 +27,7 @@ from ...bench.errors import HeadbenchError, InputError
 from ...bench.executors.settings import Execution
 from ...bench.executors.task import TASK_LOG, Task
 from ...bench.io.documents import read_json
-from ...bench.io.files import grouped_writes, user_files, write_bytes, write_json, write_text
+from ...bench.io.files import user_files, write_bytes, write_json, write_text
 from ...bench.io.provenance import SYNTHETIC, xmp
 from ...bench.machine import processor_count
 from ...bench.start import end_with_parent, starting_workers
@@ -202,8 +202,7 @@ def _render_missing(
         renderer = CaptureRenderer(plan) if work else None
         for job in work:
             assert renderer is not None
-            with grouped_writes():
-                renderer.render_frames(*job)
+            renderer.render_frames(*job)
             yield job[0], len(job[2])
         return
     # Spawned, since neither torch nor the renderer's thread pool survives a fork.
@@ -235,8 +234,7 @@ def _begin(out: Path, index: int, settings: SyntheticSettings) -> None:
 
 
 def _render(job: Job) -> None:
-    with grouped_writes():
-        _renderer[0].render_frames(*job)
+    _renderer[0].render_frames(*job)
 
 
 def _run_all(out: Path, plans: Sequence[SubjectPlan], execution: Execution) -> None:

@@ -17,13 +17,13 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import Member, cached_arrays
 from ...bench.io.files import digest
 from ..clip import CaptureClip
-from .code import tracking_code
 from .fit import Fitter
 from .images import FrameStack
 from .landmarks import ImageLandmarks
 from .rig import PoseColumns
 from .solve import HeadState
 from .views import Views
+from .work import TRACKER_VERSION
 
 MOST_TIMESTEPS, MOST_PIXELS = 64, 2.5e8
 """Timesteps, and pixels of all cameras, that are fitted together; this bounds the memory."""
@@ -141,7 +141,7 @@ def track(
             fitted = fit()
         else:
             mark = digest(
-                tracking_code(), clip.fingerprint, clip.head.fingerprint(), seen, part, *landmarks, shape
+                TRACKER_VERSION, clip.fingerprint, clip.head.fingerprint(), seen, part, *landmarks, shape
             )
             fitted = cached_arrays(store / f"part-{block:05d}.npz", mark, _PART, fit, {"T": len(part)})
         shape = fitted["shape"]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...bench.contracts import Camera, FloatArray, HeadPose, Progress, no_progress
-from ...bench.io.files import digest, digest_file, grouped_writes
+from ...bench.io.files import digest, digest_file
 from ...bench.landmark_network import LandmarkNetwork
 from ..clip import CaptureClip
 from ..head.arrays import HeadArrays
@@ -20,7 +20,7 @@ from ..head.subject import resting
 from ..images import write_image
 from ..monocular.clip import check_subject, clip_of_track, subject_of
 from ..monocular.track import VIDEO, Track, VideoFrame
-from ..tracking.code import tracking_code
+from ..tracking.work import TRACKER_VERSION
 from .decode import TimedFrame, VideoInfo, probe_video, video_frames
 from .faces import FoundFaces, crop_around, find_faces
 from .masks import FrameView, MaskSource
@@ -82,7 +82,7 @@ def open_video(
     check_subject(subject, "--subject")
     info = probe_video(path)
     masks = MaskSource(options)
-    mark = digest(tracking_code(), digest_file(path), network_digest, options.rate, options.longest)
+    mark = digest(TRACKER_VERSION, digest_file(path), network_digest, options.rate, options.longest)
     faces = find_faces(path, _frames(path, options), network, out / FACES, mark, progress)
     shown = faces.numbers[faces.found].tolist()
     mark = digest(mark, options.size, masks.prepare(shown, info))
@@ -135,17 +135,16 @@ def _write_frames(
     if not left:
         return
     masks.learn(path, _frames(path, options), faces, view)
-    with grouped_writes():
-        for done, frame in enumerate(_frames(path, options)):
-            progress(done, len(faces.numbers), "frames")
-            if frame.number not in left:
-                continue
-            pictures = [view.image(frame.image)]
-            if masks:
-                pictures.append(masks.mask(frame, view, seen[frame.number]))
-            for file, picture in zip(files[frame.number], pictures):
-                if not file.exists():
-                    write_image(file, picture)
+    for done, frame in enumerate(_frames(path, options)):
+        progress(done, len(faces.numbers), "frames")
+        if frame.number not in left:
+            continue
+        pictures = [view.image(frame.image)]
+        if masks:
+            pictures.append(masks.mask(frame, view, seen[frame.number]))
+        for file, picture in zip(files[frame.number], pictures):
+            if not file.exists():
+                write_image(file, picture)
 
 
 def _frames(path: Path, options: VideoOptions) -> Iterator[TimedFrame]:

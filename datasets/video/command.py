@@ -17,11 +17,10 @@ from ...bench.landmark_network import COUNT, LandmarkNetwork
 from ...bench.progress import counted
 from ..clip import CaptureClip
 from ..head.refit.command import target_head
-from ..tracking.code import tracking_code
 from ..tracking.embedding import Embedding
 from ..tracking.focal import FocalLength, estimate_focal
 from ..tracking.network import NetworkLandmarks, head_embedding
-from ..tracking.work import make_work_folder
+from ..tracking.work import TRACKER_VERSION, make_work_folder
 from .clip import USUAL_FOCAL, VideoClip, open_video
 
 if TYPE_CHECKING:
@@ -58,7 +57,7 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
     )  # the name of a head is not passed to a reader
     teacher = own.open(settings.embedding, progress) if settings.embedding else None
     make_work_folder(folder)
-    mark = digest(tracking_code(), weights, head.fingerprint(), teacher.fingerprint if teacher else "")
+    mark = digest(TRACKER_VERSION, weights, head.fingerprint(), teacher.fingerprint if teacher else "")
     embedding = Embedding(
         **cached_arrays(
             folder / "embedding.npz",

@@ -22,7 +22,7 @@ from ...bench.io.files import read_bytes, write_bytes
 from ...bench.io.provenance import RENDER, note, tool
 from ..ga.storage import COLUMNS
 from ..ops.harmonics import C0
-from ..shared.ply import MAX_BYTES, read_ply, write_ply
+from ..shared.ply import read_ply, write_ply
 
 STANDARD = COLUMNS[:-1]
 """62 float32: position, zero normals, harmonics (the rest channel by channel), opacity logit, log-scales, wxyz."""
@@ -154,7 +154,7 @@ def _write_glb(path: Path, splats: StoredSplats) -> None:
 
 def _read_glb(path: Path) -> StoredSplats:
     """Read what `_write_glb` wrote."""
-    content = read_bytes(path, "a GLB file", MAX_BYTES)
+    content = read_bytes(path, "a GLB file")
     (length,) = struct.unpack_from("<I", content, 12)
     header, start = json.loads(content[20 : 20 + length]), 28 + length
     found = {}
@@ -217,7 +217,7 @@ def _marked(content: bytes) -> bytes:
 def _read_sog(path: Path) -> StoredSplats:
     with tempfile.TemporaryDirectory() as folder:
         ply = Path(folder) / "splats.ply"
-        ply.write_bytes(_converted(read_bytes(path, "a SOG file", MAX_BYTES), "sog", "ply"))
+        ply.write_bytes(_converted(read_bytes(path, "a SOG file"), "sog", "ply"))
         return _read_ply(ply)
 
 

@@ -23,7 +23,6 @@ from .config import INSTAOfficialConfig, OfficialConfig
 SHORTEST_COMMIT = 7
 PROBE_S = 300.0
 """Time limit for the interpreter to import the required modules, seconds; the first import reads them from disk."""
-MOST_SOURCE = 2**22
 
 SHIM = "headbench.methods.official.shim.cpu"
 SHIMMED = (
@@ -110,7 +109,7 @@ class Checkout:
 def find_constant(folder: Path, file: str, pattern: str, what: str) -> str:
     """A value in a source file of a checkout; see `Checkout.constant`."""
     path = folder / file
-    match = re.search(pattern, read_bytes(path, "a source file", MOST_SOURCE).decode(errors="replace"))
+    match = re.search(pattern, read_bytes(path, "a source file").decode(errors="replace"))
     if match is None:
         remedy = "Check out the commit that the adapter was written for."
         raise InputError(path, what, f"a line like {pattern}", "none", remedy)

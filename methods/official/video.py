@@ -24,7 +24,7 @@ from ...bench.contracts import (
     Progress,
 )
 from ...bench.errors import InputError
-from ...bench.io.files import atomic_path, grouped_writes
+from ...bench.io.files import atomic_path
 from ...bench.io.images import read_pixels
 from ...datasets.head.loaders import FLAME_IDENTITY_SIZE
 from ...datasets.head.rotations import rotation_of
@@ -228,11 +228,10 @@ def write_video(
     the folder, and the content of the first file.
     """
     frames = training_frames(clip, posed)
-    with grouped_writes():
-        for each in frames:
-            write_image(folder / image_name(each.number), straight_rgba(clip, each.key))
-            write_torch(folder / frame_name(each.number), frame(each.camera, each.pose))
-            progress(each.number + 1, len(frames), "exporting")
+    for each in frames:
+        write_image(folder / image_name(each.number), straight_rgba(clip, each.key))
+        write_torch(folder / frame_name(each.number), frame(each.camera, each.pose))
+        progress(each.number + 1, len(frames), "exporting")
     return {image_name(each.number): each.key for each in frames}, frame(frames[0].camera, frames[0].pose)
 
 

@@ -25,7 +25,7 @@ SCALARS = {
 BEGIN, END = re.compile(rb"ply\r?\n"), re.compile(rb"\nend_header\r?\n")
 OPACITY, LARGEST_LOGIT = "opacity", 20.0  # its sigmoid is 1 in float32
 _COUNT = re.compile(r"[0-9]{1,18}")
-EXPECTED, MAX_BYTES = "a PLY file", 2**30
+EXPECTED = "a PLY file"
 HEADER_LIMIT = 65536  # bytes; files with a longer header are refused
 
 
@@ -51,7 +51,7 @@ def read_ply(path: Path, names: tuple[str, ...]) -> FloatArray:
     Other columns of any scalar type are ignored. Raises `InputError` if the file is not such a PLY, lacks a column, is
     truncated, or has numbers that are not finite in float32. Infinite opacity logits are clamped to `LARGEST_LOGIT`.
     """
-    content = read_bytes(path, EXPECTED, MAX_BYTES)
+    content = read_bytes(path, EXPECTED)
     count, columns, start = _header(path, content)
     missing = [name for name in names if name not in columns]
     if missing:

@@ -18,7 +18,6 @@ from ...bench.engine.stored import open_avatar
 from ...bench.errors import InputError
 from ...bench.experiments.extremes import head_center
 from ...bench.experiments.viewpoints import turntable
-from ...bench.io.files import grouped_writes
 from ...bench.io.images import quantise, read_png, write_png
 from ...bench.io.provenance import COMPOSITE, RENDER
 from ...bench.io.video import browser_encoder, write_browser_video
@@ -61,11 +60,10 @@ def render_avatar(settings: RenderSettings, progress: Progress = no_progress) ->
         *(_orbit(settings, form, out) if settings.frames == ORBIT else _frames(settings, clip, form, out))
     ]
     background = clip.background.tolist()
-    with grouped_writes():
-        for index, shot in enumerate(shots):
-            rgb = avatar.render(shot.camera, shot.pose, background).rgb
-            write_png(shot.path, quantise(shot.finish(rgb)), RENDER)
-            progress(index + 1, len(shots), shot.path.name)
+    for index, shot in enumerate(shots):
+        rgb = avatar.render(shot.camera, shot.pose, background).rgb
+        write_png(shot.path, quantise(shot.finish(rgb)), RENDER)
+        progress(index + 1, len(shots), shot.path.name)
     videos = _videos(shots, settings) if settings.video else []
     text = f"{out}: {counted(len(shots), 'frame')} in {shots[0].path.parent.name}/" + "".join(
         f"\n{v}" for v in videos

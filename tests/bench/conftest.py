@@ -1,5 +1,7 @@
 """A run on toy plug-ins, small enough to see through."""
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -7,6 +9,9 @@ import pytest
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.config import RunConfig
 from headbench.bench.engine.store import RunFolder
+from headbench.bench.rows import Rows
+
+from ..world import place
 
 
 @pytest.fixture
@@ -44,11 +49,33 @@ def config(toy, tmp_path, monkeypatch, subjects):
     )
 
 
+FINISHED: dict[str, Path] = {}
+"""Runs that tests copy, by their settings."""
+
+
 @pytest.fixture
-def run(config, toy):
+def finished(toy):
+    """Put a finished run of a configuration into its folder: a copy, of a run made once. Return its rows."""
+
+    def finished(config):
+        captures = sorted(path.name for path in Path(config.data).iterdir())
+        key = repr((replace(config, data="", out=""), captures))
+        if key not in FINISHED:
+            root = place(f"toy-{len(FINISHED)}")
+            shutil.copytree(config.data, root / "data")
+            runner.run(replace(config, data=str(root / "data"), out=str(root / "run")))
+            FINISHED[key] = root / "run"
+        shutil.copytree(FINISHED[key], config.out)
+        toy.FITS.clear()
+        return Rows.read(RunFolder(Path(config.out)).rows)
+
+    return finished
+
+
+@pytest.fixture
+def run(config, finished):
     """The folder of a finished run."""
-    runner.run(config)
-    toy.FITS.clear()
+    finished(config)
     return Path(config.out)
 
 

@@ -190,7 +190,7 @@ def test_help_lists_commands_in_groups(capsys):
         text.index("\n  demo ")
         < text.index("\n  run ")
         < text.index("\n  table ")
-        < text.index("\n  bundle ")
+        < text.index("\n  export ply ")
     )
     headings = [group.capitalize() for group in specs.COMMAND_GROUPS]
     assert re.findall(r"(?m)^([A-Z]\w+)$", text) == headings
@@ -241,13 +241,6 @@ def test_a_word_calls_a_command_alone_and_before_a_second_word(offer, capsys):
         assert "`headbench make twice`" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("word", commands.MOVED)
-def test_a_word_of_earlier_versions_leads_to_the_new_line(capsys, word):
-    assert cli.main([*word.split(), "a b", "--out", "c"]) == 2
-    assert f"It is now `headbench {commands.MOVED[word]} 'a b' --out c`" in capsys.readouterr().err
-    assert commands.MOVED[word] in registry.discover("commands")
-
-
 @pytest.mark.parametrize(
     ("spec", "why", "listed"),
     [
@@ -291,7 +284,6 @@ def test_every_command_with_a_folder_to_write_locks_it():
     own |= {f"run {what}" for what in ("curve", "extremes", "reenact", "sweep")}
     files = {
         "doctor bench",
-        "bundle",
         "export glb",
         "export html",
         "export ply",

@@ -175,6 +175,17 @@ def test_the_record_tells_of_the_device(pretended_gpu):
     assert "device" not in machine_record()
 
 
+def test_the_record_has_the_commit_of_a_checkout_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(machine, "__file__", str(tmp_path / "bench" / "machine.py"))
+    assert "commit" not in machine_record()
+    machine._commit_record.cache_clear()
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=me", "-c", "user.email=me@here"]
+    for words in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "first"]):
+        subprocess.run([*git, *words], check=True)
+    head = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True).stdout
+    assert machine_record()["commit"] == head.strip()
+
+
 @pytest.mark.parametrize(
     ("device", "current", "tf32"), [("cpu", None, True), ("cuda", None, False), ("cuda:1", "cuda:1", False)]
 )

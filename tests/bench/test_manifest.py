@@ -9,7 +9,6 @@ import pytest
 
 from headbench.bench.engine.store import Cell
 from headbench.bench.errors import InputError
-from headbench.bench.io.documents import MAX_RECORD_BYTES
 from headbench.bench.manifest import PROTOCOLS, Manifest, protocol_path
 from headbench.methods.ga.spec import GA
 from headbench.metrics.psnr import PSNR
@@ -36,12 +35,6 @@ def test_the_published_manifest_is_written_as_it_was_read(published, tmp_path):
     assert len(files) == 3
     for file in files:
         assert (tmp_path / "again" / file).read_bytes() == (published.parent / file).read_bytes()
-
-
-def test_a_large_record_is_refused_by_its_size(published):
-    change_json(published, lambda record: record["machine"].update(x="x" * MAX_RECORD_BYTES))
-    with pytest.raises(InputError, match=f"at most {MAX_RECORD_BYTES} bytes"):
-        Manifest.read(published)
 
 
 def test_a_missing_protocol_is_named(published):

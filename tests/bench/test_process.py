@@ -1,7 +1,7 @@
 """Programs that leave processes, never end, or write without end."""
 
+import os
 import signal
-import subprocess
 import sys
 import time
 
@@ -12,7 +12,7 @@ from headbench.bench.process import LONGEST_LOG, ProgramError, run_program
 
 LEAVES = """
 import subprocess, sys
-child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(300)"], start_new_session={session})
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(300)"])
 open("child", "w").write(str(child.pid))
 print("the last line")
 """
@@ -32,10 +32,9 @@ def is_running(process):
         return False
 
 
-@pytest.mark.parametrize("session", [False, True], ids=["in its group", "in a session of its own"])
-def test_a_child_that_holds_the_output_is_ended(tmp_path, session):
+def test_a_child_that_holds_the_output_is_ended(tmp_path):
     began = time.monotonic()
-    ended, lines = run(tmp_path, LEAVES.format(session=session))
+    ended, lines = run(tmp_path, LEAVES)
     assert time.monotonic() - began < 60  # it sleeps for 300
     assert (ended.code, lines) == (0, ["the last line"])
     child = int((tmp_path / "child").read_text())
@@ -45,35 +44,15 @@ def test_a_child_that_holds_the_output_is_ended(tmp_path, session):
     assert not is_running(child)
 
 
-def test_a_daemon_without_its_environment_is_ended(tmp_path):
-    """Its parent has ended, and it is in another session with an empty environment; so is the child that it starts."""
-    forked = (
-        "import os, time; open('pid-%d' % os.getpid(), 'w').close(); os.fork() and os._exit(0); os.setsid()"
-    )
-    daemon = f"{forked}; open('pid-%d' % os.getpid(), 'w').close(); time.sleep(300)"
-    code = (
-        "import os, sys, time\n"
-        "if os.fork() == 0:\n"
-        f"  os.setsid(); os.execve(sys.executable, ['python', '-c', {daemon!r}], {{}})\n"
-        "while len([name for name in os.listdir() if name.startswith('pid-')]) < 2: time.sleep(0.02)\n"
-    )
-    run(tmp_path, code)
-    left = [int(path.name[4:]) for path in tmp_path.glob("pid-*")]
-    assert len(left) == 2
-    assert not any(map(is_running, left))
+@pytest.fixture
+def endless(tmp_path):
+    """Code of a program that starts `yes` in a session of its own, which is no part of the program."""
+    yield "import subprocess; print(subprocess.Popen(['yes'], start_new_session=True).pid, file=open('yes', 'w'))"
+    os.kill(int((tmp_path / "yes").read_text()), signal.SIGKILL)
 
 
-def test_other_children_are_left_alone(tmp_path):
-    other = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, start_new_session=True)
-    run(tmp_path, "")
-    assert other.poll() is None
-    other.communicate(b"\n")
-    assert other.returncode == 0
-
-
-def test_a_child_that_writes_without_end_is_not_followed(tmp_path):
-    code = "import os, subprocess; subprocess.Popen(['yes'], start_new_session=True)"
-    ended, _ = run(tmp_path, code)
+def test_a_child_that_writes_without_end_is_not_followed(tmp_path, endless):
+    ended, _ = run(tmp_path, endless)
     assert ended.code == 0
 
 

@@ -99,7 +99,7 @@ def start(tmp_path):
         process.communicate()
 
 
-@pytest.mark.parametrize("module", ["csv", "numpy.linalg", "yaml", "tyro._docstrings"])
+@pytest.mark.parametrize("module", ["csv", "numpy.linalg"])
 def test_ctrl_c_while_modules_are_imported_is_a_line(start, module):
     process = start("run", "--help", flags=("-X", "importtime"))
     imported = re.compile(rf"\| +{re.escape(module)}$")
@@ -122,7 +122,7 @@ def run_words(tmp_path):
 
 
 @SIGNALS
-def test_a_signal_in_training_is_a_line_and_the_run_goes_on(start, run_words, number):
+def test_a_signal_in_training_is_a_line_and_the_run_goes_on(start, run_words, tmp_path, number):
     process = start(*run_words)
     assert process.stdout.readline() == "training\n"
     process.send_signal(number)
@@ -130,22 +130,20 @@ def test_a_signal_in_training_is_a_line_and_the_run_goes_on(start, run_words, nu
     assert process.returncode == 128 + number
     assert errors.splitlines()[-1] == LINES[number]
     assert "Traceback" not in errors
+    assert not (tmp_path / "out" / "run.lock").exists()
     if number == signal.SIGTERM:
         again = start(*run_words)
         _, errors = again.communicate()
         assert again.returncode == 0, errors
 
 
-@pytest.mark.parametrize("deaf", [False, True])
-def test_an_end_that_a_method_swallows_comes_all_the_same(start, run_words, tmp_path, deaf):
-    if deaf:
-        (tmp_path / "deaf").touch()
+def test_an_end_that_a_method_swallows_comes_all_the_same(start, run_words, tmp_path):
+    (tmp_path / "deaf").touch()
     process = start(*run_words)
     assert process.stdout.readline() == "training\n"
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate()
     assert (process.returncode, errors.splitlines()[-1]) == (143, LINES[signal.SIGTERM])
-    assert (tmp_path / "out" / "run.lock").exists() == deaf  # left to the next start
 
 
 def test_signals_that_the_caller_ignores_stay_ignored(start, run_words):

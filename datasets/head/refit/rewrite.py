@@ -9,7 +9,7 @@ from typing import TypeGuard
 
 from ....bench.contracts import FrameKey, Progress, no_progress
 from ....bench.errors import InputError
-from ....bench.io.files import atomic_path, grouped_writes
+from ....bench.io.files import atomic_path
 from ...clip import CaptureClip
 from ...ga.validate import require_full_grid
 from ...ga.writer import CapturePlan, CaptureWriter, SequencePlan
@@ -29,20 +29,15 @@ def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress
     """
     plan, index = capture_plan(clip)
     writer = CaptureWriter(out, plan)
-    with grouped_writes():
-        for done, (key, files) in enumerate(sorted(clip.files.items())):
-            progress(done, len(clip.files), "writing images")
-            place = (key.sequence, index[key.timestep], key.camera)
-            if (
-                clip.pixel_steps
-                or not _is_png(files.image)
-                or not (files.mask is None or _is_png(files.mask))
-            ):
-                writer.write_frame(*place, clip.image(key), clip.mask(key))
-                continue
-            if files.mask is not None:
-                link_or_copy(files.mask, writer.mask_path(*place))
-            link_or_copy(files.image, writer.image_path(*place))
+    for done, (key, files) in enumerate(sorted(clip.files.items())):
+        progress(done, len(clip.files), "writing images")
+        place = (key.sequence, index[key.timestep], key.camera)
+        if clip.pixel_steps or not _is_png(files.image) or not (files.mask is None or _is_png(files.mask)):
+            writer.write_frame(*place, clip.image(key), clip.mask(key))
+            continue
+        if files.mask is not None:
+            link_or_copy(files.mask, writer.mask_path(*place))
+        link_or_copy(files.image, writer.image_path(*place))
     return writer.write_metadata()
 
 

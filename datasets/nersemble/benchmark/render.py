@@ -8,7 +8,6 @@ from pathlib import Path
 from ....bench.contracts import Progress, no_progress
 from ....bench.engine.stored import AVATAR_FILE, HEAD_FILE, open_avatar
 from ....bench.errors import InputError
-from ....bench.io.files import grouped_writes
 from ....bench.io.images import quantise, write_png
 from ....bench.specs import CommandResult
 from ...head.arrays import HeadArrays, read_head
@@ -53,14 +52,13 @@ def render_participant(settings: SubmissionRenderSettings, progress: Progress = 
     home = Path(settings.out) / settings.participant
     total = sum(len(sequence.poses) * len(sequence.cameras) for sequence in sequences.values())
     done = 0
-    with grouped_writes():
-        for name, sequence in sequences.items():
-            for timestep, pose in enumerate(sequence.poses):
-                for serial, camera in sequence.cameras.items():
-                    image = quantise(avatar.render(camera, pose, WHITE).rgb)
-                    write_png(home / f"{name}_{timestep:05d}_{serial}.png", image)
-                    done += 1
-                    progress(done, total, name)
+    for name, sequence in sequences.items():
+        for timestep, pose in enumerate(sequence.poses):
+            for serial, camera in sequence.cameras.items():
+                image = quantise(avatar.render(camera, pose, WHITE).rgb)
+                write_png(home / f"{name}_{timestep:05d}_{serial}.png", image)
+                done += 1
+                progress(done, total, name)
     return CommandResult(
         f"{home}: {total} frames of {len(sequences)} sequences", {"out": home, "frames": total}
     )

@@ -48,7 +48,6 @@ CODEC_VERSION = 3
 """Codec version, increased when the same avatar and steps give different files."""
 DRIVING_FILE = "driving.npz"
 """Driving signal beside the avatars of some methods, which is not part of their size."""
-MAX_SETTINGS = 2**20
 
 
 def encode_avatar(avatar: Avatar, head: HeadAsset, precision: Precision, clip: Clip | None = None) -> Content:
@@ -138,7 +137,7 @@ def _encode_insta(avatar: InstaAvatar, head: HeadAsset, precision: Precision, cl
     members = {name: Member("f", shape, dtype="f2") for name, shape in shapes.items()}
     arrays = read_arrays(path, {**members, OCCUPIED: Member("u", ("bytes",), dtype="u1")})
     subject = read_subject(path.parent / SUBJECT_FILE, head)
-    text = {SETTINGS: read_bytes(path.parent / SETTINGS_FILE, "settings", MAX_SETTINGS).decode()}
+    text = {SETTINGS: read_bytes(path.parent / SETTINGS_FILE, "settings").decode()}
     return encode_networks(arrays, subject, precision, grid=GRID, text=text)
 
 

@@ -32,7 +32,7 @@ from ....bench.contracts import (
     Progress,
 )
 from ....bench.errors import InputError
-from ....bench.io.files import grouped_writes, read_bytes, write_bytes, write_text
+from ....bench.io.files import read_bytes, write_bytes, write_text
 from ....bench.io.images import write_png
 from ....datasets.head.arrays import region
 from ...flashavatar.config import FlashAvatarConfig
@@ -45,7 +45,7 @@ from ...shared.subject_mesh import SubjectMesh, mouth_mask
 from ...shared.surface_points import SurfacePoints, spread_points
 from ..checkout import Checkout
 from ..ga.export import mark
-from ..ga.head_files import EXPRESSION_SIZE, MOST_TEMPLATE, OfficialHead, pickled, read_obj
+from ..ga.head_files import EXPRESSION_SIZE, OfficialHead, pickled, read_obj
 from ..ga.windows import around, inside
 from ..surface import VisibleMesh
 from ..video import FlameSubject, at_rest, frame_name, straight_rgba, training_frames, write_torch
@@ -105,7 +105,7 @@ def write_program(identity: Subject, head: HeadAsset, work: Workplace, *, own_ch
     paths = [path for pattern in SOURCES for path in sorted(checkout.folder.glob(pattern))]
     unchanged = [name for name in UNCHANGED if not (own_chart and name == MESH_FILE)]
     for path in (*paths, *(checkout.folder / name for name in unchanged)):
-        content = read_bytes(path, "a file of the program", MOST_TEMPLATE)
+        content = read_bytes(path, "a file of the program")
         write_bytes(folder / path.relative_to(checkout.folder), content)
     write_bytes(folder / MODEL_FILE, pickled(subject.model()))
     # Splats of a separate chart are those of the native method; none is left out.
@@ -241,19 +241,16 @@ def write_training(
     frames = training_frames(clip, subject.posed)
     masks = ParsingMasks(clip.head, subject, native=native_masks)
     images: dict[str, FrameKey] = {}
-    with grouped_writes():
-        for frame in frames:
-            window = inside(frame.camera)
-            pixels = straight_rgba(clip, frame.key)
-            head, mouth = masks.of(frame.pose, frame.camera, pixels[..., 3])
-            parts = (np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3]), head, mouth)
-            for place, image in zip(image_names(name, frame.number), parts):
-                write_png(work.program / place, window.cut(image))
-                images[f"program/{place}"] = frame.key
-            write_torch(
-                work.program / tracked_name(name, frame.number), subject.frame(window.camera, frame.pose)
-            )
-            progress(frame.number + 1, len(frames), "exporting")
+    for frame in frames:
+        window = inside(frame.camera)
+        pixels = straight_rgba(clip, frame.key)
+        head, mouth = masks.of(frame.pose, frame.camera, pixels[..., 3])
+        parts = (np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3]), head, mouth)
+        for place, image in zip(image_names(name, frame.number), parts):
+            write_png(work.program / place, window.cut(image))
+            images[f"program/{place}"] = frame.key
+        write_torch(work.program / tracked_name(name, frame.number), subject.frame(window.camera, frame.pose))
+        progress(frame.number + 1, len(frames), "exporting")
     return images
 
 
@@ -263,13 +260,12 @@ def write_list(frames: Sequence[Listed], subject: FlameSubject, name: str, work:
     Images are marks, see `..ga.export.mark`; the renderer writes each beside the render. Masks have one pixel.
     """
     white, black = np.full((1, 1), FULL, np.uint8), np.zeros((1, 1), np.uint8)
-    with grouped_writes():
-        for index, frame in enumerate(at_rest(subject.posed, frames)):
-            window = around(frame.camera).camera
-            image = np.full((window.height, window.width, 3), mark(frame.number), np.uint8)
-            for place, pixels in zip(image_names(name, index), (image, white, white, black)):
-                write_png(work.program / place, pixels)
-            write_torch(work.program / tracked_name(name, index), subject.frame(window, frame.pose))
+    for index, frame in enumerate(at_rest(subject.posed, frames)):
+        window = around(frame.camera).camera
+        image = np.full((window.height, window.width, 3), mark(frame.number), np.uint8)
+        for place, pixels in zip(image_names(name, index), (image, white, white, black)):
+            write_png(work.program / place, pixels)
+        write_torch(work.program / tracked_name(name, index), subject.frame(window, frame.pose))
 
 
 def image_names(name: str, number: int) -> tuple[str, str, str, str]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ....bench.contracts import ByteArray, Camera, Clip, FrameKey, HeadPose, Progress
 from ....bench.errors import InputError
-from ....bench.io.files import grouped_writes, write_json
+from ....bench.io.files import write_json
 from ....bench.io.images import write_png
 from ....datasets.ga import layout
 from ....datasets.ga.writer import CANONICAL_JAW, camera_record, save_npz, transforms_document
@@ -37,16 +37,15 @@ def write_training(
     names = list(windows)
     keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
     records, images = [], {}
-    with grouped_writes():
-        for done, key in enumerate(keys, 1):
-            index = names.index(key.camera)
-            image = f"images/{layout.frame_name(number[key.timestep], index)}.png"
-            write_png(work.input / image, windows[key.camera].cut(clip.image(key)))
-            records.append(_record(windows[key.camera], index, number[key.timestep], image))
-            images[f"input/{image}"] = key
-            progress(done, len(keys), "exporting")
-        for timestep, index in number.items():
-            tracking.write(work.input / _parameters(index), clip.poses[timestep])
+    for done, key in enumerate(keys, 1):
+        index = names.index(key.camera)
+        image = f"images/{layout.frame_name(number[key.timestep], index)}.png"
+        write_png(work.input / image, windows[key.camera].cut(clip.image(key)))
+        records.append(_record(windows[key.camera], index, number[key.timestep], image))
+        images[f"input/{image}"] = key
+        progress(done, len(keys), "exporting")
+    for timestep, index in number.items():
+        tracking.write(work.input / _parameters(index), clip.poses[timestep])
     _write_splits(work.input, {TRAIN: records}, windows[names[-1]].camera)
     _write_canonical(work.input, tracking, clip.poses[timesteps[0]])
     return images
@@ -62,16 +61,15 @@ def write_list(frames: Sequence[Listed], tracking: OfficialTracking, work: Workp
     poses: list[HeadPose] = []
     number: dict[int, int] = {}
     records = []
-    with grouped_writes():
-        for frame in frames:
-            if id(frame.pose) not in number:
-                number[id(frame.pose)] = len(poses)
-                tracking.write(work.input / _parameters(len(poses)), frame.pose)
-                poses.append(frame.pose)
-            window, image = around(frame.camera), f"images/{frame.number:05d}.png"
-            size = window.camera.height, window.camera.width, 3
-            write_png(work.input / image, np.full(size, mark(frame.number), np.uint8))
-            records.append(_record(window, frame.number, number[id(frame.pose)], image))
+    for frame in frames:
+        if id(frame.pose) not in number:
+            number[id(frame.pose)] = len(poses)
+            tracking.write(work.input / _parameters(len(poses)), frame.pose)
+            poses.append(frame.pose)
+        window, image = around(frame.camera), f"images/{frame.number:05d}.png"
+        size = window.camera.height, window.camera.width, 3
+        write_png(work.input / image, np.full(size, mark(frame.number), np.uint8))
+        records.append(_record(window, frame.number, number[id(frame.pose)], image))
     _write_splits(work.input, {TRAIN: records[:1], TEST: records}, frames[-1].camera)
     _write_canonical(work.input, tracking, poses[0])
     return poses

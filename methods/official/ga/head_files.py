@@ -40,7 +40,6 @@ MASKS = (
 )
 """Regions of FLAME's masks; those that a head lacks are empty."""
 LANDMARKS = 70
-MOST_TEMPLATE = 2**26
 
 
 def padding_remarks(head: HeadAsset) -> list[str]:
@@ -285,6 +284,6 @@ def _same_faces(faces: IntArray, template: Path) -> bool:
 
 def read_obj(path: Path) -> tuple[int, IntArray]:
     """Number of vertices of an OBJ file, and its triangles (F, 3), numbered from 0; other faces are left out."""
-    text = read_bytes(path, "an OBJ file", MOST_TEMPLATE).decode(errors="replace")
+    text = read_bytes(path, "an OBJ file").decode(errors="replace")
     corners = re.findall(r"^f\s+(\d+)\S*\s+(\d+)\S*\s+(\d+)\S*\s*$", text, re.MULTILINE)
     return len(re.findall(r"^v\s", text, re.MULTILINE)), np.array(corners, np.int64).reshape(-1, 3) - 1

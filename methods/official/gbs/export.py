@@ -16,7 +16,7 @@ import torch
 from ....bench.contracts import Camera, Clip, FloatArray, FrameKey, HeadPose, Progress
 from ....bench.errors import InputError
 from ....bench.io.arrays import read_npy
-from ....bench.io.files import atomic_path, grouped_writes, read_bytes, write_bytes, write_text
+from ....bench.io.files import atomic_path, read_bytes, write_bytes, write_text
 from ....datasets.head.arrays import faces_in_region
 from ....datasets.head.subject import PosedSubject
 from ....datasets.head.teeth import with_teeth_where_possible
@@ -25,7 +25,6 @@ from ...shared.avatar_files import Subject, head_arrays
 from ..checkout import Checkout
 from ..ga.export import mark
 from ..ga.head_files import (
-    MOST_TEMPLATE,
     OfficialHead,
     obj_text,
     pickled,
@@ -86,9 +85,9 @@ class VideoHead:
         for pattern in SOURCES:
             for path in sorted(self._checkout.glob(pattern)):
                 name = path.relative_to(self._checkout).as_posix()
-                write_bytes(folder / name, read_bytes(path, "a source file", MOST_TEMPLATE))
+                write_bytes(folder / name, read_bytes(path, "a source file"))
         for name in BILLBOARDS:
-            write_bytes(folder / name, read_bytes(self._checkout / name, "an OBJ file", MOST_TEMPLATE))
+            write_bytes(folder / name, read_bytes(self._checkout / name, "an OBJ file"))
         write_bytes(folder / MODEL_FILE, pickled(self.official.model(self.identity.static_offset)))
         write_landmarks(folder / LANDMARKS_FILE, LANDMARKS)
         count = MEDIAPIPE_LANDMARKS
@@ -130,7 +129,7 @@ class VideoHead:
         """Triangles of the back of the head and vertices of the neck: theirs for FLAME, else those of the head's regions."""
         if self.is_flames:
             for name in (BACK_FILE, NECK_FILE):
-                content = read_bytes(self._checkout / name, "a list of numbers", MOST_TEMPLATE)
+                content = read_bytes(self._checkout / name, "a list of numbers")
                 write_bytes(folder / name, content)
             return
         for name, numbers in ((BACK_FILE, self._back), (NECK_FILE, self.official.region("neck"))):
@@ -177,10 +176,9 @@ def write_training(
     """
     head.write_identity(work.input)
     images, first = write_video(clip, head.posed, work.input, head.frame, progress)
-    with grouped_writes():
-        for number in range(len(images), len(images) + placeholders):
-            write_placeholder(work.input / image_name(number))
-            write_torch(work.input / frame_name(number), first)
+    for number in range(len(images), len(images) + placeholders):
+        write_placeholder(work.input / image_name(number))
+        write_torch(work.input / frame_name(number), first)
     return {f"input/{name}": key for name, key in images.items()}
 
 
@@ -191,12 +189,11 @@ def write_list(frames: Sequence[Listed], head: VideoHead, work: Workplace) -> No
     values from the checkpoint. Grids of one node in its cache files avoid that.
     """
     head.write_identity(work.input)
-    with grouped_writes():
-        for frame in at_rest(head.posed, frames):
-            image = np.full((frame.camera.height, frame.camera.width, 4), 255, np.uint8)
-            image[..., :3] = mark(frame.number)
-            write_image(work.input / image_name(frame.number), image)
-            write_torch(work.input / frame_name(frame.number), head.frame(frame.camera, frame.pose))
+    for frame in at_rest(head.posed, frames):
+        image = np.full((frame.camera.height, frame.camera.width, 4), 255, np.uint8)
+        image[..., :3] = mark(frame.number)
+        write_image(work.input / image_name(frame.number), image)
+        write_torch(work.input / frame_name(frame.number), head.frame(frame.camera, frame.pose))
     for file, name in GRIDS.items():
         box = {"bbox_min": torch.zeros(3), "bbox_max": torch.ones(3), "grid_size": [1, 1, 1]}
         write_torch(work.input / file, {**box, name: torch.zeros(1, 1, 1, 1)})

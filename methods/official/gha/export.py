@@ -13,7 +13,6 @@ import torch
 
 from ....bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
 from ....bench.errors import InputError
-from ....bench.io.files import grouped_writes
 from ....bench.io.images import write_png
 from ....datasets.ga.writer import save_npz
 from ...gha.config import GHAConfig
@@ -97,21 +96,20 @@ def write_training(
     names = list(windows)
     images: dict[str, FrameKey] = {}
     total = len(frames) * len(names)
-    with grouped_writes():
-        for number, (timestep, keys) in enumerate(frames.items()):
-            frame = f"{number:06d}"
-            for index, name in enumerate(names):
-                for kind, image in _images(clip, keys[name], windows[name]).items():
-                    place = f"{IMAGES}/{frame}/{kind}_{index:02d}.jpg"
-                    write_png(work.input / place, image)
-                    images[f"input/{place}"] = keys[name]
-                write_camera(work.input / CAMERAS / frame / f"camera_{index:02d}.npz", windows[name].camera)
-                progress(number * len(names) + index + 1, total, "exporting")
-            folder = work.input / PARAMETERS / frame
-            save_npz(folder / "params.npz", tracking.parameters(clip.poses[timestep]))
-            write_npy(folder / "lmk_3d.npy", np.ascontiguousarray(tracking.landmarks(clip.poses[timestep])))
-            # All points are landmarks; their loader would add every hundredth of these vertices.
-            write_npy(folder / "vertices.npy", np.zeros((0, 3), np.float32))
+    for number, (timestep, keys) in enumerate(frames.items()):
+        frame = f"{number:06d}"
+        for index, name in enumerate(names):
+            for kind, image in _images(clip, keys[name], windows[name]).items():
+                place = f"{IMAGES}/{frame}/{kind}_{index:02d}.jpg"
+                write_png(work.input / place, image)
+                images[f"input/{place}"] = keys[name]
+            write_camera(work.input / CAMERAS / frame / f"camera_{index:02d}.npz", windows[name].camera)
+            progress(number * len(names) + index + 1, total, "exporting")
+        folder = work.input / PARAMETERS / frame
+        save_npz(folder / "params.npz", tracking.parameters(clip.poses[timestep]))
+        write_npy(folder / "lmk_3d.npy", np.ascontiguousarray(tracking.landmarks(clip.poses[timestep])))
+        # All points are landmarks; their loader would add every hundredth of these vertices.
+        write_npy(folder / "vertices.npy", np.zeros((0, 3), np.float32))
     return images
 
 
@@ -130,19 +128,16 @@ def write_list(
         same = (camera.id, camera.width, camera.height, camera.K.tobytes(), camera.world_to_camera.tobytes())
         groups.setdefault(same, []).append(frame)
     written = []
-    with grouped_writes():
-        for index, group in enumerate(groups.values()):
-            folder = (
-                work.input / f"camera_{index:04d}"
-            )  # their configuration does not accept a number as a name
-            write_camera(folder / "camera.npz", square(group[0].camera, side).camera)
-            shown: dict[str, FloatArray] = {}
-            for place, frame in enumerate(group):
-                wanted = tracking.parameters(frame.pose)
-                save_npz(folder / PARAMETERS / f"{place:06d}.npz", overshot(wanted, shown))
-                image = np.full((MARK_SIDE, MARK_SIDE, 3), mark(frame.number), np.uint8)
-                write_png(folder / IMAGES / f"{place:06d}.png", image)
-            written.append((folder, [frame.number for frame in group]))
+    for index, group in enumerate(groups.values()):
+        folder = work.input / f"camera_{index:04d}"  # their configuration does not accept a number as a name
+        write_camera(folder / "camera.npz", square(group[0].camera, side).camera)
+        shown: dict[str, FloatArray] = {}
+        for place, frame in enumerate(group):
+            wanted = tracking.parameters(frame.pose)
+            save_npz(folder / PARAMETERS / f"{place:06d}.npz", overshot(wanted, shown))
+            image = np.full((MARK_SIDE, MARK_SIDE, 3), mark(frame.number), np.uint8)
+            write_png(folder / IMAGES / f"{place:06d}.png", image)
+        written.append((folder, [frame.number for frame in group]))
     return written
 
 

@@ -26,7 +26,7 @@ from ....bench.contracts import (
     Progress,
 )
 from ....bench.errors import InputError
-from ....bench.io.files import grouped_writes, read_bytes, write_bytes, write_json, write_text
+from ....bench.io.files import read_bytes, write_bytes, write_json, write_text
 from ....datasets.head.subject import BATCH, PosedSubject, pose_in_head_frame
 from ....datasets.images import write_image
 from ...insta.config import InstaConfig
@@ -34,7 +34,7 @@ from ...insta.warp import bare_triangles, mouth_triangles
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import pose_key
 from ..checkout import Checkout
-from ..ga.head_files import MOST_TEMPLATE, read_obj, without_teeth
+from ..ga.head_files import read_obj, without_teeth
 from ..in_parts import in_parts
 from ..surface import VisibleMesh
 from ..video import at_rest, check_no_skew, straight_rgba, training_frames
@@ -100,8 +100,7 @@ class VideoMesh:
             expected = f"vertices within {REACH} m of the origin along each axis, as FLAME's are"
             raise InputError(f"head model {head.version!r}", "template", expected, f"{farthest:.3g} m")
         files = {
-            name: read_bytes(checkout.folder / MASK_FOLDER / f"{name}.obj", "an OBJ file", MOST_TEMPLATE)
-            for name in MASKS
+            name: read_bytes(checkout.folder / MASK_FOLDER / f"{name}.obj", "an OBJ file") for name in MASKS
         }
         vertices, theirs = read_obj(checkout.folder / MASK_FOLDER / "lips.obj")
         if vertices == len(kept) and len(theirs) and 0 <= theirs.min() and theirs.max() < len(kept):
@@ -196,22 +195,21 @@ def write_training(clip: Clip, head: VideoMesh, work: Workplace, progress: Progr
     images: dict[str, FrameKey] = {}
     records = []
     head.write_canonical(work.input)
-    with grouped_writes():
-        head.write_poses(work.input, {frame_name(frame.number): frame.pose for frame in frames})
-        for frame in frames:
-            name, pixels = frame_name(frame.number), straight_rgba(clip, frame.key)
-            classes, depth = surfaces.seen(frame.pose, frame.camera, pixels[..., 3])
-            for part, image in (("images", pixels), ("seg_mask", classes), ("depth", depth)):
-                write_image(work.input / f"{part}/{name}.png", image)
-                images[f"input/{part}/{name}.png"] = frame.key
-            parts = {"depth_path": f"depth/{name}.png", "seg_mask_path": f"seg_mask/{name}.png"}
-            records.append({**record(name, frame.camera, f"images/{name}.png"), **parts})
-            progress(frame.number + 1, len(frames), "exporting")
-        write_placeholder(work.input / PLACEHOLDER)
-        shared = {**intrinsics(frames[0].camera), "integer_depth_scale": 1 / MILLIMETRES}
-        write_json(work.input / TRAIN, {**shared, "frames": records})
-        last = record(frame_name(0), frames[0].camera, PLACEHOLDER)
-        write_json(work.input / TEST, {**shared, "frames": [last]})
+    head.write_poses(work.input, {frame_name(frame.number): frame.pose for frame in frames})
+    for frame in frames:
+        name, pixels = frame_name(frame.number), straight_rgba(clip, frame.key)
+        classes, depth = surfaces.seen(frame.pose, frame.camera, pixels[..., 3])
+        for part, image in (("images", pixels), ("seg_mask", classes), ("depth", depth)):
+            write_image(work.input / f"{part}/{name}.png", image)
+            images[f"input/{part}/{name}.png"] = frame.key
+        parts = {"depth_path": f"depth/{name}.png", "seg_mask_path": f"seg_mask/{name}.png"}
+        records.append({**record(name, frame.camera, f"images/{name}.png"), **parts})
+        progress(frame.number + 1, len(frames), "exporting")
+    write_placeholder(work.input / PLACEHOLDER)
+    shared = {**intrinsics(frames[0].camera), "integer_depth_scale": 1 / MILLIMETRES}
+    write_json(work.input / TRAIN, {**shared, "frames": records})
+    last = record(frame_name(0), frames[0].camera, PLACEHOLDER)
+    write_json(work.input / TEST, {**shared, "frames": [last]})
     return images
 
 
@@ -281,12 +279,11 @@ def write_list(frames: Sequence[Listed], head: VideoMesh, work: Workplace) -> li
         folder = f"part_{len(parts):04d}"
         cameras = [frame.camera for frame in at_rest(head.posed, part)]
         names = [frame_name(index) for index in range(len(part))]
-        with grouped_writes():
-            head.write_canonical(work.input / folder)
-            head.write_poses(work.input / folder, dict(zip(names, (frame.pose for frame in part))))
-            write_placeholder(work.input / folder / PLACEHOLDER)
-            records = [record(n, c, PLACEHOLDER, height=1) for n, c in zip(names, cameras)]
-            write_json(work.input / folder / TEST, {"frames": records})
+        head.write_canonical(work.input / folder)
+        head.write_poses(work.input / folder, dict(zip(names, (frame.pose for frame in part))))
+        write_placeholder(work.input / folder / PLACEHOLDER)
+        records = [record(n, c, PLACEHOLDER, height=1) for n, c in zip(names, cameras)]
+        write_json(work.input / folder / TEST, {"frames": records})
         size = {"width": cameras[0].width, "height": cameras[0].height}
         parts.append({"folder": folder, **size, "numbers": [frame.number for frame in part]})
     return parts

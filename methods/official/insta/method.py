@@ -42,7 +42,6 @@ RECORDED = Path("headbench/debug")
 SNAPSHOT = "snapshot.msgpack"
 LAST_SIZE = 16
 """Side of the unused final render of a training."""
-MOST_CONFIG = 1 << 16
 _RECORDED = r"Recording frame \[(\d+)/\d+\]"
 
 INSTA_REPOSITORY = Repository(
@@ -142,7 +141,7 @@ def _write_program(subject: Subject, model: HeadAsset, work: Workplace) -> Video
     """Write the files that the program opens in its working directory; return the subject's mesh."""
     head = VideoMesh.of(subject, model, work.checkout)
     head.write_masks(work.program)
-    content = read_bytes(work.checkout.folder / CONFIGS / MAIN, "a configuration", MOST_CONFIG)
+    content = read_bytes(work.checkout.folder / CONFIGS / MAIN, "a configuration")
     write_bytes(work.program / CONFIGS / MAIN, content)
     return head
 

@@ -18,10 +18,10 @@ import numpy as np
 from ....bench.contracts import FloatArray, HeadAsset
 from ....bench.errors import InputError
 from ....bench.io.arrays import read_npy, read_npz
-from ....bench.io.files import grouped_writes, read_bytes, write_bytes, write_text
+from ....bench.io.files import read_bytes, write_bytes, write_text
 from ...shared.avatar_files import Subject
 from ..checkout import Checkout
-from ..ga.head_files import MOST_TEMPLATE, OfficialHead, SparseMatrix, pickled
+from ..ga.head_files import OfficialHead, SparseMatrix, pickled
 from ..video import FlameSubject, at_rest, frame_name, image_name, write_torch
 from ..workplace import Listed, Workplace, write_placeholder
 
@@ -29,7 +29,6 @@ DATA = Path("data/FLAME2020")
 MODEL_FILE, CHART_FILE = DATA / "generic_model.pkl", DATA / "flame_uv.npz"
 EYELID_FILES = (DATA / "l_eyelid.npy", DATA / "r_eyelid.npy")
 CONFIG = Path("config/offline.yaml")
-MOST_CONFIG = 1 << 16
 
 
 def has_their_topology(head: HeadAsset, checkout: Checkout) -> bool:
@@ -86,7 +85,7 @@ def write_program(identity: Subject, head: HeadAsset, work: Workplace, *, own_ch
         np.savez(content, vt=uv.reshape(-1, 2), ft=corners)
         write_bytes(folder / CHART_FILE, content.getvalue())
     else:
-        chart = read_bytes(work.checkout.folder / CHART_FILE, "a texture chart", MOST_TEMPLATE)
+        chart = read_bytes(work.checkout.folder / CHART_FILE, "a texture chart")
         write_bytes(folder / CHART_FILE, chart)
     return subject
 
@@ -97,7 +96,7 @@ def write_config(path: Path, checkout: Checkout, changes: Mapping[str, Any]) -> 
     Raises `InputError` if the published one does not have each of them once.
     """
     source = checkout.folder / CONFIG
-    text = read_bytes(source, "a configuration", MOST_CONFIG).decode(errors="replace")
+    text = read_bytes(source, "a configuration").decode(errors="replace")
     for name, value in changes.items():
         text, count = re.subn(rf"^(\s*{name}:).*$", rf"\g<1> {value}", text, flags=re.MULTILINE)
         if count != 1:
@@ -111,7 +110,6 @@ def write_list(frames: Sequence[Listed], subject: FlameSubject, folder: Path) ->
 
     Images have one pixel: the renderer loads but does not use them, and takes the size from the first frame's file.
     """
-    with grouped_writes():
-        for index, frame in enumerate(at_rest(subject.posed, frames)):
-            write_placeholder(folder / image_name(index))
-            write_torch(folder / frame_name(index), subject.frame(frame.camera, frame.pose))
+    for index, frame in enumerate(at_rest(subject.posed, frames)):
+        write_placeholder(folder / image_name(index))
+        write_torch(folder / frame_name(index), subject.frame(frame.camera, frame.pose))

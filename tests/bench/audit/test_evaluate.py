@@ -17,6 +17,7 @@ from headbench.bench.audit.settings import EvaluateSettings
 from headbench.bench.contracts import FrameKey
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import HeadbenchError, InputError
+from headbench.bench.executors import remote
 from headbench.bench.io.images import read_png, write_png
 from headbench.bench.rows import ALL, COLUMNS
 
@@ -74,9 +75,10 @@ def test_an_executor_gives_the_same_result(run, images, tmp_path):
     assert results["processes"].data["rows"] == results["inline"].data["rows"]
 
 
-def test_a_failure_in_an_executor_names_its_reason_and_log(run, tmp_path):
+def test_a_failure_in_an_executor_names_its_reason_and_log(run, tmp_path, monkeypatch):
     given = {"out": str(tmp_path / "out"), "like": str(run), "label": "theirs", "trust": True}
-    with pytest.raises(HeadbenchError, match=r"expected a folder of images.*Its log is .*job\.log"):
+    monkeypatch.setattr(remote.Schedule, "run_all", lambda self, tasks: {"command": "It was killed."})
+    with pytest.raises(HeadbenchError, match=r"It was killed\. Its log is .*job\.log"):
         evaluate_folder(EvaluateSettings(str(tmp_path / "none"), **given, executor="processes"))
 
 
@@ -190,7 +192,8 @@ def test_what_to_score_against_has_to_be_said(images, tmp_path):
 
 
 def options(folder, run, out, **others):
-    return EvaluateSettings(str(folder), out=str(out), like=str(run), label="theirs", trust=True, **others)
+    given = {"like": str(run), "label": "theirs", "trust": True, **others}
+    return EvaluateSettings(str(folder), out=str(out), **given)
 
 
 @pytest.fixture
@@ -336,15 +339,30 @@ AVATAR = {"avatar": True, "method": "toy_plugin:METHOD"}
 
 
 def test_a_stored_avatar_scores_as_in_its_run(run, cell, images, tmp_path):
-    """Its frames and, of what is measured of it as a whole, what the run asks for."""
-    findings = evaluate_folder(options(cell.folder, run, tmp_path / "out", **AVATAR))
+    """Its frames and, of what is measured of it as a whole, what the run asks for, under the name of its method."""
+    out = str(tmp_path / "out")
+    words = ["evaluate", "--avatar", str(cell.folder), "--method", AVATAR["method"], "--out", out, "--trust"]
+    assert cli.main([*words, "--like", str(run), "--data", str(tmp_path / "data")]) == 0
     rows = pd.read_parquet(RunFolder(tmp_path / "out").rows)
     own = pd.read_parquet(RunFolder(run).rows)
-    same = [column for column in COLUMNS if column not in ("method", "version")]
+    same = [column for column in COLUMNS if column != "version"]
     assert rows[same].equals(own[same])
-    assert "theirs" in findings.text
-    evaluate_folder(options(cell.avatar, run, tmp_path / "out", **AVATAR))  # kept, as a run keeps it
-    assert cli.main(["verify", str(tmp_path / "out"), "--trust"]) == 0
+    evaluate_folder(options(cell.avatar, run, out, **AVATAR | {"label": ""}))  # kept, as a run keeps it
+    assert cli.main(["verify", out, "--trust"]) == 0
+
+
+def test_the_speed_of_a_stored_avatar_is_measured_without_frames(run, cell, tmp_path):
+    settings = EvaluateSettings(
+        str(cell.folder),
+        out=str(tmp_path / "out"),
+        clip=str(tmp_path / "data"),
+        reader="toy_plugin:READER",
+        metrics=("toy_plugin:CLOCK",),
+        **AVATAR,
+    )
+    evaluate_folder(settings)
+    (row,) = pd.read_parquet(RunFolder(tmp_path / "out").rows).itertuples()
+    assert (row.method, row.metric, row.status) == ("toy", "clock", "ok")
 
 
 def test_an_avatar_of_another_subject_is_refused(run, cell, toy, tmp_path, monkeypatch):

@@ -11,8 +11,6 @@ from headbench.bench.engine import run as runner
 from headbench.bench.engine.config import RunConfig, resolve_cells
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
-from headbench.bench.io.documents import read_json
-from headbench.bench.io.files import write_json
 
 HALF = Condition("half", budget="1/2")
 
@@ -108,26 +106,6 @@ def test_conditions_are_not_lost_with_a_damaged_record(config, toy):
         runner.run(config)
     assert toy.FITS == []
     assert folder.rows.read_bytes() == rows
-
-
-def test_rows_and_record_of_version_1_are_read_by_their_labels(config):
-    """Names with a mark are methods where the record says nothing of a sweep or a curve."""
-    runner.run(replace(config, conditions=(PLAIN, Condition("dim", ("toy",), {"level": 0.1}))))
-    folder = RunFolder(Path(config.out))
-    new = folder.read_manifest()
-    record = read_json(folder.manifest)
-    for method in record["methods"]:
-        method["name"] += f"+{method.pop('condition')}" if "condition" in method else ""
-    del (
-        record["configuration"]["conditions"],
-        record["configuration"]["clip"],
-        record["configuration"]["source"],
-    )
-    write_json(folder.manifest, {**record, "format": 1, "curve_of": "somewhere"})
-    assert folder.read_manifest().methods == new.methods
-    write_json(folder.manifest, {**record, "format": 1})
-    assert [method.label for method in folder.read_manifest().methods] == ["toy", "toy+dim"]
-    assert {method.condition for method in folder.read_manifest().methods} == {""}
 
 
 def test_a_part_of_a_budget_leaves_out_methods_without_one(config, toy, monkeypatch):

@@ -10,7 +10,7 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.engine import run as runner
-from headbench.bench.engine.captures import open_run_clips, run_configuration
+from headbench.bench.engine.captures import open_run_clips
 from headbench.bench.engine.config import RunOptions
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
@@ -89,13 +89,9 @@ def test_what_is_gone_is_named_with_places_and_option(run, tmp_path, capsys, gon
         assert cli.main(["verify", str(run), "--trust", option, str(tmp_path / gone)]) == 0
 
 
-NEEDED = ("reader", "metrics", "metric_profiles")
-"""What those commands resolve that make images of no method."""
-
-
-@pytest.mark.parametrize("stored", ["avatars", "images"])
-@pytest.mark.parametrize("key", ["methods", *NEEDED])
-def test_a_module_that_a_run_names_is_not_imported(run, monkeypatch, tmp_path, capsys, key, stored):
+@pytest.mark.parametrize("key", ["methods", "metrics", "reader"])
+def test_a_module_that_a_run_names_is_not_imported(run, monkeypatch, tmp_path, capsys, key):
+    """By any command that reads runs; `test_trust` has the cases of the rule."""
     (tmp_path / "stranger.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
     record = read_json(run / "run.json")
@@ -103,18 +99,13 @@ def test_a_module_that_a_run_names_is_not_imported(run, monkeypatch, tmp_path, c
     record["configuration"] |= registered | {key: "stranger:SPEC" if key == "reader" else ["stranger:SPEC"]}
     for entry in (*record["metrics"], *record["methods"]):
         entry["implementation"] = "stranger:Class"
-    if stored == "images":
-        for entry in record["methods"]:
-            entry["implementation"] = ""
     write_json(run / "run.json", record)
-    every = ("methods", *NEEDED)
     for command, code, needed in (
-        (["verify"], 3, every if stored == "avatars" else NEEDED),
-        (["run", "sweep"], 2, every),
-        (["run", "extremes"], 2, every),
-        (["run", "reenact"], 2, every),
-        (["evaluate", str(run), "--out", str(tmp_path / "out"), "--like"], 2, NEEDED),
-        (["frames", "--out", str(tmp_path / "frames")], 2, NEEDED[:1]),
+        (["verify"], 3, ("methods", "metrics", "reader")),
+        (["run", "sweep"], 2, ("methods", "metrics", "reader")),
+        (["run", "extremes"], 2, ("methods", "metrics", "reader")),
+        (["evaluate", str(run), "--out", str(tmp_path / "out"), "--like"], 2, ("metrics", "reader")),
+        (["frames", "--out", str(tmp_path / "frames")], 2, ("reader",)),
     ):
         assert cli.main([*command, str(run)]) == code
         shown = "".join(capsys.readouterr())
@@ -135,11 +126,3 @@ def test_definitions_come_from_the_registry_never_from_the_run(run, monkeypatch,
     assert cli.main(["verify", str(run), "--trust"]) == 1
     assert cli.main(["table", str(run)]) == 0
     assert "stranger" not in sys.modules
-
-
-def test_a_run_of_an_earlier_version_is_found_where_it_says(run, monkeypatch):
-    record = read_json(run / "run.json")
-    del record["paths"]
-    write_json(run / "run.json", record)
-    monkeypatch.chdir(run.parent)
-    assert run_configuration(run, TRUSTED).data == "data"

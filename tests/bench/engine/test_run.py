@@ -4,6 +4,7 @@ import importlib
 import json
 import math
 import re
+import shutil
 import sys
 import time
 import types
@@ -11,6 +12,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -26,7 +28,9 @@ from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked
 from headbench.bench.registry import Plugin
+from headbench.bench.rows import Rows
 from headbench.bench.specs import ReportSpec
+from headbench.reports.tables import METHODS_TITLE, SUSPECT_TITLE, build_table
 
 
 @pytest.fixture
@@ -59,6 +63,17 @@ def rows_of(config, **changes):
     return pd.read_parquet(RunFolder(Path(config.out)).rows)
 
 
+@pytest.fixture
+def kept(finished):
+    """Table of the rows of a finished run, see `finished`."""
+
+    def kept(config, **changes):
+        finished(replace(config, **changes))
+        return pd.read_parquet(RunFolder(Path(changes.get("out", config.out))).rows)
+
+    return kept
+
+
 def manifest_of(config):
     return read_json(Path(config.out) / "run.json")
 
@@ -67,8 +82,8 @@ def killed(self, *args, **kwargs):
     raise KeyboardInterrupt
 
 
-def test_rows_hold_every_frame_of_every_task_keyed(config):
-    rows = rows_of(config)
+def test_rows_hold_every_frame_of_every_task_keyed(config, kept):
+    rows = kept(config)
     errors = rows[rows["metric"] == "error"]
     assert len(errors) == 2 * (3 + 2)  # subjects x (novel-view + self-reenactment frames)
     row = errors.query("subject == 'subject2' and task == 'novel_view' and timestep == 2")
@@ -80,8 +95,8 @@ def test_rows_hold_every_frame_of_every_task_keyed(config):
     assert (per_avatar["timestep"] == -1).all()
 
 
-def test_the_manifest_names_everything_that_made_the_numbers(config):
-    runner.run(config)
+def test_the_manifest_names_everything_that_made_the_numbers(config, kept):
+    kept(config)
     record = manifest_of(config)
     assert record["status"] == "done"
     assert record["methods"][0]["config"] == {"level": 0.5, "fail": False}
@@ -92,8 +107,8 @@ def test_the_manifest_names_everything_that_made_the_numbers(config):
     assert record["machine"]["packages"]["numpy"]
 
 
-def test_a_run_killed_in_training_continues(config, toy, monkeypatch):
-    whole = rows_of(config, out=config.out + "-whole")
+def test_a_run_killed_in_training_continues(config, kept, toy, monkeypatch):
+    whole = kept(config, out=config.out + "-whole")
     with monkeypatch.context() as patch:
         patch.setattr(toy.ToyAvatar, "render", killed)
         with pytest.raises(KeyboardInterrupt):
@@ -219,8 +234,8 @@ def test_several_views_for_a_monocular_method_are_refused(config, toy, monkeypat
     refuses(config, "3 further views")
 
 
-def test_other_settings_in_the_same_folder_are_refused(config, refuses):
-    runner.run(config)
+def test_other_settings_in_the_same_folder_are_refused(config, kept, refuses):
+    kept(config)
     refuses(
         config,
         "data, config.level 0.75, found one of other settings, config.level .*Choose another --out",
@@ -238,9 +253,9 @@ BOTH = {"methods": ("toy_plugin:METHOD", "toy_plugin:MIRROR"), "seeds": (0, 1)}
         ({"data": "more"}, "captures or frames of novel_view: "),
     ],
 )
-def test_a_run_that_would_lose_rows_is_refused(config, refuses, tmp_path, changes, match):
+def test_a_run_that_would_lose_rows_is_refused(config, kept, refuses, tmp_path, changes, match):
     config = replace(config, **BOTH)
-    runner.run(config)
+    kept(config)
     folder = RunFolder(Path(config.out))
     before = folder.rows.read_bytes(), folder.manifest.read_bytes()
     if "data" in changes:
@@ -263,17 +278,17 @@ def test_a_run_that_would_lose_rows_is_refused(config, refuses, tmp_path, change
         {"frames_per_task": 1},
     ],
 )
-def test_results_that_are_not_asked_for_again_are_kept(config, toy, less):
+def test_results_that_are_not_asked_for_again_are_kept(config, kept, toy, less):
     methods, metrics = ("toy_plugin:METHOD", "mean-image"), ("toy_plugin:ERROR", "psnr")
     config = replace(config, methods=methods, metrics=metrics, seeds=(0, 1))
-    before = rows_of(config)
+    before = kept(config)
     toy.FITS.clear()
     assert rows_of(config, **less).equals(before)
     assert not toy.FITS
 
 
-def test_another_preset_is_refused(config, refuses):
-    runner.run(config)
+def test_another_preset_is_refused(config, kept, refuses):
+    kept(config)
     refuses(config, "configuration.preset: expected smoke, as in this run", preset="fast")
 
 
@@ -287,9 +302,9 @@ def test_frames_may_be_added(config, toy):
     assert len(every.merge(few, on=same)) == len(few)
 
 
-def test_a_condition_is_a_cell_and_a_column(config, toy):
+def test_a_condition_is_a_cell_and_a_column(config, kept, toy):
     changed = Condition("half", ("toy",), {"level": 0.75})
-    plain = rows_of(config)
+    plain = kept(config)
     rows = rows_of(config, conditions=(PLAIN, changed))
     assert set(rows["condition"]) == {"", "half"}
     assert rows[rows["condition"] == ""].reset_index(drop=True).equals(plain)
@@ -297,8 +312,8 @@ def test_a_condition_is_a_cell_and_a_column(config, toy):
     assert cell.step("fit")["method"]["config"]["level"] == 0.75
 
 
-def test_methods_seeds_and_metrics_may_be_added(config, toy):
-    before = rows_of(config)
+def test_methods_seeds_and_metrics_may_be_added(config, kept, toy):
+    before = kept(config)
     toy.FITS.clear()
     more = (*config.metrics, "toy_plugin:FILES_LOAD")
     rows = rows_of(config, **BOTH, metrics=more, tasks=config.tasks[::-1])
@@ -307,8 +322,8 @@ def test_methods_seeds_and_metrics_may_be_added(config, toy):
     assert len(toy.FITS) == 6
 
 
-def test_values_that_cannot_be_had_again_stay(config, toy, cell, monkeypatch):
-    rows = rows_of(config)
+def test_values_that_cannot_be_had_again_stay(config, kept, toy, cell, monkeypatch):
+    rows = kept(config)
     (cell.avatar / "level.txt").unlink()
     monkeypatch.setattr(toy.ToyMethod, "fit", lambda *arguments, **options: 1 / 0)
     with pytest.raises(InputError, match="found 6 without, such as error full toy 0 novel_view subject1 EMO"):
@@ -319,9 +334,9 @@ def test_values_that_cannot_be_had_again_stay(config, toy, cell, monkeypatch):
     assert set(rows_of(config).query("subject == 'subject1'")["status"]) == {"failed"}
 
 
-def test_what_a_killed_run_measured_stays(config, toy, monkeypatch):
+def test_what_a_killed_run_measured_stays(config, kept, toy, monkeypatch):
     """No rows of the run exist yet that could be lost, those of its cells do."""
-    whole = rows_of(config)
+    whole = kept(config)
     RunFolder(Path(config.out)).rows.unlink()
     rows_of(config, metrics=("toy_plugin:ERROR",))
     monkeypatch.setattr(toy, "files_in_avatar", lambda *arguments: 1 / 0)
@@ -353,13 +368,14 @@ def edit(toy, tmp_path, monkeypatch):
         "def error(image, truth):\n    return toy.mean_error(image, truth)\n"
         "ERROR = toy.replace(toy.ERROR, implementation='edited_metric:error')\n",
     }
-    folder = tmp_path / "plug-ins"
-    folder.mkdir()
-    monkeypatch.syspath_prepend(folder)
+    folders = {name: tmp_path / name.partition("_")[2].replace("level", "plugin") for name in texts}
+    for folder in {*folders.values()}:
+        folder.mkdir()
+        monkeypatch.syspath_prepend(folder)
 
     def edit(**changes):
         for name, text in texts.items():
-            (folder / f"{name}.py").write_text(text.replace(*changes.get(name, ("", ""))))
+            (folders[name] / f"{name}.py").write_text(text.replace(*changes.get(name, ("", ""))))
             sys.modules.pop(name, None)
         importlib.invalidate_caches()
 
@@ -382,11 +398,26 @@ def test_changed_code_of_a_plug_in_is_refused(config, edit, toy, refuses, monkey
         with pytest.raises(KeyboardInterrupt) if kill else nullcontext():
             runner.run(config)
     when = "in an earlier run" if kill else r"\d+ s ago"
-    edit(edited_level=("1", "2"))
-    refuses(config, f"method, code: .*edited_plugin:Method.*changed since its training {when}")
+    for file, change in (("edited_level", ("1", "2")), ("edited_plugin", ("pass", "..."))):
+        edit(**{file: change})
+        refuses(config, f"method, code: .*edited_plugin:Method.*changed since its training {when}")
     edit()
     runner.run(config)
     assert len(toy.FITS) == 2 * kill
+
+
+def test_an_edited_plug_in_trains_again_once_avatars_are_deleted(config, edit, toy, cell):
+    """As the tutorial of an own method says."""
+    config = replace(config, **EDITED)
+    runner.run(config)
+    before = cell.step("fit")
+    edit(edited_level=("1", "2"))
+    for folder in Path(config.out).glob("*/toy"):
+        shutil.rmtree(folder)
+    toy.FITS.clear()
+    runner.run(config)
+    assert toy.FITS == ["subject1", "subject2"]
+    assert cell.step("fit")["fingerprint"] != before["fingerprint"]
 
 
 def test_changed_code_of_a_metric_is_measured_again(config, edit, toy):
@@ -422,6 +453,25 @@ def test_a_failing_method_is_recorded_and_the_others_go_on(config):
     assert failed["reason"].str.contains("the training diverged").all()
     assert failed["value"].isna().all()
     assert (rows[rows["method"] == "toy"]["status"] == "ok").all()
+
+
+def test_frames_as_good_as_the_truth_are_suspect_and_not_ranked(config, toy, monkeypatch):
+    original = toy.MirrorAvatar.render
+
+    def truth(self, camera, pose, *others):
+        frame = original(self, camera, pose, *others)
+        return frame._replace(
+            rgb=np.full_like(frame.rgb, (40 + 10 * pose.timestep + (camera.id == "b")) / 255)
+        )
+
+    monkeypatch.setattr(toy.MirrorAvatar, "render", truth)
+    rows = rows_of(config, methods=("toy_plugin:METHOD", "toy_plugin:MIRROR"), metrics=("psnr",))
+    assert set(rows["reason"][rows["method"] == "mirror"]) == {"suspect: above 50 dB"}
+    assert set(rows["reason"][rows["method"] == "toy"]) == {""}
+    psnr = RunFolder(Path(config.out)).read_manifest().metrics
+    table = build_table(Rows(rows), psnr, ("mirror", "toy"), ("novel_view",), protocol_ids={})
+    groups = {title: [line.method for line in lines] for title, lines in table.groups}
+    assert groups == {METHODS_TITLE: ["toy"], SUSPECT_TITLE: ["mirror"]}
 
 
 def test_a_missing_metric_has_its_reason_and_is_warned_of_first(config, caplog):
@@ -564,9 +614,9 @@ def test_a_report_that_fails_stops_no_other(monkeypatch, toy, tmp_path, caplog):
     assert "'failing' of other 1 failed" in messages[1]
 
 
-CELL = ("avatar", "avatar/level.txt", "fit.json", "renders", "renders/novel_view", "rows.parquet")
+CELL = ("avatar/level.txt", "fit.json", "renders")
 REPLACED = ("run.json", "rows.parquet", "contact_sheet.png", "report.html", "tables")
-REFUSED = ("protocols", "subject1", "subject1/toy", *(f"subject1/toy/seed-0/{name}" for name in ("", *CELL)))
+REFUSED = ("protocols", "subject1", *(f"subject1/toy/seed-0/{name}" for name in CELL))
 
 
 @pytest.mark.parametrize(("places", "expected"), [(REPLACED, 0), *(((place,), 2) for place in REFUSED)])
@@ -593,7 +643,12 @@ def test_a_received_run_is_not_written_through_its_links(
     assert code == expected, error
 
 
-def test_a_run_folder_names_no_module_for_a_later_call(config, refuses, monkeypatch):
-    runner.run(replace(config, methods=("toy_plugin:METHOD", "toy_plugin:MIRROR")))
-    refuses(config, "methods: expected registered names, found 'toy_plugin:MIRROR'")
-    refuses(replace(config, metrics=("psnr",), methods=("toy_plugin:METHOD", "toy_plugin:MIRROR")), "metrics")
+def test_planned_cells_have_their_state_and_nothing_is_trained(config, toy, finished):
+    finished(config)
+    longer = replace(config, out=f"{config.out}-long", settings={"toy": {"budget": {"iterations": 200}}})
+    before = toy.FITS.copy()
+    for settings, state in ((config, "done"), (longer, "to train")):
+        names = [f"{subject} toy seed 0" for subject in ("subject1", "subject2")]
+        assert runner.planned_cells(settings) == dict.fromkeys(names, state)
+    assert toy.FITS == before
+    assert not Path(longer.out).exists()

@@ -16,12 +16,12 @@ from headbench.bench.io.files import write_json
 
 @pytest.fixture
 def subjects():
-    return ("subject1", "subject2", "subject3")
+    return ("subject1", "subject2")
 
 
 @pytest.fixture
 def config(config, monkeypatch):
-    """Two methods, one of which fails, on three subjects."""
+    """Two methods, one of which fails, on two subjects."""
     monkeypatch.syspath_prepend(Path(__file__).parent)
     metrics = ("psnr", "toy_plugin:ERROR", "toy_plugin:FILES")
     return replace(config, methods=("toy_plugin:METHOD", "toy_plugin:FAILING"), metrics=metrics)

@@ -1,10 +1,20 @@
+import shutil
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 from headbench.bench.engine import run as runner
 
-from ...small_run import run_on
+from ...world import place, run_on
+
+
+@cache
+def _finished(methods, subjects):
+    """A run that tests copy."""
+    folder = place("-".join(("balls", *methods, *subjects)).replace(":", "."))
+    run_on(folder / "data", folder / "run", *methods, subjects=subjects, reader="ball_plugin:READER")
+    return folder
 
 
 @pytest.fixture
@@ -18,12 +28,17 @@ def balls(monkeypatch):
 
 
 @pytest.fixture
-def ball_run(balls, tmp_path):
-    """Makes a finished run of some of the ball methods on two subjects."""
+def run_of(balls, tmp_path):
+    """Makes a finished run of some methods on balls, its captures beside it."""
 
-    def make(*methods):
-        named = (f"ball_plugin:{name}" for name in methods)
-        how = {"subjects": ("ball-a", "ball-bee"), "reader": "ball_plugin:READER"}
-        return run_on(tmp_path / "data", tmp_path / "run", *named, **how).root
+    def make(*methods, subjects=("ball-a", "ball-bee"), folder=tmp_path):
+        shutil.copytree(_finished(methods, subjects), folder, dirs_exist_ok=True)
+        return folder / "run"
 
     return make
+
+
+@pytest.fixture
+def ball_run(run_of):
+    """Makes a finished run of some of the ball methods on two subjects."""
+    return lambda *methods: run_of(*(f"ball_plugin:{name}" for name in methods))

@@ -2,7 +2,6 @@
 
 import csv
 import importlib
-import json
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -11,12 +10,11 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from headbench.bench import cli
 from headbench.bench.condition import Condition, part_of_text
 from headbench.bench.contracts import Budget
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.store import RunFolder
-from headbench.bench.errors import ExitCode, HeadbenchError, InputError
+from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.experiments import curve as module
 from headbench.bench.experiments.curve import curve_run
 from headbench.bench.experiments.curve_settings import CurveSettings
@@ -27,8 +25,8 @@ from headbench.reports.curve.points import MEASURED
 from headbench.reports.curve.settings import CurveReportSettings
 
 from ...datasets.flat_renderer import flat_pictures
-from ...datasets.tiny_capture import write_tiny_capture
-from ...small_run import run_on
+from ...world import capture as tiny_capture
+from ...world import run_on
 
 TESTS = Path(__file__).parents[2]
 HELD_TIMESTEP, HELD_CAMERA = 2, "1"  # of timesteps 0 to 3, and of cameras at -60, -30, 30 and 60 degrees
@@ -50,15 +48,14 @@ def plugin(monkeypatch):
 
 
 @pytest.fixture
-def make_run(plugin, tmp_path):
+def make_run(plugin, run_of):
     """A finished run of methods on one ball or more."""
 
-    def make(*methods, subjects=("ball-a",)):
-        how = {"subjects": subjects, "reader": "ball_plugin:READER"}
-        run_on(tmp_path / "data", tmp_path / "run", *methods, **how)
+    def make(*methods, subjects=("ball-a",), **where):
+        run = run_of(*methods, subjects=subjects, **where)
         plugin.FITS.clear()
         plugin.RENDERED.clear()
-        return tmp_path / "run"
+        return run
 
     return make
 
@@ -79,8 +76,8 @@ def quality_rows(curve):
 
 
 def test_held_out_frames_alone_are_measured_and_never_trained_on(make_run, plugin):
-    curve_run(settings(make_run("curve_plugin:METHOD")))
-    assert [budget for _, budget in plugin.FITS] == [Budget(n) for n in (64, 32, 16, 8, 4)]
+    curve_run(settings(make_run("curve_plugin:METHOD"), fractions=("1", "1/4")))
+    assert [budget for _, budget in plugin.FITS] == [Budget(64), Budget(16)]
     for train, _ in plugin.FITS:
         assert {(key.timestep, key.camera) for key in train} == {(t, c) for t in (0, 1, 3) for c in "034"}
     held_camera = {(t, HELD_CAMERA) for t in (0, 1, 3)}
@@ -209,29 +206,32 @@ def test_a_row_for_each_method_subject_and_part(make_run, plugin):
 
 
 def test_a_kill_half_way_ends_with_the_same_rows(make_run, plugin, monkeypatch):
-    run = make_run("curve_plugin:METHOD")
-    curve_run(settings(run, out=str(run.parent / "whole")))
+    run, parts = make_run("curve_plugin:METHOD"), ("1", "1/4", "1/16")
+    curve_run(settings(run, out=str(run.parent / "whole"), fractions=parts))
     plugin.FITS.clear()
     monkeypatch.setattr(plugin.Method, "killed", (16,))
     with pytest.raises(KeyboardInterrupt):
-        curve_run(settings(run))
+        curve_run(settings(run, fractions=parts))
     monkeypatch.setattr(plugin.Method, "killed", ())
     assert RunFolder(run / "curve").read_manifest().status != "done"
-    curve_run(settings(run))
+    curve_run(settings(run, fractions=parts))
     # The one that was killed begins again, so that its time is that of the whole training.
-    assert [budget.iterations for _, budget in plugin.FITS] == [64, 32, 16, 16, 8, 4]
+    assert [budget.iterations for _, budget in plugin.FITS] == [64, 16, 16, 4]
     assert quality_rows(run / "curve").equals(quality_rows(run.parent / "whole"))
     assert all(float(line["processor_seconds"]) >= 0 for line in table(run))
-    curve_run(settings(run))
-    assert len(plugin.FITS) == 6
+    curve_run(settings(run, fractions=parts))
+    assert len(plugin.FITS) == 4
 
 
 def test_the_held_out_camera_and_timesteps_can_be_chosen(make_run, plugin):
-    findings = curve_run(settings(make_run("curve_plugin:METHOD"), fractions=("1",), camera="4", every=2))
+    run = make_run("curve_plugin:METHOD")
+    findings = curve_run(settings(run, fractions=("1",), camera="4", every=2))
     held = findings.data["held_out"]["ball-a"]
     assert (held["camera"], held["timesteps"]) == ("4", [1, 3])
     ((train, _),) = plugin.FITS
     assert {(key.timestep, key.camera) for key in train} == {(t, c) for t in (0, 2) for c in "013"}
+    with pytest.raises(InputError, match="Choose another --out"):
+        curve_run(settings(run, fractions=("1",)))
 
 
 def test_with_one_camera_timesteps_alone_are_held_out(plugin, tmp_path):
@@ -290,44 +290,18 @@ def test_what_cannot_be_trained_is_refused_before_work(make_run, plugin, changes
     assert plugin.FITS == []
 
 
-def test_other_frames_held_out_want_another_folder(make_run):
-    run = make_run("curve_plugin:METHOD")
-    curve_run(settings(run, fractions=("1",)))
-    with pytest.raises(InputError, match="Choose another --out"):
-        curve_run(settings(run, fractions=("1",), camera="4"))
-
-
-@pytest.mark.parametrize("less", [{"methods": ("noting",)}, {"fractions": ("1",)}])
-def test_points_that_are_there_are_kept(make_run, plugin, less):
+def test_points_that_are_there_are_kept(make_run, plugin):
     run = make_run("curve_plugin:METHOD", "curve_plugin:TIMED")
     whole = {"fractions": ("1", "1/4")}
     curve_run(settings(run, **whole))
     before = table(run)
-    curve_run(settings(run, **{**whole, **less}))
-    assert table(run) == before
+    for less in ({"methods": ("noting",)}, {"fractions": ("1",)}):
+        curve_run(settings(run, **{**whole, **less}))
+        assert table(run) == before
     assert len(plugin.FITS) == 4
     curve_run(settings(run, fractions=("1", "1/2", "1/4")))
     assert len(table(run)) == 6
     assert len(plugin.FITS) == 6
-
-
-def test_a_curve_by_workers_is_that_of_one_process(make_run, monkeypatch):
-    run = make_run("curve_plugin:METHOD")
-    curve_run(settings(run, out=str(run.parent / "inline"), fractions=("1", "1/4")))
-    by_workers = {"executor": "processes", "workers": 2}
-    curve_run(settings(run, fractions=("1", "1/4"), **by_workers))
-    assert quality_rows(run / "curve").equals(quality_rows(run.parent / "inline"))
-
-
-def test_damaged_rows_are_written_again(make_run, plugin, caplog):
-    run = make_run("curve_plugin:METHOD")
-    curve_run(settings(run, fractions=("1",)))
-    rows = run / "curve" / "rows.parquet"
-    before = rows.read_bytes()
-    rows.write_bytes(before[:100])
-    curve_run(settings(run, fractions=("1",)))
-    assert rows.read_bytes() == before
-    assert "written again" in caplog.text
 
 
 def test_a_run_that_did_not_end_and_a_curve_are_no_runs(make_run, plugin):
@@ -342,20 +316,9 @@ def test_a_run_that_did_not_end_and_a_curve_are_no_runs(make_run, plugin):
     assert not (run.parent / "other").exists()
 
 
-@pytest.fixture
-def tiny_run(plugin, tmp_path):
-    capture = write_tiny_capture(tmp_path / "data")
-
-    def make(*methods):
-        how = {"frames_per_task": 1, "settings": {}}
-        return run_on(capture.union, tmp_path / "run", *methods, **how).root
-
-    return make
-
-
-def test_a_method_that_keeps_images_keeps_none_that_is_held_out(tiny_run):
-    run = tiny_run("nearest-camera")
-    findings = curve_run(CurveSettings(str(run), methods=("nearest-camera",)))
+def test_a_method_that_keeps_images_keeps_none_that_is_held_out(plugin, tmp_path):
+    run_on(tiny_capture().union, tmp_path / "run", "nearest-camera", frames_per_task=1)
+    findings = curve_run(CurveSettings(str(tmp_path / "run"), methods=("nearest-camera",)))
     (point,) = findings.data["points"]  # every part of its budget of one iteration is one iteration
     assert point["fraction"] == 1.0
     assert 0 < point["psnr_camera"] < 60
@@ -369,34 +332,14 @@ def test_a_metric_that_is_missing_says_why(make_run, monkeypatch):
     assert findings.data["points"][0]["not_here_camera"] is None
 
 
-def test_ga_learns_more_with_more_of_its_budget(tiny_run, capsys):
-    run = tiny_run("ga")
-    assert (
-        cli.main(["run", "curve", str(run), "--fractions", "1/16", "1", "--frames", "2", "--json"])
-        == ExitCode.OK
-    )
-    first, last = json.loads(capsys.readouterr().out)["points"]
-    assert (first["budget_iterations"], last["budget_iterations"]) == (4, 60)
-    assert last["processor_seconds"] > first["processor_seconds"] > 0
-    assert last["psnr_camera"] > first["psnr_camera"]
-    assert cli.main(["run", "curve", str(run), "--fractions", "2"]) == ExitCode.BAD_INPUT
-
-
-def test_curves_of_several_subjects_and_methods_are_joined(make_run, tmp_path, monkeypatch):
-    run = make_run("curve_plugin:METHOD", "curve_plugin:TIMED", subjects=("ball-a", "ball-bee"))
-    whole = curve_run(settings(run, fractions=("1", "1/4")))
+def test_curves_of_several_subjects_and_methods_are_joined(make_run, tmp_path):
+    methods, subjects = ("curve_plugin:METHOD", "curve_plugin:TIMED"), ("ball-a", "ball-bee")
+    whole = curve_run(settings(make_run(*methods, subjects=subjects), fractions=("1",)))
+    runs = {each: make_run(*methods, subjects=(each,), folder=tmp_path / each) for each in subjects}
     parts = []
-    for subject, method in product(("ball-a", "ball-bee"), ("noting", "timed")):
-        one = run_on(
-            tmp_path / subject,
-            tmp_path / f"run-{subject}",
-            "curve_plugin:METHOD",
-            "curve_plugin:TIMED",
-            subjects=(subject,),
-            reader="ball_plugin:READER",
-        )
+    for subject, method in product(subjects, ("noting", "timed")):
         out = tmp_path / f"{subject}-{method}"
-        curve_run(settings(one.root, out=str(out), fractions=("1", "1/4"), methods=(method,)))
+        curve_run(settings(runs[subject], out=str(out), fractions=("1",), methods=(method,)))
         parts.append(str(out))
     joined = curve_runs(CurveReportSettings(tuple(parts), str(tmp_path / "joined")))
     costs = set(MEASURED)
@@ -407,7 +350,7 @@ def test_curves_of_several_subjects_and_methods_are_joined(make_run, tmp_path, m
     assert shown[0] == shown[1]
     # The mean of a method on fewer subjects is not beside that of the others.
     fewer = curve_runs(CurveReportSettings(tuple(parts[:3]), str(tmp_path / "fewer")))
-    assert len(fewer.data["points"]) == 6
+    assert len(fewer.data["points"]) == 3
     one = curve_runs(CurveReportSettings(tuple(parts[:2]), str(tmp_path / "one")))
     assert fewer.text.partition("Written:")[0] == one.text.partition("Written:")[0]
     with pytest.raises(InputError, match="a subject that all methods were trained on"):
@@ -429,9 +372,7 @@ def test_curves_of_several_subjects_and_methods_are_joined(make_run, tmp_path, m
         with pytest.raises(InputError, match=said):
             curve_runs(CurveReportSettings((parts[1], parts[3]), str(tmp_path / "changed")))
     other = tmp_path / "camera"
-    curve_run(
-        settings(tmp_path / "run-ball-a", out=str(other), fractions=("1",), camera="4", methods=("timed",))
-    )
+    curve_run(settings(runs["ball-a"], out=str(other), fractions=("1",), camera="4", methods=("timed",)))
     with pytest.raises(InputError, match="the held-out frames of ball-a"):
         curve_runs(CurveReportSettings((parts[0], str(other)), str(tmp_path / "frames")))
     assert [name for name in ("twice", "other", "frames") if (tmp_path / name).exists()] == []

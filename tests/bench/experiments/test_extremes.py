@@ -29,7 +29,7 @@ from headbench.bench.io.images import read_png
 from headbench.bench.io.lock import LOCK_FILE, locked
 from headbench.reports.robustness.sheets import BROKEN, EXTRAPOLATED, SHEET_FILE
 
-VIEWS, SAMPLES, PATH_FRAMES = 6, 5, 4
+VIEWS, SAMPLES, PATH_FRAMES = 4, 2, 2
 FRAMES = VIEWS + 2 * SAMPLES + PATH_FRAMES
 MEASURES = 5 + 6 + 2  # of stability in every frame, and of appearance and surface against the truth
 
@@ -55,7 +55,7 @@ def colours(path):
     return {to_hex(colour / 255) for colour in np.unique(read_png(path).reshape(-1, 3), axis=0)}
 
 
-def test_a_stable_avatar_passes_and_every_frame_has_its_rows(ball_run):
+def test_a_stable_avatar_passes_and_what_has_no_truth_is_missing(ball_run):
     folder = ball_run("BALL", "FLOOR")
     found = extremes_run(settings(folder))
     assert found.passed
@@ -73,24 +73,15 @@ def test_a_stable_avatar_passes_and_every_frame_has_its_rows(ball_run):
     record = json.loads((folder / "extremes" / RECORD_FILE).read_text())
     views = record["avatars"][0]["views"]
     assert [v["azimuth"] for v in views] == pytest.approx(np.linspace(-90, 90, VIEWS), abs=0.01)
-    assert [v["extrapolated"] for v in views] == [True, False, False, False, False, True]
+    assert [v["extrapolated"] for v in views] == [True, False, False, True]
     (protocol,) = record["protocols"]  # all subjects, methods of equal needs: one comparison
     assert set(of_frames["protocol"]) == {protocol["hash"]} == {a["protocol"] for a in record["avatars"]}
     assert protocol["id"] == "extremes/canonical/1"
     keys = of_frames[["subject", "sequence", "timestep", "camera"]].drop_duplicates()
     assert {tuple(key) for key in protocol["keys"]} == set(keys.itertuples(index=False, name=None))
-    shown = colours(folder / "extremes" / SHEET_FILE)
-    assert EXTRAPOLATED in shown
-
-
-def test_without_a_truth_it_says_so_and_judges_stability(ball_run):
-    folder = ball_run("BALL")
-    found = extremes_run(settings(folder))
-    assert found.passed
-    assert (
-        "not compared with the truth: Subject ball-a is recorded; only a synthetic capture has" in found.text
-    )
-    rows = pd.read_parquet(folder / "extremes" / "rows.parquet")
+    assert EXTRAPOLATED in colours(folder / "extremes" / SHEET_FILE)
+    said = "not compared with the truth: Subject ball-a is recorded; only a synthetic capture has"
+    assert said in found.text
     missing = rows[rows["metric"].isin([metric.name for metric in AGAINST_TRUTH])]
     assert set(missing["metric"]) == {metric.name for metric in AGAINST_TRUTH}
     assert set(missing["status"]) == {"missing"}
@@ -196,7 +187,6 @@ def test_a_run_of_trivial_baselines_has_nothing_to_test(ball_run):
     folder = ball_run("FLOOR")
     with pytest.raises(InputError, match="no trivial baseline"):
         extremes_run(settings(folder))
-    assert extremes_run(settings(folder, methods=("floor",))).passed
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,8 @@ from headbench.datasets.open import open_clip
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.reports.robustness.sheets import SHEET_FILE, table, write_extremes_sheet
 
-PARAMETERS = ExtremesSettings("run", views=3, beyond=15.0, dimensions=3, samples=3, path=3).parameters
-FRAMES, SAMPLES = 3 + 2 * 3 + 3, 2 * 3
+PARAMETERS = ExtremesSettings("run", views=2, beyond=15.0, dimensions=3, samples=2, path=2).parameters
+FRAMES, SAMPLES = 2 + 2 * 2 + 2, 2 * 2
 
 
 @pytest.fixture(scope="module")

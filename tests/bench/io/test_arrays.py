@@ -1,4 +1,4 @@
-"""Arrays from files: what is read as it was written, and what is refused before it costs anything."""
+"""Arrays from files: what is read as it was written, and what is refused."""
 
 from __future__ import annotations
 
@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.bench.io import arrays
 from headbench.bench.io.arrays import TEXT, Member, read_arrays, read_npy, read_npz
-
-from ...memory import memory_below
 
 KEPT = {
     "floats": np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4),
@@ -47,87 +44,28 @@ def npy(values) -> bytes:
     return stream.getvalue()
 
 
-def header(text: str, data: bytes = b"") -> bytes:
-    line = text.encode().ljust(117) + b"\n"
-    return b"\x93NUMPY\x01\x00" + len(line).to_bytes(2, "little") + line + data
-
-
-def described(descr: str, shape: str, data: bytes = b"") -> bytes:
-    return header(f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}", data)
-
-
 DAMAGED = {
     "no npy": b"anything",
     "empty": b"",
     "objects": npy(np.array([{}], dtype=object)),
     "records": npy(np.zeros(2, [("x", "f4")])),
-    "subarrays": described("('<f4', (2,))", "(1,)", bytes(8)),
     "complex": npy(np.zeros(2, complex)),
-    "long doubles": npy(np.zeros(2, np.longdouble)),
     "dates": npy(np.zeros(2, "M8[s]")),
     "bytes": npy(np.zeros(2, "S3")),
     "short": npy(np.zeros(100))[:-1],
-    "long": npy(np.zeros(100)) + b"\0",
-    "huge": described("'<f8'", "(4000000000000,)"),
-    "huge and empty": described("'<f8'", f"({2**62}, {2**62}, 0)"),
-    "negative": described("'<f8'", "(-1, -1)", bytes(8)),
-    "nested header": header("[" * 115),
-    "no characters": described("'<U1'", "(1,)", b"\xff\xff\xff\x7f"),
-    "half a surrogate pair": described("'<U1'", "(1,)", b"\x00\xd8\x00\x00"),
     "another version": b"\x93NUMPY\x09\x00" + npy(np.zeros(1))[8:],
 }
 
 
 @pytest.mark.parametrize("name", DAMAGED)
-def test_a_damaged_member_is_refused(tmp_path, name):
+def test_a_damaged_file_is_refused(tmp_path, name):
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("values.npy", DAMAGED[name])
-    with pytest.raises(InputError) as caught:
-        read_npz(tmp_path / "a.npz")
-    assert len(str(caught.value)) < 1000
     (tmp_path / "a.npy").write_bytes(DAMAGED[name])
-    with pytest.raises(InputError):
-        read_npy(tmp_path / "a.npy")
-
-
-def archive_of(path, *names, method=zipfile.ZIP_STORED):
-    with zipfile.ZipFile(path, "w", method) as archive:
-        for name in names:
-            archive.writestr(name, npy(np.zeros(3)))
-
-
-ARCHIVES = {
-    "a member that is no npy": lambda path: archive_of(path, "values.txt"),
-    "two of one name": lambda path: archive_of(path, "values.npy", "values.npy"),
-    "a slow compression": lambda path: archive_of(path, "values.npy", method=zipfile.ZIP_LZMA),
-    "too many members": lambda path: archive_of(path, *(f"{i}.npy" for i in range(arrays.MAX_MEMBERS + 1))),
-}
-
-
-@pytest.mark.filterwarnings("ignore:Duplicate name")
-@pytest.mark.parametrize("name", ARCHIVES)
-def test_another_file_than_an_npz_is_refused(tmp_path, name):
-    ARCHIVES[name](tmp_path / "a.npz")
-    with pytest.raises(InputError) as caught:
-        read_npz(tmp_path / "a.npz")
-    assert caught.value.file == str(tmp_path / "a.npz")
-
-
-@pytest.mark.parametrize("lie", [False, True])
-def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path, monkeypatch, lie):
-    monkeypatch.setattr(arrays, "MOST_BYTES", 2**20)
-    path = tmp_path / "zeros.npz"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.npy", "w") as stream:
-        stream.write(described("'<f8'", f"({2**22},)"))
-        for _ in range(32):
-            stream.write(bytes(2**20))
-    content = path.read_bytes()
-    if lie:  # the directory names a small size
-        place = content.rindex(b"PK\x01\x02") + 24
-        content = content[:place] + (1000).to_bytes(4, "little") + content[place + 4 :]
-        path.write_bytes(content)
-    with pytest.raises(InputError), memory_below(2**20):
-        read_npz(path)
+    for file, read in (("a.npz", read_npz), ("a.npy", read_npy), ("a.npy", read_npz), ("a.npz", read_npy)):
+        with pytest.raises(InputError) as caught:
+            read(tmp_path / file)
+        assert caught.value.file == str(tmp_path / file)
 
 
 MEMBERS = {

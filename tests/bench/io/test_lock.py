@@ -10,7 +10,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.files import TEMPORARY, check_output_folder
-from headbench.bench.io.lock import LOCK_FILE, locked
+from headbench.bench.io.lock import LOCK_FILE, is_locked, locked
 from headbench.bench.progress import log_to_file
 
 HOLDER = """
@@ -23,55 +23,34 @@ with locked(Path(sys.argv[1])):
 """
 
 
-@pytest.fixture
-def holder(tmp_path):
+def test_a_folder_that_another_process_uses_is_refused_until_that_is_killed(tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True
     )
-    assert process.stdout.readline() == "held\n"
-    yield process
-    process.kill()
-    process.wait()
-    process.stdout.close()
-
-
-def test_a_folder_that_another_process_uses_is_refused_by_name(tmp_path, holder):
-    with (
-        pytest.raises(InputError, match=rf"run\.lock.*process {holder.pid} on .*, since 20"),
-        locked(tmp_path),
-    ):
-        pytest.fail("entered a folder that was taken")
-    assert (tmp_path / LOCK_FILE).exists()  # the owner's, untouched
-
-
-def test_a_killed_owner_keeps_nobody_out(tmp_path, holder):
-    holder.send_signal(signal.SIGKILL)
-    holder.wait()
+    try:
+        assert process.stdout.readline() == "held\n"
+        owner = rf"run\.lock.*process {process.pid} on .*, since 20"
+        with pytest.raises(InputError, match=owner), locked(tmp_path):
+            pytest.fail("entered a folder that was taken")
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
     assert (tmp_path / LOCK_FILE).exists()
     with locked(tmp_path):
         assert json.loads((tmp_path / LOCK_FILE).read_text())["process"] == os.getpid()
 
 
-def test_the_lock_is_gone_after_the_block_and_after_an_error(tmp_path):
-    with pytest.raises(RuntimeError), locked(tmp_path):
-        raise RuntimeError("in the block")
-    assert list(tmp_path.iterdir()) == []
-    with locked(tmp_path):
-        pass
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_one_process_does_not_enter_twice(tmp_path):
-    with locked(tmp_path), pytest.raises(InputError, match=f"process {os.getpid()}"), locked(tmp_path):
-        pytest.fail("entered twice")
-
-
-def test_a_damaged_lock_file_is_no_obstacle(tmp_path):
+def test_one_process_does_not_enter_twice_and_a_damaged_lock_file_is_no_obstacle(tmp_path):
     (tmp_path / LOCK_FILE).write_text("[1, 2")
     with locked(tmp_path):
-        (tmp_path / LOCK_FILE).write_text("[1, 2")
-        with pytest.raises(InputError, match="of unknown number"), locked(tmp_path):
-            pytest.fail("entered twice")
+        for content, owner in ((None, f"process {os.getpid()}"), ("[1, 2", "of unknown number")):
+            if content is not None:
+                (tmp_path / LOCK_FILE).write_text(content)
+            with pytest.raises(InputError, match=owner), locked(tmp_path):
+                pytest.fail("entered twice")
+        assert is_locked(tmp_path)
+    assert not is_locked(tmp_path)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", [LOCK_FILE, "run.log"])
@@ -89,10 +68,14 @@ def test_lock_and_log_are_never_links(tmp_path, name):
     assert victim.read_text() == "victim"
 
 
-def test_what_dead_processes_left_is_removed_under_the_lock(tmp_path):
+def test_what_killed_processes_left_is_removed_except_where_another_works(tmp_path):
     (tmp_path / "below").mkdir()
     left = tmp_path / "below" / f"{TEMPORARY}x.png"
     left.touch()
+    with locked(left.parent):
+        left.touch()
+        with locked(tmp_path):
+            assert left.exists()
     with locked(tmp_path):
         assert not left.exists()
 

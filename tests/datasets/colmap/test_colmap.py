@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -207,32 +207,6 @@ def test_every_truncation_is_refused(tmp_path, name):
         read_model(tmp_path)
 
 
-@settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data(), name=st.sampled_from(FILES), suffix=st.sampled_from([".bin", ".txt"]))
-def test_damaged_bytes_raise_nothing_but_input_errors(tmp_path, data, name, suffix):
-    """Huge counts among them: no allocation follows a number in the file."""
-    whole = tmp_path / "whole"
-    if not whole.exists():
-        random_model(np.random.default_rng(0), whole)
-    folder = tmp_path / "damaged"
-    folder.mkdir(exist_ok=True)
-    for part in FILES:
-        shutil.copy(whole / f"{part}{suffix}", folder)
-        (folder / f"{part}{'.txt' if suffix == '.bin' else '.bin'}").unlink(missing_ok=True)
-    content = bytearray((folder / f"{name}{suffix}").read_bytes())
-    place = data.draw(st.integers(0, len(content) - 1))
-    damage = data.draw(st.binary(min_size=1, max_size=8))
-    content[place : place + len(damage)] = damage
-    (folder / f"{name}{suffix}").write_bytes(content)
-    try:
-        cameras = model_cameras(read_model(folder))
-    except InputError:
-        return
-    for camera in cameras.values():
-        assert np.isfinite(camera.K).all()
-        np.testing.assert_allclose(np.linalg.det(camera.world_to_camera[:3, :3]), 1, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("find", "put", "found"),
     [
@@ -242,7 +216,8 @@ def test_damaged_bytes_raise_nothing_but_input_errors(tmp_path, data, name, suff
         ("\n5 ", "\n3 ", "each image once"),
         (" 7 ab/3.png", " 8 ab/3.png", "image 3, camera"),
         (" 7 ab/3.png", " 7", "10 words"),
-        ("\n3 ", "\n3 nan ", "whole numbers"),
+        ("\n3 ", "\n3 nan ", "numbers"),
+        ("\n3 ", "\nx ", "numbers"),
     ],
 )
 def test_faults_in_a_text_model_are_named(tmp_path, find, put, found):
@@ -417,16 +392,15 @@ def test_sigterm_keeps_its_handler_with_pycolmap():
     code = (
         "import os, signal, sys\n"
         "signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))\n"
-        "import headbench.datasets.colmap.model\n"
-        "headbench.datasets.colmap.model.pycolmap()\n"
+        "from headbench.datasets.colmap.model import pycolmap\n"
+        "pycolmap()\n"
         "os.kill(os.getpid(), signal.SIGTERM)\n"
     )
     ended = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     assert (ended.returncode, ended.stderr) == (7, "")
 
 
-@pytest.mark.parametrize("start", ["", "\ufeff"])
-@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize(("start", "end"), [("", "\n"), ("\ufeff", "\r\n")])
 @pytest.mark.parametrize("name", ["a b/00001_x.png", "a\\b\\00001 x.PNG", "a  b.png"])
 def test_names_and_line_ends_of_other_systems_are_read(tmp_path, start, end, name):
     camera = "1 PINHOLE 64 48 50 50 32 24"
@@ -434,10 +408,3 @@ def test_names_and_line_ends_of_other_systems_are_read(tmp_path, start, end, nam
     (tmp_path / "cameras.txt").write_bytes((start + camera + end).encode())
     (tmp_path / "images.txt").write_bytes((start + image + end + end).encode())
     assert read_model(tmp_path).images[1].name == name.replace("\\", "/")
-
-
-def test_a_model_in_utf16_is_refused_by_name(tmp_path):
-    for name in ("cameras", "images"):
-        (tmp_path / f"{name}.txt").write_bytes("1 PINHOLE 64 48 50 50 32 24\n".encode("utf-16"))
-    with pytest.raises(InputError, match=r"cameras.txt: expected text in UTF-8, found UTF-16"):
-        read_model(tmp_path)

@@ -271,7 +271,7 @@ def test_what_another_call_left_is_used_where_it_fits(settings, monkeypatch, cha
     length = settings().focal * (1.01 if changed == "focal" else 1)
     if changed == "code":
         for module in (track, video_clip, command):
-            monkeypatch.setattr(module, "tracking_code", lambda: "another")
+            monkeypatch.setattr(module, "TRACKER_VERSION", "another")
     if changed == "embedding":  # of vertices that there are not
         path = Path(settings().out) / WORK / "embedding.npz"
         content = dict(np.load(path))

@@ -15,7 +15,7 @@ from headbench.bench.engine.guard import TrainingView
 from headbench.bench.engine.stored import avatar_digest
 from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
 from headbench.bench.io.documents import read_json
-from headbench.bench.io.files import digest_file, grouped_writes
+from headbench.bench.io.files import digest_file
 from headbench.bench.io.images import read_png
 from headbench.bench.process import ProgramError
 from headbench.methods.official.ga.windows import inside
@@ -144,8 +144,7 @@ def test_logs_are_no_part_of_an_avatar(avatar, official_clip, tmp_path):
 
 def test_a_list_is_on_disk_where_the_harness_groups_writes(avatar, official_clip):
     wanted = views(official_clip, "novel_view")
-    with grouped_writes():
-        assert dict(avatar.render_listed(wanted, (1.0, 1.0, 1.0), no_progress)).keys() == wanted.keys()
+    assert dict(avatar.render_listed(wanted, (1.0, 1.0, 1.0), no_progress)).keys() == wanted.keys()
 
 
 def test_a_frame_on_its_own_cannot_be_had(avatar, official_clip):

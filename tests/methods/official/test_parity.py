@@ -25,7 +25,7 @@ from headbench.methods.shared.config import PAPER_ITERATIONS, SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, ShuffledEpochs, Timeline
 
 from ...datasets.head.toy import toy_head
-from ...fuzz import samples
+from ...world import procedural_capture
 from .repository import lip_numbers, make_interpreter, make_repository
 
 OFFICIAL = "ga-official (cpu-shim)"
@@ -34,7 +34,7 @@ OFFICIAL = "ga-official (cpu-shim)"
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A directory with a capture, a repository and an interpreter."""
-    samples.capture(tmp_path, tmp_path)
+    procedural_capture().copied(tmp_path / "capture")
     make_repository(tmp_path / "repository", *lip_numbers(toy_head(16)))
     make_interpreter(tmp_path / "python")
     monkeypatch.chdir(tmp_path)
