@@ -1,20 +1,14 @@
 """Every benchmark runs at its smallest and has every row, and what it compares computes the same."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 import torch
 
 from headbench.bench.benchmarks import findings, table, take_turns
 from headbench.bench.contracts import no_progress
 from headbench.bench.registry import discover
-from headbench.datasets.benchmarks import head, refit
 from headbench.methods.benchmarks import avatar, splats, training
 from headbench.methods.benchmarks.scenes import cloud
 from headbench.methods.splats import available_backends, rasterize
-from headbench.metrics import benchmark as metrics
-
-from .metrics.conftest import bare_machine  # noqa: F401 - a fixture
 
 KERNELS = [name for name in available_backends() if name.startswith("cpu-")]
 SMALLEST = {
@@ -22,14 +16,10 @@ SMALLEST = {
     splats.tradeoffs: ({"QUICK_TRADEOFF_SIZE": (600, 48, 40)}, ["exact", "float16", "8/255", "0.05"]),
     avatar.speed: ({"QUICK_SIZES": ((700, 40, 32),)}, ["ratio", "deform", "rasterize", "700", "ga"]),
     training.speed: ({"SIZE": (40, 32), "QUICK_ROUNDS": 2}, ["ga", "ours", "gbs", "_Rasterize"]),
-    head.speed: ({"FLAME_SIZES": (12, 8), "QUICK_ROUNDS": 2}, [head.ONCE, "identity blended at each call"]),
-    metrics.speed: ({"QUICK_SIZE": (40, 31)}, ["scikit-image", "torchmetrics", "headbench", "weights"]),
-    refit.speed: ({"QUICK_TIMESTEPS": 3, "FLAME_SIZES": (12, 8)}, [case[0] for case in refit.CASES]),
 }
 
 
 @pytest.mark.parametrize("measure", SMALLEST, ids=lambda f: f"{f.__module__}.{f.__name__}")
-@pytest.mark.usefixtures("bare_machine")
 def test_a_benchmark_has_every_row(measure, monkeypatch):
     sizes, rows = SMALLEST[measure]
     if not KERNELS and "_Rasterize" in rows:
@@ -90,10 +80,3 @@ def test_a_contribution_is_the_light_a_splat_sends():
     image = rasterize(*own[:9], background=own.background, backend="reference").image
     torch.testing.assert_close(weights, image.sum((0, 1)))
     assert weights.max() > 0
-
-
-def test_all_ways_to_a_metric_have_one_value():
-    with ThreadPoolExecutor(2) as pool:
-        for ways in metrics.structural_ways(metrics.noisy_pairs(2, 40, 31), pool).values():
-            values = [way() for way in ways.values()]
-            assert values == pytest.approx([values[0]] * len(values), abs=1e-3)
