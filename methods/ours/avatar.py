@@ -87,10 +87,7 @@ class OursAvatar(StoredSplatAvatar):
 
     @classmethod
     def read(cls, folder: Path, device: str, *, exact: bool = False) -> OursAvatar:
-        """Read an avatar from its folder; ``exact`` reads the files of a training even if there is a coded one.
-
-        Raises `InputError` for damaged or incompatible files.
-        """
+        """Read an avatar from its folder; ``exact`` reads the files of a training even if there is a coded one."""
         head = read_shared_head(folder)
         compact = folder / COMPACT_FILE
         if compact.exists() and not exact:

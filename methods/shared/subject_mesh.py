@@ -29,11 +29,6 @@ class SubjectMesh:
         (S,) identity coefficients.
     static_offset : FloatArray
         (V, 3) metres, added to the shaped template.
-
-    Raises
-    ------
-    InputError
-        The size of the mesh is not that of a head, see `check_size`.
     """
 
     def __init__(self, head: HeadAsset, shape: FloatArray, static_offset: FloatArray, device: str):

@@ -36,8 +36,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read all tensors of a file, on the CPU, and its metadata.
 
-    The file size must match the header, so that tensors cannot be larger than the file. Raises `InputError` for a
-    missing, damaged or other file.
+    The file size must match the header, so that tensors cannot be larger than the file.
     """
     expected = "a safetensors file"
     with open_regular(path, expected) as stream:

@@ -74,10 +74,7 @@ def _warn_once(reason: str, remedy: str) -> None:
 
 
 def prepare(device: str) -> None:
-    """Load gsplat if ``device`` is a CUDA device and it is installed; see `use_device`. Call it before timing.
-
-    Raises `UnavailableError` if gsplat's extension can be neither loaded nor compiled.
-    """
+    """Load gsplat if ``device`` is a CUDA device and it is installed; see `use_device`. Call it before timing."""
     use_device(device)
     if is_cuda(device) and installed():
         load()
@@ -85,10 +82,7 @@ def prepare(device: str) -> None:
 
 @functools.cache
 def load() -> ModuleType:
-    """Import gsplat and its extension, which is compiled when first used on a machine.
-
-    Raises `UnavailableError` if gsplat, a GPU or the CUDA toolkit is missing, or if compilation fails.
-    """
+    """Import gsplat and its extension, which is compiled when first used on a machine."""
     if not torch.cuda.is_available():
         missing = "The renderer's backend 'cuda' needs a GPU, and torch finds none."
         raise UnavailableError(missing, REMEDY)

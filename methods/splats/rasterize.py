@@ -116,13 +116,6 @@ def rasterize(
         pixels and more), or if it is masked. A splat in view is not always drawn: a splat below
         ``alpha_min`` is in view but not drawn, and the rim of an opaque one beside the image beyond 3
         standard deviations is drawn, although it is out of view.
-
-    Raises
-    ------
-    ValueError
-        An argument has a wrong type, shape, dtype, device or value; the message names it.
-    UnavailableError
-        The requested backend is not available.
     """
     request = make_request(
         *(means, quats, scales, opacities, colors, viewmat, K, width, height),
