@@ -10,7 +10,7 @@ SECONDS ?= 600
 # Build of PyTorch: cpu, cuda, or what pip's indexes offer of the two, the smaller first.
 TORCH  ?=
 
-.PHONY: help setup lock demo pictures docs test test-slow test-latest check fuzz kills nightly gpu gpu-checks gate baseline bench readme \
+.PHONY: help setup lock demo pictures docs test test-commands test-slow test-latest check fuzz kills nightly gpu gpu-checks gate baseline bench readme \
   release-source dist wheels clean
 
 help:
@@ -21,6 +21,7 @@ help:
 	@echo "make docs    build the documentation, in build/docs (NOTEBOOKS=no leaves them unexecuted)"
 	@echo "make test    run the tests (in JOBS=$(JOBS) processes)"
 	@echo "make test-latest  run the tests with the newest versions instead of the lock, in $(VENV)-latest"
+	@echo "make test-commands  run all commands end to end, browsers, notebooks, the README's tables"
 	@echo "make test-slow    run the tests marked slow"
 	@echo "make nightly      run what takes too long for every change: the list in .ci/run"
 	@echo "make check   style, types, architecture"
@@ -77,6 +78,9 @@ pictures: setup
 # Where writing bytecode is switched off, every process compiles all tests again, two thirds of the time of collecting.
 test: setup
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
+
+test-commands: setup
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -m "commands and not slow" -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 test-slow: setup
 	$(BIN)/python -m pytest -m "slow and not slurm"

@@ -11,7 +11,7 @@ from headbench.bench.specs import ResolutionRule
 from headbench.methods.trivial.spec import MEAN_IMAGE
 
 from .datasets.tiny_capture import write_tiny_capture
-from .small_run import rows_of, run_on
+from .world import rows_of, run_on
 
 SQUARE = ResolutionRule(square="pad", size=(128, 128))
 FORMS = {

@@ -29,11 +29,13 @@ from headbench.metrics import speed
 from .datasets.flat_renderer import flat_pictures
 from .datasets.monocular.videos import Recording
 from .datasets.tracker_files.trackers import write_metrical
-from .fuzz.samples import SETTINGS
+from .world import SETTINGS
 
 SMALL = (f"--set=settings.{name}={json.dumps(SETTINGS[name])}" for name in ("gbs", "gha", "insta"))
 TINY = ("--preset", "smoke", "--set=frames_per_task=3", *SMALL)
 """Few frames; two iterations of the methods of which nothing but that they run is asked."""
+pytestmark = pytest.mark.commands
+
 METHODS = {"mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours", "ours-plus"}
 
 

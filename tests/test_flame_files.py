@@ -16,7 +16,9 @@ from headbench.datasets.head.teeth import with_teeth
 from .datasets.head.flame_files import write_flame
 from .datasets.head.flame_stand_in import stand_in, write_stand_in
 from .datasets.tiny_capture import make_plan, rig, write_tiny_capture
-from .fuzz.samples import SETTINGS
+from .world import SETTINGS
+
+pytestmark = pytest.mark.commands
 
 LENGTHS = {"FREE": 2, "EMO-1-shout+laugh": 2, "SEN-01-cramp_small_danger": 1}
 ALL = ("flashavatar", "ga", "gbs", "gha", "insta", "ours", "rgbavatar")

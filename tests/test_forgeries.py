@@ -25,7 +25,7 @@ from headbench.reports.leaderboard.settings import LeaderboardSettings
 
 from .datasets.head.toy import toy_head
 from .datasets.tiny_capture import make_plan, write_tiny_capture
-from .small_run import run_on
+from .world import run_on
 
 
 @pytest.fixture(scope="module")

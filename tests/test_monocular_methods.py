@@ -12,7 +12,7 @@ from headbench.reports.table_report import table_text
 from .datasets.head.toy import toy_head
 from .datasets.monocular.videos import Recording, write_imavatar, write_insta
 from .datasets.tiny_capture import FRONTAL, make_plan, rig, write_tiny_capture
-from .small_run import rows_of, run_on
+from .world import rows_of, run_on
 
 
 @pytest.fixture(scope="module")

@@ -8,16 +8,16 @@ import pytest
 
 import headbench as hb
 
-from ..fuzz.samples import SETTINGS
-from ..small_run import rows_of, small_run
+from ..world import SETTINGS, rows_of
+from ..world import finished as finished_run
 
 KEY = ["task", "timestep", "camera", "region", "metric"]
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A run of ga and of insta, which is trained on another form of the capture."""
-    return small_run(tmp_path_factory.mktemp("api"), "ga", "insta")
+def finished():
+    """A run of ga and, among others, of insta, which is trained on another form of the capture."""
+    return finished_run()
 
 
 @pytest.fixture(scope="module")

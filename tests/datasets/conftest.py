@@ -6,13 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from .tiny_capture import TinyCapture, write_tiny_capture
+from .. import world
+from .tiny_capture import TinyCapture
 
 
 @pytest.fixture(scope="session")
-def pristine_capture(tmp_path_factory) -> TinyCapture:
+def pristine_capture() -> TinyCapture:
     """A capture that tests only read."""
-    return write_tiny_capture(tmp_path_factory.mktemp("capture"))
+    return world.capture()
 
 
 @pytest.fixture

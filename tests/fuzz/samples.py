@@ -39,11 +39,8 @@ from ..datasets.nersemble.benchmark_folder import write_benchmark
 from ..datasets.nersemble.recordings import write_recording
 from ..datasets.tiny_capture import make_plan, rig, write_tiny_capture
 from ..datasets.tracker_files.trackers import write_flashavatar
-from ..methods.flashavatar.small import SMALL as SMALL_FLASHAVATAR
-from ..methods.gha.small import SMALL as SMALL_GHA
-from ..methods.insta.small import SMALL as SMALL_INSTA
 from ..methods.official.repository import lip_numbers, make_interpreter, make_repository
-from ..methods.rgbavatar.small import SMALL as SMALL_RGBAVATAR
+from ..world import SETTINGS
 
 AVATAR = "run/901/{}/seed-0/avatar"
 GA, OURS = AVATAR.format("ga"), AVATAR.format("ours")
@@ -54,23 +51,7 @@ PREPARE = (
     "--sequences EMO-1,FREE --downscale 2 --every 1"
 )
 METHODS = ("mean-image", "nearest-camera", "flashavatar", "ga", "gbs", "gha", "insta", "rgbavatar", "ours")
-ITERATIONS = {"budget": {"iterations": 2}}
 NUMBERS = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
-SETTINGS = {
-    "flashavatar": {**ITERATIONS, **SMALL_FLASHAVATAR},
-    "ga": ITERATIONS,
-    "gbs": {**ITERATIONS, "samples": 200, "teeth_samples": 20},
-    "gha": {**ITERATIONS, **SMALL_GHA, "start_steps": 2, "motion_steps": 2},
-    "insta": {**ITERATIONS, **SMALL_INSTA},
-    "rgbavatar": {**ITERATIONS, **SMALL_RGBAVATAR},
-    "ours": {
-        **ITERATIONS,
-        "planes": {"resolution": 8},
-        "lines": {"resolution": 4, "channels": 2},
-        "hidden": 8,
-    },
-}
-"""Two iterations of the smallest form of each method."""
 
 
 def configuration(methods: tuple[str, ...], metrics: tuple[str, ...] = ("psnr", "storage")) -> dict:

@@ -26,7 +26,7 @@ from headbench.methods.benchmarks.scenes import SplatScene, head_shell, relative
 from headbench.methods.shared.loop import CHECKPOINT, synchroniser
 from headbench.methods.splats import cuda, rasterize
 from headbench.metrics.speed import SpeedProtocol, measure_speed
-from headbench.tests.small_run import small_run
+from headbench.tests.world import small_run
 
 ROOT = Path(__file__).parents[2]
 ITERATIONS = 6

@@ -1,16 +1,15 @@
-"""A small head and a small clip, made once."""
+"""The shared head and clip."""
 
 import pytest
 
-from ..datasets.head.toy import toy_head
-from .toy_clip import toy_clip
+from .. import world
 
 
 @pytest.fixture(scope="session")
 def head():
-    return toy_head(16)
+    return world.clip().head
 
 
 @pytest.fixture(scope="session")
-def clip(head):
-    return toy_clip(head, timesteps=3, cameras=3, width=28, height=36)
+def clip():
+    return world.clip()

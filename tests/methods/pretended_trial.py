@@ -17,7 +17,7 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.engine.config import RunOptions
 from headbench.bench.engine.jobs import trained
 
-from ..small_run import small_run
+from ..world import small_run
 from . import pretended
 
 METHODS = ("flashavatar", "ga", "gbs", "gha", "ours", "rgbavatar")

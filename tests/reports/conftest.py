@@ -12,7 +12,7 @@ from headbench.bench.manifest import Manifest, MethodRecord, ProtocolRecord
 from headbench.bench.rows import Rows
 from headbench.bench.specs import MetricSpec
 
-from ..small_run import run_on
+from ..world import run_on
 from .made_rows import TASKS, avatar_row, row
 
 PSNR = MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr")

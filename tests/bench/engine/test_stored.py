@@ -10,12 +10,12 @@ from headbench.bench.engine.stored import AVATAR_FILE, HEAD_FILE, load_avatar, o
 from headbench.bench.errors import InputError
 from headbench.methods.ga.method import GAAvatar
 
-from ...small_run import small_run
+from ...world import finished
 
 
 @pytest.fixture(scope="module")
-def cell(tmp_path_factory):
-    return small_run(tmp_path_factory.mktemp("stored"), "ga").cell("901", "ga", 0)
+def cell():
+    return finished().cell("901", "ga", 0)
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import pytest
 
 from headbench.bench.engine import run as runner
 
-from ...small_run import run_on
+from ...world import run_on
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ from headbench.reports.curve.settings import CurveReportSettings
 
 from ...datasets.flat_renderer import flat_pictures
 from ...datasets.tiny_capture import write_tiny_capture
-from ...small_run import run_on
+from ...world import run_on
 
 TESTS = Path(__file__).parents[2]
 HELD_TIMESTEP, HELD_CAMERA = 2, "1"  # of timesteps 0 to 3, and of cameras at -60, -30, 30 and 60 degrees

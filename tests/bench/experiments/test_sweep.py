@@ -11,7 +11,7 @@ from headbench.bench.experiments.sweep_settings import SweepSettings
 from headbench.bench.io.documents import read_json
 from headbench.bench.rows import ALL, Rows
 
-from ...small_run import run_on
+from ...world import run_on
 
 
 @pytest.fixture

@@ -21,14 +21,14 @@ from headbench.methods.avatars.web.export import export_page
 from headbench.methods.avatars.web.settings import ExportHtmlSettings
 from headbench.methods.shared.avatar_files import read_shared_head
 
-from ...small_run import small_run
+from ...world import finished
 
 METHODS = ("ga", "gbs", "gha", "ours")
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return small_run(tmp_path_factory.mktemp("formats"), *METHODS)
+def run():
+    return finished()
 
 
 def folder_of(run, method):

@@ -3,7 +3,7 @@ import pytest
 from headbench.reports.view.scene import open_scene
 from headbench.reports.view.settings import ViewSettings
 
-from ...small_run import small_run
+from ...world import small_run
 
 
 @pytest.fixture(scope="package")

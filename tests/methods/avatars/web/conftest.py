@@ -8,7 +8,7 @@ from headbench.methods.avatars.web.bake import Source
 from headbench.methods.avatars.web.model import WebAvatar
 from headbench.methods.avatars.web.settings import ExportHtmlSettings
 
-from ....small_run import small_run
+from ....world import finished
 
 
 class Exported(NamedTuple):
@@ -23,8 +23,8 @@ class Exported(NamedTuple):
 
 
 @pytest.fixture(scope="package")
-def run(tmp_path_factory):
-    return small_run(tmp_path_factory.mktemp("web"), "ga", "gbs", "ours")
+def run():
+    return finished()
 
 
 @pytest.fixture(
