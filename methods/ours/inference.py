@@ -17,19 +17,13 @@ from .field import blend_lines, line_table, normalised_weight, offset_layers
 
 
 class DrivenPose(NamedTuple):
-    """Results for a pose that are cached for known poses."""
+    """What a pose determines, for any camera."""
 
     frames: TriangleFrames
     turns: Tensor
     """(F, 3, 3) world directions to canonical ones."""
     offsets: Tensor | None
     """(N, D) of the lines; None without lines."""
-
-    @property
-    def bytes(self) -> int:
-        """Memory it takes."""
-        tensors = (*self.frames, self.turns, *(() if self.offsets is None else (self.offsets,)))
-        return sum(value.nbytes for value in tensors)
 
 
 class LineOffsets:
