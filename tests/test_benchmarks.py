@@ -39,7 +39,7 @@ def test_every_listed_benchmark_is_tried():
     specs = [plugin.spec for plugin in discover("benchmarks").values()]
     named = {name for spec in specs for name in (spec.speed, spec.tradeoffs, spec.stress) if name}
     tried = {f"{f.__module__}:{f.__name__}" for f in SMALLEST}
-    others = {"headbench.methods.benchmarks.extremes:stress", "headbench.datasets.benchmarks.head:stress"}
+    others = {"headbench.methods.benchmarks.extremes:stress", "headbench.datasets.head.extremes:stress"}
     assert named == tried | others  # those two in test_extremes.py
 
 
