@@ -80,7 +80,7 @@ def test_rows_are_those_of_one_process_and_done_cells_are_kept(config, rows_of, 
     assert "2 done, 2 failed" in capsys.readouterr().out
 
 
-def test_a_killed_process_is_started_again_until_its_restarts_end(config, rows_of):
+def test_a_killed_process_is_started_again_up_to_its_restarts(config, rows_of):
     config = replace(config, methods=("dying_plugin:DYING", "dying_plugin:ALWAYS", "toy_plugin:METHOD"))
     rows = rows_of(config, replace(TWO, restarts=1))
     by_method = dict(iter(rows.groupby("method")))
