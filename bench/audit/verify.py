@@ -24,7 +24,7 @@ from ..errors import ExitCode, InputError
 from ..io.images import read_png
 from ..manifest import ProtocolRecord
 from ..protocol import make_protocols
-from ..rows import ALL, FRAME
+from ..rows import ALL, FRAME, Rows
 from ..specs import CommandResult, MetricSpec
 from .evaluate import NoAvatar, images_method
 from .settings import VerifySettings
@@ -124,7 +124,7 @@ def verify(run: Path, settings: VerifySettings, progress: Progress = no_progress
         if found.mismatches:
             return found
         folder.read_rows(manifest)
-        rows = folder.rows_by_condition(manifest)
+        rows = Rows.read(folder.rows)
         rows.check_protocols(folder.rows, {task: protocol.hash for task, protocol in protocols.items()})
         images = [(images_method(m.name, m.version), Condition(m.condition)) for m in manifest.methods]
         cells = resolve_cells(config) if trained else images
