@@ -114,14 +114,12 @@ def test_an_interrupted_training_has_the_processor_of_others(tracked_run):
     assert "Trained on: one kind: subjects a, b, c; unknown processors: subjects d." in text
 
 
-def test_a_second_run_has_its_own_heading(tracked_run, write_run):
-    alone = suite_report(tracked_run.parent, "ours")
-    write_run("suite/run-large/01", {"ga": 30.0, "ours": 31.0})
-    first, second = suite_report(tracked_run.parent, "ours").split(f"\n# {LARGE}\n")
-    assert first == alone
-    write_run("other/run/01", {"ga": 30.0, "ours": 31.0})
-    primary, own = suite_report(tracked_run.parents[1] / "other", "ours").split("\n\n## All frames")
+def test_large_images_have_their_own_heading_and_no_primary_endpoints(write_run):
+    for name in ("run", "run-large"):
+        folder = write_run(f"suite/{name}/01", {"ga": 30.0, "ours": 31.0})
+    first, large = suite_report(folder.parents[1], "ours").split(f"\n# {LARGE}\n")
+    primary, usual = first.split("\n\n## All frames")
     assert primary.startswith("## Primary endpoints")
+    assert ENDPOINTS in usual
     # The endpoints are those of the whole suite: the other part has no note on them.
-    assert second.strip() == f"## All frames{own}".replace(f"{ENDPOINTS}\n\n", "").strip()
-    assert ENDPOINTS in own
+    assert large.strip() == f"## All frames{usual}".replace(f"{ENDPOINTS}\n\n", "").strip()
