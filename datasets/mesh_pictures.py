@@ -98,11 +98,6 @@ def rasterize_mesh(vertices: FloatArray, faces: IntArray, camera: Camera) -> Fra
 
     A pixel centre on an edge belongs to one of its two triangles. Among triangles at one depth (to float32) the one of
     lowest index is in front. See `draw_mesh` for ``vertices`` and ``faces``; `NEAR` bounds the depth.
-
-    Raises
-    ------
-    InputError
-        The triangles cover the picture more than `MAX_LAYERS` times in total, which no head does.
     """
     width, height = camera.width, camera.height
     points, usable = _project(vertices, camera)

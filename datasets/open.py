@@ -18,13 +18,7 @@ from .foreign import describe
 
 
 def find_reader(path: str | PathLike[str], name: str = "") -> DatasetSpec:
-    """The reader ``name``, see `registry.get`; without a name, the one that finds captures under ``path``.
-
-    Raises
-    ------
-    InputError
-        No reader recognises the path as a capture, or several do.
-    """
+    """The reader ``name``, see `registry.get`; without a name, the one that finds captures under ``path``."""
     if name:
         spec: DatasetSpec = get("datasets", name)
         return spec
@@ -61,11 +55,6 @@ def open_clips(
         Settings such as ``leaks`` that are passed to readers that have them and ignored otherwise.
     settings : Mapping[str, Any] | None
         Settings of the reader.
-
-    Raises
-    ------
-    InputError
-        As for `find_reader`; or the reader lacks a setting or finds a fault.
     """
     spec = find_reader(path, reader)
     known = inspect.signature(resolve(spec.implementation)).parameters

@@ -43,15 +43,8 @@ SYNTHETIC = DatasetSpec(
 
 HEAD = BenchmarkSpec(
     name="head",
-    summary="the head model: time of a forward pass, fast and readable implementation; numerical extremes",
-    speed="headbench.datasets.benchmarks.head:speed",
-    stress="headbench.datasets.benchmarks.head:stress",
-)
-
-REFIT = BenchmarkSpec(
-    name="refit",
-    summary="the refit to another head model: residuals, timesteps per second",
-    speed="headbench.datasets.benchmarks.refit:speed",
+    summary="the head model: numerical extremes",
+    stress="headbench.datasets.head.extremes:stress",
 )
 
 SYNTH = CommandSpec(
@@ -68,16 +61,6 @@ PREPARE_NERSEMBLE = CommandSpec(
     summary="Convert raw NeRSemble recordings to captures.",
     settings="headbench.datasets.nersemble.settings:PrepareSettings",
     function="headbench.datasets.nersemble.command:prepare_nersemble",
-)
-
-RECORD_NERSEMBLE = CommandSpec(
-    name="export nersemble",
-    group="export",
-    summary="Write a synthetic capture as a raw NeRSemble recording, to test `prepare`.",
-    settings="headbench.datasets.nersemble.settings:RecordSettings",
-    function="headbench.datasets.nersemble.command:record_nersemble",
-    writes="out",
-    kinds=("a recording",),
 )
 
 LINT = CommandSpec(

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -103,7 +103,7 @@ class Flip:
         filters = _sensitivity_filters(self.pixels_per_degree)
         blurred = [blur(np.ascontiguousarray(opponent[..., i])) for i, blur in enumerate(filters)]
         linear = np.clip(_from_opponent(np.stack(blurred, axis=-1)), 0, 1)
-        return _hunt(_lab(linear))
+        return _appearance(linear)
 
     def _feature_error(self, luminance: FloatArray, target_luminance: FloatArray) -> FloatArray:
         """Section 4.2: difference of edges and of points, in [0, 1]."""
@@ -122,9 +122,11 @@ def _linear(image: ByteArray) -> FloatArray:
     return table[image]
 
 
-def _opponent(linear: FloatArray) -> FloatArray:
-    """Linear sRGB to the opponent space YCxCz (section 4.1.1)."""
-    x, y, z = np.moveaxis(linear @ (_TO_XYZ / _WHITE[:, None]).T, -1, 0)
+def _opponent(
+    linear: FloatArray, curve: Callable[[FloatArray], FloatArray] = lambda light: light
+) -> FloatArray:
+    """Linear sRGB to the opponent space YCxCz (section 4.1.1), or with a curve for the light to CIELAB."""
+    x, y, z = np.moveaxis(curve(linear @ (_TO_XYZ / _WHITE[:, None]).T), -1, 0)
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
 
 
@@ -135,24 +137,17 @@ def _from_opponent(opponent: FloatArray) -> FloatArray:
     return (np.stack([x, y, z], axis=-1) * _WHITE) @ np.linalg.inv(_TO_XYZ).T
 
 
-def _lab(linear: FloatArray) -> FloatArray:
-    """Linear sRGB to CIELAB."""
-    ratio = linear @ (_TO_XYZ / _WHITE[:, None]).T
+def _appearance(linear: FloatArray) -> FloatArray:
+    """Linear sRGB to CIELAB with equation 9: the darker a colour, the less colourful it appears."""
     delta = 6 / 29
-    x, y, z = np.moveaxis(np.where(ratio > delta**3, np.cbrt(ratio), ratio / (3 * delta**2) + 4 / 29), -1, 0)
-    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
-
-
-def _hunt(lab: FloatArray) -> FloatArray:
-    """Equation 9: the darker a colour, the less colourful it appears."""
-    adjusted = lab.copy()
-    adjusted[..., 1:] *= 0.01 * lab[..., :1]
-    return adjusted
+    lab = _opponent(linear, lambda v: np.where(v > delta**3, np.cbrt(v), v / (3 * delta**2) + 4 / 29))
+    lab[..., 1:] *= 0.01 * lab[..., :1]
+    return lab
 
 
 def _color_error(seen: FloatArray, true: FloatArray) -> FloatArray:
     """Sections 4.1.4 and 4.1.5: HyAB distance, compressed and stretched to [0, 1]."""
-    largest = _hyab(*(_hunt(_lab(np.array(c, dtype=float))) for c in ([0, 1, 0], [0, 0, 1]))) ** _QC
+    largest = _hyab(*(_appearance(np.array(c, dtype=float)) for c in ([0, 1, 0], [0, 0, 1]))) ** _QC
     error = _hyab(seen, true) ** _QC
     knee = _PC * largest
     upper = _PT + (error - knee) / (largest - knee) * (1 - _PT)

@@ -70,13 +70,6 @@ class Lpips:
     ----------
     fingerprint : str
         Hex digest of all weights in use, the same for a full file and one with only the convolutional part.
-
-    Raises
-    ------
-    UnavailableError
-        Weights are missing; the message says how to get them.
-    InputError
-        The weights are not those of the network.
     """
 
     def __init__(
@@ -278,16 +271,7 @@ def present_backbone(spec: NetworkSpec, path: Path | None = None) -> Path | None
 
 
 def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
-    """Return the file with the weights of ``spec``, downloaded if necessary (see the module).
-
-    Raises
-    ------
-    InputError
-        ``path`` or the environment variable names a missing file.
-    UnavailableError
-        The file is missing in the named folder, or was not found and cannot be downloaded; the
-        message names the remedy.
-    """
+    """Return the file with the weights of ``spec``, downloaded if necessary (see the module)."""
     if found := present_backbone(spec, path):
         return found
     target = cache_folder() / spec.file

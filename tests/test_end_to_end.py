@@ -28,6 +28,7 @@ from headbench.metrics import speed
 
 from .datasets.flat_renderer import flat_pictures
 from .datasets.monocular.videos import Recording
+from .datasets.nersemble.recordings import write_recording
 from .datasets.tracker_files.trackers import write_metrical
 from .world import SETTINGS
 
@@ -183,8 +184,9 @@ OTHERS = "synth --out others --subjects 2 --cameras 2 --timesteps 4 --size 24x32
 PLAIN = "run --data {capture} --out plain --methods mean-image,nearest-camera --preset smoke --set metrics=psnr,ssim,fps --set frames_per_task=3"
 SUITE = "run suite --out suite --methods mean-image --preset smoke --subjects 1 --cameras 2 --timesteps 60 --size 16x16 --large 1"
 GATE = "compare plain --baseline baseline.json"
-RECORD = "export nersemble {capture} --out recording"
-PREPARE = "prepare nersemble --root recording/recording --tracking recording/tracking --head recording/head_model.npz"
+PREPARE = (
+    "prepare nersemble --root recording/recording --tracking recording/tracking --head recording/head.npz"
+)
 
 FINDS_FAULTS = ("run extremes",)
 """Commands that end with 1: avatars trained for two iterations do not look like the person."""
@@ -222,7 +224,6 @@ CASES = {
         case("protocols {demo}", "pixels: face.*"),
         case("protocols {demo} --methods ga --out p.md", "p.md", "p.md"),
     ],
-    "recommend": [case("recommend {demo} --megabytes 20", "Recommended for 20 MB: .*")],
     "report": [
         case("report {demo} --out report.html --max-mb 5", "frames with pictures", "report.html"),
         case("report plain --split", "frames with pictures", "report/index.html"),
@@ -386,12 +387,11 @@ CASES = {
     "track": [
         case("track {capture} --out tracked", "a timestep", "tracked/overlay.png", "tracked/track.json")
     ],
-    "export nersemble": [case(RECORD, "Prepare it", "recording/head_model.npz")],
     "prepare nersemble": [
         case(
-            f"{PREPARE} --subjects {{subject}} --sequences all --downscale 1 --out prepared",
+            f"{PREPARE} --subjects 901 --sequences all --downscale 1 --out prepared",
             "FREE",
-            "prepared",
+            "prepared/UNION2_901/transforms_train.json",
         )
     ],
     "doctor bench": [case("doctor bench splats --quick --tradeoffs --out bench.json", "knob", "bench.json")],
@@ -407,6 +407,7 @@ def elsewhere(run, tmp_path_factory):
     (union,) = (run.root / "capture").glob("UNION*")
     clip = read_capture(union)
     write_metrical(Recording(clip, next(iter(clip.cameras))), folder / "tracker")
+    write_recording(folder / "recording")
     return folder
 
 

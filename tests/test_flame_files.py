@@ -15,6 +15,7 @@ from headbench.datasets.head.teeth import with_teeth
 
 from .datasets.head.flame_files import write_flame
 from .datasets.head.flame_stand_in import stand_in, write_stand_in
+from .datasets.nersemble.recordings import write_recording
 from .datasets.tiny_capture import make_plan, rig, write_tiny_capture
 from .world import SETTINGS
 
@@ -59,6 +60,7 @@ def files(tmp_path_factory):
         )
     )
     (folder / "capture").symlink_to(union.resolve())
+    write_recording(folder / "recording", size=(24, 32), head=load_head(folder / "flame" / "flame2023.pkl"))
     return folder
 
 
@@ -76,8 +78,7 @@ COMMANDS = (
     "prepare refit refitted/UNION3_901 --target flame/flame2023.pkl --out again",
     "prepare refit refitted/UNION3_901 --target 2023 --out procedural",
     f"export colmap capture {GIVEN} --out colmap --names flat --tracking",
-    f"export nersemble capture {GIVEN} --out recording",
-    f"{PREPARE} --sequences EMO-1,FREE,SEN-01 --downscale 1 --out prepared",
+    f"{PREPARE} --sequences EMO-1,FREE --downscale 1 --out prepared",
     "export ply run/901/ga/seed-0/avatar --out ga.ply",
     "render run/901/ours/seed-0/avatar --capture colmap --reader colmap --frames train --out rendered",
     f"import ga run/901/ga/seed-0/avatar/point_cloud.ply --capture capture {GIVEN} --out imported",

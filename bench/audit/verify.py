@@ -197,7 +197,9 @@ def _compare(
     digits = {metric.name: metric.digits for metric in metrics}
     rows = rows[rows["metric"].isin(digits.keys())]
     if rows.duplicated(KEY).any():
-        found.differ(f"{file}, {_place([*rows[rows.duplicated(KEY)][KEY].iloc[0]])}", "one row", "several")
+        found.differ(
+            f"{file}, {_place(rows[rows.duplicated(KEY)][KEY].iloc[0].tolist())}", "one row", "several"
+        )
         return
     both = pd.concat([again.set_index(KEY)["value"], rows.set_index(KEY)["value"]], axis=1)
     for key, *values in both.dropna(how="all").itertuples(name=None):

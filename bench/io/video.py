@@ -1,89 +1,20 @@
-"""Videos: mp4 by OpenCV, H.264 by the program FFmpeg if that encoder is requested, WebM for browsers by
-PyAV."""
+"""Videos: H.264 by the program FFmpeg, WebM and mp4 for browsers by PyAV."""
 
 from __future__ import annotations
 
-import functools
 import importlib
-import os
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
-
 from ..contracts import ByteArray
 from ..errors import HeadbenchError, InputError, UnavailableError, install_extra
-from .files import ROOM_BYTES, atomic_path
+from .files import atomic_path
 from .provenance import note
-
-_H264, _MPEG4 = "avc1", "mp4v"
-
-
-@functools.cache
-def video_codec() -> str:
-    """Codec of written videos: H.264 ("avc1") if OpenCV supports it, else MPEG-4 part 2 ("mp4v").
-
-    OpenCV's wheels have no H.264 encoder and print long messages about it, so the check runs in another
-    process.
-    """
-    asked = (
-        "import cv2, sys, tempfile\n"
-        "with tempfile.NamedTemporaryFile(suffix='.mp4') as file:\n"
-        f"    code = cv2.VideoWriter_fourcc(*{_H264!r})\n"
-        "    writer = cv2.VideoWriter(file.name, cv2.CAP_FFMPEG, code, 73.0, (64, 64))\n"
-        "    sys.exit(not writer.isOpened())\n"
-    )
-    answer = subprocess.run([sys.executable, "-c", asked], capture_output=True, check=False)
-    return _MPEG4 if answer.returncode else _H264
-
-
-def write_video(path: Path, frames: Iterable[ByteArray], fps: float) -> str:
-    """Write RGB (or one-channel) frames as an mp4; return the codec.
-
-    Raises `InputError` for no frames, odd sizes, or where OpenCV cannot write a video.
-    """
-    codec = video_codec()
-    writer: cv2.VideoWriter | None = None
-    count = 0
-    with atomic_path(path) as temporary:
-        for frame in frames:
-            height, width = frame.shape[:2]
-            if writer is None:
-                if width % 2 or height % 2:
-                    expected = "even width and height, as the codec requires"
-                    raise InputError(path, "size", expected, f"{width}x{height}")
-                code = cv2.VideoWriter.fourcc(*codec)
-                writer = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, code, fps, (width, height))
-                if not writer.isOpened():
-                    raise InputError(path, "", "a video that OpenCV can write", f"no encoder for {codec}")
-            order = cv2.COLOR_GRAY2BGR if frame.ndim == 2 else cv2.COLOR_RGB2BGR
-            writer.write(cv2.cvtColor(frame, order))
-            count += 1
-        if writer is None:
-            raise InputError(path, "", "at least one frame", "none")
-        writer.release()
-        _check_whole(path, temporary, count)
-    return codec
-
-
-def _check_whole(path: Path, written: Path, count: int) -> None:
-    """Raise an error if a video has fewer frames than were written, since OpenCV does not report a full disk."""
-    capture = cv2.VideoCapture(str(written), cv2.CAP_FFMPEG)
-    found = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
-    complete = capture.isOpened() and found == count
-    capture.release()
-    if not complete:
-        with written.open("ab") as stream:  # raises the system's error, if it persists
-            stream.write(bytes(ROOM_BYTES))
-            stream.flush()
-            os.fsync(stream.fileno())
-        raise InputError(path, "", f"a video of {count} frames after writing it", f"{found} frames")
 
 
 def browser_encoder(path: Path = Path("video.webm")) -> Any:

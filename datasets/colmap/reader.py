@@ -62,11 +62,6 @@ def model_cameras(
         How to treat distortion, which `Camera` lacks. "refuse" raises if a camera of the model is
         distorted; "left to the images" gives the cameras of the undistorted images, which
         `undistort_clip` makes with `model_lenses`.
-
-    Raises
-    ------
-    InputError
-        A lens is distorted or unknown, or two images have the same name.
     """
     lenses = {number: _lens(model, number) for number in model.cameras}
     found: dict[str, Camera] = {}
@@ -148,12 +143,6 @@ def read_dataset(
         Splits as for the reader ``ga``. Without them every frame is for training.
     exclude, cache_mb, use_cache : Mapping[int, str] | str | Path | None, float, bool
         As for the reader ``ga``.
-
-    Raises
-    ------
-    InputError
-        There is no tracking, an image name gives no timestep and camera, a camera moves, or a file is
-        invalid.
     """
     root = Path(os.path.abspath(path))
     model = read_model(root)

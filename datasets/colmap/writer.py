@@ -81,12 +81,6 @@ def export_model(
         Naming of images, see `image_name`. "flat" is for readers that expect all images in one folder
         (3D Gaussian splatting and its derivatives); masks are then also written under the image's own
         name.
-
-    Raises
-    ------
-    InputError
-        There is no frame, a camera has skew, which COLMAP's pinhole cannot express, or a flat name is
-        ambiguous.
     """
     if not keys:
         raise InputError("frames to export", "", "at least one", "none")

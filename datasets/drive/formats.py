@@ -56,13 +56,7 @@ FORMATS = (
 
 
 def read_signal(request: SignalRequest, name: str = "") -> DrivingSignal:
-    """Read a signal in the named format, or in the one that recognises it.
-
-    Raises
-    ------
-    InputError
-        There is no such file, no format recognises it, or the reader finds a fault.
-    """
+    """Read a signal in the named format, or in the one that recognises it."""
     formats = {form.name: form for form in FORMATS}
     if name and name not in formats:
         raise unknown("command line", "--form", name, [*formats])

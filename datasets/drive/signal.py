@@ -11,7 +11,6 @@ import numpy as np
 
 from ...bench.contracts import FloatArray, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
-from ..ga.tracking import check_motion
 from ..head.arrays import HeadArrays
 from ..head.refit.command import target_head
 from ..options import CaptureOptions
@@ -121,11 +120,7 @@ def make_poses(path: Path, head: HeadArrays, parts: Mapping[str, FloatArray]) ->
         columns[name] = np.pad(values, ((0, 0), (0, wanted - given)))
     if lids:
         columns.setdefault("eyelids", np.zeros((length, lids)))
-    poses = [
+    return [
         HeadPose(head.version, **{name: values[row] for name, values in columns.items()})
         for row in range(length)
     ]
-    numbered = dict(enumerate(poses))
-    none = np.zeros(head.shape_basis.shape[2]), np.zeros(head.template.shape)
-    check_motion(dict.fromkeys(numbered, path), head, *none, numbered)
-    return poses

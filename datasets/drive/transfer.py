@@ -50,11 +50,6 @@ def transfer(
     ----------
     neutral : int | None
         Frame of the signal with the neutral face; None takes the neutral face of the signal's head model.
-
-    Raises
-    ------
-    InputError
-        The signal lacks the frame, or the head models are incompatible, see `refit`.
     """
     poses = list(signal.poses)
     if neutral is not None and neutral >= len(poses):

@@ -18,10 +18,6 @@ from ...bench.io.files import cache_folder, digest, digest_file, write_json
 _log = logging.getLogger(__name__)
 _THREADS = 4  # hashing releases the interpreter lock; more threads help only on slow disks
 
-MAX_CACHE_BYTES = 128 * 2**20
-"""Size of the cache for all captures, about half a million files; the least recently read captures are
-dropped first."""
-
 YOUNG_NS = 2 * 10**9
 """Digests of files changed more recently are not stored: they may change again within the clock resolution."""
 
@@ -95,8 +91,6 @@ def _name(stamp: Stamp) -> str:
 def _read_cache(path: Path) -> dict[str, str]:
     """Entries of the cache; none if it is missing or not written by `_write_cache`."""
     try:
-        if path.stat().st_size > MAX_CACHE_BYTES:
-            return {}
         content = json.loads(path.read_bytes())
         entries: dict[str, str] = content["entries"]
         return entries if content["digest"] == digest(entries) else {}
@@ -105,14 +99,7 @@ def _read_cache(path: Path) -> dict[str, str]:
 
 
 def _write_cache(path: Path, entries: dict[str, str]) -> None:
-    """Write the entries of one capture, and delete others until all fit into `MAX_CACHE_BYTES`."""
     try:
         write_json(path, {"digest": digest(entries), "entries": entries})
-        kept = [(other.stat().st_mtime_ns, other.stat().st_size, other) for other in path.parent.iterdir()]
-        total = 0
-        for _, size, other in sorted(kept, reverse=True):
-            total += size
-            if total > MAX_CACHE_BYTES:
-                other.unlink(missing_ok=True)
     except OSError as error:
         _log.info("digests are not stored, %s cannot be written: %s", path, error)

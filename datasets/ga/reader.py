@@ -106,11 +106,6 @@ def read_capture(
     use_cache : bool
         Whether to reuse cached digests of files that have not changed since. ``headbench verify``
         sets it to False.
-
-    Raises
-    ------
-    InputError
-        The first fault found.
     """
     folder = find_capture(path)
     declaration = layout.Declaration.read(folder)

@@ -35,11 +35,6 @@ def find_head(
     files : str | Path | None
         Arguments masks, regions and eyelids of `load_head`, which finds them by itself beside a FLAME
         pickle.
-
-    Raises
-    ------
-    InputError
-        The file does not exist, or its version is not the one that the capture was tracked with.
     """
     if isinstance(head, HeadArrays):
         asset = head
@@ -66,8 +61,6 @@ def _load(path: Path, files: Mapping[str, Any]) -> HeadArrays:
 log = logging.getLogger(__name__)
 
 TeethPolicy = Literal["auto", "add", "keep"]
-
-MAX_MOTION = 100.0  # metres; a wide open mouth takes 0.05
 
 POSE_SIZES = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
 """Arrays of a parameter file and their numbers per timestep, in the order of VHAP's export."""
@@ -103,12 +96,6 @@ def read_tracking(
         FLAME, so that all methods have the same; a head without lip rings stays without teeth, unless
         it is FLAME's or the static offset has rows for them. "add" always appends them; "keep" does
         not change the head.
-
-    Raises
-    ------
-    InputError
-        A file or array is missing or damaged, a shape is wrong, numbers are not finite or beyond
-        `MAX_MAGNITUDE`, or the size of the mesh is not that of a head.
     """
     poses: dict[int, HeadPose] = {}
     shape = static = None
@@ -132,7 +119,7 @@ def read_tracking(
     static_offset = np.zeros((len(head.template), 3), dtype=np.float32)
     if static is not None:
         static_offset[:rows] = static[:rows]
-    check_motion(files, head, shape, static_offset, poses)
+    check_neutral(files[min(files)], head, shape, static_offset)
     notes = {
         "static_offset": "zeros, as the files have none" if static is None else f"{len(static)} rows",
         "teeth": len(head.regions.get("teeth", ())),
@@ -172,7 +159,7 @@ def read_animation(
     static_offset = np.zeros((len(head.template), 3), dtype=np.float32)
     if static is not None:
         static_offset[:rows] = static[:rows]
-    check_motion(dict.fromkeys(poses, path), head, identity, static_offset, poses)
+    check_neutral(path, head, identity, static_offset)
     dynamic = _array(path, arrays, "dynamic_offset") if "dynamic_offset" in arrays else None
     closed = _largest(_array(path, arrays, "eyelids")) if "eyelids" in arrays else 0.0
     notes = {"dynamic_offset_ignored_m": _largest(dynamic), **_eyelids(path, head, closed)}
@@ -216,22 +203,10 @@ def resolve_teeth(
     raise InputError(file, "static_offset", expected, found, remedy)
 
 
-def check_motion(
-    files: Mapping[int, Path],
-    head: HeadArrays,
-    shape: FloatArray,
-    static_offset: FloatArray,
-    poses: Mapping[int, HeadPose],
-) -> None:
-    """Raise `InputError` if identity or an expression gives a mesh with a size impossible for a head."""
+def check_neutral(file: Path, head: HeadArrays, shape: FloatArray, static_offset: FloatArray) -> None:
+    """Raise `InputError` if the identity gives a mesh with a size impossible for a head."""
     neutral = head.template + head.shape_basis @ shape + static_offset
-    check_size(files[min(files)], "shape, static_offset", neutral, head.faces)
-    reach = np.abs(head.expression_basis).max(axis=(0, 1))  # (E,) metres per unit
-    for timestep, pose in poses.items():
-        moved = float(reach @ np.abs(pose.expression))
-        if not moved <= MAX_MOTION:
-            expected = f"coefficients that move no vertex further than {MAX_MOTION:g} m together"
-            raise InputError(files[timestep], "expr", expected, f"up to {moved:g} m")
+    check_size(file, "shape, static_offset", neutral, head.faces)
 
 
 def _pose(

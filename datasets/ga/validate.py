@@ -212,11 +212,6 @@ def require_full_grid(clip: CaptureClip, source: str | Path = "") -> None:
     ----------
     source : str | Path
         The capture that the clip was read from, for the message.
-
-    Raises
-    ------
-    InputError
-        Frames are missing. The message names the first one and their number.
     """
     timesteps = sorted({(key.sequence, key.timestep) for key in clip.files})
     wanted = (

@@ -26,9 +26,6 @@ RING_REGIONS = ("lip_outside_ring_upper", "lip_outside_ring_lower")
 FORMAT = "headbench-head-1"
 WEIGHT_TOLERANCE = 1e-4
 
-MAX_CORRECTION = 100.0
-"""Maximum displacement of a vertex by all pose correctives in any pose, metres; ICT-FaceKit's reach 0.08."""
-
 MAX_EXTENT, MAX_AREA = 10.0, 100.0
 """Maximum extent and area of an unposed head, metres and square metres; a head with shoulders has 1 and 2. Distant
 vertices or large triangles would take the time and memory of thousands of heads when a mesh is drawn."""
@@ -109,13 +106,6 @@ class HeadArrays:
         ----------
         file : str | PathLike[str]
             Source of the arrays, named in the error.
-
-        Raises
-        ------
-        InputError
-            Wrong types or shapes, numbers that are not finite or beyond `MAX_MAGNITUDE`, face or
-            region indices out of range, an invalid joint tree, skinning weights that do not sum
-            to 1, or a mesh whose size is not that of a head.
         """
         arrays = {name: np.asarray(getattr(self, name)) for name in STORED} | self._optional()
         sizes = {"J": len(JOINT_NAMES), "9 (J - 1)": 9 * (len(JOINT_NAMES) - 1)}
@@ -137,7 +127,6 @@ class HeadArrays:
             expected = "a tree: -1 for joint 0, then a parent that comes before its joint"
             raise InputError(file, "parents", expected, str(parents))
         check_size(file, "template", self.template, self.faces)
-        self._validate_motion(file)
         return self
 
     def __call__(
@@ -151,11 +140,6 @@ class HeadArrays:
             (S,) identity coefficients; None for the mean head.
         static_offset : FloatArray | None
             (V, 3) metres, added to the shaped template.
-
-        Raises
-        ------
-        InputError
-            The pose belongs to another head model.
         """
         from .subject import PosedSubject  # with torch
 
@@ -180,17 +164,6 @@ class HeadArrays:
         """Existing `OPTIONAL` arrays by name."""
         given = ((name, getattr(self, name)) for name in OPTIONAL)
         return {name: values for name, values in given if values is not None}
-
-    def _validate_motion(self, file: str | PathLike[str]) -> None:
-        joints = float(np.abs(self.joint_regressor.astype(np.float64) @ self.template).max())
-        if joints > MAX_EXTENT:
-            expected = f"joints within {MAX_EXTENT:g} m of the origin"
-            raise InputError(file, "joint_regressor", expected, f"{joints:g} m")
-        # Entries of a rotation minus the identity are at most 2.
-        corrected = 2 * float(np.abs(self.pose_basis).max(axis=(0, 1)).sum(dtype=np.float64))
-        if corrected > MAX_CORRECTION:
-            expected = f"correctives that move no vertex further than {MAX_CORRECTION:g} m together"
-            raise InputError(file, "pose_basis", expected, f"up to {corrected:g} m")
 
     def _validate_indices(self, file: str | PathLike[str]) -> None:
         vertices = self.template.shape[0]
@@ -258,13 +231,7 @@ def save_head(path: Path, arrays: HeadArrays) -> None:
 
 
 def read_head(path: Path) -> HeadArrays:
-    """Read what `save_head` wrote, validated.
-
-    Raises
-    ------
-    InputError
-        The file is not such an npz, lacks a member, or its arrays do not form a head.
-    """
+    """Read what `save_head` wrote, validated."""
     content = read_arrays(path, {"format": TEXT})
     if str(content["format"]) != FORMAT:
         raise InputError(path, "format", repr(FORMAT), repr(str(content["format"]))[:80])
@@ -326,13 +293,7 @@ def region(head: HeadAsset, name: str) -> IntArray:
 
 
 def faces_in_region(asset: HeadAsset, name: str) -> IntArray:
-    """Indices of the triangles whose three vertices are all in the region, ascending.
-
-    Raises
-    ------
-    InputError
-        The head has no such region.
-    """
+    """Indices of the triangles whose three vertices are all in the region, ascending."""
     if name not in asset.regions:
         known = ", ".join(sorted(asset.regions)) or "no regions"
         raise InputError(f"head model {asset.version!r}", "regions", f"a region {name!r}", known)

@@ -79,11 +79,6 @@ def ict_head(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> He
         Head with one identity direction per mode (metres per standard deviation), one expression
         direction for each shape except `DROPPED_SHAPES` (coefficients in [0, 1]), and 68 named
         landmarks.
-
-    Raises
-    ------
-    InputError
-        A member is missing or inconsistent, or the mesh lacks the kit's parts.
     """
     _check(file, content)
     with reading(file, "the mesh of ICT-FaceKit, whose parts can be told apart"):
@@ -386,11 +381,6 @@ def fit_hinge(points: FloatArray, moved: FloatArray) -> Hinge:
 
     Planar case of the orthogonal Procrustes problem (Schoenemann 1966); the centre is the fixed point of the
     fitted rigid motion of the y-z plane.
-
-    Raises
-    ------
-    ValueError
-        The points hardly rotate, so the motion has no centre.
     """
     plane, target = points[:, 1:], moved[:, 1:]
     middle, target_middle = plane.mean(0), target.mean(0)

@@ -1,4 +1,4 @@
-"""Load a head model from a FLAME pickle, headbench's npz, ICT-FaceKit's npz, or GNM Head's npz."""
+"""Load a head model from a FLAME pickle, headbench's npz, or ICT-FaceKit's npz."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from ...bench.io.files import open_regular
 from ...bench.io.unpickle import read_pickle
 from .arrays import RING_REGIONS, HeadArrays, read_head, with_derived_regions
 from .chart import CHART_FILES, read_chart
-from .gnm import gnm_head, is_gnm
 from .ict import ict_head, is_ict
 
 FLAME_IDENTITY_SIZE = 300
@@ -55,7 +54,7 @@ def load_head(
     ----------
     path : str | PathLike[str]
         FLAME pickle (2020: ``generic_model.pkl``, 2023: ``flame2023.pkl``), npz written by
-        `save_head`, ICT-FaceKit npz, or ``gnm_head.npz`` of GNM Head.
+        `save_head`, or ICT-FaceKit npz.
     masks : str | PathLike[str] | None
         ``FLAME_masks.pkl``, for a FLAME pickle; the derived regions are added.
     regions : str | PathLike[str] | None
@@ -79,9 +78,7 @@ def load_head(
         start = stream.read(len(_ZIP))
     if start == _ZIP:
         content = read_npz(path)
-        kinds = ((is_ict, ict_head), (is_gnm, gnm_head))
-        found = next((read for known, read in kinds if known(content)), None)
-        head = found(path, content) if found else read_head(path)
+        head = ict_head(path, content) if is_ict(content) else read_head(path)
         if version is not None and version != head.version:
             raise InputError(path, "version", repr(version), repr(head.version))
     elif start[:1] not in _PICKLES or path.suffix.lower() in MESHES:

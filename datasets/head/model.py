@@ -123,11 +123,6 @@ class HeadModel(torch.nn.Module):
             (B, V, 3) output of `canonical` for this identity; replaces ``shape`` and
             ``static_offset``. Saves time if the identity is fixed, because the identity basis is
             the largest array.
-
-        Raises
-        ------
-        ValueError
-            Sizes do not fit the model, or identity is given twice or not at all.
         """
         neutral = self._neutral(shape, static_offset, canonical)
         expression = _rows(expression, self.expression_size, "expression")
@@ -204,13 +199,7 @@ class HeadModel(torch.nn.Module):
         return {name: part.clone() for name, part in zip(columns, parts)}
 
     def pose_columns(self, poses: Sequence[HeadPose]) -> dict[str, FloatArray]:
-        """Result of `pose_arguments` as float64 arrays on the host: (T, n) each.
-
-        Raises
-        ------
-        InputError
-            There is no pose, a pose belongs to another head model, or its sizes do not fit.
-        """
+        """Result of `pose_arguments` as float64 arrays on the host: (T, n) each."""
         if not poses:
             raise InputError("poses", "", "at least one pose", "none")
         sizes = {"expression": self.expression_size, "rotation": 3, "neck": 3, "jaw": 3, "eyes": 6}

@@ -39,11 +39,6 @@ def with_teeth(arrays: HeadArrays) -> HeadArrays:
     Upper teeth follow the neck joint, lower ones the jaw. They follow the identity like the lips in front of them
     (mean of the matching upper and lower lip vertex), and have no expression, pose correctives, influence on joints or place in the chart.
     Adds the regions ``teeth``, ``teeth_upper`` and ``teeth_lower``.
-
-    Raises
-    ------
-    InputError
-        The head has teeth already, or lip rings are neither given nor found.
     """
     if "teeth" in arrays.regions:
         found = f"{len(arrays.regions['teeth'])} vertices"
@@ -171,11 +166,6 @@ def lip_rings(asset: HeadAsset) -> tuple[IntArray, IntArray]:
     asset : HeadAsset
         Head whose ring regions are returned unchanged if it has both; otherwise the rings are found
         from ``lips``, with `RING_LENGTH` vertices, fewer if the lips have fewer.
-
-    Raises
-    ------
-    InputError
-        The given rings differ in length, or none can be found.
     """
     where = f"head model {asset.version!r}"
     if all(name in asset.regions for name in RING_REGIONS):

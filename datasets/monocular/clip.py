@@ -14,7 +14,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import check_name, digest
 from ..clip import CaptureClip, FrameFiles, FramePixels
 from ..ga.content_digests import digests_below
-from ..ga.tracking import TeethPolicy, check_motion, resolve_teeth
+from ..ga.tracking import TeethPolicy, check_neutral, resolve_teeth
 from ..ga.validate import check_disjoint, split_by_holding_out
 from ..head.arrays import HeadArrays
 from ..images import ImageStore, read_mask
@@ -73,11 +73,6 @@ def clip_of_track(
         As for `reader.read_video`.
     files : Collection[Path]
         Files besides those of the track that the clip depends on.
-
-    Raises
-    ------
-    InputError
-        The first fault found.
     """
     for frame in track.frames:
         check_name(frame.sequence, root, "video")
@@ -85,8 +80,7 @@ def clip_of_track(
     first = track.frames[0]
     toothed, _ = resolve_teeth(head, len(head.template), teeth, first.where[0])
     static_offset = np.zeros((len(toothed.template), 3), np.float32)
-    sources = {index: frame.where[0] for index, frame in enumerate(track.frames)}
-    check_motion(sources, toothed, track.shape, static_offset, poses)
+    check_neutral(first.where[0], toothed, track.shape, static_offset)
 
     keys = [FrameKey(subject, f.sequence, index, camera.id) for index, f in enumerate(track.frames)]
     splits, held_out = _split(root, keys, track, held_out_frames, held_out_sequences)

@@ -75,11 +75,6 @@ def read_video(
         Names of the videos for self-reenactment, instead of the last frames.
     exclude, cache_mb, use_cache : Mapping[int, str] | str | Path | None, float, bool
         As for the reader ``ga``.
-
-    Raises
-    ------
-    InputError
-        The first fault found.
     """
     root = Path(os.path.abspath(path))
     declaration = Declaration.read(root)

@@ -1,4 +1,4 @@
-"""``headbench prepare nersemble`` and ``headbench export nersemble``."""
+"""``headbench prepare nersemble``."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind
 from ...bench.specs import CommandResult
-from ..ga.layout import HEAD_FILE
-from ..head.arrays import save_head
 from .names import SUBJECT_NAMES, chosen_subjects
-from .settings import PrepareSettings, RecordSettings
+from .settings import PrepareSettings
 
 if TYPE_CHECKING:
     from .plan import PreparationPlan
@@ -24,9 +22,9 @@ def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progres
 
     Everything about every subject is checked before the first frame is decoded.
     """
-    from .export import check_unions
     from .plan import plan_subject
     from .prepare import prepare
+    from .unions import check_unions
 
     subjects = chosen_subjects(settings.subjects)
     if bool(settings.root) == bool(settings.union_root):
@@ -101,37 +99,3 @@ def _done(
         del data[result.subject]["subject"]
     passed = not settings.tracking or all(result.union is not None for result in results)
     return CommandResult("\n".join(lines), data, passed)
-
-
-def record_nersemble(settings: RecordSettings, progress: Progress = no_progress) -> CommandResult:
-    """Write a synthetic capture as a raw NeRSemble recording with VHAP's tracking, to test `prepare`.
-
-    Only for synthetic captures, which contain their head model.
-    """
-    from ...bench.io.video import video_codec
-    from ..clip import check_apart
-    from .re_record import re_record
-
-    clip = settings.open(settings.capture, progress)
-    out = Path(settings.out)
-    check_apart(clip, out)
-    masks = settings.frames == "images"
-    sequences = re_record(
-        clip,
-        out / "recording",
-        tracking=out / "tracking",
-        release=settings.release,
-        masks=masks,
-        source=settings.capture,
-        progress=progress,
-    )
-    save_head(out / HEAD_FILE, clip.head)
-    codec = "" if masks or settings.release == "paper2023" else video_codec()
-    text = (
-        f"Subject {clip.subject}, {len(sequences)} sequences, {len(clip.cameras)} cameras"
-        f"{f', videos in {codec}' if codec else ''}.\n"
-        f"Prepare it: headbench prepare nersemble --root {out / 'recording'} --tracking {out / 'tracking'} "
-        f"--head {out / HEAD_FILE} --subjects {clip.subject} --sequences {','.join(sequences)} --downscale 1"
-    )
-    data = {"subject": clip.subject, "sequences": sequences, "cameras": [*clip.cameras], "codec": codec}
-    return CommandResult(text, data)

@@ -17,9 +17,6 @@ from ...bench.errors import InputError
 FULL_SIZE = (2200, 3208)
 """Default width and height of a calibration."""
 
-FPS = 73.0
-"""Frames per second of the released videos; the value in the container is not reliable."""
-
 BACKGROUND = "BACKGROUND"
 TONGUE_SEQUENCES = ("EXP-6-tongue-1", "EXP-7-tongue-2")
 SEQUENCES = (

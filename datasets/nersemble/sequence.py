@@ -127,12 +127,6 @@ def read_sequence(
     cut : bool
         Whether to keep only the frames that all cameras have if they differ, instead of raising an
         error.
-
-    Raises
-    ------
-    InputError
-        A camera without frames, frames without a camera, truncated videos, damaged headers, different
-        frame counts, or masks that are incomplete or of another size.
     """
     name = participant.match(wanted)
     folder = participant.sequences[name]

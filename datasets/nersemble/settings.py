@@ -1,14 +1,11 @@
-"""Settings of the conversions of NeRSemble recordings."""
+"""Settings of the conversion of NeRSemble recordings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
 
-import tyro
-
 from ...bench.options import DependentOptions
-from ..options import CaptureOptions
 
 
 @dataclass(frozen=True)
@@ -79,18 +76,3 @@ class PrepareSettings:
         ),
         DependentOptions(("rejoin",), "union_root"),
     )
-
-
-@dataclass(frozen=True)
-class RecordSettings(CaptureOptions):
-    """Settings of the raw recording."""
-
-    capture: tyro.conf.Positional[str]
-    """Synthetic capture: a UNION folder, as `headbench synth` writes them."""
-    out: str
-    """Folder to write: recording/ is for --root of `headbench prepare nersemble`, tracking/ for --tracking,
-    head_model.npz for --head."""
-    release: Literal["v2", "v1", "paper2023"] = "v2"
-    """Layout: of the second release, the first, or the 2023 paper."""
-    frames: Literal["images", "video"] = "images"
-    """"images" with masks, as written by VHAP's preprocessing, or "video" without."""

@@ -107,11 +107,6 @@ def cluster_expressions(
     variant : Literal['paper', 'official']
         "official" reproduces the published code: all pairs regardless of their number, k-means from
         ten random starts. Both use training timesteps only.
-
-    Raises
-    ------
-    InputError
-        The head has no region "face".
     """
     timesteps = np.array(sorted({key.timestep for key in clip.splits["train"]}))
     faces = expression_displacements(clip, timesteps.tolist())

@@ -50,11 +50,6 @@ def exclude_timesteps(
         Label by timestep, such as {57: "tongue out"}.
     source : str | PathLike[str]
         Source of the reasons, named in the error.
-
-    Raises
-    ------
-    InputError
-        A timestep is not in the clip, or no training frame would remain.
     """
     unknown = sorted(set(reasons) - set(clip.poses))
     if unknown:
@@ -77,12 +72,6 @@ def exclude_given(clip: Clip, exclude: Mapping[int, str] | str | Path | None) ->
     exclude : Mapping[int, str] | str | Path | None
         Reason by timestep, or a file for `read_reasons`, such as the one that ``headbench prepare tongue``
         writes.
-
-    Raises
-    ------
-    InputError
-        As for `exclude_timesteps` and `read_reasons`; or the clip's head model does not have FLAME's
-        layout.
     """
     from ..clip import as_capture  # slow to import
 
@@ -104,13 +93,7 @@ def read_labels(path: Path) -> dict[int, str]:
 
 
 def read_reasons(path: Path, clip: CaptureClip) -> dict[int, str]:
-    """Reasons by timestep for a clip: from the YAML of the module, or from JSON labels by the suffix.
-
-    Raises
-    ------
-    InputError
-        The file does not mention the clip's subject, or numbers timesteps differently.
-    """
+    """Reasons by timestep for a clip: from the YAML of the module, or from JSON labels by the suffix."""
     if path.suffix.lower() == ".json":
         return read_labels(path)
     subjects = read_exclusions(path)

@@ -36,12 +36,6 @@ def clip_for_method(source: Clip, needs: MethodNeeds, heads: Mapping[str, str]) 
     ----------
     heads : Mapping[str, str]
         Head model files by version, to refit to. The procedural head's versions need none.
-
-    Raises
-    ------
-    InputError
-        The method accepts none of the available head models, a file holds another version than
-        stated, or images are too small for the resolution rule.
     """
     clip = as_capture(source)
     target = None

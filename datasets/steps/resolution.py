@@ -186,11 +186,6 @@ def resize_image(image: FloatArray, width: int, height: int) -> FloatArray:
     Keys' cubic (a = -1/2, "Cubic convolution interpolation for digital image processing", 1981), widened by the factor
     when a side shrinks, to avoid aliasing; it reproduces linear ramps and overshoots at edges by up to some per cent,
     so clamp if necessary. Weights outside the image are dropped and the rest renormalised.
-
-    Raises
-    ------
-    InputError
-        A size has no pixels or exceeds `MAX_SIDE`, or an image is not float32.
     """
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise InputError("resize", "size", f"sides of 1 to {MAX_SIDE} pixels", f"{width}x{height}")

@@ -42,11 +42,6 @@ class Lens:
         In COLMAP's order; lengths in pixels.
     width, height : int
         Image size, pixels.
-
-    Raises
-    ------
-    InputError
-        The model is unknown, or the parameters do not belong to it.
     """
 
     model: str
@@ -143,11 +138,6 @@ def undistort_clip(clip: CaptureClip, lenses: Mapping[str, Lens]) -> CaptureClip
     ----------
     lenses : Mapping[str, Lens]
         Lens by camera id; cameras without one have no distortion.
-
-    Raises
-    ------
-    InputError
-        A lens belongs to a camera that the clip does not have, or to another image size.
     """
     stray = sorted(set(lenses) - set(clip.cameras))
     if stray:

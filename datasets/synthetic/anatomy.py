@@ -83,13 +83,7 @@ class Anatomy:
 
 
 def measure(head: HeadAsset, vertices: FloatArray) -> Anatomy:
-    """Find the anatomy of ``head`` in the neutral shape ``vertices`` (V, 3).
-
-    Raises
-    ------
-    InputError
-        The head has neither its own landmarks nor iBUG's, or lacks eyeball regions.
-    """
+    """Find the anatomy of ``head`` in the neutral shape ``vertices`` (V, 3)."""
     landmarks: Mapping[str, int] = getattr(head, "landmarks", {})
     points = {name: vertices[landmark_index(landmarks, name)] for name in _IBUG}
     for region in ("left_eyeball", "right_eyeball"):

@@ -132,16 +132,6 @@ def synthesize(
     execution : Execution | None
         Executor that renders the subjects, one task each; None renders one after another in this
         process and its ``workers``.
-
-    Raises
-    ------
-    InputError
-        Settings are out of range, the folder holds a capture of other settings, or ``pictures`` have
-        other settings or are incomplete. Raised before rendering.
-    UnavailableError
-        The compiled kernel is missing.
-    HeadbenchError
-        A task of ``execution`` failed.
     """
     samples = default_samples(*size) if samples_per_pixel is None else sample_count(samples_per_pixel)
     pixels = (size[0], size[1])

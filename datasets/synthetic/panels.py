@@ -165,11 +165,6 @@ class PanelTracer:
         Rays per pixel, rounded up to a square number.
     seed : int
         Seed of the points on the panels that each vertex samples.
-
-    Raises
-    ------
-    UnavailableError
-        The compiled kernel is missing.
     """
 
     def __init__(

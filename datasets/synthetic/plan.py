@@ -264,13 +264,7 @@ class Geometry:
 
 
 def load_geometry(name: str) -> Geometry:
-    """``procedural`` (or ``procedural2020``, ``procedural2023``), or the path of an ICT-FaceKit npz.
-
-    Raises
-    ------
-    InputError
-        The file is not an ICT-FaceKit npz. Coefficients of other models have no semantic translation.
-    """
+    """``procedural`` (or ``procedural2020``, ``procedural2023``), or the path of an ICT-FaceKit npz."""
     if name in PROCEDURAL:
         return _procedural(name.removeprefix("procedural") or "2023")
     path = Path(name)

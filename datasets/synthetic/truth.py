@@ -44,12 +44,6 @@ class SyntheticTruth:
     ----------
     fingerprint : str
         Hex digest of everything that a picture depends on beside pose and camera.
-
-    Raises
-    ------
-    UnavailableError
-        The clip is not a synthetic capture of the procedural head and of the present edition, is tracked with another head
-        model than it was made with, or the compiled kernel is missing.
     """
 
     def __init__(self, clip: Clip) -> None:

@@ -87,11 +87,6 @@ def find_pictures(
         Folders; "" takes those of the layout, in ``root`` and, for images, beside it.
     first : int | None
         Number of the image of frame 0; None takes that of the layout.
-
-    Raises
-    ------
-    InputError
-        Folder, image or mask is missing or damaged, or a mask has another size than its image.
     """
     folder = _image_folder(root, layout, images)
     found = _numbered(folder)

@@ -38,11 +38,6 @@ def video_track(
         Coefficients beyond its bases must be zero; missing ones are zero.
     resized : bool
         Whether images may have another size than the ones tracked, with the same ratio of width to height.
-
-    Raises
-    ------
-    InputError
-        An image has another size than tracked, or the head model lacks a direction that is used.
     """
     identities, expressions = head.shape_basis.shape[2], head.expression_basis.shape[2]
     found = []

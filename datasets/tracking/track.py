@@ -106,11 +106,6 @@ def track(
         Recorded with the step.
     store : Path | None
         Folder that keeps the fit of every part, which a later call with the same images and landmarks does not repeat.
-
-    Raises
-    ------
-    InputError
-        A camera is unknown, there are no cameras, timesteps or landmarks, or a frame of a camera is missing.
     """
     where = f"clip of {clip.subject}"
     check_cameras(clip, cameras)

@@ -90,11 +90,6 @@ def learn_background(path: Path, images: Sequence[ByteArray]) -> Background:
         The video, for messages.
     images : Sequence[ByteArray]
         Images (H, W, 3) of one view.
-
-    Raises
-    ------
-    InputError
-        There are too few images, or the room moves.
     """
     if len(images) < LEAST_EMPTY:
         expected = f"at least {LEAST_EMPTY} frames that show nobody's face, {_USE}"

@@ -15,8 +15,6 @@ from ...bench.errors import InputError
 
 LEAST_SHARE = 0.9
 """Minimum fraction of the stated number of frames that must be decoded."""
-MOST_SIDE = 8192
-"""Longest side of a frame, pixels."""
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 
@@ -70,11 +68,6 @@ def video_frames(path: Path, rate: float | None = None) -> Iterator[TimedFrame]:
     ----------
     rate : float | None
         Maximum number of frames a second; None for all frames.
-
-    Raises
-    ------
-    InputError
-        The file is no video, frames have different sizes, or many frames cannot be decoded.
     """
     following = 0
     size = None
@@ -111,9 +104,6 @@ def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
         raise InputError(path, "", "a video", "no such file")
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
-        sides = [int(capture.get(name)) for name in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
-        if max(sides) > MOST_SIDE:
-            raise InputError(path, "size", f"at most {MOST_SIDE} pixels a side", "x".join(map(str, sides)))
         yield capture
     finally:
         capture.release()

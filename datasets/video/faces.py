@@ -206,11 +206,6 @@ def find_faces(
         File of the landmarks, written during the search; a later call skips its frames.
     mark : str
         Digest of everything that the landmarks depend on.
-
-    Raises
-    ------
-    InputError
-        Too few frames show the person.
     """
     kept = stored_arrays(store, mark, _STORED)
     if kept is None or not kept["finished"]:

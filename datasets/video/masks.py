@@ -55,15 +55,7 @@ class FrameView(NamedTuple):
 
 
 class MaskSource:
-    """Masks according to the options.
-
-    Raises
-    ------
-    InputError
-        None or several sources are requested, or the file is not the network.
-    UnavailableError
-        The package of the network is missing.
-    """
+    """Masks according to the options."""
 
     def __init__(self, options: VideoOptions):
         if bool(options.segmentation) == bool(options.masks):

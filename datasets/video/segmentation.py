@@ -18,15 +18,7 @@ from ...bench.tflite import open_network
 
 
 class SelfieSegmentation:
-    """The network of a file.
-
-    Raises
-    ------
-    UnavailableError
-        The package ai-edge-litert is missing.
-    InputError
-        The file is missing or is not such a network.
-    """
+    """The network of a file."""
 
     def __init__(self, path: Path):
         remedy = "It is in the wheel of mediapipe 0.10.21, as mediapipe/modules/selfie_segmentation/selfie_segmentation.tflite."

@@ -172,10 +172,7 @@ def _words(command: str) -> list[str]:
 def _answer(
     command: Sequence[str], source: str, kind: str, errors: int = subprocess.STDOUT, remedy: str = ""
 ) -> tuple[str, str]:
-    """Output of a command run for at most `PROBE_S` and, if ``errors`` separates it, its stderr.
-
-    Raises `InputError` if it does not end, or cannot be started; then ``kind`` says what was expected.
-    """
+    """Output of a command run for at most `PROBE_S` and, if ``errors`` separates it, its stderr."""
     try:
         done = subprocess.run(
             command,
@@ -202,8 +199,7 @@ def inspect_checkout(
 ) -> Checkout:
     """Check the settings of a method: folder, commit, interpreter or program, importable modules, and GPU.
 
-    ``environment`` checks what runs the code; None uses `inspect_interpreter`. Raises `InputError` with the setting
-    and the next step for the first failed check.
+    ``environment`` checks what runs the code; None uses `inspect_interpreter`.
     """
     folder, record = inspect_folder(method, config, repository)
     python, versions = environment() if environment else inspect_interpreter(method, config, repository)

@@ -243,8 +243,7 @@ class OfficialMethod(ABC, Generic[Config]):
         """Export the training frames, run the authors' training on them, and keep what rendering needs.
 
         After a kill the training restarts on the existing export, since the repositories' checkpoints do not allow an
-        exact continuation. Raises `InputError` before any work for what `check` refuses and for a budget in seconds,
-        and `ProgramError` if the program fails.
+        exact continuation.
         """
         run = run_digest(self.name, self.version, self.config, clip, budget, seed)
         if not is_finished(out, run):

@@ -82,8 +82,6 @@ def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) ->
     Every image in the program's folders must be exported for a training key, each equally often, or be a placeholder of a
     single pixel, which shows no frame. `clip` gives no pixels of other frames
     (`headbench.bench.engine.guard.TrainingView`), so that none can have such a name.
-
-    Raises `InputError` for an image of another frame, one that was not exported, and a missing one.
     """
     allowed = frozenset(clip.splits["train"])
     for path, key in images.items():
@@ -137,10 +135,7 @@ def as_recorded(record: Path, work: Workplace) -> bool:
 
 @contextmanager
 def alone(folder: Path) -> Iterator[IO[str]]:
-    """Make a folder and hold its lock; a program that inherits the lock keeps it if this process is killed.
-
-    Raises `InputError` if a program of an earlier call still runs.
-    """
+    """Make a folder and hold its lock; a program that inherits the lock keeps it if this process is killed."""
     check_output_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / LOCK).open("a+") as stream:

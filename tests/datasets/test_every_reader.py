@@ -15,7 +15,6 @@ COMMANDS = {
     ),
     "prepare tongue": (["--cameras", "1"], ["tongue.yaml", "tongue_901.png"]),
     "export colmap": (["--tracking"], ["sparse/0/images.bin", "flame_param/00000.npz", "head_model.npz"]),
-    "export nersemble": ([], ["recording/metadata_sequences.csv", "head_model.npz"]),
 }
 
 

@@ -27,11 +27,6 @@ def procedural_head(version: str = "2023") -> HeadArrays:
     version : str
         "2023" ("procedural2023") or "2020" ("procedural2020"). Both have the same topology and
         template. In 2020 two eyelid bases represent the blinks, and shapes and directions differ slightly.
-
-    Raises
-    ------
-    InputError
-        The version is unknown.
     """
     name = full_version(version)
     surface = load_sculpture()

@@ -56,11 +56,6 @@ def render_parts(
         (S,) identity coefficients; the mean head if None. Parts follow the surrounding wall of the mouth.
     tongue_out : float
         0 places the tongue behind the lower teeth, 1 over the lower lip (the jaw should be open).
-
-    Raises
-    ------
-    InputError
-        The head is not procedural, or ``tongue_out`` is not in [0, 1].
     """
     if "mouth_socket" not in head.regions or not head.version.startswith("procedural"):
         raise InputError(f"head model {head.version!r}", "regions", "a procedural head", "another head")

@@ -143,13 +143,7 @@ def assemble(skin: FloatArray, faces: IntArray, mirror: IntArray) -> SculptedHea
 
 
 def load_sculpture(path: Path = PACKAGED) -> SculptedHead:
-    """The surface that `sculpt` wrote: the packaged one, or the one at ``path``.
-
-    Raises
-    ------
-    InputError
-        The file is not such an npz.
-    """
+    """The surface that `sculpt` wrote: the packaged one, or the one at ``path``."""
     members = {
         "vertices": Member("f", ("V", 3)),
         "faces": Member("iu", ("F", 3)),

@@ -93,11 +93,6 @@ def match(source: HeadAsset, neutral: FloatArray, target: HeadAsset, settings: R
     ----------
     neutral : FloatArray
         (V source, 3) metres.
-
-    Raises
-    ------
-    InputError
-        A head lacks a face region, or too few counterparts are found.
     """
     vertices, weights = fitted_vertices(target, settings)
     if same_topology(source, target):

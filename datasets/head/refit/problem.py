@@ -80,11 +80,6 @@ class FitProblem:
         (n,) vertices with targets.
     weights : FloatArray
         (n,) non-negative weights of the squared distances; only their ratios matter.
-
-    Raises
-    ------
-    InputError
-        The joint tree is not FLAME's.
     """
 
     def __init__(
@@ -304,11 +299,6 @@ def solve_bounded(gram: FloatArray, right: FloatArray, bound: FloatArray) -> Flo
         (n, n) symmetric positive definite; only the lower triangle is read.
     bound : FloatArray
         (n,) positive.
-
-    Raises
-    ------
-    ValueError
-        ``gram`` is not positive definite.
     """
     x = _solve(gram, right)
     if (np.abs(x) <= bound).all():

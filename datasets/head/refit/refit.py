@@ -60,12 +60,6 @@ def refit(
         are added.
     folder : Path | None
         Cache of finished blocks of timesteps; a second call with the same input continues.
-
-    Raises
-    ------
-    InputError
-        There is no timestep, the tracking is not finite, or the models are incompatible (see
-        `match`).
     """
     settings = settings or RefitSettings()
     timesteps = sorted(clip.poses)

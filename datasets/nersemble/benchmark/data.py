@@ -45,11 +45,6 @@ def read_sequence(
     ----------
     head : HeadArrays
         FLAME 2023 with or without teeth; coefficients are padded with zeros to its bases.
-
-    Raises
-    ------
-    InputError
-        A file is missing or damaged, or does not fit the head model or the conventions.
     """
     path = tracking_file(data, participant, sequence)
     arrays = read_arrays(path, MEMBERS)

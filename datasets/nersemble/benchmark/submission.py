@@ -48,12 +48,6 @@ def find_frames(
     data : Path | None
         The benchmark's folder, which gives the number of frames of a sequence if that is not
         published.
-
-    Raises
-    ------
-    InputError
-        Participants, sequences, cameras or frames are missing, timesteps have a gap, or a size is
-        wrong.
     """
     found: dict[Video, list[Path]] = {}
     by_participant = {name: _by_camera(folder, name, method) for name in track.sequences}
@@ -229,11 +223,6 @@ def check_submission(
         published totals.
     name : str
         Name of the track; "" takes the one with the most files in the zip.
-
-    Raises
-    ------
-    InputError
-        The file is not a zip, or damaged.
     """
     issues = Issues()
     with reading(file, "the zip of a submission"):

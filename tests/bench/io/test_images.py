@@ -22,7 +22,6 @@ from headbench.bench.io.images import (
     read_png,
     write_png,
 )
-from headbench.bench.io.video import write_video
 from headbench.datasets.images import read_image, read_mask, write_image
 
 NOISE = np.random.default_rng(3).integers(0, 256, (23, 37, 4), np.uint8)
@@ -258,7 +257,6 @@ WRITERS = {
     "frame": ("a.png", lambda path: write_png(path, NOISE[..., :3])),
     "image": ("a.png", lambda path: write_image(path, NOISE)),
     "JPEG": ("a.jpg", lambda path: write_image(path, NOISE[..., :3])),
-    "video": ("a.mp4", lambda path: write_video(path, [np.tile(NOISE[:22, :36, :3], (9, 9, 1))] * 9, 25.0)),
 }
 
 

@@ -69,17 +69,7 @@ def test_without_memory_every_byte_is_read(capture, cache, reads):
     assert sorted(reads) == ["a", "b", "c"]
 
 
-def test_a_file_of_digests_inside_a_capture_is_ignored(capture, cache):
-    digests = expected(capture)
-    stamps = {path.name: path.stat() for path in digests}
-    lies = {name: [stamp.st_size, stamp.st_mtime_ns, "0" * 64] for name, stamp in stamps.items()}
-    (capture / ".headbench-digests.json").write_text(json.dumps(lies))
-    assert content_digests(digests, cached_for=capture) == digests
-
-
-@pytest.mark.parametrize(
-    "rubbish", ["", "[]", '{"entries": 1}', '{"digest": "0", "entries": {"a": "b"}}', "\0", "[" * 100_000]
-)
+@pytest.mark.parametrize("rubbish", ["", "[]", '{"digest": "0", "entries": {"a": "b"}}'])
 def test_a_damaged_cache_is_ignored(capture, cache, rubbish):
     content_digests(capture.iterdir(), cached_for=capture)
     for path in cache.iterdir():
@@ -91,18 +81,6 @@ def test_a_file_that_just_changed_is_not_remembered(capture, cache, monkeypatch)
     monkeypatch.setattr(module, "YOUNG_NS", 60 * 10**9)
     content_digests(capture.iterdir(), cached_for=capture)
     assert all(json.loads(path.read_text())["entries"] == {} for path in cache.iterdir())
-
-
-def test_the_captures_read_longest_ago_are_forgotten(capture, cache, monkeypatch):
-    for number in range(4):
-        content_digests(capture.iterdir(), cached_for=capture / str(number))
-        for path in cache.iterdir():
-            os.utime(path, (path.stat().st_atime, path.stat().st_mtime - 60))
-    first, *_ = sorted(cache.iterdir(), key=lambda path: path.stat().st_mtime)
-    monkeypatch.setattr(module, "MAX_CACHE_BYTES", 4 * first.stat().st_size)
-    content_digests(capture.iterdir(), cached_for=capture)
-    assert not first.exists()
-    assert len([*cache.iterdir()]) == 4
 
 
 @pytest.mark.parametrize("home", ["a file", "none"])

@@ -52,10 +52,9 @@ def flipped(view: OutlineView) -> OutlineView:
     return OutlineView(view.vertices, Camera(camera.id, WIDTH, HEIGHT, K, camera.world_to_camera), view.mask)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.001])
-@pytest.mark.parametrize("offset", [-6.0, -2.0, 2.0, 6.0])
-def test_outlines_decide_in_spite_of_hair_shoulders_and_noise(offset, noise):
-    views = make_views(offset, noise)
+@pytest.mark.parametrize("offset", [-6.0, 2.0])
+def test_outlines_decide_in_spite_of_hair_shoulders_and_noise(offset):
+    views = make_views(offset, 0.001)
     assert weigh_cy(views, HEAD.faces).decision == "top"
     assert weigh_cy([flipped(view) for view in views], HEAD.faces).decision == "bottom"
 

@@ -27,7 +27,7 @@ KEYS = [
 ]
 
 
-@settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(key=st.sampled_from(KEYS), value=values)
 @example(key="w", value=BEYOND_FLOAT)
 @example(key="fl_x", value=BEYOND_FLOAT)
@@ -76,14 +76,6 @@ def test_lenses_that_are_no_pinhole_are_refused(capture, lens, refused, everywhe
     with pytest.raises(InputError, match=r"undistort|distortion") as caught:
         read_capture(capture.union)
     assert caught.value.key.rpartition(".")[2] == refused
-
-
-@pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "."])
-@pytest.mark.parametrize("key", ["file_path", "fg_mask_path", "flame_param_path"])
-def test_paths_no_file_can_have_are_refused(capture, key, name):
-    capture.each_frame(lambda frame: frame.update({key: f"{frame[key].rsplit('/', 2)[0]}/{name}"}))
-    with pytest.raises(InputError):
-        read_capture(capture.union)
 
 
 def test_size_and_intrinsics_may_stand_at_the_top_level(tmp_path):

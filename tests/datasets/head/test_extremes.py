@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from headbench.bench.contracts import no_progress
-from headbench.datasets.benchmarks.head import HEAD_EXTREMES, stress, try_extreme
+from headbench.datasets.head.extremes import HEAD_EXTREMES, stress, try_extreme
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.rotations import axis_angle_to_matrix
 

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from headbench.datasets.images import read_image, write_image
+from headbench.datasets.images import read_image
 
-from .good_capture import GoodCapture
+from .good_capture import GoodCapture, write_pixels
 
 CAMERA, OTHER = "222200001", "222200004"
 """The camera that faults are planted at, and the one that it is exchanged with."""
@@ -28,7 +28,7 @@ def images(capture: GoodCapture, camera: str = "") -> list[Path]:
 
 def change_images(capture: GoodCapture, change: Callable[[np.ndarray], np.ndarray], camera: str = "") -> None:
     for path in images(capture, camera):
-        write_image(path, change(read_image(path, (1, 1, 1))))
+        write_pixels(path, change(read_image(path, (1, 1, 1))))
 
 
 def add_noise(capture: GoodCapture, sigma: float, seed: int = 0) -> None:
@@ -110,11 +110,8 @@ class CameraFault(NamedTuple):
 CAMERA_FAULTS = (
     CameraFault("exchanged", "HB513", exchange),
     CameraFault("3 cm aside", "HB514", _aside(0.03, 0)),
-    CameraFault("3 cm down", "HB514", _aside(-0.03, 1)),
-    CameraFault("turned by 1 degree", "HB514", _rotated(1.0, 1)),
     CameraFault("tilted by 1 degree", "HB514", _rotated(1.0, 0)),
     CameraFault("2 frames late", "HB515", _late(2)),
-    CameraFault("2 frames early", "HB515", _late(-2)),
     CameraFault("blurred by 4 px", "HB517", _each(lambda image: cv2.GaussianBlur(image, (0, 0), 4.0))),
     CameraFault("black", "HB308", _each(np.zeros_like)),
     CameraFault("frozen", "HB516", _freeze),

@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 
 from headbench.datasets.ga.layout import Declaration
-from headbench.datasets.images import write_image
 
 from ..tiny_capture import edit_json, edit_npz
-from .good_capture import HEIGHT, WIDTH, GoodCapture, read_rgb
+from .good_capture import HEIGHT, WIDTH, GoodCapture, read_rgb, write_pixels
 
 Plant = Callable[[GoodCapture], None]
 
@@ -98,7 +97,7 @@ def _copy_to_test(good):
 def _nearly_copy_to_test(good):
     image = read_rgb(good.files("images")[0]).astype(int)
     noise = np.random.default_rng(0).integers(-1, 2, size=image.shape)
-    write_image(_test_images(good, 5)[0], np.clip(image + noise, 0, 255).astype(np.uint8))
+    write_pixels(_test_images(good, 5)[0], np.clip(image + noise, 0, 255).astype(np.uint8))
 
 
 def _move(source: str, index: int) -> Plant:
@@ -135,7 +134,7 @@ def _never_multiplied(image, mask):
 def _flat_mask(level: int) -> Plant:
     def plant(good):
         for image in _test_images(good, 4):
-            write_image(
+            write_pixels(
                 image.parent.parent / "fg_masks" / image.name, np.full((HEIGHT, WIDTH), level, np.uint8)
             )
 
@@ -144,7 +143,7 @@ def _flat_mask(level: int) -> Plant:
 
 def _blank(good):
     for path in _test_images(good, 4):
-        write_image(path, np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
+        write_pixels(path, np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
 
 
 def _images(change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Plant:
@@ -177,7 +176,7 @@ def _tint_one_camera(good):
             image = read_rgb(path).copy()
             blue = image[..., 2].astype(float)
             image[..., 2] = np.where(image.min(axis=2) < 250, np.clip(blue * 1.6, 0, 255), blue)
-            write_image(path, image)
+            write_pixels(path, image)
 
 
 def _jpeg(good):
@@ -288,7 +287,7 @@ FAULTS = (
     Fault(
         "mask of another size",
         "HB104",
-        lambda good: write_image(
+        lambda good: write_pixels(
             good.files("fg_masks")[7], np.full((HEIGHT // 2, WIDTH // 2), 255, np.uint8)
         ),
     ),

@@ -16,7 +16,6 @@ from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePla
 from headbench.datasets.head.arrays import HeadArrays
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.head.teeth import with_teeth
-from headbench.datasets.images import write_image
 from headbench.datasets.mesh_pictures import rasterize_mesh
 
 from ..head.toy import toy_head
@@ -111,6 +110,12 @@ def composite(colour: np.ndarray, alpha: np.ndarray, background: float = 1.0) ->
     return np.round(colour * alpha[..., None] + 255 * background * (1 - alpha[..., None])).astype(np.uint8)
 
 
+def write_pixels(path: Path, pixels: np.ndarray) -> None:
+    """Replace an image by (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA, without the care of a capture's writer."""
+    turned = pixels if pixels.ndim == 2 else np.dstack([pixels[..., 2::-1], pixels[..., 3:]])
+    cv2.imwrite(str(path), turned)
+
+
 def read_rgb(path: Path) -> np.ndarray:
     """(H, W, 3) 8-bit."""
     return cv2.imread(str(path), cv2.IMREAD_COLOR)[..., ::-1]
@@ -135,7 +140,7 @@ class GoodCapture(TinyCapture):
         for path in self.files("images"):
             mask_path = path.parent.parent / "fg_masks" / path.name
             image, mask = read_rgb(path), read_grey(mask_path)
-            write_image(mask_path if masks else path, change(image, mask))
+            write_pixels(mask_path if masks else path, change(image, mask))
 
     def each_parameters(self, change: Callable[[dict[str, np.ndarray], int], None]) -> None:
         """Apply ``change`` to the arrays of every parameter file, given its position in the order of files."""

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from headbench.bench.progress import counted
 from headbench.datasets.ga.transforms import read_transforms
-from headbench.datasets.images import write_image
 from headbench.datasets.lint.rules import spans
 from headbench.datasets.lint.views import (
     _fringe,
@@ -19,7 +18,7 @@ from headbench.datasets.lint.views import (
     pixels_of_files,
 )
 
-from .good_capture import read_rgb
+from .good_capture import read_rgb, write_pixels
 
 
 @given(st.sets(st.integers(0, 60)))
@@ -73,7 +72,7 @@ def test_near_duplicates_survive_noise_and_not_motion(good, noise, shift, twins)
             np.roll(image, shift, axis=1)
             + rng.integers(-1, 2, size=(20, 15, 1)).repeat(4, 0).repeat(4, 1) * noise
         )
-        write_image(entry.image, np.clip(image, 0, 255).astype(np.uint8))
+        write_pixels(entry.image, np.clip(image, 0, 255).astype(np.uint8))
     again = make_thumbnails({"other": entries}, white, 100)
     pairs = list(near_duplicates(original, again))
     assert len(pairs) == twins

@@ -13,7 +13,6 @@ from headbench.bench.io.images import ImageInfo
 from headbench.datasets.ga.layout import Declaration
 from headbench.datasets.ga.writer import SequencePlan
 from headbench.datasets.head.arrays import save_head
-from headbench.datasets.images import write_image
 from headbench.datasets.lint.catalogue import GROUPS, RULES
 from headbench.datasets.lint.command import lint_capture
 from headbench.datasets.lint.rules import apply
@@ -33,6 +32,7 @@ from .good_capture import (
     read_rgb,
     smooth_poses,
     write_good_capture,
+    write_pixels,
 )
 
 PLANTED_APART = {"HB115", "HB510", "HB511", "HB513", "HB514", "HB515", "HB516", "HB517", "HB615"}
@@ -123,7 +123,7 @@ def test_alpha_in_the_image_is_a_mask_and_has_no_background(good):
         image = read_rgb(path).astype(float)
         alpha = mask[..., None] / 255
         colour = np.where(alpha > 0, (image - (1 - alpha) * 255) / np.maximum(alpha, 1e-3), 0)
-        write_image(path, np.dstack([np.clip(colour, 0, 255).round(), mask]).astype(np.uint8))
+        write_pixels(path, np.dstack([np.clip(colour, 0, 255).round(), mask]).astype(np.uint8))
     good.without_masks()
     assert codes(good) == []
 

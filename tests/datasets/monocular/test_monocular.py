@@ -18,11 +18,9 @@ from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.monocular.clip import CONVENTION, _last
-from headbench.datasets.monocular.mesh_fit import read_vertices
 from headbench.datasets.monocular.reader import find_videos, read_video
 from headbench.datasets.open import find_reader, open_clip
 
-from ...memory import memory_below
 from ..head.toy import toy_head
 from ..tiny_capture import edit_json, in_camera, make_plan, rig, write_tiny_capture
 from .videos import HEAD_FILE, recording_of, write_imavatar, write_insta
@@ -217,14 +215,6 @@ FILE_FAULTS = {
     "mesh gone": ("canonical.obj", None, "canonical.obj"),
     "exp gone": ("flame/exp/00003.txt", None, "00003.txt"),
 }
-
-
-def test_a_long_number_takes_no_memory_for_every_vertex(tmp_path):
-    path = tmp_path / "canonical.obj"
-    path.write_bytes(b"v 0 0 0." + b"1" * 10**6 + b"\n" + b"v 0 0 0\n" * 999)
-    with memory_below(20e6):
-        vertices = read_vertices(path, 1_000)
-    assert vertices[0, 2] == pytest.approx(1 / 9)
 
 
 def test_another_head_model_is_told_by_its_meshes(written):

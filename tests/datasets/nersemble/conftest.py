@@ -6,15 +6,12 @@ import shutil
 
 import pytest
 
-from headbench.datasets.nersemble.re_record import RecordingWriter
-
-from .recordings import SUBJECT, Recording, world_cameras, write_recording
+from .recordings import Recording, write_recording
 
 
 def _copied(pristine: Recording, folder) -> Recording:
-    shutil.copytree(pristine.head.parent, folder)
-    writer = RecordingWriter(folder / "recording", SUBJECT, world_cameras(), pristine.writer.release)
-    return Recording(writer.root, writer, folder / "tracking", folder / "head.npz")
+    shutil.copytree(pristine.folder, folder)
+    return Recording(folder, pristine.release)
 
 
 @pytest.fixture(scope="session")

@@ -1,15 +1,17 @@
-"""Tiny recordings for tests: flat colours that tell subject, camera and frame."""
+"""Raw recordings in the layouts of NeRSemble's releases, with VHAP's tracking of them: every frame tells its camera and number."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from headbench.bench.contracts import Camera
+from headbench.bench.io.files import write_json, write_text
 from headbench.datasets.head.arrays import HeadArrays, save_head
-from headbench.datasets.nersemble.re_record import RecordingWriter, Release, write_tracked
+from headbench.datasets.images import write_image
 from headbench.datasets.nersemble.settings import PrepareSettings
 
 from ..head.toy import toy_head
@@ -53,13 +55,32 @@ def mask(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     return mask
 
 
-class Recording(NamedTuple):
-    """A written recording."""
+@dataclass(frozen=True)
+class Recording:
+    """One participant below a folder, in the layout of a release: "v2", "v1" (parts merged) or "paper2023"."""
 
-    root: Path
-    writer: RecordingWriter
-    tracking: Path
-    head: Path
+    folder: Path
+    release: str = "v2"
+
+    @property
+    def root(self) -> Path:
+        return self.folder / "recording"
+
+    @property
+    def tracking(self) -> Path:
+        return self.folder / "tracking"
+
+    @property
+    def head(self) -> Path:
+        return self.folder / "head.npz"
+
+    @property
+    def calibration_file(self) -> Path:
+        places = {"v2": f"{SUBJECT}/calibration", "v1": f"camera_params/{SUBJECT}", "paper2023": SUBJECT}
+        return self.root / places[self.release] / "camera_params.json"
+
+    def sequence_folder(self, sequence: str) -> Path:
+        return self.root / SUBJECT / ("" if self.release == "v1" else "sequences") / sequence
 
     def settings(self, out: Path, **changes) -> PrepareSettings:
         """Settings that prepare all of it."""
@@ -74,6 +95,66 @@ class Recording(NamedTuple):
             "every": 1,
         }
         return PrepareSettings(**(values | changes))
+
+    def write_calibration(self, cameras: list[Camera]) -> None:
+        value = {
+            "world_2_cam": {camera.id: camera.world_to_camera for camera in cameras},
+            "intrinsics": cameras[0].K,
+            "height": cameras[0].height,
+            "width": cameras[0].width,
+        }
+        write_json(self.calibration_file, value)
+
+    def write_background(self, serial: str, rgb: np.ndarray) -> None:
+        write_image(self.sequence_folder("BACKGROUND") / f"image_{serial}.jpg", rgb, *_JPEG)
+
+    def write_metadata(self, sequences: list[str]) -> None:
+        rows = ["ID", "wears_glasses", *sequences], [SUBJECT, "", *("x" for _ in sequences)]
+        write_text(self.root / "metadata_sequences.csv", "".join(",".join(row) + "\n" for row in rows))
+
+    def write_video(self, sequence: str, serial: str, frames) -> None:
+        folder = self.sequence_folder(sequence) / ("images" if self.release == "v2" else "")
+        write_video(folder / f"cam_{serial}.mp4", frames, 73)
+
+    def write_frame(self, sequence: str, serial: str, number: int, rgb, mask=None) -> None:
+        """As VHAP's preprocessing does, or the 2023 release, whose frame folders count at 73 frames a second."""
+        folder, name, kinds = (
+            self.sequence_folder(sequence),
+            f"cam_{serial}_{number:06d}.jpg",
+            ("images", "alpha_maps"),
+        )
+        if self.release == "paper2023":
+            folder, name, kinds = (
+                folder / f"frame_{number:05d}",
+                f"cam_{serial}.png",
+                ("images-2x", "alpha_map"),
+            )
+        for kind, pixels in zip(kinds, (rgb, mask)):
+            if pixels is not None:
+                write_image(folder / kind / name, pixels, *(_JPEG if name.endswith(".jpg") else ()))
+
+
+_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97)
+
+
+def write_video(path: Path, frames, fps: float) -> None:
+    """Write (H, W, 3) RGB or (H, W) frames of even size as MPEG-4."""
+    frames = [*frames]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    size = frames[0].shape[1::-1]
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+    for pixels in frames:
+        writer.write(np.dstack([pixels] * 3) if pixels.ndim == 2 else pixels[..., ::-1].copy())
+    writer.release()
+
+
+def write_tracked(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write tracked parameters as VHAP does, see `tracked_arrays`."""
+    count = len(next(iter(arrays.values())))
+    values = {key: np.asarray(value, np.float32) for key, value in arrays.items()}
+    values["timestep_id"] = np.array([f"{number:06d}" for number in range(count)])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, **values, n_processed_frames=np.array(count))
 
 
 def tracked_arrays(head: HeadArrays, count: int, seed: int = 0) -> dict[str, np.ndarray]:
@@ -92,25 +173,26 @@ def tracked_arrays(head: HeadArrays, count: int, seed: int = 0) -> dict[str, np.
 def write_recording(
     folder: Path,
     *,
-    release: Release = "v2",
+    release: str = "v2",
     images: bool = True,
     sequences: dict[str, int] | None = None,
     size: tuple[int, int] = (WIDTH, HEIGHT),
+    head: HeadArrays | None = None,
 ) -> Recording:
-    """Write a recording with frames as images with masks, or as videos."""
+    """Write a recording with frames as images with masks, or as videos, and the tracking of a head (a small one)."""
     cameras = world_cameras(*size)
-    writer = RecordingWriter(folder / "recording", SUBJECT, cameras, release)
-    writer.write_calibration()
-    head = toy_head(16)
-    save_head(folder / "head.npz", head)
+    recording = Recording(folder, release)
+    recording.write_calibration(cameras)
+    head = head or toy_head(16)
+    save_head(recording.head, head)
     for name, count in (sequences or SEQUENCES).items():
         for index, camera in enumerate(cameras):
             frames = [frame(index, tone(name, number), *size) for number in range(count)]
             if images:
                 for number, pixels in enumerate(frames):
-                    writer.write_frame(name, camera.id, number, pixels, mask(*size))
+                    recording.write_frame(name, camera.id, number, pixels, mask(*size))
             else:
-                writer.write_video(name, camera.id, frames)
-        path = folder / "tracking" / f"{SUBJECT}_{name}_v3_DS2_wBg" / "2026-01-01_00-00-00"
-        write_tracked(path / "tracked_flame_params_30.npz", tracked_arrays(head, count), range(count))
-    return Recording(writer.root, writer, folder / "tracking", folder / "head.npz")
+                recording.write_video(name, camera.id, frames)
+        path = recording.tracking / f"{SUBJECT}_{name}_v3_DS2_wBg" / "2026-01-01_00-00-00"
+        write_tracked(path / "tracked_flame_params_30.npz", tracked_arrays(head, count))
+    return recording

@@ -16,7 +16,6 @@ from headbench.bench.contracts import Frame, no_progress
 from headbench.bench.engine.stored import StoredAvatar, avatar_folder
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.images import write_png
-from headbench.bench.io.video import write_video
 from headbench.bench.specs import MethodSpec, ResolutionRule
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.subject import PosedSubject
@@ -30,6 +29,7 @@ from headbench.datasets.nersemble.benchmark.tracks import MONO, NVS, tracking_fi
 from ..head.toy import toy_head
 from ..tiny_capture import edit_json
 from .benchmark_folder import SCALE, tracking, write_benchmark
+from .recordings import write_video
 
 # Tracking
 

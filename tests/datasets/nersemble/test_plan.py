@@ -23,7 +23,7 @@ def free_of(recording, out, **changes):
 def remove(recording, number, camera=1):
     name = f"cam_{world_cameras()[camera].id}_{number:06d}.jpg"
     for kind in ("images", "alpha_maps"):
-        (recording.writer.sequence_folder("FREE") / kind / name).unlink()
+        (recording.sequence_folder("FREE") / kind / name).unlink()
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from headbench.datasets.ga import writer
 from headbench.datasets.ga.layout import SPLIT_FILES
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import read_head, save_head
+from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.nersemble import frames as image_pool
 from headbench.datasets.nersemble import prepare, sequence
 from headbench.datasets.nersemble.command import prepare_nersemble
@@ -99,22 +100,38 @@ def test_images_are_the_frames_on_white(clip):
         assert (mask[:6] <= 5).all()
 
 
-def test_cameras_and_poses_stand_to_each_other_as_tracked(clip, pristine_recording):
+def test_cameras_and_meshes_stand_to_each_other_as_tracked(clip, pristine_recording):
     """In one world: each sequence was shifted by a mean of its own, and the reader brings them together again."""
-    aligned = read_calibration(pristine_recording.writer.calibration_file).aligned()
+    aligned = read_calibration(pristine_recording.calibration_file).aligned()
+    subject = PosedSubject(clip.head, clip.shape, clip.static_offset)
+    renamed = {"expr": "expression", "neck_pose": "neck", "jaw_pose": "jaw", "eyes_pose": "eyes"}
     first = 0
     for name, length in SEQUENCES.items():
-        path = next(pristine_recording.tracking.rglob(f"*{name}*/**/*.npz"))
-        tracked = np.load(path, allow_pickle=False)
+        tracked = np.load(next(pristine_recording.tracking.rglob(f"*{name}*/**/*.npz")), allow_pickle=False)
         for local in range(length):
             pose = clip.poses[first + local]
+            moved = {
+                renamed.get(key, key): tracked[key][local] for key in (*renamed, "rotation", "translation")
+            }
+            expected, found = subject.meshes([replace(pose, **moved), pose])
             for serial, camera in clip.cameras.items():
-                # The tracked origin of the head, seen by each camera, before and after.
-                expected = aligned.world_to_camera[serial] @ [*tracked["translation"][local], 1.0]
-                found = camera.world_to_camera @ [*pose.translation, 1.0]
-                np.testing.assert_allclose(found, expected, atol=1e-6)
-            np.testing.assert_array_equal(pose.expression, tracked["expr"][local])
+                before, after = aligned.world_to_camera[serial], camera.world_to_camera
+                np.testing.assert_allclose(
+                    found @ after[:3, :3].T + after[:3, 3],
+                    expected @ before[:3, :3].T + before[:3, 3],
+                    atol=1e-6,
+                )
         first += length
+
+
+@pytest.mark.parametrize(("release", "images"), [("v1", False), ("paper2023", True)])
+def test_earlier_releases_show_the_same_frames(release, images, clip, tmp_path):
+    recording = write_recording(tmp_path, release=release, images=images)
+    again = read_capture(prepared(recording, tmp_path / "out")[0]["union"])
+    assert again.splits == clip.splits
+    for key in again.files:
+        shown, expected = (each.image(key)[HEIGHT // 4, WIDTH // 4].astype(int) for each in (again, clip))
+        assert np.abs(shown - expected).max() <= 8
 
 
 def test_keys_of_the_jsons_are_those_of_vhap(whole):
@@ -212,9 +229,9 @@ def test_a_subject_is_prepared_by_one_process_at_a_time(whole, pristine_recordin
 def test_other_settings_never_mix_with_images_that_are_there(change, recording, tmp_path):
     out = tmp_path / "out"
     matrices = {camera.id: np.eye(3) * 0.9 for camera in world_cameras()}
-    write_json(recording.writer.calibration_file.with_name(COLOUR_FILE), matrices)
+    write_json(recording.calibration_file.with_name(COLOUR_FILE), matrices)
     for camera in world_cameras():
-        recording.writer.write_background(camera.id, np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
+        recording.write_background(camera.id, np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
     prepared(recording, out, tracking="")
     before = contents(out)
     if "downscale" in change:  # the folder's name tells
@@ -282,9 +299,7 @@ def test_new_tracking_replaces_the_old_and_keeps_the_images(recording, whole, tm
 
 
 def test_images_are_never_enlarged(recording, tmp_path):
-    edit_json(
-        recording.writer.calibration_file, lambda value: value.update(height=2 * HEIGHT, width=2 * WIDTH)
-    )
+    edit_json(recording.calibration_file, lambda value: value.update(height=2 * HEIGHT, width=2 * WIDTH))
     with pytest.raises(InputError) as error:
         prepared(recording, tmp_path / "out", downscale=1)
     assert error.value.key == "downscale"
@@ -338,7 +353,7 @@ def test_a_video_that_ends_early_stops_the_run(videos, tmp_path, monkeypatch):
 def test_colours_are_corrected(recording, tmp_path):
     swap = [[0, 1.0, 0], [1.0, 0, 0], [0, 0, 1.0]]
     matrices = {camera.id: swap for camera in world_cameras()}
-    write_json(recording.writer.calibration_file.with_name(COLOUR_FILE), matrices)
+    write_json(recording.calibration_file.with_name(COLOUR_FILE), matrices)
     result, _ = prepared(recording, tmp_path / "out")
     assert result["missing"] == []
     clip = read_capture(result["union"])

@@ -5,10 +5,9 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.files import write_json
-from headbench.datasets.nersemble.re_record import RecordingWriter
 from headbench.datasets.nersemble.recording import participant, participants, read_calibration
 
-from .recordings import SEQUENCES, SUBJECT, world_cameras, write_recording
+from .recordings import SEQUENCES, SUBJECT, Recording, world_cameras, write_recording
 
 
 @pytest.mark.parametrize("release", ["v2", "v1", "paper2023"])
@@ -32,38 +31,37 @@ def test_unmerged_parts_of_the_first_release_are_found(tmp_path):
     assert sorted(participant(recording.root, SUBJECT).sequences) == sorted(SEQUENCES)
 
 
-def write_colour(writer, matrices):
-    if writer.release == "v2":
-        write_json(writer.calibration_file.with_name("color_calibration.json"), matrices)
-        return
+def with_colour(folder, release, matrices):
+    """A recording without frames but with a colour calibration."""
+    recording = Recording(folder, release)
+    recording.write_calibration(world_cameras())
+    recording.sequence_folder("FREE").mkdir(parents=True)
+    if release == "v2":
+        write_json(recording.calibration_file.with_name("color_calibration.json"), matrices)
+        return recording
     old = f"{SUBJECT}/annotations/FREE/color_correction"
-    folder = writer.root / (old if writer.release == "paper2023" else f"color_correction/{SUBJECT}")
+    folder = recording.root / (old if release == "paper2023" else f"color_correction/{SUBJECT}")
     folder.mkdir(parents=True)
     for serial, matrix in matrices.items():
         np.save(folder / f"{serial}.npy", matrix)
+    return recording
 
 
 @pytest.mark.parametrize("release", ["v2", "v1", "paper2023"])
 def test_colour_files_are_found_where_each_release_has_them(release, tmp_path):
     cameras = world_cameras()
-    writer = RecordingWriter(tmp_path, SUBJECT, cameras, release)
-    writer.write_calibration()
-    writer.sequence_folder("FREE").mkdir(parents=True)
     matrix = np.eye(3, 4) + 0.1 if release != "v2" else np.eye(3, 10) + 0.1
-    write_colour(writer, {camera.id: matrix for camera in cameras})
-    corrections = participant(tmp_path, SUBJECT).corrections("FREE", [cameras[0].id])
+    recording = with_colour(tmp_path, release, {camera.id: matrix for camera in cameras})
+    corrections = participant(recording.root, SUBJECT).corrections("FREE", [cameras[0].id])
     np.testing.assert_allclose(corrections[cameras[0].id].matrix, matrix)
 
 
-def test_a_colour_calibration_without_a_camera_is_an_error(tmp_path):
-    for release in ("v1", "v2"):
-        cameras = world_cameras()
-        writer = RecordingWriter(tmp_path / release, SUBJECT, cameras, release)
-        writer.write_calibration()
-        writer.sequence_folder("FREE").mkdir(parents=True)
-        write_colour(writer, {cameras[0].id: np.eye(3, 4)})
-        with pytest.raises(InputError, match=cameras[1].id):
-            participant(tmp_path / release, SUBJECT).corrections("FREE", [c.id for c in cameras])
+@pytest.mark.parametrize("release", ["v1", "v2"])
+def test_a_colour_calibration_without_a_camera_is_an_error(release, tmp_path):
+    cameras = world_cameras()
+    recording = with_colour(tmp_path, release, {cameras[0].id: np.eye(3, 4)})
+    with pytest.raises(InputError, match=cameras[1].id):
+        participant(recording.root, SUBJECT).corrections("FREE", [c.id for c in cameras])
 
 
 def test_without_colour_files_there_is_no_correction(pristine_recording):
@@ -71,14 +69,14 @@ def test_without_colour_files_there_is_no_correction(pristine_recording):
 
 
 def test_stills_are_no_sequence(recording):
-    recording.writer.write_background("222200037", np.zeros((4, 4, 3), np.uint8))
+    recording.write_background("222200037", np.zeros((4, 4, 3), np.uint8))
     one = participant(recording.root, SUBJECT)
     assert "BACKGROUND" not in one.sequences
     assert [*one.backgrounds] == ["222200037"]
 
 
 def test_the_metadata_says_what_to_fetch(recording):
-    recording.writer.write_metadata([*SEQUENCES, "HAIR"])
+    recording.write_metadata([*SEQUENCES, "HAIR"])
     one = participant(recording.root, SUBJECT)
     assert one.match("EMO-1") == "EMO-1-shout+laugh"
     with pytest.raises(InputError, match="metadata_sequences.csv lists HAIR"):
@@ -109,6 +107,6 @@ def test_missing_participants_and_calibrations_are_named(recording):
     with pytest.raises(InputError) as error:
         participant(recording.root, "902")
     assert (error.value.key, error.value.found) == ("subject", "902")
-    recording.writer.calibration_file.unlink()
+    recording.calibration_file.unlink()
     with pytest.raises(InputError, match="camera_params.json"):
         participant(recording.root, SUBJECT)

@@ -7,13 +7,22 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.bench.io.video import write_video
 from headbench.datasets.nersemble import sequence as sequence_module
 from headbench.datasets.nersemble.frames import read_frames
 from headbench.datasets.nersemble.recording import participant, read_calibration
 from headbench.datasets.nersemble.sequence import check_boxes, probe_video, read_sequence
 
-from .recordings import HEIGHT, SEQUENCES, SUBJECT, WIDTH, colour_of, mask, world_cameras, write_recording
+from .recordings import (
+    HEIGHT,
+    SEQUENCES,
+    SUBJECT,
+    WIDTH,
+    colour_of,
+    mask,
+    world_cameras,
+    write_recording,
+    write_video,
+)
 
 SERIALS = [camera.id for camera in world_cameras()]
 
@@ -60,7 +69,7 @@ def test_by_default_videos_give_every_third_frame_and_images_all(pristine_videos
 
 
 def test_videos_of_masks_are_read_with_the_frames(videos):
-    folder = videos.writer.sequence_folder("FREE")
+    folder = videos.sequence_folder("FREE")
     for serial in SERIALS:
         # What OpenCV's MPEG-4 keeps best is flat, so the masks tell their number by a flat level.
         levels = (np.full((HEIGHT, WIDTH), 40 * number, np.uint8) for number in range(6))
@@ -74,7 +83,7 @@ def test_videos_of_masks_are_read_with_the_frames(videos):
 def test_images_with_masks_go_before_videos(recording):
     for index, serial in enumerate(SERIALS):
         frames = (np.full((HEIGHT, WIDTH, 3), colour_of(index, n), np.uint8) for n in range(12))
-        recording.writer.write_video("FREE", serial, frames)
+        recording.write_video("FREE", serial, frames)
     assert look(recording).views[SERIALS[0]].video is None
     assert look(recording, source="video", every=1).numbers == tuple(range(12))
     for path in recording.root.rglob("alpha_maps/*"):
@@ -84,7 +93,7 @@ def test_images_with_masks_go_before_videos(recording):
 
 
 def test_a_lone_camera_has_no_serial_in_its_files(recording):
-    folder = recording.writer.sequence_folder("FREE")
+    folder = recording.sequence_folder("FREE")
     for kind in ("images", "alpha_maps"):
         for path in (folder / kind).iterdir():
             _, serial, number = path.stem.split("_")
@@ -97,7 +106,7 @@ def test_a_lone_camera_has_no_serial_in_its_files(recording):
 def test_missing_and_unknown_cameras_are_named(videos):
     with pytest.raises(InputError, match="camera 123"):
         look(videos, cameras=["123"])
-    path = videos.writer.sequence_folder("FREE") / "images" / f"cam_{SERIALS[2]}.mp4"
+    path = videos.sequence_folder("FREE") / "images" / f"cam_{SERIALS[2]}.mp4"
     path.rename(path.with_name("cam_123.mp4"))
     assert fault(videos).key == "123"
     path.with_name("cam_123.mp4").unlink()
@@ -107,14 +116,14 @@ def test_missing_and_unknown_cameras_are_named(videos):
 
 def test_frame_counts_that_differ_are_an_error_or_cut(videos):
     frames = (np.zeros((HEIGHT, WIDTH, 3), np.uint8) for _ in range(4))
-    videos.writer.write_video("FREE", SERIALS[1], frames)
+    videos.write_video("FREE", SERIALS[1], frames)
     error = fault(videos)
     assert (error.key, error.found) == ("frames", f"camera {SERIALS[1]} without 4-5")
     assert look(videos, cut=True, every=1).numbers == (0, 1, 2, 3)
 
 
 def test_cameras_that_lack_other_frames_are_told_by_their_frames(recording):
-    folder = recording.writer.sequence_folder("FREE") / "images"
+    folder = recording.sequence_folder("FREE") / "images"
     for serial, number in zip(SERIALS, (2, 4, 4), strict=True):
         (folder / f"cam_{serial}_{number:06d}.jpg").unlink()
     first, second, third = SERIALS
@@ -126,7 +135,7 @@ def test_cameras_that_lack_other_frames_are_told_by_their_frames(recording):
 
 
 def test_truncated_videos_are_found_before_decoding(videos, monkeypatch):
-    path = videos.writer.sequence_folder("FREE") / "images" / f"cam_{SERIALS[1]}.mp4"
+    path = videos.sequence_folder("FREE") / "images" / f"cam_{SERIALS[1]}.mp4"
     content = path.read_bytes()
     monkeypatch.setattr(sequence_module, "open_video", None)  # so that opening it would be seen
     for damaged in (content[:-40], b"<html>not found</html>"):
@@ -137,7 +146,7 @@ def test_truncated_videos_are_found_before_decoding(videos, monkeypatch):
 
 
 def test_masks_of_another_size_are_named(recording):
-    folder = recording.writer.sequence_folder("FREE") / "alpha_maps"
+    folder = recording.sequence_folder("FREE") / "alpha_maps"
     for path in folder.glob(f"cam_{SERIALS[0]}_*"):
         cv2.imwrite(str(path), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8))
     error = fault(recording)
@@ -148,7 +157,7 @@ def test_masks_of_another_size_are_named(recording):
 @pytest.mark.parametrize("kind", ["alpha_maps", "images"])
 @pytest.mark.parametrize("number", [0, 3])
 def test_the_one_file_at_fault_is_blamed(kind, number, recording):
-    path = recording.writer.sequence_folder("FREE") / kind / f"cam_{SERIALS[0]}_{number:06d}.jpg"
+    path = recording.sequence_folder("FREE") / kind / f"cam_{SERIALS[0]}_{number:06d}.jpg"
     path.write_bytes(path.read_bytes()[:100])
     assert fault(recording).file == str(path)
     cv2.imwrite(str(path), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8))
@@ -161,7 +170,7 @@ def test_the_one_file_at_fault_is_blamed(kind, number, recording):
 
 
 def test_an_image_damaged_in_the_middle_is_found_when_decoding(recording):
-    path = recording.writer.sequence_folder("FREE") / "images" / f"cam_{SERIALS[0]}_000003.jpg"
+    path = recording.sequence_folder("FREE") / "images" / f"cam_{SERIALS[0]}_000003.jpg"
     content = path.read_bytes()
     header = content[: content.index(b"\xff\xdb")]
     frame = content[content.index(b"\xff\xc0") : content.index(b"\xff\xc0") + 19]
@@ -173,7 +182,7 @@ def test_an_image_damaged_in_the_middle_is_found_when_decoding(recording):
 
 
 def test_an_empty_sequence_is_refused(recording):
-    recording.writer.sequence_folder("HAIR").mkdir()
+    recording.sequence_folder("HAIR").mkdir()
     with pytest.raises(InputError, match="none of them"):
         look(recording, "HAIR")
     with pytest.raises(InputError, match="source=video"):

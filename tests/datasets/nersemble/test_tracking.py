@@ -5,11 +5,10 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.teeth import with_teeth
-from headbench.datasets.nersemble.re_record import write_tracked
 from headbench.datasets.nersemble.tracking import find_tracked, read_tracked
 
 from ..head.toy import toy_head
-from .recordings import tracked_arrays
+from .recordings import tracked_arrays, write_tracked
 
 COUNT = 5
 
@@ -21,7 +20,7 @@ def head():
 
 def written(path, head, **changes):
     arrays = tracked_arrays(head, COUNT) | changes
-    write_tracked(path, {key: value for key, value in arrays.items() if value is not None}, range(COUNT))
+    write_tracked(path, {key: value for key, value in arrays.items() if value is not None})
     return path
 
 

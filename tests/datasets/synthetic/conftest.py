@@ -6,11 +6,31 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
+from headbench.datasets.synthetic.capture import synthesize
 from headbench.datasets.synthetic.history import over_time
 from headbench.datasets.synthetic.panels import default_samples
 from headbench.datasets.synthetic.performance import CONTROLS
 from headbench.datasets.synthetic.plan import SyntheticSettings, load_geometry, plan_subject
+from headbench.datasets.synthetic.renderer import CaptureRenderer
 from headbench.datasets.synthetic.subject import RenderedSubject
+
+SMALL = {
+    "cameras": 2,
+    "timesteps": 4,
+    "size": (32, 46),
+    "samples_per_pixel": 9,
+    "workers": 1,
+    "performance": "full",
+}
+
+
+@pytest.fixture(scope="session")
+def capture(tmp_path_factory):
+    """The smallest capture: its folder, its union and the calls of its progress. Tests leave it as it is."""
+    out = tmp_path_factory.mktemp("synthetic") / "capture"
+    calls = []
+    (union,) = synthesize(out, **SMALL, progress=lambda done, total, note="": calls.append((done, total)))
+    return out, union, calls
 
 
 @pytest.fixture(scope="session")
@@ -27,6 +47,12 @@ def plan(geometry, tmp_path_factory):
 @pytest.fixture(scope="session")
 def subject(plan):
     return RenderedSubject(plan.person, plan.geometry, plan.shape)
+
+
+@pytest.fixture(scope="session")
+def renderer(plan):
+    """One renderer that tests share, each of which poses it first."""
+    return CaptureRenderer(plan)
 
 
 @pytest.fixture

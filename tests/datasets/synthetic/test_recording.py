@@ -21,7 +21,7 @@ from headbench.datasets.synthetic.recording import (
     outline,
     sub_frames,
 )
-from headbench.datasets.synthetic.renderer import CaptureRenderer, develop
+from headbench.datasets.synthetic.renderer import develop
 
 METRE = 1000.0  # pixels of a metre
 
@@ -36,18 +36,12 @@ class Kept:
         self.written[camera] = image, mask
 
 
-@pytest.fixture(scope="module")
-def rendered(plan):
-    """One renderer of the head that all tests share; see `recorded`."""
-    return CaptureRenderer(plan)
-
-
 @pytest.fixture
-def recorded(plan, rendered):
+def recorded(plan, renderer):
     """A renderer of the same head with other settings of the recording, posed at a timestep."""
 
     def recorded(plan=plan, **changes):
-        made = copy.copy(rendered)
+        made = copy.copy(renderer)
         settings = replace(plan.settings, **changes)
         made._plan, made._states = replace(plan, settings=settings, writer=Kept(plan.writer.plan)), {}
         made.pose_at("FREE", 0)
@@ -76,8 +70,8 @@ def linear(levels):
 def test_a_camera_changes_each_pixel_by_one_curve_per_channel(plan, recorded):
     """Two numbers a channel, fitted to the pictures of a camera, explain the change; masks and background stay."""
     exact, coloured = recorded(), recorded(camera_colour=2.0)
-    curves = {}
-    for camera in plan.cameras:
+    curves, cameras = {}, [*plan.cameras][::2]
+    for camera in cameras:
         (before, mask), (after, same) = exact.render(camera, 1), coloured.render(camera, 1)
         np.testing.assert_array_equal(mask, same)
         np.testing.assert_array_equal(after[mask == 0], before[mask == 0])
@@ -88,7 +82,7 @@ def test_a_camera_changes_each_pixel_by_one_curve_per_channel(plan, recorded):
             slope, shift = np.polyfit(x, y, 1)
             assert np.abs(slope * x + shift - y).max() < 0.06  # levels are whole numbers
             curves[camera, channel] = slope, shift
-    shifts = np.array([[curves[camera, channel][1] for channel in range(3)] for camera in plan.cameras])
+    shifts = np.array([[curves[camera, channel][1] for channel in range(3)] for camera in cameras])
     assert np.ptp(shifts, axis=0).min() > 0.02  # cameras differ
 
 
@@ -112,7 +106,7 @@ def test_an_exposure_adds_light_where_it_is_covered():
     np.testing.assert_allclose(rgb[0], [red, 0.5 * (red + blue)])
 
 
-@pytest.mark.parametrize(("speed", "several"), [(0.0, False), (1.2, True)])
+@pytest.mark.parametrize(("speed", "several"), [(0.0, False), (0.9, True)])
 def test_a_moving_head_is_the_mean_of_its_sub_frames(plan, recorded, speed, several):
     def curves(time):
         return {

@@ -15,7 +15,6 @@ import pytest
 from headbench.bench.contracts import no_progress
 from headbench.bench.doctor import DoctorSettings, doctor
 from headbench.bench.errors import InputError
-from headbench.bench.io.video import write_video
 from headbench.bench.process import ProgramError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.tracking.command import track_capture
@@ -23,6 +22,7 @@ from headbench.datasets.tracking.programs import LOG, PROGRAMS
 from headbench.datasets.tracking.settings import TrackSettings
 
 from ..monocular.videos import recording_of
+from ..nersemble.recordings import write_video
 from ..tiny_capture import rig
 from ..tracker_files.test_import import LENGTHS, SIZE, TRACKED
 from ..tracker_files.trackers import HEAD_FILE, write_pixel3dmm

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.video import decode
 from headbench.datasets.video.decode import is_video, probe_video, video_frames
 
 
@@ -104,12 +103,6 @@ def test_a_damaged_video_is_refused(tmp_path):
     path.write_bytes(path.read_bytes()[: 6 * path.stat().st_size // 10])
     with pytest.raises(InputError, match="60 frames, as the file states, found"):
         list(video_frames(path))
-
-
-def test_frames_beyond_the_largest_size_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(decode, "MOST_SIDE", 63)
-    with pytest.raises(InputError, match="at most 63 pixels a side, found 64x48"):
-        probe_video(write(tmp_path / "a.mp4", range(0, 200, 40)))
 
 
 def test_videos_are_recognised_by_their_suffix(tmp_path):

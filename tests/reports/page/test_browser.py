@@ -13,6 +13,8 @@ from headbench.reports.page.settings import PageSettings
 
 from .test_page import HOSTILE
 
+pytestmark = pytest.mark.commands
+
 
 @pytest.fixture
 def opened(new_tab, tmp_path):

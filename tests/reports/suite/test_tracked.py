@@ -9,7 +9,7 @@ import pytest
 from headbench.bench.engine.store import RunFolder
 from headbench.reports.runs import RunSet
 from headbench.reports.suite.suite import CROSSED, ENDPOINTS, LARGE, suite_report
-from headbench.reports.suite.tracked import condition_table, drop_table, drops_by_tracking
+from headbench.reports.suite.tracked import condition_table, drop_table
 from headbench.reports.table_report import table_of
 
 PSNR = {
@@ -46,15 +46,6 @@ def test_the_drop_is_novel_view_minus_self_reenactment(tracked_run):
     assert {row.method: row.cells[-1].value for row in table.rows} == pytest.approx(DROP)
     assert {row.method: float(row.cells[-1].text) for row in table.rows} == pytest.approx(DROP, abs=1e-4)
     assert {row.method: row.cells[0].value for row in table.rows} == {name: PSNR[name] for name in DROP}
-
-
-def test_drops_by_tracking_are_means_of_shared_subjects(tracked_run):
-    text = drops_by_tracking(RunSet.read([tracked_run]), {"": "exact", "tracked": "tracked"})
-    assert text.startswith("Subjects a, b, c, d, means")
-    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| Self")]
-    assert [title.partition(", ")[2] for title, *_ in rows] == ["exact", "tracked"]
-    found = [[float(value.partition(" (")[0]) for value in values] for _, *values in rows]
-    assert found == [[DROP["ga"], DROP["ours"]], [DROP["ga+tracked"], DROP["ours+tracked"]]]
 
 
 def test_a_drop_is_missing_where_a_task_has_no_values(tracked_run):

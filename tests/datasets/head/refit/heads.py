@@ -1,11 +1,14 @@
-"""Heads for refit tests: small ones, and one surface in two topologies."""
+"""Heads for refit tests: small ones, and one surface in two topologies; and a performance of any head."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from headbench.bench.contracts import FrameKey, HeadPose
+from headbench.datasets.clip import CaptureClip, FrameFiles, without_images
 from headbench.datasets.head.arrays import HeadArrays
 
 from ..toy import toy_head
@@ -57,4 +60,48 @@ def subdivided(head: HeadArrays, seed: int = 0) -> HeadArrays:
         eyelid_basis=lids,
         regions={name: members(region) for name, region in head.regions.items() if "ring" not in name},
         landmarks={},
+    )
+
+
+def performance(head: HeadArrays, timesteps: int, *, seed: int = 0, strength: float = 1.0) -> CaptureClip:
+    """A clip without images in which everything moves: smooth curves, the jaw between closed and wide open.
+
+    Parameters
+    ----------
+    strength : float
+        Standard deviation of the expression coefficients.
+    """
+    rng = np.random.default_rng(seed)
+    size = head.expression_basis.shape[2]
+    clock = 0.1 * np.arange(timesteps)
+
+    def curves(count: int) -> np.ndarray:
+        return np.sin(clock[:, None] * rng.uniform(0.4, 2.5, count) + rng.uniform(0, 2 * np.pi, count))
+
+    # Six motions that many coefficients share, as a face's do.
+    expression = strength * np.sqrt(1 / 3) * curves(6) @ rng.normal(size=(6, size))
+    jaw = np.column_stack([0.22 * (1 + curves(1)), 0.04 * curves(2)])
+    rotation, neck, eyes, place = 0.3 * curves(3), 0.1 * curves(3), 0.25 * curves(6), 0.02 * curves(3)
+    lids = 0.5 * (1 + curves(2))
+    poses = {
+        t: HeadPose(
+            head_model=head.version,
+            expression=expression[t],
+            rotation=rotation[t],
+            neck=neck[t],
+            jaw=jaw[t],
+            eyes=eyes[t],
+            translation=place[t],
+            eyelids=None if head.eyelid_basis is None else lids[t],
+            timestep=t,
+        )
+        for t in range(timesteps)
+    }
+    keys = tuple(FrameKey("subject", "EMO", t, "camera") for t in range(timesteps))
+    return CaptureClip(
+        subject="subject",
+        shape=np.asarray(0.8 * rng.normal(size=head.shape_basis.shape[2])),
+        splits={"train": keys, "novel_view": (), "self_reenactment": ()},
+        files={key: FrameFiles(Path("none"), None) for key in keys},
+        **without_images(head, poses),
     )

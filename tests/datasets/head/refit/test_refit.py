@@ -7,7 +7,6 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from headbench.bench.errors import InputError
-from headbench.datasets.benchmarks.refit import EXACT_MEAN_MM, EXACT_P95_MM, performance
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.head.refit import refit as block
 from headbench.datasets.head.refit.refit import BLOCK, refit
@@ -15,7 +14,9 @@ from headbench.datasets.head.refit.settings import RefitSettings
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.head.teeth import with_teeth
 
-from .heads import subdivided, toy_pair
+from .heads import performance, subdivided, toy_pair
+
+EXACT_MEAN_MM, EXACT_P95_MM = 0.15, 0.40  # residuals allowed where the target's own model made the meshes
 
 SOURCE, TARGET = toy_pair()
 

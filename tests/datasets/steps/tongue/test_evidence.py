@@ -1,7 +1,6 @@
 """What counts as a tongue and what does not, on painted heads."""
 
 import numpy as np
-import pytest
 
 from headbench.datasets.steps.tongue.evidence import ALWAYS, NEVER, find_evidence
 from headbench.datasets.steps.tongue.mouth import facing_cameras, mouth_atlas, sample_clip
@@ -18,8 +17,7 @@ def areas(moments, **how):
     return evidence.areas, evidence
 
 
-@pytest.mark.parametrize("tracking_mm", [0.0, 1.0])
-def test_tongues_are_found_and_nothing_else_is(tracking_mm):
+def test_tongues_are_found_and_nothing_else_is():
     tongue = [
         Moment({"jaw_open": 0.4}, blob=TONGUE),
         Moment({"jaw_open": 0.7, "head_turn": 0.1}, blob=TONGUE, drop=0.016, radius=0.014),
@@ -34,7 +32,7 @@ def test_tongues_are_found_and_nothing_else_is(tracking_mm):
         Moment({"chin_raise": 1.0}, lines=0.5),
         Moment({"jaw_open": 0.5}, tint=(0.6, 0.6, 0.6)),
     ]
-    found, _ = areas([*tongue, *other], tracking_mm=tracking_mm)
+    found, _ = areas([*tongue, *other], tracking_mm=1.0)
     first = len(REST)
     assert (found[first : first + len(tongue)] > ALWAYS).all(), found
     assert (found[:first] < NEVER).all(), found
@@ -47,10 +45,10 @@ def test_what_does_not_begin_at_the_mouth_is_no_tongue():
     assert (evidence.strength[-1].astype(float) > 4).sum() > 20  # it is seen all the same
 
 
-@pytest.mark.parametrize("colour", [INSIDE * 0.3, np.full(3, 0.7), SKIN * 0.9])
-def test_darkness_teeth_and_the_subjects_own_skin_are_no_tongue(colour):
-    found, _ = areas([Moment({"jaw_open": 0.4}, blob=colour)])
-    assert found[-1] < NEVER
+def test_darkness_teeth_and_the_subjects_own_skin_are_no_tongue():
+    colours = [INSIDE * 0.3, np.full(3, 0.7), SKIN * 0.9]
+    found, _ = areas([Moment({"jaw_open": 0.4}, blob=colour) for colour in colours])
+    assert (found[-3:] < NEVER).all()
 
 
 def test_area_is_that_of_what_covers_the_closed_mouth():

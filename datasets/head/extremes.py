@@ -1,7 +1,4 @@
-"""The head model: time of its forward pass (``headbench doctor bench head``) and extremes (``headbench doctor stress head``).
-
-Measured on a head with random bases of any size: as large as a licensed model's, without a licence.
-"""
+"""``headbench doctor stress head``: numerical extremes of the head model."""
 
 from __future__ import annotations
 
@@ -12,108 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.benchmarks import Row, findings, table, take_turns
-from ...bench.contracts import FloatArray, Progress
+from ...bench.benchmarks import Row, table
+from ...bench.contracts import Progress
 from ...bench.specs import CommandResult
-from ..head.arrays import HeadArrays
-from ..head.model import HeadModel
-from ..head.procedural.model import procedural_head
-
-FLAME_SIZES = (300, 100)
-"""Identity and expression directions of FLAME."""
-
-_WAVES = 3
-_COARSE, _FINE = 20.0, 160.0  # radians per metre: bumps from the size of a cheek to that of a lip
-_IDENTITY, _EXPRESSION = 0.004, 0.003  # metres: root mean square of the first direction
-_CORRECTIVE = 0.002  # metres per unit entry of R - I
+from .arrays import HeadArrays
+from .model import HeadModel
+from .procedural.model import procedural_head
 
 Arguments = Mapping[str, Tensor]
-
-
-def sized_head(version: str, shape_size: int, expression_size: int) -> HeadArrays:
-    """The procedural head's surface and rig with smooth random bases, dense as those of a scanned model.
-
-    Directions are sums of plane waves, later ones finer and smaller; expressions act where the procedural head's
-    do. All 36 pose correctives act. Versions differ in their bases alone.
-
-    Parameters
-    ----------
-    version : str
-        Version of the procedural head, "2020" or "2023"; seeds the bases too.
-    shape_size, expression_size : int
-        Number of directions.
-    """
-    head = procedural_head(version)
-    rng = np.random.default_rng([int(version[-4:]), shape_size, expression_size])
-    points = np.asarray(head.template, dtype=np.float64)
-    mobility = np.linalg.norm(head.expression_basis.reshape(len(points), -1), axis=1)
-    mobility = np.sqrt(mobility / mobility.max())[:, None, None]
-    eyeballs = np.concatenate([head.regions["left_eyeball"], head.regions["right_eyeball"]])
-    identity = _IDENTITY * _waves(points, shape_size, rng)
-    identity[eyeballs] = identity[eyeballs].mean(axis=0)
-    expression = _EXPRESSION * mobility * _waves(points, expression_size, rng)
-    corrective = _CORRECTIVE * mobility * _waves(points, head.pose_basis.shape[2], rng)
-    return replace(
-        head,
-        version=f"{head.version}-{shape_size}-{expression_size}",
-        shape_basis=identity.astype(np.float32),
-        expression_basis=expression.astype(np.float32),
-        pose_basis=corrective.astype(np.float32),
-    )
-
-
-def _waves(points: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
-    """(V, 3, count) smooth fields, the first ones of unit root mean square, falling with the index."""
-    fineness = np.geomspace(_COARSE, _FINE, count)
-    axes = rng.normal(size=(3, _WAVES * 3 * count))
-    axes /= np.linalg.norm(axes, axis=0)
-    phases = points @ axes * np.repeat(fineness, 3 * _WAVES) + rng.uniform(0, 2 * np.pi, axes.shape[1])
-    fields = np.sin(phases).reshape(len(points), count, 3, _WAVES).sum(axis=3)
-    fields /= np.sqrt(np.square(fields).mean(axis=(0, 2), keepdims=True))
-    return (fields / np.sqrt(1 + np.arange(count))[:, None]).transpose(0, 2, 1)
-
-
-BATCHES = (1, 16)
-CLOSE = 1e-5
-"""Metres; the largest difference between any two ways."""
-ROUNDS, QUICK_ROUNDS = 200, 40
-ONCE = "identity blended once"
-
-
-def speed(quick: bool, progress: Progress) -> CommandResult:
-    """Time poses of one identity, blended once and at each call, in turns; passed where both agree."""
-    model = HeadModel(sized_head("2023", *FLAME_SIZES))
-    rows: list[Row] = []
-    with torch.no_grad():
-        for number, batch in enumerate(BATCHES):
-            progress(number, len(BATCHES), f"batch {batch}")
-            ways = _ways(model, batch)
-            vertices = {name: way() for name, way in ways.items()}
-            seconds = take_turns(ways, QUICK_ROUNDS if quick else ROUNDS)
-            for name, values in seconds.items():
-                row = {"batch": batch, "way": name, "ms a frame": 1e3 * min(values) / batch}
-                row["times as fast"] = min(seconds[ONCE]) / min(values)
-                row["differs by m"] = float((vertices[name] - vertices[ONCE]).abs().max())
-                rows.append(row)
-    note = (
-        f"{len(model.template)} vertices, {FLAME_SIZES[0]} + {FLAME_SIZES[1]} directions, float32, {torch.get_num_threads()} "
-        "threads; the least of runs by the clock."
-    )
-    faults = [f"{row['way']}: differs by too much" for row in rows if not row["differs by m"] < CLOSE]
-    return findings({"Forward pass without gradients": rows}, note, faults)
-
-
-def _ways(model: HeadModel, batch: int) -> dict[str, Callable[[], Tensor]]:
-    """Ways to the vertices (B, V, 3) of a batch of poses of one identity."""
-    pose = _arguments(model, batch, torch.float32)
-    shape = pose.pop("shape")[:1]
-    pose.pop("eyelids", None)
-    canonical = model.canonical(shape)
-    return {
-        ONCE: lambda: model(canonical=canonical, **pose),
-        "identity blended at each call": lambda: model(shape=shape.expand(batch, -1), **pose),
-    }
-
 
 ANGLES = ("rotation", "neck", "jaw", "eyes")
 FLOAT32 = 1e-6
@@ -165,7 +68,7 @@ HEAD_EXTREMES = (
 
 def stress(quick: bool, progress: Progress) -> CommandResult:
     """Try every case; ``quick`` tries the same, it takes seconds."""
-    rows = []
+    rows: list[Row] = []
     for done, case in enumerate(HEAD_EXTREMES):
         progress(done, len(HEAD_EXTREMES), case.name)
         rows.append(try_extreme(case))
