@@ -120,20 +120,23 @@ def posed_vertices(plan: CapturePlan, pose: HeadPose) -> np.ndarray:
 
 
 def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
-    """(H, W) bool: pixels whose centre is covered, tested triangle by triangle with barycentric signs."""
-    pixels = projected(vertices, camera)
-    covered = np.zeros((camera.height, camera.width), dtype=bool)
-    size = [camera.width, camera.height]
-    for corners in pixels[faces]:
-        left, top = np.clip(np.floor(corners.min(axis=0)).astype(int), 0, size)
-        right, bottom = np.clip(np.ceil(corners.max(axis=0)).astype(int), 0, size)
-        y, x = np.mgrid[top:bottom, left:right] + 0.5
-        sides = [
-            (q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0])
-            for p, q in zip(corners, np.roll(corners, -1, axis=0))
+    """(H, W) bool: pixels whose centre is covered, tested for each triangle with barycentric signs."""
+    corners = projected(vertices, camera)[faces]
+    size = np.array([camera.width, camera.height])
+    low = np.clip(np.floor(corners.min(axis=1)).astype(int), 0, size)
+    high = np.clip(np.ceil(corners.max(axis=1)).astype(int), 0, size)
+    steps = np.indices((high - low).max(axis=0)).reshape(2, -1).T
+    pixels = low[:, None] + steps  # (F, n, 2)
+    x, y = np.moveaxis(pixels + 0.5, -1, 0)
+    sides = np.stack(
+        [
+            (q[:, :1] - p[:, :1]) * (y - p[:, 1:]) - (q[:, 1:] - p[:, 1:]) * (x - p[:, :1])
+            for p, q in zip(np.moveaxis(corners, 1, 0), np.moveaxis(np.roll(corners, -1, axis=1), 1, 0))
         ]
-        inside = np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
-        covered[top:bottom, left:right] |= inside
+    )
+    inside = ((sides >= 0).all(axis=0) | (sides <= 0).all(axis=0)) & (pixels < high[:, None]).all(axis=-1)
+    covered = np.zeros((camera.height, camera.width), dtype=bool)
+    covered[tuple(pixels[inside].T[::-1])] = True
     return covered
 
 
