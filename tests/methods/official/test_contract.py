@@ -182,7 +182,7 @@ def test_training_frames_alone_are_exported(name, method, clip, tmp_path):
         with pytest.raises(InputError):
             check_export(work, images | wrong, clip)
     shutil.copyfile(work.root / first, work.program / "test.JPG")
-    with pytest.raises(InputError, match="another image"):
+    with pytest.raises(InputError, match="test.JPG"):
         check_export(work, images, clip)
     (work.program / "test.JPG").unlink()
     (work.root / first).unlink()

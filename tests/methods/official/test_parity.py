@@ -107,7 +107,7 @@ def test_the_order_is_that_of_the_native_method(folder, monkeypatch):
     ],
 )
 def test_bad_input_is_told_before_any_work(folder, capsys, words, expected):
-    assert cli.main(["run", "parity", *words.split(), "--out", "out"]) == 2
+    assert cli.main(["run", "parity", *words.split(), "--device", "cpu-shim", "--out", "out"]) == 2
     assert expected in capsys.readouterr().err
     assert not list(folder.glob("out/run/901"))
 
